@@ -77,6 +77,15 @@ def piece(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Resu
     return _Kernel(function, {"no_cpython_wrapper": True, "no_cfunc_wrapper": True})
 
 
+def merged(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+    """Return a piece that becomes part of its callers.
+
+    A call of a piece counts references to all arrays that it is given, which takes longer than many a piece;
+    within one function, nearly all of that counting cancels out.
+    """
+    return _Kernel(function, {"forceinline": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True})
+
+
 def inlined(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
     """Return a small helper that is compiled into every kernel that calls it.
 
@@ -85,6 +94,12 @@ def inlined(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Re
     """
     options = {"forceinline": True, "_nrt": False, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     return _Kernel(function, options)
+
+
+def direct(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+    """Return what calls of a kernel run from now on, without asking at each call; after `compile_ahead`."""
+    kernel = cast("_Kernel[_Arguments, _Result]", function)
+    return function if _process.interprets or _process.only == "interpreted" else kernel.compiled()
 
 
 def compile_ahead() -> None:

@@ -11,8 +11,9 @@ from typing import NamedTuple
 from spatial_replay.compiled import compile_ahead
 from spatial_replay.errors import TraceError, UsageError
 from spatial_replay.geometry.arrays import Floats
+from spatial_replay.monitor.online.live_runs import ROOM
 from spatial_replay.monitor.result import no_such_node
-from spatial_replay.monitor.semantics import LIVE_ROOM, checked_semantics
+from spatial_replay.monitor.semantics import checked_semantics
 from spatial_replay.monitor.stream import LiveStream
 from spatial_replay.monitor.verdict import Verdict, final_verdict, online_verdict, worst_verdict
 from spatial_replay.monitor.violation import Settled, Violation, ViolationLog, rehearse
@@ -166,13 +167,15 @@ class Monitor:
         compile_ahead()
         # a trial run loads every kernel now, so that no sample has to wait for one
         trial = LiveStream(specification, checked, 0)
-        for time_ns in range(2 * LIVE_ROOM):
+        for time_ns in range(2 * ROOM):
             trial.extend(Sample(time_ns))
+        # unknown members of open groups take another way
+        trial.extend(Sample(2 * ROOM, unknown={"unknown": None}))
         if checked == "ltlf":
             rehearse(specification)
         self._live = LiveStream(specification, checked, start_ns or 0)
         self._violations = ViolationLog(specification, start_ns or 0) if checked == "ltlf" else None
-        self._last_ns: int | None = None
+        self._last_ns = -1
         self._numbers: list[Floats | None] = [None] * len(self._specs)
 
     def endings(self) -> tuple[Ending, ...]:
@@ -193,19 +196,30 @@ class Monitor:
         """
         if not isinstance(sample, Sample):
             raise UsageError(f"{sample!r} is not a sample; give a Sample(time_ns, objects)")
-        if self._last_ns is not None and sample.time_ns <= self._last_ns:
-            at, last = times_apart(sample.time_ns, self._last_ns)
+        time_ns = sample.time_ns
+        if time_ns <= self._last_ns:
+            at, last = times_apart(time_ns, self._last_ns)
             raise TraceError(
                 f"a sample at {at} follows one at {last}; give samples in the order of their times"
             )
-        self._last_ns = sample.time_ns
-        self._numbers = numbers = list(map(_read_only, self._live.extend(sample)))
-        specs = tuple(map(SpecUpdate, self._specs, numbers, self._names))
-        if self._violations is None:
-            return Update(sample.time_ns, specs, self._places)
-        self._violations.extend(sample, numbers)
-        known = self._violations
-        return Update(sample.time_ns, specs, self._places, known.settled, known.satisfied)
+        self._last_ns = time_ns
+        self._numbers = numbers = self._live.extend(sample)
+        specs = []
+        for spec, each, names in zip(self._specs, numbers, self._names, strict=True):
+            # bypasses the constructors of frozen values, which would take as long as the kernel
+            of_spec = object.__new__(SpecUpdate)
+            of_spec.__dict__.update(spec=spec, numbers=each, names=names)
+            specs.append(of_spec)
+        settled: tuple[Settled, ...] = ()
+        satisfied: tuple[Settled, ...] = ()
+        if self._violations is not None:
+            self._violations.extend(sample, numbers)
+            settled, satisfied = self._violations.settled, self._violations.satisfied
+        update = object.__new__(Update)
+        update.__dict__.update(
+            time_ns=time_ns, specs=tuple(specs), places=self._places, settled=settled, satisfied=satisfied
+        )
+        return update
 
 
 def _places_of_names(names: tuple[tuple[str | None, ...], ...]) -> Mapping[str, tuple[int, int]]:
@@ -220,9 +234,3 @@ def _places_of_names(names: tuple[tuple[str | None, ...], ...]) -> Mapping[str, 
 
 def _robustness(numbers: Floats | None) -> float:
     return float("nan") if numbers is None else float(numbers[0, 0])
-
-
-def _read_only(numbers: Floats | None) -> Floats | None:
-    if numbers is not None:
-        numbers.flags.writeable = False
-    return numbers

@@ -15,9 +15,6 @@ from spatial_replay.spec.formula import Formula, Specification
 Semantics: TypeAlias = Literal["ltlf", "paper"]
 """Robustness over finite traces, or the paper's Def. 16 to the letter."""
 
-LIVE_ROOM = 64
-"""Recent samples a live run has room for at first: few, so that they stay in the processor's cache."""
-
 
 def checked_semantics(name: str, specifications: Iterable[Specification] = ()) -> Semantics:
     """Return a name as semantics that define all operators of some specifications.
@@ -74,15 +71,11 @@ class Evaluator(NamedTuple):
         """Whether numbers before the end of a log are about its continuations, too."""
         return self.semantics == "ltlf"
 
-    def begin(self, *, live: bool = False) -> Run:
-        """Start a run before the first sample.
-
-        Args:
-            live: samples will come one by one.
-        """
+    def begin(self) -> Run:
+        """Start a run before the first sample."""
         if self.semantics == "paper":
             return PaperRun(self.formula, self.program.leaves)
-        return OnlineRun(self.program, room=LIVE_ROOM, tile=1) if live else OnlineRun(self.program)
+        return OnlineRun(self.program)
 
     def leaves_within_log(
         self, leaves: Floats, positions: Integers, times_ns: Integers, first_ns: int

@@ -20,6 +20,7 @@ from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.online.codes import in_channels
+from spatial_replay.monitor.online.live_runs import LiveRuns
 from spatial_replay.monitor.online.program import compile_formula
 from spatial_replay.monitor.semantics import Evaluator, Semantics
 from spatial_replay.monitor.verdict import Verdict, final_verdict
@@ -181,10 +182,12 @@ class LiveStream:
         """
         formulas = [spec.formula for spec in specification.results]
         self._evaluators = [Evaluator(each, compile_formula(each), semantics) for each in formulas]
-        self._runs = [evaluator.begin(live=True) for evaluator in self._evaluators]
-        leaves = [evaluator.program.leaves for evaluator in self._evaluators]
-        self._own = [slice(*ends) for ends in pairwise(accumulate(map(len, leaves), initial=0))]
-        self._leaves = SampleLeaves(leaves, specification.regions)
+        programs = [evaluator.program for evaluator in self._evaluators]
+        self._leaves = SampleLeaves([program.leaves for program in programs], specification.regions)
+        self._live = LiveRuns(programs) if semantics == "ltlf" else None
+        self._apart = [] if self._live else [evaluator.begin() for evaluator in self._evaluators]
+        self._own_leaves = _ranges(len(program.leaves) for program in programs)
+        self._own_nodes = _ranges(len(program.reports) for program in programs)
         self._start_ns = start_ns
         self._first_ns: int | None = None
         self._position = -1
@@ -193,28 +196,46 @@ class LiveStream:
     def finals(self) -> list[Floats | None]:
         """For each formula (N, 2), lower and upper end of each node's value if the log ends here, or None
         before the first sample that is evaluated."""
-        return [run.final if len(run) else None for run in self._runs]
+        if self._live is not None:
+            return self._live.finals
+        return [run.final if len(run) else None for run in self._apart]
 
     def extend(self, sample: Sample) -> list[Floats | None]:
         """Add the next sample, whose time comes after the last one's.
 
         Returns:
-            (N, 4) for each formula: value, now, lower and upper of each node. Before the start, None, or NaN
-            under semantics without continuations to wait for.
+            (N, 4) for each formula, read-only: value, now, lower and upper of each node. Before the start,
+            None, or NaN under semantics without continuations to wait for.
         """
+        samples = self._leaves.look_at(sample)
+        if self._live is None:
+            return self._extend_apart(sample, samples)
+        if sample.time_ns < self._start_ns:
+            return [None] * len(self._evaluators)
+        planned = self._leaves.planned(samples)
+        if planned is None:
+            numbers = self._live.extend_with(self._leaves.values(samples), sample.time_ns)
+        else:
+            numbers = self._live.extend(*planned, sample.time_ns)
+        numbers.setflags(write=False)
+        return [numbers[own] for own in self._own_nodes] if len(self._own_nodes) > 1 else [numbers]
+
+    def _extend_apart(self, sample: Sample, samples: Sequence[Sample | None]) -> list[Floats | None]:
         self._position += 1
         if self._first_ns is None:
             self._first_ns = sample.time_ns
-        samples = self._leaves.look_at(sample)
         if sample.time_ns < self._start_ns:
-            return [
-                None if each.has_open_end else np.full((len(each.program.reports), 4), np.nan)
-                for each in self._evaluators
-            ]
+            return [np.full((len(each.program.reports), 4), np.nan) for each in self._evaluators]
         values = self._leaves.values(samples)
         position, time_ns = np.array([self._position]), np.array([sample.time_ns])
-        numbers: list[Floats | None] = []
-        for evaluator, run, own in zip(self._evaluators, self._runs, self._own, strict=True):
+        results: list[Floats | None] = []
+        for evaluator, run, own in zip(self._evaluators, self._apart, self._own_leaves, strict=True):
             leaves = evaluator.leaves_within_log(values[:, own], position, time_ns, self._first_ns)
-            numbers.append(run.extend(leaves, time_ns)[:, :, 0])
-        return numbers
+            numbers = run.extend(leaves, time_ns)[:, :, 0]
+            numbers.flags.writeable = False
+            results.append(numbers)
+        return results
+
+
+def _ranges(lengths: Iterable[int]) -> list[slice]:
+    return [slice(*ends) for ends in pairwise(accumulate(lengths, initial=0))]

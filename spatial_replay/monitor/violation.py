@@ -231,7 +231,7 @@ class ViolationLog:
         self._specification = specification
         self._start_ns = start_ns
         self._samples: deque[Sample] = deque(maxlen=REMEMBERED)
-        self._first_ns: int | None = None
+        self._first_ns = 0
         self._dropped = False
         self._open = [
             (index, spec, list(conjuncts_of(spec.formula, spec.name)))
@@ -243,18 +243,19 @@ class ViolationLog:
 
     def extend(self, sample: Sample, numbers: Sequence[Floats | None]) -> None:
         """Take in a sample and the numbers (N, 4) of each result after it."""
-        if self._first_ns is None:
-            self._first_ns = sample.time_ns
         samples = self._samples
-        self._dropped = self._dropped or len(samples) == REMEMBERED
+        if len(samples) == REMEMBERED:
+            self._dropped = True
+        elif not samples:
+            self._first_ns = sample.time_ns
         samples.append(sample)
         for index, spec, conjuncts in self._open:
             after = numbers[index]
             if after is None:
                 continue
-            if after[0, 3] < 0.0 and conjuncts:
+            if after.item(0, 3) < 0.0 and conjuncts:
                 self._settle(spec, conjuncts, after)
-            elif after[0, 2] >= 0.0 and index in self._unsatisfied:
+            elif after.item(0, 2) >= 0.0 and index in self._unsatisfied:
                 del self._unsatisfied[index]
                 whole = Conjunct(0, spec.name, spec.formula)
                 found = self._settled(spec, whole, Verdict.SATISFIED, float(after[0, 2]))
@@ -280,5 +281,5 @@ class ViolationLog:
             samples,
             next(k for k, each in enumerate(samples) if each.time_ns >= self._start_ns),
             not self._dropped,
-            self._first_ns or 0,
+            self._first_ns,
         )

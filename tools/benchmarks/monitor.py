@@ -9,9 +9,11 @@ import random
 import tempfile
 import time
 from array import array
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 import spatial_replay as sr
 
@@ -66,6 +68,9 @@ def bench_monitor(bench: Any) -> None:
             f"from sample {start_at:,}: 99.9 %", stretch, 0.999, limit_s=1e-3 if is_quiet else None
         )
     bench.quantile("doing nothing: 99.9 %", pauses, 0.999)
+    passes = _passes_over_outlines(samples)
+    bench.quantile("numpy over the same outlines", passes, 0.5)
+    bench.ratio("median, to numpy's", _median(times[10:STRETCH]) / _median(passes), 12.0)
     bench.size(f"grown over {count:,} samples", grown, 5_000_000)
 
     def read_all(update: Any) -> object:
@@ -81,6 +86,21 @@ def bench_monitor(bench: Any) -> None:
         unit="sample",
         runs=51,
     )
+
+
+def _median(times: Sequence[float]) -> float:
+    return sorted(times)[len(times) // 2]
+
+
+def _passes_over_outlines(samples: list[sr.Sample]) -> list[float]:
+    """Times of what numpy needs to join the outlines of a sample's objects, and to take a minimum."""
+    times = []
+    for k in range(STRETCH):
+        objects = samples[k % len(samples)].objects
+        start = time.perf_counter()
+        np.concatenate([part.vertices for each in objects.values() for part in each.footprint.parts]).min()
+        times.append(time.perf_counter() - start)
+    return times
 
 
 def _nothing_for(duration_s: float) -> list[float]:

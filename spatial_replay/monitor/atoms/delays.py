@@ -58,12 +58,14 @@ class RecentSamples:
 
     def __init__(self, delays: Iterable[Delay]) -> None:
         self._queues: list[tuple[Delay, deque[Sample]]] = [(delay, deque()) for delay in delays]
+        self._is_newest_only = [delay for delay, _ in self._queues] == [NO_DELAY]
 
     def add(self, sample: Sample) -> list[Sample | None]:
         """Add the next sample; return the one at each delay from it, None before the first sample."""
-        found = [_at_delay(delay, queue, sample) for delay, queue in self._queues]
         self._newest = sample
-        return found
+        if self._is_newest_only:
+            return [sample]
+        return [_at_delay(delay, queue, sample) for delay, queue in self._queues]
 
     @property
     def span(self) -> list[Sample]:

@@ -11,11 +11,13 @@ each sample assigns objects to placeholders. Tracks that appear under new names 
 
 from __future__ import annotations
 
+from array import array
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import chain, zip_longest
 from math import nan
-from typing import TypeAlias, cast
+from types import MappingProxyType
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 
@@ -26,7 +28,13 @@ from spatial_replay.geometry.footprint import TrackedObject
 from spatial_replay.geometry.measure import QUANTITY_CODES
 from spatial_replay.monitor.atoms.delays import NO_DELAY, RecentSamples, iter_delays
 from spatial_replay.monitor.atoms.instructions import LeafCode
-from spatial_replay.monitor.atoms.live_kernel import ABSENT, PlanArrays, leaves_of_sample, packed
+from spatial_replay.monitor.atoms.live_kernel import (
+    ABSENT,
+    PackedPlan,
+    PlanArrays,
+    leaves_of_sample,
+    packed,
+)
 from spatial_replay.monitor.atoms.live_rows import (
     Leaves,
     Member,
@@ -63,67 +71,51 @@ class LeafPlan:
         rows = PlanRows(frame, members)
         code = LeafCode(rows)
         outputs = [number for leaves in frame.leaves for number in code.add_leaves(leaves, {})]
-        self._arrays = packed(_arrays(frame, rows, code, outputs))
+        self.arrays = packed(_arrays(frame, rows, code, outputs))
         self._places = tuple(rows.places)
         self._signals = tuple(code.signals)
 
     @property
     def nbytes(self) -> int:
         """The memory of its arrays."""
-        return sum(array.nbytes for array in self._arrays)
+        return sum(array.nbytes for array in self.arrays)
 
-    def leaf_values(self, samples: Sequence[Sample | None], stands_for: Mapping[str, str]) -> Floats:
-        """Compute the leaves of all formulas, one after the other.
+    def numbers(self, samples: Sequence[Sample | None], stands_for: Mapping[str, str]) -> Floats:
+        """Flatten samples for `leaves_of_sample`.
 
         Args:
             samples: the one at each of the frame's delays; None before the first.
             stands_for: the objects that go by another name among the plan's members.
-
-        Returns:
-            (C, A, 1), in as many channels as `leaves.leaf_values` would give.
         """
-        seen = [
-            None if (sample := samples[number]) is None else sample.objects.get(stands_for.get(name, name))
-            for number, name in self._places
-        ]
-        newest = cast(Sample, samples[0]).signals
-        whole, numbers, vertices = self._flattened(cast(list[TrackedObject | None], seen))
-        return leaves_of_sample(
-            self._arrays,
-            np.array([ABSENT if sample is None else 0 for sample in samples] + whole, np.int64),
-            np.array(numbers + [newest.get(name, nan) for name in self._signals], np.float64),
-            np.concatenate(vertices).ravel(),
-        )
-
-    def _flattened(self, seen: list[TrackedObject | None]) -> tuple[list[int], list[float], list[Floats]]:
-        """Flatten the objects at the plan's places for `leaves_of_sample`."""
-        classes: list[int] = []
-        counts: list[int] = []
-        sizes: list[int] = []
-        numbers: list[float] = []
-        radii: list[float] = []
-        vertices: list[Floats] = [_NO_VERTICES]
-        for tracked in seen:
+        numbers: list[float] = [ABSENT if sample is None else 0 for sample in samples]
+        parts: list[float] = []
+        vertices: list[bytes] = []
+        classes = self._classes
+        for place, name in self._places:
+            sample = samples[place]
+            tracked: Any = None
+            if sample is not None:
+                tracked = sample.objects.get(stands_for.get(name, name) if stands_for else name)
             if tracked is None:
-                classes.append(ABSENT)
-                counts.append(0)
-                numbers += _NO_NUMBERS
+                numbers += _NO_OBJECT_THERE
                 continue
-            classes.append(class_code(tracked, self._classes))
-            bottom, top = tracked.height or _NO_HEIGHT
-            numbers += (bottom, top, nan if tracked.yaw is None else tracked.yaw, tracked.uncertainty)
-            parts = tracked.footprint.parts
-            counts.append(len(parts))
-            for part in parts:
-                sizes.append(len(part.vertices))
-                radii.append(part.radius)
-                vertices.append(part.vertices)
-        return classes + counts + sizes, numbers + radii, vertices
+            yaw, (bottom, top), own = tracked.yaw, tracked.height or _NO_HEIGHT, tracked.footprint.parts
+            code = class_code(tracked, classes) if classes else 0
+            numbers += (code, len(own), bottom, top, nan if yaw is None else yaw, tracked.uncertainty)
+            for part in own:
+                corners = part.vertices
+                parts += (len(corners), part.radius)
+                # an array that is read as a buffer keeps 72 bytes for that as long as it lives
+                vertices.append(corners.tobytes())
+        if self._signals:
+            newest = cast(Sample, samples[0]).signals
+            parts += [newest.get(name, nan) for name in self._signals]
+        # one copy of all: each array that is made or passed costs as much as some objects
+        return np.frombuffer(b"".join((array("d", numbers + parts), *vertices)))
 
 
 _NO_HEIGHT = (nan, nan)
-_NO_NUMBERS = (nan, nan, nan, 0.0)
-_NO_VERTICES = np.empty((0, 2))
+_NO_OBJECT_THERE = (ABSENT, 0, nan, nan, nan, 0.0)
 
 
 def class_code(tracked: TrackedObject, classes: Mapping[str, int]) -> int:
@@ -200,6 +192,7 @@ MOST_BYTES = 1 << 22
 
 _NO_OBJECT = ""
 """A name that no object has."""
+_NOTHING: Mapping[str, str] = MappingProxyType({})
 
 _Classes: TypeAlias = tuple[int, ...]
 """Codes of the classes of one object in the samples looked at: nearly always one."""
@@ -248,11 +241,25 @@ class SampleLeaves:
         Raises:
             UsageError: more bindings than `MAX_BINDINGS`.
         """
-        if self._only_plan is not None:
+        planned = self.planned(samples)
+        return self._values_with_unknown() if planned is None else leaves_of_sample(*planned)
+
+    def planned(self, samples: Sequence[Sample | None]) -> tuple[PackedPlan, Floats] | None:
+        """Return what `leaves_of_sample` takes; None if `values` alone can compute the leaves.
+
+        Raises:
+            UsageError: more bindings than `MAX_BINDINGS`.
+        """
+        plan, stands_for = self._only_plan, _NOTHING
+        if plan is None:
             # to what names its objects, one that is unknown is as one that is not there
-            return self._only_plan.leaf_values(samples, {})
-        if any(sample is not None and sample.unknown for sample in samples):
-            return self._values_with_unknown()
+            if any(sample is not None and sample.unknown for sample in samples):
+                return None
+            plan, stands_for = self._fitting_plan(samples)
+        return plan.arrays, plan.numbers(samples, stands_for)
+
+    def _fitting_plan(self, samples: Sequence[Sample | None]) -> tuple[LeafPlan, Mapping[str, str]]:
+        """Return a plan for the members of open groups in some samples, and their names in it."""
         unnamed = self._unnamed_members(samples)
         counts = {classes: _room(len(names)) for classes, names in unnamed.items()}
         try:
@@ -265,7 +272,7 @@ class SampleLeaves:
             stands_for.update(
                 zip_longest(self._placeholders(classes, counts[classes]), names, fillvalue=_NO_OBJECT)
             )
-        return plan.leaf_values(samples, stands_for)
+        return plan, stands_for
 
     def _values_with_unknown(self) -> Floats:
         """Compute the leaves as a replay does: plans have no unknown members of open groups."""

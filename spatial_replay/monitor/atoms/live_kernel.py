@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from spatial_replay.compiled import inlined, kernel, piece
+from spatial_replay.compiled import inlined, kernel, merged
 from spatial_replay.geometry.arrays import Flags, Floats, Integers
 from spatial_replay.geometry.kernels import measure_rows
 from spatial_replay.geometry.measure import misalignment_of
@@ -21,8 +21,9 @@ ABSENT = -1
 ANY = -1
 """The required class if any class matches."""
 
-NUMBERS_OF_PLACE = 4
-"""Bottom, top, yaw (NaN if absent) and uncertainty."""
+CLASS, PARTS, BOTTOM, TOP, YAW, UNCERTAINTY = range(6)
+"""What a sample says of a place: bottom, top and yaw are NaN where there is none."""
+NUMBERS_OF_PLACE = 6
 
 
 class PlanArrays(NamedTuple):
@@ -96,7 +97,7 @@ def packed(plan: PlanArrays) -> PackedPlan:
     return PackedPlan(whole, numbers, np.array(starts, np.int64))
 
 
-@piece
+@merged
 def _unpacked(plan: PackedPlan) -> PlanArrays:
     at, whole, numbers = plan.starts, plan.whole, plan.numbers
     return PlanArrays(
@@ -127,34 +128,77 @@ def _unpacked(plan: PackedPlan) -> PlanArrays:
     )
 
 
+class SampleRows(NamedTuple):
+    """The rows of a plan in one sample, as `measure_rows` takes them, with the class code of each.
+
+    Attributes:
+        places: (P, NUMBERS_OF_PLACE), what a sample says of each place.
+        signals: (S, 1).
+    """
+
+    classes: Integers
+    part_start: Integers
+    vertex_start: Integers
+    vertices: Floats
+    radius: Floats
+    bottom: Floats
+    top: Floats
+    places: Floats
+    signals: Floats
+
+
+@merged
+def _rows_of_sample(plan: PlanArrays, numbers: Floats) -> SampleRows:
+    """Lay the regions and the objects of a sample out in rows; `numbers` as for `leaves_of_sample`."""
+    samples, regions, places, signals = plan.extent[0], plan.extent[1], plan.extent[2], plan.extent[3]
+    here = samples + regions
+    at = samples + NUMBERS_OF_PLACE * places
+    of_places = numbers[samples:at].reshape((places, NUMBERS_OF_PLACE))
+    classes = np.zeros(here + places, np.int64)
+    part_start = np.zeros(here + places + 1, np.int64)
+    bottom, top = np.empty(here + places), np.empty(here + places)
+    for k in range(samples):
+        classes[k] = int(numbers[k])
+        bottom[k] = top[k] = np.nan
+    for k in range(regions):
+        part_start[samples + k + 1] = part_start[samples + k] + plan.region_parts[k]
+        bottom[samples + k], top[samples + k] = plan.region_heights[k, 0], plan.region_heights[k, 1]
+    for k in range(places):
+        classes[here + k] = int(of_places[k, CLASS])
+        part_start[here + k + 1] = part_start[here + k] + int(of_places[k, PARTS])
+        bottom[here + k], top[here + k] = of_places[k, BOTTOM], of_places[k, TOP]
+    known, parts = len(plan.region_radius), part_start[here + places]
+    vertex_start, radius = np.zeros(parts + 1, np.int64), np.empty(parts)
+    for p in range(known):
+        vertex_start[p + 1], radius[p] = vertex_start[p] + plan.region_sizes[p], plan.region_radius[p]
+    for p in range(known, parts):
+        vertex_start[p + 1], radius[p] = vertex_start[p] + int(numbers[at]), numbers[at + 1]
+        at += 2
+    of_regions, following = len(plan.region_vertices), at + signals
+    vertices = np.empty(2 * vertex_start[parts])
+    for k in range(of_regions):
+        vertices[k] = plan.region_vertices[k]
+    for k in range(of_regions, len(vertices)):
+        vertices[k] = numbers[following + k - of_regions]
+    return SampleRows(
+        classes,
+        part_start,
+        vertex_start,
+        vertices.reshape((-1, 2)),
+        radius,
+        bottom,
+        top,
+        of_places,
+        numbers[at:following].reshape((signals, 1)),
+    )
+
+
 @inlined
 def _is_there(classes: Integers, row: int, wanted: int) -> bool:
     return classes[row] != ABSENT and wanted in (ANY, classes[row])
 
 
-@piece
-def _starts(before: int, first: Integers, second: Integers) -> Integers:
-    """Return where rows begin and the last ends: `before` empty ones, then lengths `first` and `second`."""
-    starts = np.zeros(before + len(first) + len(second) + 1, np.int64)
-    at = before
-    for lengths in (first, second):
-        for k in range(len(lengths)):
-            starts[at + 1] = starts[at] + lengths[k]
-            at += 1
-    return starts
-
-
-@piece
-def _joined(first: Floats, second: Floats) -> Floats:
-    joined = np.empty(len(first) + len(second))
-    for k in range(len(first)):
-        joined[k] = first[k]
-    for k in range(len(second)):
-        joined[len(first) + k] = second[k]
-    return joined
-
-
-@piece
+@merged
 def _lengths(starts: Integers) -> Integers:
     lengths = np.empty(len(starts) - 1, np.int64)
     for k in range(len(lengths)):
@@ -162,50 +206,39 @@ def _lengths(starts: Integers) -> Integers:
     return lengths
 
 
-@piece
+@merged
 def _spreads(starts: Integers, members: Integers, places: Floats, here: int) -> Floats:
     """Return each operand's uncertainty, the largest of its members'; then 0, for no operand."""
     spreads = np.zeros(len(starts))
     for operand in range(len(starts) - 1):
         for k in range(starts[operand], starts[operand + 1]):
             if members[k] >= here:
-                spreads[operand] = max(spreads[operand], places[members[k] - here, 3])
+                spreads[operand] = max(spreads[operand], places[members[k] - here, UNCERTAINTY])
     return spreads
 
 
 @inlined
 def _yaw(row: int, classes: Integers, places: Floats, here: int) -> float:
-    return places[row - here, 2] if row >= here and classes[row] != ABSENT else np.nan
+    return places[row - here, YAW] if row >= here and classes[row] != ABSENT else np.nan
 
 
-@piece
-def _measure(
-    plan: PlanArrays, classes: Integers, counts: Integers, sizes: Integers, radius: Floats, places: Floats,
-    vertices: Floats, values: Floats, spreads: Floats,
-) -> None:  # fmt: skip
+@merged
+def _measure(plan: PlanArrays, rows: SampleRows, values: Floats, spreads: Floats) -> None:
     """Fill `values` and `spreads` (K, 1), as `measurements.measured` gives them."""
-    here, regions = len(classes) - len(places), plan.extent[1]
-    bottom, top = np.empty(len(classes)), np.empty(len(classes))
-    for row in range(len(classes)):
-        bottom[row] = top[row] = np.nan
-        if row >= here:
-            bottom[row], top[row] = places[row - here, 0], places[row - here, 1]
-        elif row >= here - regions:
-            heights = plan.region_heights[row - here + regions]
-            bottom[row], top[row] = heights[0], heights[1]
+    classes, places = rows.classes, rows.places
+    here = len(classes) - len(places)
     members = np.empty(len(plan.operand_rows), np.int64)
     for k in range(len(members)):
         is_there = _is_there(classes, plan.operand_rows[k], plan.operand_classes[k])
         members[k] = plan.operand_rows[k] if is_there else ABSENT
     measured = np.empty((len(plan.geometric), 1))
-    joined = _joined(plan.region_vertices, vertices).reshape((-1, 2))
     measure_rows(
-        _starts(plan.extent[0], plan.region_parts, counts),
-        _starts(0, plan.region_sizes, sizes),
-        joined,
-        _joined(plan.region_radius, radius),
-        bottom,
-        top,
+        rows.part_start,
+        rows.vertex_start,
+        rows.vertices,
+        rows.radius,
+        rows.bottom,
+        rows.top,
         members,
         plan.operand_start,
         _lengths(plan.operand_start),
@@ -213,7 +246,7 @@ def _measure(
         plan.quantity,
         plan.first,
         plan.second,
-        np.empty((len(joined), 3)),
+        np.empty((len(rows.vertices), 3)),
         measured,
     )
     of_operands = _spreads(plan.operand_start, members, places, here)
@@ -222,7 +255,7 @@ def _measure(
         values[k, 0] = measured[g, 0]
         spreads[k, 0] = of_operands[plan.first[g]] + of_operands[plan.second[g]]  # the last for -1
     for y in range(len(plan.yaws)):
-        k, a, b = plan.yaws[y]
+        k, a, b = plan.yaws[y, 0], plan.yaws[y, 1], plan.yaws[y, 2]
         yaws = _yaw(a, classes, places, here), _yaw(b, classes, places, here)
         values[k, 0], spreads[k, 0] = misalignment_of(yaws[0], yaws[1]), 0.0
     for k in range(len(values)):
@@ -259,33 +292,28 @@ def _channels_of(values: Floats, spreads: Floats, signals: Floats, members: Flag
     return channels
 
 
+@merged
+def leaves_of_plan(packed_plan: PackedPlan, numbers: Floats) -> Floats:
+    """Compute `leaves_of_sample`, within another kernel."""
+    plan = _unpacked(packed_plan)
+    rows = _rows_of_sample(plan, numbers)
+    values = np.empty((len(plan.required_start) - 1, 1))
+    spreads = np.empty((len(plan.required_start) - 1, 1))
+    _measure(plan, rows, values, spreads)
+    members = np.empty((len(plan.is_group), 1), np.int8)
+    _members(plan, rows.classes, members)
+    channels = _channels_of(values, spreads, rows.signals, members)
+    leaves = np.empty((channels, len(plan.outputs), 1))
+    run_instructions(plan.code, plan.constants, values, spreads, rows.signals, members, plan.outputs, leaves)
+    return leaves
+
+
 @kernel
-def leaves_of_sample(packed_plan: PackedPlan, whole: Integers, numbers: Floats, vertices: Floats) -> Floats:
+def leaves_of_sample(packed_plan: PackedPlan, numbers: Floats) -> Floats:
     """Compute the leaves of one sample, (C, A, 1), as `leaf_values` does.
 
     Args:
-        whole: class codes of the samples and of the places, parts of each place, vertices of each part.
-        numbers: `NUMBERS_OF_PLACE` of each place, radius of each part, value of each signal.
-        vertices: x and y of each vertex of all parts.
+        numbers: for each sample looked at 0, or `ABSENT`; `NUMBERS_OF_PLACE` of each place; how many vertices
+            each part has, and its radius; the value of each signal; x and y of each vertex of all parts.
     """
-    plan = _unpacked(packed_plan)
-    samples, regions, places, signals = plan.extent
-    counts = whole[samples + places : samples + 2 * places]
-    sizes = whole[samples + 2 * places :]
-    classes = np.zeros(samples + regions + places, np.int64)
-    for k in range(samples):
-        classes[k] = whole[k]
-    for k in range(places):
-        classes[samples + regions + k] = whole[samples + k]
-    of_places = numbers[: NUMBERS_OF_PLACE * places].reshape((places, NUMBERS_OF_PLACE))
-    radius = numbers[NUMBERS_OF_PLACE * places : len(numbers) - signals]
-    of_signals = numbers[len(numbers) - signals :].reshape((signals, 1))
-    values = np.empty((len(plan.required_start) - 1, 1))
-    spreads = np.empty((len(plan.required_start) - 1, 1))
-    _measure(plan, classes, counts, sizes, radius, of_places, vertices, values, spreads)
-    members = np.empty((len(plan.is_group), 1), np.int8)
-    _members(plan, classes, members)
-    channels = _channels_of(values, spreads, of_signals, members)
-    leaves = np.empty((channels, len(plan.outputs), 1))
-    run_instructions(plan.code, plan.constants, values, spreads, of_signals, members, plan.outputs, leaves)
-    return leaves
+    return leaves_of_plan(packed_plan, numbers)

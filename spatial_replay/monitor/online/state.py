@@ -23,6 +23,11 @@ NUMBERS = 8
 continuation, and of its value if the run ends there."""
 
 
+POSITION, OFFSET, START_NS, KEEPS = range(4)
+CLOCK = 4
+"""What the clock of a run holds."""
+
+
 class Memory(NamedTuple):
     """What is carried from sample to sample.
 
@@ -37,6 +42,8 @@ class Memory(NamedTuple):
         heights: (B, CHANNELS, 3, room), numbers beside the positions of the first rings.
         tables: (CHANNELS, ...), the parts' tables (see `tables`).
         cells: the parts' bookkeeping (see `windows`).
+        clock: (CLOCK,), the number of samples so far; the one that the recent samples begin with; the time
+            of the first; 1 if more than the newest sample is looked at, else 0.
     """
 
     history: Floats
@@ -49,6 +56,7 @@ class Memory(NamedTuple):
     heights: Floats
     tables: Floats
     cells: Integers
+    clock: Integers
 
 
 class Scratch(NamedTuple):
@@ -99,6 +107,7 @@ def first_memory(program: Program, room: int) -> Memory:
         heights=np.zeros((int(np.isin(program.signals[:, 0], BEGUN).sum()), CHANNELS, 3, room)),
         tables=np.zeros((CHANNELS, program.table_size)),
         cells=cells,
+        clock=np.array([0, 0, 0, int(program.keeps_history)], np.int64),
     )
 
 

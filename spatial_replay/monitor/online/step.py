@@ -9,18 +9,24 @@ Each node has the numbers listed at `state.NUMBERS`, in as many channels as need
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
-from spatial_replay.compiled import elementwise, kernel, piece
+from spatial_replay.compiled import elementwise, inlined, kernel, merged, piece
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.codes import in_channels
 from spatial_replay.monitor.online.program import Program
 from spatial_replay.monitor.online.signals import step_signals
 from spatial_replay.monitor.online.state import (
+    KEEPS,
     NUMBERS,
+    OFFSET,
+    POSITION,
+    START_NS,
     TILE,
     Memory,
     Scratch,
@@ -33,8 +39,10 @@ from spatial_replay.monitor.online.state import (
 from spatial_replay.monitor.online.tables import step_tables
 from spatial_replay.monitor.online.windows import kept_from, step_windows
 
+AnyArray: TypeAlias = NDArray[Any]
 
-@piece
+
+@inlined
 def _combine_low(code: int, low: float, high: float, other_low: float, other_high: float) -> float:
     """Return the lower end of a Boolean operator over two intervals; the upper end is its mirror image."""
     if code == codes.REPORT_AND:
@@ -48,7 +56,7 @@ def _combine_low(code: int, low: float, high: float, other_low: float, other_hig
     return min(max(-high, other_low), max(-other_high, low))
 
 
-@piece
+@merged
 def _combine(code: int, into: Floats, other: Floats, count: int) -> None:
     for pair in range(0, NUMBERS, 2):
         low, high, other_low, other_high = into[pair], into[pair + 1], other[pair], other[pair + 1]
@@ -72,7 +80,17 @@ def _copy(source: Floats, target: Floats) -> None:
     target[: len(source)] = source
 
 
-@piece
+@merged
+def _copy_numbers(source: Floats, target: Floats, count: int) -> None:
+    """Copy the numbers of one node, (NUMBERS, count)."""
+    for number in range(NUMBERS):
+        if count == 1:  # a slice costs more than its only number
+            target[number, 0] = source[number, 0]
+        else:
+            _copy(source[number, :count], target[number])
+
+
+@merged
 def _set_now(rule: int, into: Floats, first: Floats, last: Floats, count: int) -> None:
     """Compute what a part is now, from what its first and its last operand are."""
     for number in (2, 3):
@@ -87,7 +105,7 @@ def _set_now(rule: int, into: Floats, first: Floats, last: Floats, count: int) -
                 into[number, k] = -np.inf
 
 
-@piece
+@merged
 def _write_series(numbers: Floats, t: int, count: int, series: Floats) -> None:
     """Write value, now, lower and upper of every node; NaN where the ends of value or now differ.
 
@@ -104,7 +122,7 @@ def _write_series(numbers: Floats, t: int, count: int, series: Floats) -> None:
                 series[n, 2 + which, t + k] = end[k] + 0.0
 
 
-@piece
+@merged
 def report(
     reports: Integers, operands: Integers, memory: Memory, scratch: Scratch, channels: int, begin: int,
     count: int, t: int, series: Floats, final: Floats,
@@ -129,15 +147,18 @@ def report(
         start, stop = reports[n, codes.REPORT_FIRST], reports[n, codes.REPORT_END]
         rows = numbers[n]
         if code == codes.REPORT_SIGNAL:  # settled by the first sample
-            _copy(memory.history[0, index, begin : begin + count], rows[2])
-            _copy(memory.history[nominal_high, index, begin : begin + count], rows[3])
+            if count == 1:
+                rows[2, 0] = memory.history[0, index, begin]
+                rows[3, 0] = memory.history[nominal_high, index, begin]
+            else:
+                _copy(memory.history[0, index, begin : begin + count], rows[2])
+                _copy(memory.history[nominal_high, index, begin : begin + count], rows[3])
             for k in range(count):
                 rows[0, k], rows[1, k] = memory.firsts[0, index], memory.firsts[nominal_high, index]
                 rows[4, k], rows[5, k] = memory.firsts[wide_low, index], memory.firsts[wide_high, index]
                 rows[6, k], rows[7, k] = rows[4, k], rows[5, k]
         elif code == codes.REPORT_PART:
-            for number in range(NUMBERS):
-                _copy(scratch.parts[index, number, :count], rows[number])
+            _copy_numbers(scratch.parts[index], rows, count)
             _set_now(rule, rows, numbers[operands[start]], numbers[operands[stop - 1]], count)
         elif code == codes.REPORT_NOT:
             child = numbers[operands[start]]
@@ -145,9 +166,7 @@ def report(
                 for k in range(count):
                     rows[pair, k], rows[pair + 1, k] = -child[pair + 1, k], -child[pair, k]
         else:
-            child = numbers[operands[start]]
-            for number in range(NUMBERS):
-                _copy(child[number, :count], rows[number])
+            _copy_numbers(numbers[operands[start]], rows, count)
             for each in range(start + 1, stop):
                 _combine(code, rows, numbers[operands[each]], count)
     _write_series(numbers, t, count, series)
@@ -172,37 +191,37 @@ class Tables(NamedTuple):
 @elementwise
 @kernel
 def step(
-    tables: Tables, memory: Memory, scratch: Scratch, leaves: Floats, times_ns: Integers, start_ns: int,
-    position: int, offset: int, t: int, count: int, series: Floats, final: Floats,
+    tables: Tables, memory: Memory, scratch: Scratch, leaves: Floats, times_ns: Integers, t: int, count: int,
+    series: Floats, final: Floats,
 ) -> None:  # fmt: skip
     """Run the samples t … t + count - 1 of `leaves` through a program without windows under its parts.
 
     Args:
         leaves: (C, A, T), for as many channels as the run has.
-        start_ns: time of the first sample of the run.
-        position: of the first of these samples in the run; it stands at position - offset in the history.
         series: (N, 4, T), receives value, now, lower and upper.
         final: (N, 2), receives the ends of each node's value if the run ends with the last of them.
     """  # fmt: skip
-    channels, begin = leaves.shape[0], position - offset
-    for k in range(count):
-        memory.stamps[begin + k] = times_ns[t + k]
-    step_signals(tables.signals, leaves, t, count, position, offset, memory)
-    step_tables(tables.nodes, tables.parts, memory, scratch, channels, position, start_ns, begin, count)
+    channels, position, begin = leaves.shape[0], memory.clock[POSITION], _begin(memory, times_ns, t, count)
+    step_signals(tables.signals, leaves, t, count, position, position - begin, memory)
+    step_tables(
+        tables.nodes, tables.parts, memory, scratch, channels, position, memory.clock[START_NS], begin, count
+    )
     report(tables.reports, tables.operands, memory, scratch, channels, begin, count, t, series, final)
+    memory.clock[POSITION] = position + count
 
 
 @kernel
 def step_with_windows(
-    tables: Tables, memory: Memory, scratch: Scratch, leaves: Floats, times_ns: Integers, start_ns: int,
-    position: int, offset: int, t: int, count: int, series: Floats, final: Floats,
+    tables: Tables, memory: Memory, scratch: Scratch, leaves: Floats, times_ns: Integers, t: int, count: int,
+    series: Floats, final: Floats,
 ) -> None:  # fmt: skip
     """`step` for any program; apart from it because it is much more to compile and to load."""
-    channels, begin = leaves.shape[0], position - offset
-    for k in range(count):
-        memory.stamps[begin + k] = times_ns[t + k]
+    channels, position, begin = leaves.shape[0], memory.clock[POSITION], _begin(memory, times_ns, t, count)
+    offset = position - begin
     step_signals(tables.signals, leaves, t, count, position, offset, memory)
-    step_tables(tables.nodes, tables.parts, memory, scratch, channels, position, start_ns, begin, count)
+    step_tables(
+        tables.nodes, tables.parts, memory, scratch, channels, position, memory.clock[START_NS], begin, count
+    )
     for p in range(len(tables.parts)):
         part = tables.parts[p]
         if part[codes.PART_KIND] == codes.WINDOWED:
@@ -210,6 +229,21 @@ def step_with_windows(
                 tables.nodes, part, memory, scratch, channels, position, offset, count, scratch.parts[p]
             )
     report(tables.reports, tables.operands, memory, scratch, channels, begin, count, t, series, final)
+    memory.clock[POSITION] = position + count
+
+
+@inlined
+def _begin(memory: Memory, times_ns: Integers, t: int, count: int) -> int:
+    """Enter the times of the next samples; return where they stand in the history."""
+    clock = memory.clock
+    if clock[POSITION] == 0:
+        clock[START_NS] = times_ns[t]
+    if not clock[KEEPS]:
+        clock[OFFSET] = clock[POSITION]
+    begin = clock[POSITION] - clock[OFFSET]
+    for k in range(count):
+        memory.stamps[begin + k] = times_ns[t + k]
+    return int(begin)
 
 
 class OnlineRun:
@@ -234,16 +268,30 @@ class OnlineRun:
         self._scratch = scratch_for(program, room, tile)
         self._final = np.zeros((len(program.reports), 2))
         self._tables = Tables.of(program)
-        has_windows = (program.parts[:, codes.PART_KIND] == codes.WINDOWED).any()
-        self._take_in = step_with_windows if has_windows else step
+        self._take_in = step_with_windows if self.has_windows else step
         self._channels = 1
-        self._position = 0
-        self._offset = 0
-        self._start_ns = 0
 
     def __len__(self) -> int:
         """Return how many samples were added."""
-        return self._position
+        return int(self._memory.clock[POSITION])
+
+    @property
+    def has_windows(self) -> bool:
+        """Whether `step_with_windows` runs it."""
+        return bool((self._program.parts[:, codes.PART_KIND] == codes.WINDOWED).any())
+
+    @property
+    def arrays(self) -> list[AnyArray]:
+        """All it works with: `Tables`, `Memory`, `Scratch` and `final`."""
+        return [*self._tables, *self._memory, *self._scratch, self._final]
+
+    def work_with(self, arrays: Sequence[AnyArray]) -> None:
+        """Go on with copies of all `arrays`."""
+        memory, scratch = len(Tables._fields), len(Tables._fields) + len(Memory._fields)
+        self._tables = Tables(*arrays[:memory])
+        self._memory = Memory(*arrays[memory:scratch])
+        self._scratch = Scratch(*arrays[scratch:-1])
+        self._final = arrays[-1]
 
     @property
     def final(self) -> Floats:
@@ -261,43 +309,39 @@ class OnlineRun:
         Returns:
             (N, 4, T): value, now, lower and upper of each node.
         """
-        if len(leaves) > self._channels:
-            widen(self._memory, self._channels)
-            self._channels = len(leaves)
+        self.widen(len(leaves))
         leaves = np.ascontiguousarray(in_channels(leaves, self._channels))
         times_ns = np.array(times_ns, np.int64)  # writable, since kernels are compiled for that
         series = np.empty((len(self._program.reports), 4, len(times_ns)))
         done = 0
         while done < len(times_ns):
-            count = self._make_room(min(self._tile, len(times_ns) - done))
-            self._step(leaves, times_ns, done, count, series)
+            count = self.make_room(min(self._tile, len(times_ns) - done))
+            self._take_in(
+                self._tables, self._memory, self._scratch, leaves, times_ns, done, count, series, self._final
+            )
             done += count
         return series
 
-    def _step(self, leaves: Floats, times_ns: Integers, t: int, count: int, series: Floats) -> None:
-        """Run the samples t up to t + count, for which there is room."""
-        if self._position == 0:
-            self._start_ns = int(times_ns[t])
-        self._take_in(
-            self._tables, self._memory, self._scratch, leaves, times_ns, self._start_ns,
-            self._position, self._offset, t, count, series, self._final,
-        )  # fmt: skip
-        self._position += count
+    def widen(self, channels: int) -> None:
+        """Have at least so many channels."""
+        if channels > self._channels:
+            widen(self._memory, self._channels)
+            self._channels = channels
 
-    def _make_room(self, wanted: int) -> int:
+    def make_room(self, wanted: int) -> int:
         """Make room for at least one of the wanted samples; return for how many."""
-        room = len(self._memory.stamps)
+        room, clock = len(self._memory.stamps), self._memory.clock
         if not self._program.keeps_history:
-            self._offset = self._position
-        used = self._position - self._offset
+            return min(wanted, room)
+        position, offset = int(clock[POSITION]), int(clock[OFFSET])
+        used = position - offset
         if used + wanted > room:
             signals, nodes, parts = self._program.signals, self._program.nodes, self._program.parts
-            last = self._position - 1
-            keep = kept_from(signals, nodes, parts, self._memory, self._scratch, self._offset, last)
-            if 2 * (keep - self._offset) >= room:
-                forget(self._memory, keep - self._offset, used, self._channels)
-                self._offset = keep
+            keep = kept_from(signals, nodes, parts, self._memory, self._scratch, offset, position - 1)
+            if 2 * (keep - offset) >= room:
+                forget(self._memory, keep - offset, used, self._channels)
+                clock[OFFSET] = offset = keep
             elif used == room:
                 self._memory = doubled(self._memory, self._channels)
                 self._scratch = scratch_for(self._program, 2 * room, self._tile)
-        return min(wanted, len(self._memory.stamps) - (self._position - self._offset))
+        return min(wanted, len(self._memory.stamps) - (position - offset))
