@@ -6,6 +6,7 @@ The kind of a panel, the part of its identifier before `!`, is one that both vie
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
@@ -267,7 +268,8 @@ def _violation_text(outcome: FinalStanding) -> str:
         return ""
     unit = f" {outcome.unit}" if outcome.unit and outcome.unit != MIXED else ""
     over = f": {shortened_formula(outcome.over)}" if outcome.over else ""
-    return f", violated since {outcome.since_s:.3f} s by {number_text(outcome.by)}{unit}{over}"
+    by = f" by {number_text(outcome.by)}{unit}" if math.isfinite(outcome.by) else ""
+    return f", violated since {outcome.since_s:.3f} s{by}{over}"
 
 
 def _titled(identifier: str, title: str, config: Config) -> Panel:
