@@ -118,9 +118,9 @@ class SqliteBag(MessageReader):
     def _read(self, topics: Collection[str], first: int, last: int, *, as_recorded: bool) -> Columns:
         wanted = {number: topic.name for number, topic in self._tables.topics.items() if topic.name in topics}
         query = (
-            "SELECT id, topic_id, timestamp, data FROM messages"
+            "SELECT rowid, topic_id, timestamp, data FROM messages"
             f" WHERE topic_id IN ({', '.join('?' * len(wanted))}) AND timestamp BETWEEN ? AND ?"
-            f" ORDER BY {'id' if as_recorded else 'timestamp, id'}"
+            f" ORDER BY {'rowid' if as_recorded else 'timestamp, rowid'}"
         )
         key = _by_id if as_recorded else _by_time
         after = (-1, -1)
@@ -302,7 +302,11 @@ def _intact_rows(database: sqlite3.Connection) -> tuple[list[RowHead], set[_Span
 
     A part of the ids that cannot be read is halved until what is damaged is found.
     """
-    query = "SELECT id, topic_id, timestamp FROM messages NOT INDEXED WHERE id BETWEEN ? AND ? ORDER BY id"
+    # where the file describes its table wrongly, `id` may be anything
+    query = (
+        "SELECT rowid, topic_id, timestamp FROM messages NOT INDEXED"
+        " WHERE rowid BETWEEN ? AND ? ORDER BY rowid"
+    )
     spans = deque([_all_ids(database)])
     found: dict[int, RowHead] = {}
     lost: set[_Span] = set()
@@ -331,7 +335,8 @@ def _all_ids(database: sqlite3.Connection) -> _Span:
     """Return the ids that messages may have."""
     try:
         ((first, last),) = database.execute(
-            "SELECT (SELECT min(id) FROM messages NOT INDEXED), (SELECT max(id) FROM messages NOT INDEXED)"
+            "SELECT (SELECT min(rowid) FROM messages NOT INDEXED),"
+            " (SELECT max(rowid) FROM messages NOT INDEXED)"
         )
         if type(first) is type(last) is int:
             return first, last
@@ -346,12 +351,15 @@ def _all_ids(database: sqlite3.Connection) -> _Span:
 
 def _contents(database: sqlite3.Connection, heads: Sequence[RowHead], lost: set[_Span]) -> Iterator[Row]:
     """Yield rows with their contents; the ids of those that cannot be read go to `lost`."""
-    for row_id, *_ in heads:
+    for place, (row_id, *_) in enumerate(heads):
         try:
             yield from database.execute(
-                "SELECT id, topic_id, timestamp, data FROM messages NOT INDEXED WHERE id = ?", (row_id,)
+                "SELECT rowid, topic_id, timestamp, data FROM messages NOT INDEXED WHERE rowid = ?", (row_id,)
             )
-        except sqlite3.Error:
+        except sqlite3.Error as error:
+            if error.sqlite_errorcode == sqlite3.SQLITE_INTERRUPT:
+                lost.update((each, each) for each, *_ in heads[place:])
+                return
             lost.add((row_id, row_id))
 
 
