@@ -6,6 +6,7 @@ a free path leads to.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
@@ -19,16 +20,19 @@ from spatial_replay.planning.maps import (
     FREE,
     OUT_OF_REACH,
     REASONS,
+    Cubes,
     GradientMap,
     PropositionMaps,
     centre_of,
     concerns,
+    danger_of,
     gradient_map,
+    moved_object,
     proposition_maps,
 )
 from spatial_replay.planning.paths import Path, shortest_path
 from spatial_replay.planning.settings import Settings
-from spatial_replay.planning.workspace import Grid
+from spatial_replay.planning.workspace import Grid, Workspace
 from spatial_replay.spec.formula import Formula, Outline
 from spatial_replay.trace.sample import Sample
 
@@ -216,9 +220,62 @@ class Movables:
             self._settings.constraint_margin,
         )
         target = find_target(gradient, tracked, self._settings, failed)
+        if isinstance(target, Target):
+            target = self.with_way(target, consideration.constraints.cubes)
         if isinstance(target, str):
             return Candidate(name, gradient, None, target)
         return Candidate(name, gradient, target)
+
+    def with_way(self, target: Target, constraints: Cubes) -> Target | str:
+        """Return the target of a carried object with a way that keeps the constraints, or why there is none.
+
+        Where no constraint is about the object, its way does not matter. On the way, constraints stay away
+        from holding by the margin and half a cell; where there is no such way, by the margin; else at all.
+        """
+        settings, name = self._settings, target.name
+        about = sorted({number for cube in constraints for number, _ in cube})
+        is_bound = any(concerns(self._propositions[number], name) for number in about)
+        if settings.skill == "push" or settings.lift is None or not is_bound:
+            return target
+        danger, grid = self._danger_on_the_way(target, constraints, about)
+        away = np.hypot(*(grid.centres() - np.array(settings.workspace.base)).T).reshape(grid.shape)
+        reached = (away >= settings.workspace.nearest) & (away <= settings.workspace.farthest)
+        (here, there), goals = target.waypoints, np.zeros(grid.shape, np.bool_)
+        goals[grid.cell(*there)] = True
+        margin = settings.constraint_margin
+        for distance in (margin + grid.cell_size / math.sqrt(2.0), margin, 0.0):
+            path = shortest_path(reached & (danger < -distance), grid.cell(*here), goals)
+            if path is not None:
+                turns = [grid.centre(*each) for each in path.cells[1:-1].tolist()]
+                # a way of two points is one that does not matter
+                middle = ((here[0] + there[0]) / 2.0, (here[1] + there[1]) / 2.0)
+                return replace(target, waypoints=(here, *(turns or [middle]), there))
+        return "on every way there a constraint would hold"
+
+    def _danger_on_the_way(
+        self, target: Target, constraints: Cubes, about: Sequence[int]
+    ) -> tuple[np.ndarray, Grid]:
+        """Return (rows, columns): the constraints' robustness with the object carried there; and the grid."""
+        settings, tracked = self._settings, self._sample.objects[target.name]
+        if not isinstance(tracked, TrackedObject):
+            raise TraceError(f"object {target.name!r} is {tracked!r}; give a TrackedObject")
+        if tracked.height is not None and settings.lift:
+            low, high = tracked.height
+            tracked = replace(tracked, height=(low + settings.lift, high + settings.lift))
+        here = centre_of(tracked.footprint)
+        grid = settings.workspace.grid.reaching(*here)
+        # nothing that is carried over stands in the way
+        free = Workspace(grid, supports=frozenset(self._sample.objects))
+        formulas = [self._propositions[number] for number in about]
+        danger = np.full(grid.shape, -np.inf)
+        for turn in dict.fromkeys((0.0, target.turn)):
+            objects = {**self._sample.objects, target.name: moved_object(tracked, *here, turn)}
+            sample = Sample(self._sample.time_ns, objects, self._sample.signals, self._sample.unknown)
+            maps = proposition_maps(formulas, self._regions, sample, target.name, free)
+            places = {number: place for place, number in enumerate(about)}
+            cubes = tuple(tuple((places[n], wanted) for n, wanted in cube) for cube in constraints)
+            np.maximum(danger, danger_of(maps, cubes)[0], out=danger)
+        return danger, grid
 
     def maps_of(self, name: str) -> PropositionMaps:
         """Return the maps of all propositions over the cells of an object.

@@ -210,5 +210,6 @@ class Executor(Protocol):
     def execute(self, step: Step) -> Outcome:
         """Move `step.target.name` to its target, along the waypoints if the path matters to the robot.
 
-        Return once the robot is at rest. The planner observes samples during the motion, or after it.
+        Return once the robot is at rest. The planner observes samples during the motion, or after it. If its
+        `stop_reason` is not empty after one, stop, and return that as the reason of a failure.
         """

@@ -471,6 +471,8 @@ class _Order:
             if not isinstance(tracked, TrackedObject):
                 return None
             found = target_in(gradient, tracked, settings, self._poses[name])
+            if isinstance(found, Target):
+                found = movables.with_way(found, constraints)
             return None if isinstance(found, str) else replace(found, robustness=self._robustness)
         return self._placed(scene, name, constraints)
 
@@ -494,7 +496,9 @@ class _Order:
             ):
                 return None
         yaw = None if tracked.yaw is None else tracked.yaw + turn
-        return Target(name, x, y, turn, yaw, (centre_of(tracked.footprint), (x, y)), self._robustness)
+        target = Target(name, x, y, turn, yaw, (centre_of(tracked.footprint), (x, y)), self._robustness)
+        found = of._movables_in(scene).with_way(target, constraints)
+        return None if isinstance(found, str) else found
 
 
 def _chosen(consideration: Consideration, number: int, motions: tuple[Target, ...]) -> Consideration:

@@ -118,9 +118,7 @@ def gradient_map(
     robustness = np.full(shape, -np.inf)
     for cube in progress:
         np.maximum(robustness, _holds(then.lower, then.upper, cube, shape), out=robustness)
-    danger = np.full(shape, -np.inf)
-    for cube in constraints:
-        np.maximum(danger, _holds(maps.upper, maps.lower, cube, shape), out=danger)
+    danger = danger_of(maps, constraints)
     blocked = np.zeros(shape, np.uint8)
     # later assignments win: a cell is reported as constrained even if it is also occupied or out of reach
     blocked[robustness == -np.inf] = UNKNOWN
@@ -128,6 +126,14 @@ def gradient_map(
     blocked[maps.clearance <= workspace.clearance] = OCCUPIED
     blocked[danger >= -margin] = CONSTRAINED
     return GradientMap(maps.name, maps.grid, robustness, blocked, maps.clearance, maps.turns)
+
+
+def danger_of(maps: PropositionMaps, constraints: Cubes) -> Floats:
+    """Return (A, rows, columns): the greatest robustness that a constraint may have in each cell."""
+    danger = np.full(maps.clearance.shape, -np.inf)
+    for cube in constraints:
+        np.maximum(danger, _holds(maps.upper, maps.lower, cube, danger.shape), out=danger)
+    return danger
 
 
 def _holds(positive: Floats, negative: Floats, cube: Cube, shape: tuple[int, ...]) -> Floats:

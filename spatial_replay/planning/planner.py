@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -11,6 +12,7 @@ from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.compile import automaton as automaton_of
 from spatial_replay.automata.guards import Transition
 from spatial_replay.errors import TraceError, UsageError
+from spatial_replay.geometry.footprint import TrackedObject
 from spatial_replay.planning.candidates import Movables, with_choice
 from spatial_replay.planning.decisions import Consideration, Edge, Kind, Outcome, Reason, Step, Target
 from spatial_replay.planning.edges import (
@@ -24,7 +26,7 @@ from spatial_replay.planning.edges import (
     worst_state,
 )
 from spatial_replay.planning.foresight import Foresight
-from spatial_replay.planning.maps import Cubes, refuse_delays, refuse_unknown
+from spatial_replay.planning.maps import Cubes, centre_of, moved_object, refuse_delays, refuse_unknown
 from spatial_replay.planning.settings import Settings
 from spatial_replay.planning.workspace import Workspace, kind_faults, refuse_faults
 from spatial_replay.spec.formula import Specification
@@ -85,6 +87,7 @@ class Planner:
         self._sample: Sample | None = None
         self._observer = Observer(self._formulas, specification.regions)
         self._symbol: Symbol = ()
+        self._stop_reason = ""
         self._pruned: dict[Edge, Reason] = {}
         self._attempts = _Attempts()
         self._running: Step | None = None
@@ -119,6 +122,16 @@ class Planner:
         return self._sample is not None and self._states <= self.automaton.accepting
 
     @property
+    def stop_reason(self) -> str:
+        """Why a motion has to stop now; empty while it may go on.
+
+        A motion has to stop when one more sample like the newest two, with its object farther by as much as
+        between these, would lose acceptance. A robot that asks after each sample can end the motion with
+        `Outcome(False, planner.stop_reason)`.
+        """
+        return self._stop_reason
+
+    @property
     def is_doubtful(self) -> bool:
         """Whether they satisfy it unless it was violated while propositions were unknown.
 
@@ -146,11 +159,34 @@ class Planner:
             self._settings = Settings(Workspace.around(sample))
         if self._sample is None:
             refuse_unknown(self._settings.movable or (), sample, self._formulas)
-        self._sample = sample
+        before, self._sample = self._sample, sample
         self._symbol = self._observer.symbol(sample)
         self._states = self.automaton.step_set(self._states, self._symbol)
+        self._stop_reason = self._why_stop(before, sample)
         # a wait ends early if the automaton is not where time alone should have taken it
         self._ahead = self._ahead[1:] if not self._states.isdisjoint(self._ahead[:1]) else ()
+
+    def _why_stop(self, before: Sample | None, sample: Sample) -> str:
+        """Return why the motion has to stop on a sample that follows another one; "" if it need not."""
+        target = None if self._running is None else self._running.target
+        if before is None or target is None or self._states.isdisjoint(self.automaton.can_accept):
+            return ""
+        was, now = before.objects.get(target.name), sample.objects.get(target.name)
+        if not (isinstance(was, TrackedObject) and isinstance(now, TrackedObject)):
+            return ""
+        (u, v), (x, y) = centre_of(was.footprint), centre_of(now.footprint)
+        if math.hypot(x - u, y - v) <= was.uncertainty + now.uncertainty:
+            return ""
+        there = moved_object(now, 2.0 * x - u, 2.0 * y - v)
+        objects = {**sample.objects, target.name: there}
+        symbol = self._observer.symbol(Sample(sample.time_ns, objects, sample.signals, sample.unknown))
+        if not self.automaton.step_set(self._states, symbol).isdisjoint(self.automaton.can_accept):
+            return ""
+        labels = zip(self.automaton.propositions, self._symbol, symbol, strict=True)
+        changed = [each.literal(bool(after)) for each, value, after in labels if after is not value]
+        return (
+            f"stopped: with the next sample, {' and '.join(changed) or 'the specification would be violated'}"
+        )
 
     def next_step(self) -> Step:
         """Return the next decision (Algorithm 1).

@@ -24,7 +24,7 @@ Skill: TypeAlias = Literal["push", "place"]
 """What the robot does with an object: push it along a path in the plane, or pick and place it."""
 
 _SKILLS = ("push", "place")
-_PLAIN = ("skill", "movable", "margin", "constraint_margin", "room", "attempts", "motions")
+_PLAIN = ("skill", "movable", "margin", "constraint_margin", "room", "attempts", "motions", "lift")
 """Settings that stand in the text as they are."""
 
 
@@ -43,6 +43,9 @@ class Settings:
         attempts: how many failed motions prune an edge, at least 1.
         motions: how many objects are moved for one edge at most, at least 1. With 1, the planner takes one
             edge by one motion and looks no further, as in the paper.
+        lift: how high above where it stood an object is carried, in footprint units, at least 0. Its way then
+            keeps what must not hold at a distance, over other things where heights allow. None leaves the way
+            to the robot.
 
     Raises:
         UsageError: invalid values, all of them reported.
@@ -56,6 +59,7 @@ class Settings:
     room: float = 0.0
     attempts: int = 3
     motions: int = 6
+    lift: float | None = 0.0
 
     def __post_init__(self) -> None:
         refuse_faults(self._faults())
@@ -70,6 +74,8 @@ class Settings:
         if self.movable is not None:
             yield from member_faults("movable", self.movable, tuple, str, "a tuple of names")
         distances = {name: getattr(self, name) for name in ("margin", "constraint_margin", "room")}
+        if self.lift is not None:
+            distances["lift"] = self.lift
         yield from number_faults(distances, 0)
         yield from count_faults({"attempts": self.attempts, "motions": self.motions})
 
@@ -131,4 +137,5 @@ def _settings(read: dict[str, Any]) -> Settings:
         attempts=int(read["attempts"]),
         # logs of planners that did not look ahead do not have it
         motions=int(read.get("motions", 1)),
+        lift=None if read.get("lift") is None else float(read["lift"]),
     )

@@ -46,14 +46,19 @@ class _Preset:
     constraint_margin: float
     clearance: float
     room: float
+    lift: float
 
 
 _PRESETS: MappingProxyType[Skill, _Preset] = MappingProxyType(
     {
         # a pushed block stops within a centimetre of its target
-        "push": _Preset(cell_size=0.005, margin=0.012, constraint_margin=0.008, clearance=0.0, room=0.0),
+        "push": _Preset(
+            cell_size=0.005, margin=0.012, constraint_margin=0.008, clearance=0.0, room=0.0, lift=0.0
+        ),
         # fingers need room beside what they hold, and the hand beside taller things
-        "place": _Preset(cell_size=0.02, margin=0.01, constraint_margin=0.01, clearance=0.02, room=0.09),
+        "place": _Preset(
+            cell_size=0.02, margin=0.01, constraint_margin=0.01, clearance=0.02, room=0.09, lift=0.15
+        ),
     }
 )
 
@@ -79,6 +84,7 @@ def settings_for(world: World) -> Settings:
         margin=preset.margin,
         constraint_margin=preset.constraint_margin,
         room=preset.room,
+        lift=preset.lift,
     )
 
 
@@ -101,7 +107,7 @@ class WorldExecutor:
         if self._skill == "push":
             done = self._world.push(target.name, target.waypoints[1:] or target.waypoints)
         else:
-            done = self._world.place(target.name, target.x, target.y, target.yaw)
+            done = self._world.place(target.name, target.x, target.y, target.yaw, target.waypoints[1:-1])
         return Outcome(done.succeeded, done.reason)
 
 
@@ -229,11 +235,12 @@ def record_plan(
             log.add_metadata(PLAN_METADATA, plan_metadata(planner, kept.filename))
             loop = PlanLoop(BlackBox(planner), log)
 
-            def observe(sample: Sample) -> None:
+            def observe(sample: Sample) -> str:
                 loop.observe(sample)
                 if film is not None:
                     film.take(sample)
                 advance(1)
+                return planner.stop_reason
 
             world.attach(observe)
             end = run_plan(loop, WorldExecutor(world, world.skill).execute, world.step)

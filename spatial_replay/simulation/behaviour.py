@@ -5,6 +5,7 @@ The only module that knows py_trees.
 
 from __future__ import annotations
 
+from collections import abc
 from collections.abc import Callable, Generator, Mapping
 
 from py_trees.behaviour import Behaviour
@@ -25,10 +26,12 @@ _TURNED = 0.15
 """The tolerance of the yaw, in radians."""
 
 
-def setting_by_tree(scene: Scene, goals: Mapping[str, Goal]) -> Generator[None, None, Execution]:
-    """Place bodies one after the other, with a few attempts each."""
+def setting_by_tree(
+    scene: Scene, goals: Mapping[str, Goal], via: abc.Sequence[Point] = ()
+) -> Generator[None, None, Execution]:
+    """Place bodies one after the other, with a few attempts each; carry them along some points."""
     blackboard = _Blackboard()
-    tasks = [_task(scene, name, goal, blackboard) for name, goal in goals.items()]
+    tasks = [_task(scene, name, goal, blackboard, via) for name, goal in goals.items()]
     tree = Sequence("set", memory=True, children=tasks)
     tree.tick_once()
     while tree.status is Status.RUNNING:
@@ -49,7 +52,9 @@ class _Blackboard:
         self.failures: list[str] = []
 
 
-def _task(scene: Scene, name: str, goal: Goal, blackboard: _Blackboard) -> Behaviour:
+def _task(
+    scene: Scene, name: str, goal: Goal, blackboard: _Blackboard, via: abc.Sequence[Point]
+) -> Behaviour:
     """Return the subtree that places one body."""
     point, _ = goal
 
@@ -64,7 +69,7 @@ def _task(scene: Scene, name: str, goal: Goal, blackboard: _Blackboard) -> Behav
 
     steps: dict[str, _Motion] = {
         "pick": lambda: pick_up(scene, name, blackboard.grasps[name]),
-        "carry": lambda: carry(scene, name, blackboard.grasps[name], point),
+        "carry": lambda: carry(scene, name, blackboard.grasps[name], point, via),
         "place": lambda: set_down(scene, name, point),
         "leave": leave,
     }

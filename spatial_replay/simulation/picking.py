@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
+from itertools import pairwise
 
-from spatial_replay.simulation.arm import ABOVE, Motion
+from spatial_replay.simulation.arm import ABOVE, WIDEST, Motion
 from spatial_replay.simulation.grasp import Grasp, Point, best_grasp, surface
 from spatial_replay.simulation.scene import Scene
 from spatial_replay.simulation.world import Execution
@@ -15,19 +16,23 @@ _SETTING_DOWN = 0.002
 """The height above its support at which a body is released, in metres."""
 _LOST_TICKS = 6
 """Ticks without contact after which a body is lost."""
+_STRAIGHT = 0.08
+"""The longest stretch, in metres, on which the tool's way counts as straight."""
 _NEAR = 0.02
 """The tolerance of a body's position, in metres."""
 
 
-def picking(scene: Scene, name: str, goal: Point, yaw: float | None) -> Generator[None, None, Execution]:
-    """Pick a body up and place its centre at a point, with `yaw` unless that is None."""
+def picking(
+    scene: Scene, name: str, goal: Point, yaw: float | None, via: Sequence[Point] = ()
+) -> Generator[None, None, Execution]:
+    """Pick a body up and place its centre at a point, along others, with `yaw` unless that is None."""
     grasp = best_grasp(scene, name, goal, yaw)
     if isinstance(grasp, str):
         return Execution(False, grasp)
     stood = scene.pose(name).stands
     trouble = yield from pick_up(scene, name, grasp)
     if not trouble:
-        trouble = yield from carry(scene, name, grasp, goal)
+        trouble = yield from carry(scene, name, grasp, goal, via)
     if not trouble:
         trouble = yield from set_down(scene, name, goal)
     yield from let_go(scene, grasp.opening)
@@ -50,11 +55,33 @@ def pick_up(scene: Scene, name: str, grasp: Grasp) -> Generator[None, None, str]
     return "" if lifted else f"{name} slipped out of the fingers as it was lifted"
 
 
-def carry(scene: Scene, name: str, grasp: Grasp, goal: Point) -> Generator[None, None, str]:
-    """Move the held body above a point; return the reason of a failure, or ""."""
-    x, y = _tool_for(scene, name, goal, grasp.turn)
-    carried = yield from _holding(scene, name, scene.arm.travel(x, y, grasp.turn))
-    return "" if carried else f"{name} slipped out of the fingers on the way"
+def carry(
+    scene: Scene, name: str, grasp: Grasp, goal: Point, via: Sequence[Point] = ()
+) -> Generator[None, None, str]:
+    """Move the held body above a point, along others; return the reason of a failure, or ""."""
+    for point in _fine(scene.place_of(name), (*via, goal)) if via else (goal,):
+        x, y = _tool_for(scene, name, point, grasp.turn)
+        carried = yield from _holding(scene, name, scene.arm.travel(x, y, grasp.turn))
+        if not carried:
+            return f"{name} slipped out of the fingers on the way"
+    return ""
+
+
+def put_back(scene: Scene, name: str) -> Motion:
+    """Put down what the fingers hold, where it is, and open them."""
+    if scene.engine.fingers_touching(name):
+        yield from set_down(scene, name, scene.place_of(name))
+    yield from let_go(scene, WIDEST)
+
+
+def _fine(start: Point, points: Sequence[Point]) -> list[Point]:
+    """Return points along straight lines, so close that the tool's way hardly leaves these."""
+    fine = []
+    for begin, end in pairwise((start, *points)):
+        count = max(1, math.ceil(math.dist(begin, end) / _STRAIGHT))
+        shares = (step / count for step in range(1, count + 1))
+        fine += [(begin[0] + s * (end[0] - begin[0]), begin[1] + s * (end[1] - begin[1])) for s in shares]
+    return fine
 
 
 def set_down(scene: Scene, name: str, goal: Point) -> Generator[None, None, str]:

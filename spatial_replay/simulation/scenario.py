@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 
 from spatial_replay.simulation.grasp import Point
@@ -10,8 +10,9 @@ from spatial_replay.simulation.picking import picking
 from spatial_replay.simulation.scene import Scene
 from spatial_replay.simulation.world import Body, Execution, ReachableArea, Skill
 
-Placing = Callable[[Scene, str, Point, float | None], Generator[None, None, Execution]]
-"""How the robot picks a body up and places it: `picking`, or a behaviour tree around it."""
+Placing = Callable[[Scene, str, Point, float | None, Sequence[Point]], Generator[None, None, Execution]]
+"""How the robot picks a body up, carries it along some points and places it: `picking`, or a behaviour tree
+around it."""
 
 Script = Callable[[Scene], Generator[None, None, Execution]]
 """The motion of the robot without a planner."""

@@ -15,6 +15,7 @@ from spatial_replay.geometry.footprint import Footprint, TrackedObject
 from spatial_replay.simulation.arm import STEPS_PER_TICK, TICKS_PER_S, Arm
 from spatial_replay.simulation.bullet import Engine
 from spatial_replay.simulation.injection import Injection
+from spatial_replay.simulation.picking import put_back
 from spatial_replay.simulation.pushing import pushing
 from spatial_replay.simulation.scenario import Scenario
 from spatial_replay.simulation.scene import Scene
@@ -67,7 +68,8 @@ class Tabletop:
         self._scenario = scenario
         self._noise_m = noise_m
         self._injections = tuple(injections)
-        self._listen: Callable[[Sample], None] = lambda sample: None
+        self._listen: Callable[[Sample], str | None] = lambda sample: None
+        self._halt = ""
         self._gui = gui
         self._engine: Engine | None = None
         self.reset(seed)
@@ -101,7 +103,7 @@ class Tabletop:
         """The robot and the bodies, for motions."""
         return self._scene
 
-    def attach(self, listen: Callable[[Sample], None]) -> None:
+    def attach(self, listen: Callable[[Sample], str | None]) -> None:
         self._listen = listen
 
     def reset(self, seed: int) -> None:
@@ -141,11 +143,18 @@ class Tabletop:
 
     def push(self, name: str, path: Sequence[tuple[float, float]]) -> Execution:
         self._refuse_unless("push", name, [number for point in path for number in point])
-        return self.run(pushing(self._scene, name, path))
+        return self._move(name, pushing(self._scene, name, path))
 
-    def place(self, name: str, x: float, y: float, yaw: float | None = None) -> Execution:
+    def place(
+        self,
+        name: str,
+        x: float,
+        y: float,
+        yaw: float | None = None,
+        via: Sequence[tuple[float, float]] = (),
+    ) -> Execution:
         self._refuse_unless("place", name, [x, y, 0.0 if yaw is None else yaw])
-        return self.run(self._scenario.placing(self._scene, name, (x, y), yaw))
+        return self._move(name, self._scenario.placing(self._scene, name, (x, y), yaw, via))
 
     def script(self) -> Generator[None, None, Execution]:
         """Return the motion of the robot without a planner."""
@@ -164,6 +173,22 @@ class Tabletop:
                 result: _Result = end.value
                 return result
             self.tick()
+
+    def _move(self, name: str, motion: Generator[None, None, Execution]) -> Execution:
+        """Run a motion of a body to its end, or until the listener stops it."""
+        self._halt = ""
+        while not self._halt:
+            try:
+                next(motion)
+            except StopIteration as end:
+                result: Execution = end.value
+                return result
+            self.tick()
+        reason = self._halt
+        motion.close()
+        if self._scenario.skill == "place":
+            self.run(put_back(self._scene, name))
+        return Execution(False, reason)
 
     def follow(self, motion: Generator[None, None, _Result], duration_ns: int | None) -> _Result | None:
         """Run a motion for a time; the robot holds still after its end. Return None if it does not end.
@@ -210,7 +235,7 @@ class Tabletop:
         """Pass the current sample to the listener, once, if one is due."""
         if self._ticks % _TICKS_PER_SAMPLE == 0 and self._ticks != self._last_sampled:
             self._last_sampled = self._ticks
-            self._listen(self.sample())
+            self._halt = self._listen(self.sample()) or ""
 
     def _inject(self) -> None:
         if not self._injections:

@@ -103,8 +103,8 @@ class World(Protocol):
     def time_ns(self) -> int:
         """The simulated time, from 0."""
 
-    def attach(self, listen: Callable[[Sample], None]) -> None:
-        """Pass samples to `listen` from now on."""
+    def attach(self, listen: Callable[[Sample], str | None]) -> None:
+        """Pass samples to `listen` from now on; a reason that it returns stops a motion."""
 
     def reset(self, seed: int) -> None:
         """Restart at time 0; equal seeds give equal worlds."""
@@ -122,8 +122,15 @@ class World(Protocol):
             UsageError: no such object, or the robot does not push.
         """
 
-    def place(self, name: str, x: float, y: float, yaw: float | None = None) -> Execution:
-        """Pick an object up and place its centre at (x, y); None keeps its yaw.
+    def place(
+        self,
+        name: str,
+        x: float,
+        y: float,
+        yaw: float | None = None,
+        via: Sequence[tuple[float, float]] = (),
+    ) -> Execution:
+        """Pick an object up, carry it along points and place its centre at (x, y); None keeps its yaw.
 
         Raises:
             UsageError: no such object, or the robot does not pick.

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+from itertools import pairwise
+
 import pytest
 
 import spatial_replay as sr
@@ -11,6 +15,8 @@ from spatial_replay import Planner, Settings
 from spatial_replay.planning import (
     Grid,
     Workspace,
+    centre_of,
+    moved_object,
     read_decisions,
     recompute_decisions,
     settings_from_text,
@@ -128,6 +134,75 @@ def test_joint_decisions_are_logged_and_recomputed(tmp_path):
     recomputed = recompute_decisions(open_source(tmp_path / "run.mcap"))
     assert recomputed.differences == ()
     assert recomputed.decisions == len(steps)
+
+
+VASE = {"cup": block(1, 5, size=1), "vase": block(5, 3, size=1), "fork": block(1, 9, size=1)}
+NEVER = "spec s = (F (cup dist fork >= 8.5)) and G (cup dist vase >= 0.5)"
+
+
+def on_the_way(waypoints, name, objects, step_length=0.05):
+    """Samples with an object at places close to each other along a way."""
+    samples = []
+    for begin, end in pairwise(waypoints):
+        count = max(1, round(math.dist(begin, end) / step_length))
+        for k in range(count):
+            x, y = (a + k / count * (b - a) for a, b in zip(begin, end, strict=True))
+            moved = {**objects, name: moved_object(objects[name], x, y)}
+            samples.append(sr.Sample(len(samples), moved))
+    return samples
+
+
+def never_violated(samples):
+    specification = sr.parse_specification(f"{NEVER}\nspec g = G (cup dist vase >= 0.5)")
+    return sr.evaluate(specification, sr.Trace.from_samples(samples)).node("g").verdict == "satisfied"
+
+
+def first_way(objects, **options):
+    settings = replace(TABLE, movable=("cup",), constraint_margin=0.02, **options)
+    planner = Planner(sr.parse_specification(NEVER), settings)
+    planner.observe(sr.Sample(0, objects))
+    return planner.next_step()
+
+
+def test_an_object_is_carried_around_what_it_must_not_come_near():
+    step = first_way(VASE)
+    ends = step.target.waypoints[0], step.target.waypoints[-1]
+    assert not never_violated(on_the_way(ends, "cup", VASE))
+    assert never_violated(on_the_way(step.target.waypoints, "cup", VASE))
+
+
+def test_an_object_is_carried_over_what_it_must_not_come_near_if_heights_allow():
+    raised = {name: replace(each, height=(0.0, 1.0)) for name, each in VASE.items()}
+    over = first_way(raised, lift=2.0).target.waypoints
+    around = first_way(raised, lift=0.2).target.waypoints
+    length = [sum(math.dist(*each) for each in pairwise(way)) for way in (over, around)]
+    assert length[0] < length[1]
+    lifted = {**raised, "cup": replace(raised["cup"], height=(2.0, 3.0))}
+    assert never_violated(on_the_way(over, "cup", lifted))
+
+
+def test_an_object_is_not_carried_where_no_way_keeps_the_constraints():
+    walls = {**VASE, "vase": sr.TrackedObject(sr.Footprint.box(4, -50, 5, 50))}
+    step = first_way(walls)
+    assert step.kind == "no path"
+    assert "on every way there a constraint would hold" in str(step.pruned[0][1])
+
+
+def test_a_motion_stops_before_the_sample_that_would_violate():
+    planner = Planner(sr.parse_specification(NEVER), replace(TABLE, movable=("cup",), constraint_margin=0.02))
+    planner.observe(sr.Sample(0, VASE))
+    assert planner.next_step().kind == "execute"
+    seen = []
+    for k, sample in enumerate(on_the_way(((1.0, 3.0), (9.0, 3.0)), "cup", VASE, 0.3)):
+        seen.append(sr.Sample(k + 1, sample.objects))
+        planner.observe(seen[-1])
+        if planner.stop_reason:
+            break
+    assert never_violated(seen)
+    assert "cup dist vase >= 0.5" in planner.stop_reason
+    assert centre_of(seen[-1].objects["cup"].footprint)[0] > 3.0
+    planner.conclude(sr.Outcome(False, planner.stop_reason))
+    assert planner.next_step().kind == "execute"
 
 
 class Robot(Table):

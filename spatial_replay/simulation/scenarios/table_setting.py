@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 
 from spatial_replay.simulation.behaviour import setting_by_tree
 from spatial_replay.simulation.grasp import Point
@@ -17,8 +17,10 @@ _UPRIGHT = math.pi / 2
 _STEEL = (0.75, 0.77, 0.8)
 
 
-def _placing(scene: Scene, name: str, goal: Point, yaw: float | None) -> Generator[None, None, Execution]:
-    return setting_by_tree(scene, {name: (goal, yaw)})
+def _placing(
+    scene: Scene, name: str, goal: Point, yaw: float | None, via: Sequence[Point]
+) -> Generator[None, None, Execution]:
+    return setting_by_tree(scene, {name: (goal, yaw)}, via)
 
 
 def _script(scene: Scene) -> Generator[None, None, Execution]:
