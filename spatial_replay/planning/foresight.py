@@ -43,7 +43,7 @@ MOST_MAPS: Final = 150
 """The most maps that looking ahead computes for one decision."""
 _MOST_EDGES: Final = 12
 """The most edges that are tried from one state that is foreseen."""
-_MOST_ORDERED: Final = 12
+_MOST_ORDERED: Final = 6
 """The most arrangements of which the order of motions is looked for."""
 _STRICTLY: Final = 1e-12
 """What a constraint has to stay away from holding at least: at 0 it does."""
@@ -93,6 +93,8 @@ class Foresight:
         self._movables: dict[tuple[tuple[str, Pose], ...], Movables] = {}
         self._first: Foreseen | None = None
         self._why: dict[str, None] = {}
+        self._symbols: dict[tuple[tuple[str, Pose], ...], Symbol] = {}
+        self._ruled_out: frozenset[Edge] = frozenset()
 
     def decide(
         self,
@@ -152,8 +154,9 @@ class Foresight:
     def _found(self, scene: Foreseen, state: int) -> tuple[Target, ...] | None:
         automaton, symbol = self._automaton, self._symbol(scene)
         idle = idle_transitions(automaton, state, symbol)
-        pruned = (self._pruned | self._hopeless) - idle.edges
+        pruned = self._pruned - idle.edges
         for _ in range(_MOST_EDGES):
+            pruned |= self._ruled_out
             path = next(automaton.paths(state, pruned), None)
             if path is None or self._budget.left <= 0:
                 return None
@@ -163,6 +166,8 @@ class Foresight:
             for motions, after in self._ways(scene, path, consideration):
                 if (rest := self._ahead(*after)) is not None:
                     return (*motions, *rest)
+            # what is hopeless is worked out when something has failed
+            self._ruled_out = self._hopeless
             pruned.add(consideration.edge)
             pruned |= set(equivalent_edges(automaton, consideration, idle, pruned, symbol))
         return None
@@ -214,6 +219,8 @@ class Foresight:
             if length == 1 and not self._can_be_taken_in_turns(scene, path[0]):
                 continue
             aims = path[:length]
+            if any((each.source, each.target) in self._ruled_out for each in aims):
+                continue
             for demands in self._demands_of(scene, aims):
                 about = Arranger(scene.sample, self._regions, self._settings, demands, self._budget)
                 if self._budget.left <= 0 or about.why_hopeless():
@@ -350,8 +357,12 @@ class Foresight:
     # --------------------------------------------------------------------------------------- what is seen
 
     def _symbol(self, scene: Foreseen) -> Symbol:
-        bounds = zip(*values_in(scene.sample, self._formulas, self._regions), strict=True)
-        return tuple(None if low < 0.0 <= high else low >= 0.0 for low, high in bounds)
+        if scene.moved not in self._symbols:
+            bounds = zip(*values_in(scene.sample, self._formulas, self._regions), strict=True)
+            self._symbols[scene.moved] = tuple(
+                None if low < 0.0 <= high else low >= 0.0 for low, high in bounds
+            )
+        return self._symbols[scene.moved]
 
     def _movables_in(self, scene: Foreseen) -> Movables:
         if scene.moved not in self._movables:
@@ -385,9 +396,13 @@ class Foresight:
     def _why_hopeless(self, sample: Sample, number: int, wanted: bool, budget: Budget) -> str:
         why = "it never holds"
         for demands in demands_of(((number, wanted),), self._formulas, self._settings.margin):
-            why = Arranger(sample, self._regions, self._settings, demands, budget).why_hopeless()
+            about = Arranger(sample, self._regions, self._settings, demands, budget)
+            why = about.why_hopeless()
             if not why:
-                return ""
+                found = next(about.arrangements(self._settings.motions), None)
+                if found is not None or budget.left <= 0:
+                    return ""
+                why = "no arrangement of objects brings it about"
         return why
 
 

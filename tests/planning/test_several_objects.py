@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from importlib.machinery import SourceFileLoader
+from importlib.util import module_from_spec, spec_from_loader
 from itertools import pairwise
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 import spatial_replay as sr
@@ -203,6 +207,22 @@ def test_a_motion_stops_before_the_sample_that_would_violate():
     assert centre_of(seen[-1].objects["cup"].footprint)[0] > 3.0
     planner.conclude(sr.Outcome(False, planner.stop_reason))
     assert planner.next_step().kind == "execute"
+
+
+@pytest.fixture(scope="module")
+def campaign():
+    loader = SourceFileLoader("plan_campaign", str(Path(__file__).parents[2] / "tools" / "plan_campaign"))
+    module = module_from_spec(spec_from_loader("plan_campaign", loader))
+    loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("kind", ["joint", "blocked", "tight", "ordered", "infeasible", "never"])
+def test_scenes_of_the_campaign_end_as_they_should(campaign, kind):
+    for seed in range(2):
+        random = np.random.default_rng([seed, list(campaign.KINDS).index(kind)])
+        task = campaign.KINDS[kind](random)
+        assert campaign.is_as_wanted(task, campaign.run(task))
 
 
 class Robot(Table):
