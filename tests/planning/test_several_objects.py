@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import replace
 from importlib.machinery import SourceFileLoader
 from importlib.util import module_from_spec, spec_from_loader
@@ -211,9 +212,12 @@ def test_a_motion_stops_before_the_sample_that_would_violate():
 
 @pytest.fixture(scope="module")
 def campaign():
+    """The program, as a module; its dataclasses look themselves up among the modules."""
     loader = SourceFileLoader("plan_campaign", str(Path(__file__).parents[2] / "tools" / "plan_campaign"))
     module = module_from_spec(spec_from_loader("plan_campaign", loader))
-    loader.exec_module(module)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, "plan_campaign", module)
+        loader.exec_module(module)
     return module
 
 
