@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import product
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeAlias
 
 from spatial_replay.geometry.footprint import TrackedObject
 from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene
+from spatial_replay.planning.decisions import Target
 from spatial_replay.planning.maps import Cube, moved_object
 from spatial_replay.spec.formula import Boolean, Formula, Outline, Truth, expand
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
+
+Pose: TypeAlias = tuple[float, float, float]
+"""x, y and turn of an object."""
 
 MOST_ALTERNATIVES: Final = 32
 """The most conjunctions that a formula is written as; further ones are not tried."""
@@ -84,7 +88,7 @@ class Budget:
         return self.left >= 0
 
 
-def with_moved(sample: Sample, poses: Mapping[str, tuple[float, float, float]]) -> Sample:
+def with_moved(sample: Sample, poses: Mapping[str, Pose]) -> Sample:
     """Return a sample with objects moved to poses (x, y, turn)."""
     objects = dict(sample.objects)
     for name, (x, y, turn) in poses.items():
@@ -92,3 +96,20 @@ def with_moved(sample: Sample, poses: Mapping[str, tuple[float, float, float]]) 
         if isinstance(tracked, TrackedObject):
             objects[name] = moved_object(tracked, x, y, turn)
     return Sample(sample.time_ns, objects, sample.signals, sample.unknown)
+
+
+class Foreseen(NamedTuple):
+    """A sample that is expected after motions.
+
+    Attributes:
+        moved: the poses of the objects moved, by name and in order.
+    """
+
+    sample: Sample
+    moved: tuple[tuple[str, Pose], ...] = ()
+
+    def after(self, target: Target) -> Foreseen:
+        """Return the scene after a motion."""
+        pose = target.x, target.y, target.turn
+        moved = {**dict(self.moved), target.name: pose}
+        return Foreseen(with_moved(self.sample, {target.name: pose}), tuple(sorted(moved.items())))

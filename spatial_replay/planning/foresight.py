@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from itertools import combinations, islice, product
-from typing import Final, NamedTuple, TypeAlias
+from typing import Final
 
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.guards import Transition
@@ -22,6 +22,8 @@ from spatial_replay.planning.decisions import Candidate, Consideration, Edge, Re
 from spatial_replay.planning.demands import (
     Budget,
     Demand,
+    Foreseen,
+    Pose,
     alternatives,
     demands_of,
     values_in,
@@ -47,26 +49,6 @@ _MOST_ORDERED: Final = 6
 """The most arrangements of which the order of motions is looked for."""
 _STRICTLY: Final = 1e-12
 """What a constraint has to stay away from holding at least: at 0 it does."""
-
-Pose: TypeAlias = tuple[float, float, float]
-"""x, y and turn of an object."""
-
-
-class Foreseen(NamedTuple):
-    """A sample that is expected after motions.
-
-    Attributes:
-        moved: the poses of the objects moved, by name and in order.
-    """
-
-    sample: Sample
-    moved: tuple[tuple[str, Pose], ...] = ()
-
-    def after(self, target: Target) -> Foreseen:
-        """Return the scene after a motion."""
-        pose = target.x, target.y, target.turn
-        moved = {**dict(self.moved), target.name: pose}
-        return Foreseen(with_moved(self.sample, {target.name: pose}), tuple(sorted(moved.items())))
 
 
 class Foresight:
