@@ -19,8 +19,9 @@ from spatial_replay.geometry.arrays import Floats
 from spatial_replay.perception.opencv import Camera, fit_homography, fit_pose, projection
 from spatial_replay.perception.tags_file import ReferenceTag, TagsFile
 
-LEAST_CORNER_ERROR: Final = 0.1
-"""Standard deviation of a corner in pixels that is assumed at least, however well reference tags fit."""
+LEAST_CORNER_ERROR: Final = 0.2
+"""Standard deviation of a corner in pixels that is assumed at least, however well reference tags fit: they
+lie still, and nothing hides half of their rims."""
 
 USUAL_CORNER_ERROR: Final = 0.3
 """The same where nothing measures it."""
@@ -137,7 +138,7 @@ class CameraPlane:
     @property
     def rotation(self) -> Floats:
         """(3, 3), from the plane's frame to the camera's."""
-        return rotations(self.pose[None, :3])[0]
+        return np.asarray(rotations(self.pose[None, :3])[0], np.float64)
 
     def places(self, pixels: Floats, z: Floats) -> Floats:
         """See `Plane`."""

@@ -374,8 +374,8 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
                 (place, "lifted needs a calibrated camera; add camera (tags calibrate measures one)")
             )
     plane = value.get("plane")
-    tags = plane.get("tags") if isinstance(plane, dict) else None
-    if isinstance(tags, dict):
+    tags: Any = plane.get("tags") if isinstance(plane, dict) else None
+    if isinstance(plane, dict) and isinstance(tags, dict):
         for key, entry in tags.items():
             own = ("plane", "tags", key)
             if not key.isdecimal():

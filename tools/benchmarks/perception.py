@@ -1,0 +1,159 @@
+"""A camera: frames a second from picture to verdict, and how often the truth is within what is stated."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import spatial_replay as sr
+from spatial_replay.perception import Frame, TagObserver, load_tags, observe_frames, open_frames, parse_tags
+from spatial_replay.perception.opencv import Camera
+from spatial_replay.perception.rendering import Plate, render
+from spatial_replay.perception.tags_file import pose_looking_at
+from spatial_replay.simulation.worlds import default_specification
+
+TAGS = """
+size: 45mm
+objects:
+  a: {tag: 0, class: block, box: [50mm, 50mm], height: [0, 40mm]}
+  b: {tag: 1, class: block, box: [50mm, 50mm], height: [0, 40mm]}
+  c: {tag: 2, class: block, box: [50mm, 50mm], height: [0, 40mm]}
+  d: {tag: 3, class: block, box: [50mm, 50mm], height: [0, 40mm]}
+plane: {tags: {10: [0.28, -0.2], 11: [0.66, -0.2], 12: [0.66, 0.2], 13: [0.28, 0.2]}}
+"""
+SPEC = """
+spec apart = G (a dist b >= 0.01 and c dist d >= 0.01)
+spec meets = F (a dist c <= 0.06)
+"""
+OPPOSITE = {("satisfied", "violated"), ("violated", "satisfied")}
+_FRAMES = 60
+
+
+def bench_camera_speed(measure: Any) -> None:
+    """Eight tags in each frame, four of them on objects, on one thread: detection to verdict."""
+    for (width, height), focal, per_second in (((640, 480), 800.0, 30.0), ((1280, 720), 1300.0, 12.0)):
+        camera = Camera((focal, focal), ((width - 1) / 2, (height - 1) / 2), (width, height))
+        text = f"{TAGS}\ncamera: {{size: [{width}, {height}], focal: [{focal}, {focal}]}}\n"
+        frames = [Frame(k * 33_333_333, _picture(camera, text, k)) for k in range(_FRAMES)]
+        specification = sr.parse_specification(SPEC)
+
+        def run(made: tuple[TagObserver, sr.Monitor], frames: list[Frame] = frames) -> None:
+            observer, monitor = made
+            for frame in frames:
+                monitor.update(observer.observe(frame).sample)
+
+        def prepare(text: str = text, specification: Any = specification) -> tuple[TagObserver, sr.Monitor]:
+            return TagObserver(parse_tags(text)), sr.Monitor(specification)
+
+        name = f"{width} x {height}, to the verdict"
+        measure(name, run, prepare=prepare, per=_FRAMES, unit="frame", runs=5, limit_s=1 / per_second)
+
+
+def _picture(camera: Camera, text: str, index: int) -> np.ndarray:
+    pose = pose_looking_at(np.array([0.9, 0.0, 0.8]), np.array([0.47, 0.0, 0.0]), np.array([0.0, 0.0, 1.0]))
+    plates = [Plate(n, np.array([x, y, z]), _axes(yaw), 0.045) for n, x, y, z, yaw in _scene(text, index)]
+    return render("36h11", [plates], camera, pose, seed=(index,))
+
+
+def _scene(text: str, index: int) -> Iterator[tuple[int, float, float, float, float]]:
+    for each in parse_tags(text).references:
+        yield each.id, each.x, each.y, 0.0, each.yaw
+    for number in range(4):
+        turn = 0.02 * index + number
+        yield number, 0.38 + 0.06 * number + 0.01 * math.sin(turn), 0.1 * math.cos(turn), 0.04, turn
+
+
+def _axes(yaw: float) -> np.ndarray:
+    return np.array([[math.cos(yaw), math.sin(yaw), 0.0], [-math.sin(yaw), math.cos(yaw), 0.0]])
+
+
+def bench_camera_truth(measure: Any) -> None:
+    """A planned run of a simulated world, filmed, 1,000 frames and more, with --full; else the first of one.
+
+    How often the truth is outside of what is stated, and verdicts are the opposite of the true ones.
+    """
+    try:
+        import pybullet  # noqa: F401
+    except ImportError:
+        measure.remark("camera_truth: PyBullet is not installed")
+        return
+    from spatial_replay.runs.planned import record_plan
+    from spatial_replay.runs.scripted import record_script
+
+    total = _Comparison()
+    seed = 1
+    with tempfile.TemporaryDirectory() as folder:
+        video, log = Path(folder) / "run.mp4", Path(folder) / "run.mcap"
+        while total.samples < (1_000 if measure.full else 1):
+            if measure.full:
+                record_plan("push", log, seed=seed, camera=video)
+            else:
+                record_script("push", log, seed=seed, camera=video, duration_ns=2 * 10**9)
+            total += compared(log, video)
+            seed += 1
+    frames = f"of {total.samples} frames"
+    measure.ratio(f"outlines outside, {frames}", total.outside / total.outlines, 0.01)
+    measure.ratio(f"robustness outside, {frames}", total.beyond / total.values, 0.0)
+    measure.ratio("opposite verdicts", total.opposite / total.verdicts, 0.0)
+    measure.ratio("unknown verdicts", total.unknown / total.verdicts, 0.05)
+
+
+class _Comparison(NamedTuple):
+    """Counts over some runs: samples; outlines, and those outside of what is stated; values of robustness,
+    and those beyond their bounds; verdicts, those that are opposite, and those that are unknown."""
+
+    samples: int = 0
+    outlines: int = 0
+    outside: int = 0
+    values: int = 0
+    beyond: int = 0
+    verdicts: int = 0
+    opposite: int = 0
+    unknown: int = 0
+
+    def __add__(self, other: Any) -> _Comparison:
+        return _Comparison(*(one + more for one, more in zip(self, other, strict=True)))
+
+
+def compared(log: Path, video: Path) -> _Comparison:
+    """Compare what a video says with the log of the run."""
+    truth = sr.read_trace(log)
+    tags = load_tags(video.with_suffix(".tags.yaml"))
+    seen = sr.Trace.from_samples([each.sample for each in observe_frames(open_frames(video), tags)])
+    if seen.times_ns.tolist() != truth.times_ns.tolist():
+        seen = _at_times(seen, truth)
+    outlines = outside = 0
+    for column, name in enumerate(truth.names):
+        for sample, row in enumerate(seen.rows[:, list(seen.names).index(name)].tolist()):
+            if row < 0:
+                continue
+            found = seen.footprints.select(np.array([row])).vertices
+            there = truth.footprints.select(truth.rows[sample, [column]]).vertices
+            off = max(np.linalg.norm(found - corner, axis=1).min() for corner in there)
+            outlines += 1
+            outside += bool(off > seen.uncertainty[row])
+    values = beyond = verdicts = opposite = unknown = 0
+    specification = default_specification("push")
+    real, read = sr.evaluate(specification, truth), sr.evaluate(specification, seen)
+    for one, other in zip(real.results, read.results, strict=True):
+        for node, its in zip(one.nodes, other.nodes, strict=True):
+            known = ~np.isnan(node.value)
+            values += int(known.sum())
+            beyond += int(((node.value < its.lower) | (node.value > its.upper))[known].sum())
+            verdicts += 1
+            opposite += (str(node.verdict), str(its.verdict)) in OPPOSITE
+            unknown += str(its.verdict) == "unknown"
+    return _Comparison(len(truth), outlines, outside, values, beyond, verdicts, opposite, unknown)
+
+
+def _at_times(seen: sr.Trace, truth: sr.Trace) -> sr.Trace:
+    """Return samples with the times of the truth, from which those of a video differ by their rounding."""
+    if len(seen) != len(truth) or np.abs(seen.times_ns - truth.times_ns).max() > 10**6:
+        raise ValueError("the video has not the frames of the run")
+    return replace(seen, times_ns=truth.times_ns)
