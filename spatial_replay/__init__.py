@@ -43,12 +43,12 @@ if TYPE_CHECKING:
     from spatial_replay.compare.decision_diff import DecisionDiff
     from spatial_replay.compare.declarations import TextPlace
     from spatial_replay.compare.edit_cause import EditOutcome
+    from spatial_replay.compare.edits import Edit
     from spatial_replay.compare.movement import ObjectDiff
     from spatial_replay.compare.run_results import RunSpecDiff
     from spatial_replay.compare.runs import LogDiff
     from spatial_replay.compare.spec_diff import FirstDifference, SpecDiff
     from spatial_replay.compare.specifications import SpecificationDiff
-    from spatial_replay.compare.trees import Edit
     from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
     from spatial_replay.monitor.causes import Cause, LeastPart
     from spatial_replay.monitor.evaluate import Evaluation, evaluate
@@ -207,7 +207,7 @@ __getattr__, __dir__ = loaded_when_used(
         "compare.declarations": ("TextPlace",),
         "compare.spec_diff": ("FirstDifference", "SpecDiff"),
         "compare.specifications": ("SpecificationDiff",),
-        "compare.trees": ("Edit",),
+        "compare.edits": ("Edit",),
         "geometry.footprint": ("ConvexPart", "Footprint", "TrackedObject"),
         "monitor.causes": ("Cause", "LeastPart"),
         "monitor.evaluate": ("Evaluation", "evaluate"),

@@ -8,7 +8,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from spatial_replay.compare.trees import TreeDiff
+from spatial_replay.compare.edits import TreeDiff
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.monitor.offline import evaluate_offline, new_leaves
 from spatial_replay.monitor.online.codes import in_channels

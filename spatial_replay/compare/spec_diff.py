@@ -11,7 +11,7 @@ import numpy as np
 
 from spatial_replay.compare.declarations import DeclarationChange, TextPlace
 from spatial_replay.compare.edit_cause import EditOutcome
-from spatial_replay.compare.trees import Edit, TreeDiff
+from spatial_replay.compare.edits import Edit, TreeDiff
 from spatial_replay.lazy import Displayed
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.sentences import reason_sentence

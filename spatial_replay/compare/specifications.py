@@ -13,9 +13,10 @@ from typing import Any
 
 from spatial_replay.compare.declarations import DeclarationChange, TextPlace, TextVersions
 from spatial_replay.compare.edit_cause import EditOutcome, EditOutcomes, find_cause
+from spatial_replay.compare.edits import Edit, Origin, TreeDiff
 from spatial_replay.compare.shared_names import unify_regions
 from spatial_replay.compare.spec_diff import SpecDiff
-from spatial_replay.compare.trees import Edit, Origin, TreeDiff, changed_nodes, compare_trees
+from spatial_replay.compare.trees import changed_nodes, compare_trees
 from spatial_replay.errors import UsageError
 from spatial_replay.lazy import Displayed
 from spatial_replay.logs.source import Source
@@ -270,7 +271,7 @@ def _origins(versions: TextVersions, one: NamedSpec, other: NamedSpec) -> Iterat
             _changed(old, one, versions.undone(every), other.name),
             _changed(new, other, versions.applied(every), one.name),
         )
-        # where the two cannot be told apart, every node may follow from the text
+        # where the two cannot be distinguished, every node may follow from the text
         all_nodes = frozenset(range(MAX_SIZE))
         yield Origin(None, *(all_nodes if each is None else each for each in nodes))
 

@@ -1,19 +1,18 @@
 """Two formulas compared node by node, by meaning: the edits that turn one into the other.
 
 Equal nodes are found wherever they moved to and whatever they are called. What follows from one declaration,
-such as a constant, is one edit. Any unit of edits can be made without the others (`TreeDiff.formula`), which
-is how the one that matters is found.
+such as a constant, is one edit.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import chain
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
-from spatial_replay.compare.declarations import DeclarationChange
+from spatial_replay.compare.edits import Edit, EditKind, Inner, Merged, Origin, Site, TreeDiff, renumbered
 from spatial_replay.compare.shared_names import SharedNames, without_variables
 from spatial_replay.spec.format import format_bound, format_formula, format_term
 from spatial_replay.spec.formula import (
@@ -33,123 +32,6 @@ from spatial_replay.spec.formula import (
     operator_of,
 )
 from spatial_replay.spec.walks import base_of, iter_terms
-
-EditKind: TypeAlias = Literal[
-    "constant", "region", "group", "definition", "replaced", "added", "removed", "moved", "renamed"
-]
-"""What was edited: a number, a shape or group that is named, what a macro or relation means (`def`, profile,
-`scale`), the node itself, one operand of a conjunction or disjunction, only its place or its name."""
-
-
-@dataclass(frozen=True, slots=True)
-class Edit:
-    """One edit of a formula, wherever it occurs in it.
-
-    Attributes:
-        spec: the innermost named spec that it is in.
-        old, new: canonical text of the node before and after; None if it was added or removed.
-        old_nodes, new_nodes: ids of the nodes in the two trees.
-        old_span, new_span: the place of the first of them in the two texts.
-        depth: of the deepest of them, from 0 at the root.
-        subject: the constant, region, group or macro whose declaration was edited, if it was one.
-        change: that declaration in both texts; None if the text of a spec was edited.
-    """
-
-    kind: EditKind
-    spec: str
-    old: str | None
-    new: str | None
-    old_nodes: tuple[int, ...]
-    new_nodes: tuple[int, ...]
-    old_span: Span | None
-    new_span: Span | None
-    depth: int
-    subject: str | None = None
-    change: DeclarationChange | None = None
-
-    @property
-    def is_structural(self) -> bool:
-        """Whether operators, objects or operands changed, not only numbers, shapes or names."""
-        return self.kind in ("replaced", "added", "removed", "moved")
-
-    def __str__(self) -> str:
-        about = f" {self.subject}" if self.subject else ""
-        match self.kind:
-            case "added":
-                return f"added `{self.new}`"
-            case "removed":
-                return f"removed `{self.old}`"
-            case "moved":
-                return f"moved `{self.new}`"
-            case "renamed":
-                return f"renamed {self.old} to {self.new}"
-            case "region" | "group" | "definition":
-                return f"{self.kind}{about} changed in `{self.old if self.new is None else self.new}`"
-        if self.old is None or self.new is None:
-            return f"{self.kind}{about}: {f'adds `{self.new}`' if self.new else f'removes `{self.old}`'}"
-        return f"{self.kind}{about}: `{self.old}` to `{self.new}`"
-
-
-class Origin(NamedTuple):
-    """The nodes of two trees that follow from one edit of their texts.
-
-    Attributes:
-        change: the declaration that was edited; None for the text of the specs themselves.
-        old, new: ids of the nodes.
-    """
-
-    change: DeclarationChange | None
-    old: frozenset[int]
-    new: frozenset[int]
-
-
-@dataclass(frozen=True, slots=True)
-class _Site:
-    """A place where the trees differ; `edit` is its number once sites of one edit are joined."""
-
-    edit: int
-    old: Formula | None
-    new: Formula | None
-
-
-@dataclass(frozen=True, slots=True)
-class _Inner:
-    """A node of both trees with operands that differ, or, if `edit` is given, with another window."""
-
-    edit: int | None
-    old: Boolean | Temporal
-    new: Boolean | Temporal
-    operands: tuple[_Merged, ...]
-
-
-_Merged: TypeAlias = "Formula | _Site | _Inner"
-
-
-@dataclass(frozen=True, eq=False)
-class TreeDiff:
-    """The edits between two formulas; none if they mean the same under the same names.
-
-    Attributes:
-        units: edits that the tree can only show together: one, or declarations that share a node.
-    """
-
-    units: tuple[tuple[Edit, ...], ...]
-    _merged: _Merged = field(repr=False)
-
-    @property
-    def edits(self) -> tuple[Edit, ...]:
-        """All edits."""
-        return tuple(edit for unit in self.units for edit in unit)
-
-    @property
-    def effective(self) -> tuple[int, ...]:
-        """The numbers of the units that change what the formula means: all but new names."""
-        return tuple(number for number, unit in enumerate(self.units) if unit[0].kind != "renamed")
-
-    def formula(self, units: Collection[int]) -> Formula:
-        """Return the old formula with only these of the units made, by number."""
-        built = _built(self._merged, frozenset(units))
-        return Truth(True) if built is None else built
 
 
 def compare_trees(
@@ -290,7 +172,7 @@ class _Comparison:
                 key = (node.operator, node.bound, tuple(map(self.meaning, node.operands)))
         return self._numbers.setdefault(key, len(self._numbers))
 
-    def align(self, old: _Place, new: _Place) -> _Merged:
+    def align(self, old: _Place, new: _Place) -> Merged:
         """Compare two nodes that stand in for each other."""
         if old.node.name != new.node.name and None not in (old.node.name, new.node.name):
             self.sites.append(_Found("renamed", old, new, None))
@@ -306,16 +188,16 @@ class _Comparison:
             case Boolean(operator="and" | "or" as one), _ if self._is_among(new, old.members(one)):
                 return self._matched(old.node, old.members(one), old.node, [new])
             case Boolean(), Boolean() if old.node.operator == new.node.operator:
-                return _Inner(None, old.node, new.node, self._pairwise(old, new))
+                return Inner(None, old.node, new.node, self._pairwise(old, new))
             case Temporal(), Temporal() if old.node.operator == new.node.operator:
                 edit = None
                 if old.node.bound != new.node.bound:
                     edit = self._site("constant", old, new).edit
-                return _Inner(edit, old.node, new.node, self._pairwise(old, new))
+                return Inner(edit, old.node, new.node, self._pairwise(old, new))
         kind, subject = _kind_of(old.node, new.node)
         return self._site(kind, old, new, subject)
 
-    def finished(self, merged: _Merged, origins: Sequence[Origin]) -> TreeDiff:
+    def finished(self, merged: Merged, origins: Sequence[Origin]) -> TreeDiff:
         """Join the sites of one edit, wherever they occur, and return the edits."""
         declared = [origin for origin in origins if origin.change is not None]
         shared: list[tuple[set[int], list[int]]] = []
@@ -340,7 +222,7 @@ class _Comparison:
             tuple(
                 tuple(self._unit(sites, [declared[index] for index in own], text)) for _, sites, own in units
             ),
-            _renumbered(merged, numbers),
+            renumbered(merged, numbers),
         )
 
     def _joined(self, sites: Sequence[int]) -> Iterable[list[int]]:
@@ -403,11 +285,9 @@ class _Comparison:
 
     def _site(
         self, kind: EditKind, old: _Place | None, new: _Place | None, subject: str | None = None
-    ) -> _Site:
+    ) -> Site:
         self.sites.append(_Found(kind, old, new, subject))
-        return _Site(
-            len(self.sites) - 1, None if old is None else old.node, None if new is None else new.node
-        )
+        return Site(len(self.sites) - 1, None if old is None else old.node, None if new is None else new.node)
 
     def _align_names(self, old: _Place, new: _Place) -> None:
         """Note the nodes within equal ones that have other names."""
@@ -417,15 +297,13 @@ class _Comparison:
                     self.sites.append(_Found("renamed", one, other, None))
                 self._align_names(one, other)
 
-    def _pairwise(self, old: _Place, new: _Place) -> tuple[_Merged, ...]:
+    def _pairwise(self, old: _Place, new: _Place) -> tuple[Merged, ...]:
         return tuple([self.align(*pair) for pair in zip(old.operands, new.operands, strict=True)])
 
     def _is_among(self, place: _Place, operands: Sequence[_Place]) -> bool:
         return any(self.meaning(place.node) == self.meaning(each.node) for each in operands)
 
-    def _matched(
-        self, old_node: Any, olds: Sequence[_Place], new_node: Any, news: Sequence[_Place]
-    ) -> _Inner:
+    def _matched(self, old_node: Any, olds: Sequence[_Place], new_node: Any, news: Sequence[_Place]) -> Inner:
         """Match the operands of a conjunction or disjunction: equal ones, those of one name, similar ones."""
         partner: dict[int, int] = {}
         taken: set[int] = set()
@@ -442,12 +320,12 @@ class _Comparison:
         match(lambda old, new: old.node.name is not None and old.node.name == new.node.name)
         for least in (1.0, 0.5, 0.01):
             match(lambda old, new, least=least: _similarity(old.bare.node, new.bare.node) >= least)
-        operands: list[_Merged] = [
+        operands: list[Merged] = [
             self.align(olds[partner[number]], new) if number in partner else self._site("added", None, new)
             for number, new in enumerate(news)
         ]
         operands += [self._site("removed", old, None) for index, old in enumerate(olds) if index not in taken]
-        return _Inner(None, old_node, new_node, tuple(operands))
+        return Inner(None, old_node, new_node, tuple(operands))
 
 
 _NOWHERE = _Place(Truth(True), 0, "", 0)
@@ -513,25 +391,3 @@ def _text(place: _Place | None, kind: EditKind) -> str | None:
         # the operands stay or have edits of their own
         return f"{place.node.operator}{format_bound(place.node.bound)} …"
     return format_formula(place.node)
-
-
-def _built(merged: _Merged, chosen: frozenset[int]) -> Formula | None:
-    if isinstance(merged, _Site):
-        return merged.new if merged.edit in chosen else merged.old
-    if not isinstance(merged, _Inner):
-        return merged
-    head = merged.new if merged.edit in chosen else merged.old
-    operands = tuple(each for operand in merged.operands if (each := _built(operand, chosen)) is not None)
-    if head.operator in ("and", "or") and len(operands) < 2:
-        return operands[0] if operands else Truth(head.operator == "and")
-    return replace(head, operands=operands)
-
-
-def _renumbered(merged: _Merged, numbers: Mapping[int, int]) -> _Merged:
-    if isinstance(merged, _Site):
-        return replace(merged, edit=numbers[merged.edit])
-    if not isinstance(merged, _Inner):
-        return merged
-    operands = tuple(_renumbered(operand, numbers) for operand in merged.operands)
-    edit = None if merged.edit is None else numbers[merged.edit]
-    return replace(merged, edit=edit, operands=operands)
