@@ -19,9 +19,8 @@ from spatial_replay.geometry.arrays import Floats
 from spatial_replay.perception.opencv import Camera, fit_homography, fit_pose, projection
 from spatial_replay.perception.tags_file import ReferenceTag, TagsFile
 
-LEAST_CORNER_ERROR: Final = 0.2
-"""Standard deviation of a corner in pixels that is assumed at least, however well reference tags fit: they
-lie still, and nothing hides half of their rims."""
+LEAST_CORNER_ERROR: Final = 0.1
+"""Standard deviation of a corner in pixels that is assumed at least, however well reference tags fit."""
 
 USUAL_CORNER_ERROR: Final = 0.3
 """The same where nothing measures it."""
