@@ -125,10 +125,12 @@ class InstanceStream:
 
     def _settle(self, times_ns: Integers, series: Floats) -> None:
         """Take the time of the first sample at which each node became certain."""
-        for column, settled in enumerate((series[:, 2] >= 0.0, series[:, 3] < 0.0)):
-            # what is certain stays so: only the newest sample needs to be looked at
-            nodes = np.flatnonzero(settled[:, -1] & (self.settled_ns[:, column] == NEVER))
-            self.settled_ns[nodes, column] = times_ns[settled[nodes].argmax(axis=1)]
+        newest = series[:, :, -1]
+        for column, settled in enumerate((newest[:, 2] >= 0.0, newest[:, 3] < 0.0)):
+            # what is certain stays so: only where the newest sample is, the first one is looked for
+            nodes = np.flatnonzero(settled & (self.settled_ns[:, column] == NEVER))
+            certain = series[nodes, 3] < 0.0 if column else series[nodes, 2] >= 0.0
+            self.settled_ns[nodes, column] = times_ns[certain.argmax(axis=1)]
 
 
 class EvaluationStream:
