@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from spatial_replay.bags.open import is_log, open_messages
 from spatial_replay.bags.topic import Topic
 from spatial_replay.errors import LogError, UsageError
+from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.downloads import local_copy
 from spatial_replay.logs.remote import LogFile
 from spatial_replay.logs.topics import is_image_type
 from spatial_replay.mapping.message_types import short_type
 from spatial_replay.perception.frame import Frame, Image
 from spatial_replay.perception.opencv import decode_image
-from spatial_replay.perception.video import H264Decoder, VideoFile
+from spatial_replay.perception.video import H264Decoder, VideoFile, has_key
 from spatial_replay.text import nearest_hint
 
 _CHANNELS: Final[Mapping[str, tuple[int, tuple[int, ...]]]] = MappingProxyType(
@@ -87,6 +89,55 @@ class ImageTopic:
             last_ns = time_ns
             yield Frame(time_ns, image, message.payload)
         self.faults += self._reader.take_faults()
+
+    def frames_at(self, times_ns: Sequence[int]) -> Iterator[Frame]:
+        """Yield what the camera showed at some times, increasing: of each the last frame stamped until then.
+
+        Each frame is yielded once, and no more is decoded than these take. Damaged ones are left out.
+
+        Raises:
+            UsageError: a codec that is not installed.
+        """
+        shown = self._shown()
+        found = np.searchsorted(shown.stamps_ns, np.asarray(times_ns, np.int64), side="right") - 1
+        decoder = H264Decoder() if "CompressedVideo" in self._type else None
+        done = 0
+        for place in np.unique(found[found >= 0]).tolist():
+            stamp_ns, last_ns = int(shown.stamps_ns[place]), int(shown.log_times_ns[place])
+            # from the key frame on, unless the decoder is already past it
+            first_ns = max(int(shown.key_times_ns[place]), done) if decoder is not None else last_ns
+            for message in self._reader.iter_messages({self.topic}, first_ns, last_ns + 1):
+                with suppress(LogError):
+                    value: Any = self._decode(message.payload)
+                    image = _image(value, self._type, decoder)
+                    if image is not None and (_stamp_ns(value) or message.log_time_ns) == stamp_ns:
+                        yield Frame(stamp_ns, image)
+            done = last_ns + 1
+
+    def _shown(self) -> _Shown:
+        """Return when there are frames, without decoding them."""
+        rows: list[tuple[int, int, int]] = []
+        key_ns = last_ns = -1
+        for message in self._reader.iter_messages({self.topic}):
+            try:
+                value: Any = self._decode(message.payload)
+            except LogError:
+                continue
+            if "CompressedVideo" not in self._type or has_key(bytes(value.data)):
+                key_ns = message.log_time_ns
+            stamp_ns = _stamp_ns(value) or message.log_time_ns
+            if stamp_ns > last_ns and key_ns >= 0:
+                last_ns = stamp_ns
+                rows.append((stamp_ns, message.log_time_ns, key_ns))
+        return _Shown(*np.array(rows, np.int64).reshape(-1, 3).T)
+
+
+class _Shown(NamedTuple):
+    """Frames by their increasing stamps: log times, and those of the key frames they are decoded from."""
+
+    stamps_ns: Integers
+    log_times_ns: Integers
+    key_times_ns: Integers
 
 
 def _chosen(name: str, topics: tuple[Topic, ...], wanted: str | None) -> Topic:

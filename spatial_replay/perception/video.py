@@ -18,6 +18,7 @@ import numpy as np
 
 from spatial_replay.errors import LogError, MissingFileError, OutputError, UsageError
 from spatial_replay.perception.frame import Frame, Image
+from spatial_replay.text import counted
 
 _KEY_FRAMES: Final = 30
 """Frames from one key frame to the next in what we encode: a viewer seeks to the one before the cursor."""
@@ -99,19 +100,30 @@ class VideoFile:
     def __iter__(self) -> Iterator[Frame]:
         av = _load()
         last_ns, first, count = -1, None, 0
+        damaged, is_damaged = 0, False
         try:
             length_ns = self._length_ns()
             for packet, frame in self._decoded():
                 stamp = self._stamp_ns(frame, count)
                 count += 1
+                # what the decoder makes up of a frame in parts may show objects where they are not
+                is_damaged = bool(frame.is_corrupt)
+                damaged += is_damaged
+                if is_damaged:
+                    continue
                 first = stamp if first is None else first
                 time_ns = stamp - first
                 if time_ns <= last_ns:
                     self._add_fault(f"{self.name}: frame {count} is not after the one before it; left out")
                     continue
                 last_ns = time_ns
-                yield Frame(time_ns, frame.to_ndarray(format="bgr24"), packet, _has_key(packet))
-            if count > 1 and last_ns + 2 * (last_ns // (count - 1)) < length_ns:
+                yield Frame(time_ns, frame.to_ndarray(format="bgr24"), packet, has_key(packet))
+            if damaged > is_damaged:
+                self._add_fault(f"{self.name}: {counted(damaged - is_damaged, 'damaged frame')}, left out")
+            if is_damaged:
+                at = "in its first frame" if last_ns < 0 else f"after {last_ns / 1e9:.3f} s, within a frame"
+                self._add_fault(f"{self.name} breaks off {at}")
+            elif count > 1 and last_ns + 2 * (last_ns // (count - 1)) < length_ns:
                 ends = f"{last_ns / 1e9:.3f} s, though its header says {length_ns / 1e9:.3f} s"
                 self._add_fault(f"{self.name} breaks off after {ends}")
         except (av.FFmpegError, EOFError) as error:
@@ -226,7 +238,7 @@ class H264Decoder:
         Raises:
             LogError: it is damaged.
         """
-        self._is_ready |= _has_key(data)
+        self._is_ready |= has_key(data)
         if not self._is_ready:
             return None
         av = _load()
@@ -234,7 +246,12 @@ class H264Decoder:
             frames = self._context.decode(av.Packet(data))
         except av.FFmpegError as error:
             raise LogError(f"a frame cannot be decoded ({_reason(error)})") from None
-        return np.asarray(frames[-1].to_ndarray(format="bgr24"), np.uint8) if frames else None
+        if not frames:
+            return None
+        width, height = frames[-1].width, frames[-1].height
+        if width * height > _LARGEST:
+            raise LogError(f"a frame of {width} x {height} is too large")
+        return np.asarray(frames[-1].to_ndarray(format="bgr24"), np.uint8)
 
 
 class VideoWriter:
@@ -288,7 +305,7 @@ class VideoWriter:
         return stream
 
 
-def _has_key(data: bytes) -> bool:
+def has_key(data: bytes) -> bool:
     """Return whether H.264 in Annex B form can be decoded from here on."""
     at = data.find(b"\x00\x00\x01")
     while 0 <= at < len(data) - 3:

@@ -17,6 +17,7 @@ from spatial_replay.monitor.verdict import Verdict, worst_verdict
 from spatial_replay.report.automaton_panel import StatePath
 from spatial_replay.report.decision_panel import ReportedDecisions
 from spatial_replay.report.event_panel import ReportedEvent
+from spatial_replay.report.picture_panel import NO_PICTURES, ReportedPictures
 from spatial_replay.report.scene_panel import ReportedScene
 from spatial_replay.report.tree_panel import final_text
 from spatial_replay.spec.formula import Formula, NamedSpec, Specification
@@ -140,6 +141,7 @@ class RunReport:
     scene: ReportedScene
     events: tuple[ReportedEvent, ...]
     decisions: ReportedDecisions
+    pictures: ReportedPictures = NO_PICTURES
 
     @property
     def verdict(self) -> Verdict:

@@ -19,6 +19,7 @@ from spatial_replay.report.compact import Packing, sentence_parts, singles
 from spatial_replay.report.contents import MOST_DRAWN, ReportedResult, RunReport
 from spatial_replay.report.decision_panel import decisions_value
 from spatial_replay.report.event_panel import MOST_EVENTS, event_values
+from spatial_replay.report.picture_panel import picture_values
 from spatial_replay.report.scene_panel import ReportedScene, scene_value
 from spatial_replay.report.tree_panel import (
     MOST_NODES,
@@ -153,6 +154,7 @@ def page_data(report: RunReport) -> PageData:
         "scene": scene_value(scene, report.first_ns, _places(report), packing),
         "events": event_values(report.events, report.first_ns),
         "decisions": decisions["decisions"],
+        "camera": picture_values(report.pictures, report.first_ns),
     }
     omissions = tuple(_omissions(report, len(times_ns), len(kept), decisions["maps_left_out"]))
     return PageData(facts, packing.text(), omissions)

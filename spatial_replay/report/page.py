@@ -58,6 +58,7 @@ def panels(report: RunReport) -> Html:
     has_automaton = any(result.automaton is not None for result in report.drawn)
     sections = [
         panel("verdicts", "Verdicts", *_verdicts(report)),
+        *([panel("camera", "Camera", kind="panel wide")] if report.pictures.topic else []),
         panel("scene", "Scene", element("p", f"Seen from above, {report.axes}.", **{"class": "axes"})),
         panel("tree", "Specification"),
         panel("timeline", "Over time"),
@@ -296,7 +297,8 @@ def _rule(declarations: Mapping[str, str]) -> str:
 _STYLES: Final = ("uplot/uPlot.min.css", "browser/page.css", "browser/panels.css")
 _LIBRARY: Final = "uplot/uPlot.iife.min.js"
 _SCRIPTS: Final = (
-    "elements", "read", "clock", "verdicts", "tree", "timeline", "curves", "decisions", "scene", "automaton",
+    "elements", "read", "clock", "verdicts", "tree", "timeline", "curves", "decisions", "scene", "camera",
+    "automaton",
 )  # fmt: skip
 """Files of browser/; after them comes the one that runs them."""
 
@@ -310,11 +312,18 @@ def page(report: RunReport) -> bytes:
         {"facts": json_text(data.facts)},
         {"numbers": data.numbers},
         "page",
+        has_pictures=bool(report.pictures.pictures),
     )
 
 
 def document(
-    title: str, parts: Sequence[Html], facts: Mapping[str, str], numbers: Mapping[str, str], script_name: str
+    title: str,
+    parts: Sequence[Html],
+    facts: Mapping[str, str],
+    numbers: Mapping[str, str],
+    script_name: str,
+    *,
+    has_pictures: bool = False,
 ) -> bytes:
     """Return a whole page, in UTF-8.
 
@@ -322,13 +331,15 @@ def document(
         parts: what is between the beginning of its body and the bar at the bottom.
         facts, numbers: what the scripts read, as JSON and packed, by the ids of its elements.
         script_name: the file of browser/ that runs the others.
+        has_pictures: whether there are pictures among the facts.
     """
     style = "\n".join([theme(), *map(_asset, _STYLES)])
     library, script = _asset(_LIBRARY), _script(script_name)
+    allowed = policy([library, script], style, has_pictures)
     json_kind, packed_kind = "application/json", "application/octet-stream"
     whole = [
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">',
-        f'<meta http-equiv="Content-Security-Policy" content="{policy([library, script], style)}">',
+        f'<meta http-equiv="Content-Security-Policy" content="{allowed}">',
         '<meta name="viewport" content="width=device-width, initial-scale=1">',
         '<meta name="color-scheme" content="light dark">',
         element("title", text(title)),
@@ -353,11 +364,12 @@ def _script(name: str) -> str:
     return f'(() => {{\n"use strict";\n{scripts}\n}})();\n'
 
 
-def policy(scripts: Sequence[str], style: str) -> str:
+def policy(scripts: Sequence[str], style: str, has_pictures: bool = False) -> str:
     """Return the policy: the browser loads nothing, and runs only the scripts of the page."""
+    pictures = "img-src data:; " if has_pictures else ""
     allowed = " ".join(map(_digest, scripts))
     return (
-        f"default-src 'none'; script-src {allowed}; style-src {_digest(style)}; "
+        f"default-src 'none'; script-src {allowed}; style-src {_digest(style)}; {pictures}"
         "base-uri 'none'; form-action 'none'"
     )
 

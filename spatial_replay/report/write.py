@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,7 @@ from spatial_replay.report.contents import Pointer, ReportedResult, RunReport, w
 from spatial_replay.report.decision_panel import DecisionCollector
 from spatial_replay.report.event_panel import ReportedEvent, event_of
 from spatial_replay.report.page import page
+from spatial_replay.report.picture_panel import pictures_of
 from spatial_replay.report.scene_panel import SceneCollector
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.relations import RELATION_NAMES
@@ -103,7 +105,9 @@ def write_report(
     refuse_output(output, inputs)
     with replacing(output, inputs) as stream:
         replayed, report = report_of(source, files, options, advance)
-        stream.write(page(report))
+        decided_ns = [each.decided_ns for each in report.drawn if each.decided_ns is not None]
+        pictures = pictures_of(source, report.start_ns, report.end_ns, decided_ns)
+        stream.write(page(replace(report, pictures=pictures)))
     return replayed
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from playwright.sync_api import Browser, ConsoleMessage, Error, Locator, Page, expect
 
 import spatial_replay as sr
+from perception.filmed import write_approach
 from report.report_pages import (
     RECORDINGS,
     report_of_recording,
@@ -18,8 +20,10 @@ from report.report_pages import (
     report_of_trace,
     two_discs,
 )
+from spatial_replay.perception import load_tags, open_frames
 from spatial_replay.replay import load_files
 from spatial_replay.report.write import write_report
+from spatial_replay.runs.seen import record_seen
 from spatial_replay.sources import open_source
 
 Open = Callable[..., Page]
@@ -76,6 +80,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Path]:
         for t in range(6)
     ]
     report_of_samples(folder / "reached.html", meeting, "spec meet = F (a ovlp b)")
+    _film(folder)
     hostile = [
         sr.Sample(t * 10**8, {name: sr.Footprint.disc(3 * k, t, 1) for k, name in enumerate(HOSTILE)})
         for t in range(9)
@@ -83,6 +88,17 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Path]:
     ovlp = " or ".join(f"({quoted(name)} ovlp {quoted(HOSTILE[0])})" for name in HOSTILE[1:])
     report_of_samples(folder / "hostile.html", hostile, f"spec {'s' * 200} = F ({ovlp})")
     return {page.stem: page for page in folder.glob("*.html")}
+
+
+def _film(folder: Path) -> None:
+    """Write the page of a filmed run, if what that takes is installed."""
+    if find_spec("av") is None or find_spec("cv2") is None:
+        return
+    write_approach(folder, 12)
+    log, specifications = folder / "filmed.mcap", [sr.load_specification(folder / "apart.spatial")]
+    record_seen(open_frames(folder / "table.mp4"), load_tags(folder / "tags.yaml"), log, specifications)
+    source = open_source(log)
+    write_report(source, load_files([], source), folder / "filmed.html")
 
 
 def quoted(name: str) -> str:
@@ -457,6 +473,22 @@ def test_light_and_dark_can_be_chosen(open_page: Open) -> None:
     assert page.evaluate(ground) != dark
     page.get_by_role("button", name="Dark").click()
     assert page.evaluate(ground) == dark
+
+
+def test_the_picture_at_the_cursor_is_shown_and_one_of_the_strip_leads_to_its_time(open_page: Open) -> None:
+    pytest.importorskip("av")
+    pytest.importorskip("cv2")
+    page = open_page("filmed")
+    picture, strip = page.locator(".picture"), page.locator(".pictures button")
+    expect(strip).to_have_count(12)
+    page.keyboard.press("Home")
+    expect(picture).to_have_attribute("alt", "What the camera saw at 0.000 s")
+    assert picture.evaluate("each => each.decode().then(() => each.naturalWidth)") == 320
+    strip.nth(5).click()
+    expect(readout(page)).to_have_text("0.200 s / 0.440 s")
+    expect(picture).to_have_attribute("alt", "What the camera saw at 0.200 s")
+    expect(strip.nth(5)).to_have_attribute("aria-current", "true")
+    assert picture.get_attribute("src") == strip.nth(5).locator("img").get_attribute("src")
 
 
 def test_without_scripts_verdicts_can_be_read(browser: Browser, pages: Mapping[str, Path]) -> None:

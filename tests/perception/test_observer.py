@@ -21,9 +21,10 @@ from perception.filmed import (
 )
 from spatial_replay import TrackedObject, UsageError
 from spatial_replay.perception import Frame, TagObserver, observe_frames, parse_tags
-from spatial_replay.perception.opencv import Camera, TagDetector, corners_from_apriltag
-from spatial_replay.perception.plane import rotations
+from spatial_replay.perception.opencv import Camera, TagDetector, corners_from_apriltag, projection
+from spatial_replay.perception.plane import plane_from_references, rotations
 from spatial_replay.perception.rendering import Flaws, Plate
+from spatial_replay.perception.tags_file import pose_looking_at
 
 pytest.importorskip("cv2")
 
@@ -182,6 +183,24 @@ def test_reference_tags_that_do_not_fit_are_an_error_that_names_the_worst() -> N
     wrong = parse_tags(TABLE.replace("12: [0.65, 0.17]", "12: [0.6, 0.17]"), "tags.yaml")
     with pytest.raises(UsageError, match=r"tags\.yaml: the reference tags do not fit .* tag 1\d is off most"):
         TagObserver(wrong).observe(Frame(0, picture(scene)))
+
+
+@pytest.mark.parametrize("camera", [False, True])
+def test_a_plane_that_is_seen_edge_on_is_refused(camera: bool) -> None:
+    tags = parse_tags(TABLE if camera else FLAT, "tags.yaml")
+    corners = np.concatenate([each.corners for each in tags.references])
+    points = np.concatenate([corners, np.zeros((len(corners), 1))], axis=1)
+
+    def seen_at(degrees: float) -> dict[int, np.ndarray]:
+        slant = math.radians(degrees)
+        eye = np.array([0.49 + math.cos(slant), 0.0, math.sin(slant)])
+        pose = pose_looking_at(eye, np.array([0.49, 0.0, 0.0]), np.array([0.0, 0.0, 1.0]))
+        pixels, _ = projection(points, pose, LENS)
+        return {each.id: part for each, part in zip(tags.references, pixels.reshape(-1, 4, 2), strict=True)}
+
+    assert plane_from_references(tags, seen_at(15.0)).worst[1] < 0.1
+    with pytest.raises(UsageError, match=r"tags\.yaml: the plane is seen edge-on, .* from further above"):
+        plane_from_references(tags, seen_at(3.0))
 
 
 def test_a_camera_that_moves_is_noticed_and_places_stay_right() -> None:

@@ -150,6 +150,29 @@ def test_image_topics_of_ros_give_the_samples_of_their_stamps(folder: Path) -> N
     assert stated[0] == pytest.approx(stated[1], abs=0.003)
 
 
+def test_image_topics_of_ros_1_are_read(folder: Path) -> None:
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS1_NOETIC)
+    time, header = store.types["builtin_interfaces/msg/Time"], store.types["std_msgs/msg/Header"]
+    raw = store.types["sensor_msgs/msg/Image"]
+    with Writer(folder / "ros1.bag") as writer:
+        grey = writer.add_connection("/camera/image_raw", raw.__msgtype__, typestore=store)
+        for index, frame in enumerate(film(approaching(3), 3)):
+            height, width = frame.image.shape
+            stamp = header(index, time(5, frame.time_ns), "camera")
+            message = raw(stamp, height, width, "mono8", 0, width, frame.image.ravel())
+            data = store.serialize_ros1(message, raw.__msgtype__)
+            writer.write(grey, 8 * 10**9 + frame.time_ns, data)
+    log, tags = folder / "ros1.mcap", f"{folder}/tags.yaml"
+    assert run(["record", "video", f"{folder}/ros1.bag", "--tags", tags, "-o", str(log)]) == 0
+    trace = read_trace(log)
+    assert trace.times_ns.tolist() == [5 * 10**9 + 40_000_000 * index for index in range(3)]
+    assert set(trace.names) == {"blue", "red"}
+    assert len(payloads(log, "/camera/image_raw")) == 3
+
+
 def test_in_python_frames_become_samples_for_a_monitor_and_a_recorder(folder: Path, tmp_path: Path) -> None:
     from spatial_replay.perception import load_tags, observe_frames, open_frames
 
@@ -166,21 +189,50 @@ def test_in_python_frames_become_samples_for_a_monitor_and_a_recorder(folder: Pa
     )
 
 
+@pytest.mark.parametrize("ending", ["mkv", "ts", "mp4"])
 def test_a_video_that_breaks_off_is_recorded_up_to_there(
-    folder: Path, capsys: pytest.CaptureFixture[str]
+    ending: str, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    # what was recorded as .mkv needs no index at its end
-    video = write_approach(folder, COUNT, "cut.mkv")
+    # .mkv and .ts need no index at their end, nor does an .mp4 that has it at its beginning
+    video = folder / f"cut.{ending}"
+    _write_streamed(folder / "table.mp4", video)
     video.write_bytes(video.read_bytes()[: video.stat().st_size * 2 // 3])
     output, tags = folder / "cut.mcap", f"{folder}/tags.yaml"
     code = run(["record", "video", str(video), "--tags", tags, "-o", str(output)])
     assert 4 <= len(read_trace(output)) < COUNT
     assert run(["verify", str(output)]) == 0
     said = capsys.readouterr().err
-    assert (code, "cut.mkv breaks off after 0.") == (
-        3,
-        next(each[:27] for each in said.split(": ") if "off" in each),
-    )
+    assert code == 3
+    assert f"cut.{ending} breaks off after 0." in said
+
+
+def _write_streamed(video: Path, output: Path) -> None:
+    """Write a video again, frame by frame as it is, so that each is found without the end of the file."""
+    import av
+
+    options = {"movflags": "faststart"} if output.suffix == ".mp4" else {}
+    with av.open(str(video)) as source, av.open(str(output), "w", options=options) as container:
+        stream = container.add_stream_from_template(source.streams.video[0])
+        for packet in source.demux(video=0):
+            if packet.dts is not None:
+                packet.stream = stream
+                container.mux(packet)
+
+
+def test_a_video_without_time_stamps_asks_for_its_rate(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from spatial_replay.perception import open_frames
+
+    frames = open_frames(folder / "table.mp4")
+    (folder / "raw.h264").write_bytes(b"".join(frame.data for frame in frames))
+    output = folder / "raw.mcap"
+    arguments = ["record", "video", f"{folder}/raw.h264", "--tags", f"{folder}/tags.yaml", "-o", str(output)]
+    assert run(arguments) == 3
+    assert "raw.h264 has no time stamps; say how many frames a second it has" in capsys.readouterr().err
+    assert not output.exists()
+    assert run([*arguments, "--rate", "25"]) == 0
+    assert read_trace(output) == read_trace(folder / "run.mcap")
 
 
 BAD = {

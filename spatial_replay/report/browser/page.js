@@ -6,6 +6,7 @@ function makePage(run) {
   makeTransport(clock, run.events);
   linkVerdicts(clock);
   makeVerdicts(clock);
+  makeCamera(clock);
   makeScene(clock);
   makeTree(clock);
   makeLanes(clock);
