@@ -97,6 +97,11 @@ def number_text(number: float) -> str:
     return f"{number:.0f}" if is_long else f"{number:.{DIGITS}g}"
 
 
+def with_unit(number: float, unit: str) -> str:
+    """Return a number with its unit, as in "0.05 m"; neither infinity nor a number of unit "1" has one."""
+    return number_text(number) if unit in ("", "1") or math.isinf(number) else f"{number_text(number)} {unit}"
+
+
 def json_number(number: float) -> float | str | None:
     """Return a number as valid JSON: infinities become the strings "inf" and "-inf", NaN becomes null."""
     if math.isnan(number):

@@ -74,7 +74,7 @@ class AnnotatedEvaluation:
         self._compiled_before = compiled_before
         self._known = known
         self._show = show
-        self._arrow, self._units = arrow, units
+        self._arrow, self.units = arrow, units
 
         self._evaluations = [
             EvaluationStream(own, file.regions, semantics) for own, file in zip(instances, files, strict=True)
@@ -156,7 +156,7 @@ class AnnotatedEvaluation:
             derived | set(topics),
             axes,
             images=sorted(images),
-            units=self._units,
+            units=self.units,
         )
 
     def layout(
@@ -180,7 +180,7 @@ class AnnotatedEvaluation:
                     topics,
                     axes,
                     images=sorted(images),
-                    units=self._units,
+                    units=self.units,
                 )
             )
         contents = self.contents(self._extent, topics, axes, images)
@@ -224,7 +224,7 @@ class AnnotatedEvaluation:
             scene,
             self._show,
             arrow,
-            self._units,
+            self.units,
         )
 
     @cached_property

@@ -96,7 +96,7 @@ class Annotator:
             for tree, instance, requirements in zip(trees, instances, self._requirements, strict=True)
         ]
         self._reporters = [
-            EventReporter(tree, instance, files[tree.file], semantics)
+            EventReporter(tree, instance, files[tree.file], semantics, units)
             for tree, instance in zip(trees, instances, strict=True)
         ]
         self._runs = [

@@ -8,7 +8,7 @@ from typing import Final
 
 from spatial_replay.annotate.verdict_changes import FAILING, HOLDING, SATISFIED, VIOLATED, Period
 from spatial_replay.monitor.verdict import Verdict
-from spatial_replay.text import number_text, time_text
+from spatial_replay.text import time_text, with_unit
 
 _NOW: Final[Mapping[int, str]] = {
     HOLDING: "holds so far",
@@ -30,40 +30,42 @@ def leaf_words(text: str, number: float, amount: str, *, past: bool = False) -> 
     return f"`{text}` just {how}" if is_residue else f"`{text}` {how} by {amount}"
 
 
-def change_sentence(title: str, after: Period, witness: str) -> str:
+def change_sentence(title: str, after: Period, witness: str, unit: str = "") -> str:
     """Return a sentence on what has begun.
 
     Args:
         title: what the node is called.
         witness: the leaf that its number is that of, in words; "" for none.
+        unit: the declared one of its number, or "".
     """
     is_short = after.code == FAILING
     because = ""
     if math.isfinite(after.worst):
-        number = number_text(abs(after.worst))
+        number = with_unit(abs(after.worst), unit)
         because = f", {number} short of holding" if is_short else f", by {number}"
     if witness:
         because = f": {witness}"
     return f"{title} {_NOW[after.code]}{because}."
 
 
-def end_sentence(title: str, verdict: Verdict, ends: tuple[float, float], witness: str) -> str:
+def end_sentence(title: str, verdict: Verdict, ends: tuple[float, float], witness: str, unit: str) -> str:
     """Return a sentence on the verdict over the finished log.
 
     Args:
         ends: of the interval of its value; NaN where that is not determined.
+        unit: their declared one, or "".
     """
     amount, because = "", f": {witness}" if witness else ""
     number = ends[verdict is Verdict.VIOLATED]
     if verdict is Verdict.UNKNOWN:
-        low, high = map(number_text, ends)
+        low, high = (with_unit(end, unit) for end in ends)
         because = f": robustness {'not determined' if math.isnan(number) else f'between {low} and {high}'}"
     elif not witness and math.isfinite(number):
-        amount = f" by {number_text(abs(number))}"
+        amount = f" by {with_unit(abs(number), unit)}"
     return f"{title} is {verdict}{amount}, for the log has ended{because}."
 
 
-def past_sentence(before: Period, until_ns: int, witness: str) -> str:
+def past_sentence(before: Period, until_ns: int, witness: str, unit: str) -> str:
     """Return a sentence on the period before, until another began."""
     seconds = time_text(until_ns, before.start_ns)
     if before.code == FAILING:
@@ -72,5 +74,5 @@ def past_sentence(before: Period, until_ns: int, witness: str) -> str:
     if witness:
         worst = f"; its worst was that {witness}"
     elif math.isfinite(before.worst):
-        worst = f", by {number_text(abs(before.worst))} or more"
+        worst = f", by {with_unit(abs(before.worst), unit)} or more"
     return f"Before, it held for {seconds}{worst}."

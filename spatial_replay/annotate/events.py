@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -45,6 +46,7 @@ from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Specification, iter_nodes, operator_of
 from spatial_replay.spec.relations import RELATION_NAMES
+from spatial_replay.spec.units import declared_unit
 from spatial_replay.spec.walks import substitute
 from spatial_replay.text import requirement_text, time_text
 
@@ -60,6 +62,7 @@ class ReportedNode(NamedTuple):
         below: its leaves.
         requirement, sentence: the id of the requirement that the spec stands for, and its words, or None.
         is_needed: whether the root needs it to hold; not within `not`, or as one of several that may hold.
+        unit: the declared one of its number, or "".
     """
 
     node: int
@@ -70,6 +73,7 @@ class ReportedNode(NamedTuple):
     requirement: str | None = None
     sentence: str | None = None
     is_needed: bool = True
+    unit: str = ""
 
 
 class PeriodText(NamedTuple):
@@ -118,14 +122,20 @@ class EventReporter:
     """
 
     def __init__(
-        self, tree: ReportedTree, instance: Instance, file: Specification, semantics: Semantics = "ltlf"
+        self,
+        tree: ReportedTree,
+        instance: Instance,
+        file: Specification,
+        semantics: Semantics = "ltlf",
+        units: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
-        """Before the first sample."""
+        """Before the first sample; `units` are those that are declared, see `unit_of`."""
+        self._units = units
         self._settles = semantics == "ltlf"  # the paper's semantics has no verdict over all continuations
         self._tree, self._filename = tree, "" if file.filename == "<text>" else file.filename
         self._leaves = instance.program.leaves
         below = leaves_below(tree.formula, self._leaves)
-        self._reported = _reported_nodes(tree, below, file)
+        self._reported = _reported_nodes(tree, below, file, units)
         self._nodes = np.array([each.node for each in self._reported], np.int64)
         self._leaf_finder = DecidingLeaves(tree.formula, below, self._nodes.tolist())
         self._history = LeafHistory(tree.formula, self._leaves, instance.bindings) if self._settles else None
@@ -217,10 +227,14 @@ class EventReporter:
             witness = because = self._words(found)
             if after.code in _VERDICTS:
                 self._remember(change.node, found)
-        now = PeriodText(after, witness, change_sentence(reported.title, after, because), settled)
+        now = PeriodText(
+            after, witness, change_sentence(reported.title, after, because, reported.unit), settled
+        )
         past = None
         if before is not None:
-            past = self._past(before, after.start_ns, self._deciding_leaf(change.node, before, block))
+            past = self._past(
+                reported, before, after.start_ns, self._deciding_leaf(change.node, before, block)
+            )
         return self._encoded(reported, time_ns, now, past)
 
     def _final_event(self, node: int, time_ns: int, last_ns: int, final: Floats) -> EncodedEvent:
@@ -237,17 +251,19 @@ class EventReporter:
             witness = because = self._words(found)
             self._remember(node, found)
         after = Period(_ENDED[verdict], last_ns, last_ns, lower if low else upper, OF_CURRENT)
-        sentence = end_sentence(reported.title, verdict, (lower, upper), because)
+        sentence = end_sentence(reported.title, verdict, (lower, upper), because, reported.unit)
         now = PeriodText(after, witness, sentence, decided)
         past = None
         if before.code != START and before.start_ns < last_ns:
-            past = self._past(before, last_ns, self._carried[node, OF_CURRENT])
+            past = self._past(reported, before, last_ns, self._carried[node, OF_CURRENT])
         return self._encoded(reported, time_ns, now, past)
 
-    def _past(self, period: Period, until_ns: int, worst: LeafValue | None) -> PeriodText:
+    def _past(
+        self, reported: ReportedNode, period: Period, until_ns: int, worst: LeafValue | None
+    ) -> PeriodText:
         """Put a period that has ended into words."""
         witness = self._words(worst, past=True)
-        return PeriodText(period, witness, past_sentence(period, until_ns, witness))
+        return PeriodText(period, witness, past_sentence(period, until_ns, witness, reported.unit))
 
     def _encoded(
         self, reported: ReportedNode, time_ns: int, now: PeriodText, past: PeriodText | None
@@ -311,7 +327,7 @@ class EventReporter:
         """Return a leaf and its number in words; "" for none."""
         if found is None:
             return ""
-        amount = amount_text(abs(found.number), self._leaves[found.leaf])
+        amount = amount_text(abs(found.number), self._leaves[found.leaf], self._units)
         return leaf_words(self._leaf_text(found.leaf), found.number, amount, past=past)
 
     def _facts(self, reported: ReportedNode) -> dict[str, str]:
@@ -339,7 +355,7 @@ class EventReporter:
 
 
 def _reported_nodes(
-    tree: ReportedTree, below: Sequence[LeavesBelow], file: Specification
+    tree: ReportedTree, below: Sequence[LeavesBelow], file: Specification, units: Mapping[str, str]
 ) -> list[ReportedNode]:
     """Return the root, and once each named node that later samples can change.
 
@@ -368,8 +384,8 @@ def _reported_nodes(
         about = (None, None) if spec is None else (spec.id, spec.title)
         if any(about):
             title = f"{title} ({requirement_text(*about)})"
-        own = ReportedNode(identifier, title, name, line, below[identifier], *about, identifier in needed)
-        found.append(own)
+        is_needed, unit = identifier in needed, declared_unit(node, units)
+        found.append(ReportedNode(identifier, title, name, line, below[identifier], *about, is_needed, unit))
     return found
 
 

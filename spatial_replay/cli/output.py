@@ -12,7 +12,15 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
 from spatial_replay.cli.terminal import Coloured, Line, fitted, show, show_json
-from spatial_replay.text import counted, escaped, json_number, number_text, requirement_text, time_text
+from spatial_replay.text import (
+    counted,
+    escaped,
+    json_number,
+    number_text,
+    requirement_text,
+    time_text,
+    with_unit,
+)
 
 if TYPE_CHECKING:
     from google.protobuf.message import Message
@@ -145,9 +153,9 @@ def _titled(result: SpecResult) -> str:
 
 def _numbers(result: SpecResult, first_ns: int) -> str:
     robustness, lower, upper = result.robustness, result.lower, result.upper
-    parts = [f"robustness {_shown(robustness)}"]
+    parts = [f"robustness {_shown(robustness, result.unit)}"]
     if not (lower == upper == robustness or math.isnan(lower)):
-        parts.append(f"between {_shown(lower)} and {_shown(upper)}")
+        parts.append(f"between {_shown(lower, result.unit)} and {_shown(upper, result.unit)}")
     if robustness == 0.0:
         parts.append("marginal")
     certain_ns = result.certain_ns()
@@ -158,7 +166,8 @@ def _numbers(result: SpecResult, first_ns: int) -> str:
     if result.least is not None and result.verdict == "violated":
         parts.append(f"the least robustness is that of `{result.least.name}`")
     elif result.least_at_ns is not None:
-        parts.append(f"least at {time_text(result.least_at_ns, first_ns)}")
+        least_at = time_text(result.least_at_ns, first_ns)
+        parts += [f"least at {least_at}"] if f"certain since {least_at}" not in parts else []
     return ", ".join(parts)
 
 
@@ -188,15 +197,16 @@ def _over_window(result: SpecResult, first_ns: int, window_ns: int) -> str:
     values, times_ns = result.window_signal(window_ns)[0], result.times_ns
     over = f"over the last {time_text(window_ns)}"
     failing = (values < 0.0).nonzero()[0]
+    at_end = _shown(float(values[-1]), result.unit)
     if not len(failing):
-        return f"{over} never violated; robustness at the end {_shown(float(values[-1]))}"
+        return f"{over} never violated; robustness at the end {at_end}"
     first = time_text(int(times_ns[failing[0]]), first_ns)
     count = f"{len(failing):,} of {counted(len(values), 'sample')}"
-    return f"{over} violated at {count}, first at {first}; robustness at the end {_shown(float(values[-1]))}"
+    return f"{over} violated at {count}, first at {first}; robustness at the end {at_end}"
 
 
-def _shown(number: float) -> str:
-    return "not determined" if math.isnan(number) else number_text(number)
+def _shown(number: float, unit: str = "") -> str:
+    return "not determined" if math.isnan(number) else with_unit(number, unit)
 
 
 _LONGEST: Final = 400

@@ -30,7 +30,8 @@ from spatial_replay.monitor.witness.witness import Witness, find_witness, time_o
 from spatial_replay.spec.diagnostics import nearest_hint
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Formula, NamedSpec, iter_nodes, operator_of
-from spatial_replay.text import Instant, Sentence, number_text, shortened_formula
+from spatial_replay.spec.units import declared_unit
+from spatial_replay.text import Instant, Sentence, shortened_formula, with_unit
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,6 +204,11 @@ class SpecResult(Displayed):
         return final_verdict(self.lower, self.upper)
 
     @property
+    def unit(self) -> str:
+        """The declared unit of its robustness; "" where its atoms have several or none is declared."""
+        return declared_unit(self.formula, self.evidence.units)
+
+    @property
     def satisfied_at_ns(self) -> int | None:
         """When it became certain that it is satisfied, whatever came after; None if only the end decided."""
         return self.certain_ns() if self.verdict is Verdict.SATISFIED else None
@@ -366,7 +372,7 @@ class SpecResult(Displayed):
         least = "Least robustness" if is_violated else "Robustness"
         return Sentence(
             *(f"{str(self.verdict).capitalize()} since ", since, ": ", reason),
-            *(f" {least} {number_text(number)}: ", reason_sentence(whole, first_ns=first_ns)),
+            *(f" {least} {with_unit(number, self.unit)}: ", reason_sentence(whole, first_ns=first_ns)),
         )
 
     def explain(self, *, first_ns: int | None = None) -> str:
@@ -409,6 +415,7 @@ class SpecResult(Displayed):
             f"`{self._name_of(node)}`{instance}",
             verdict,
             (lower, upper),
+            unit=self.unit if node == 0 else "",
             has_ended=settled_ns is None and verdict is Verdict.VIOLATED and self.can_explain,
             certain_since=None if settled_ns is None else Instant(settled_ns, first_ns),
             least=least,

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
+from types import MappingProxyType
 
 from spatial_replay.monitor.causes import Cause, LeastPart
 from spatial_replay.monitor.verdict import Verdict
@@ -15,6 +17,7 @@ from spatial_replay.monitor.witness.witness import Witness, WitnessStep
 from spatial_replay.spec.expressions import Number, Scaled
 from spatial_replay.spec.format import format_number
 from spatial_replay.spec.formula import Atom, Formula
+from spatial_replay.spec.units import declared_unit
 from spatial_replay.spec.walks import iter_expressions, iter_formulas
 from spatial_replay.text import (
     DIGITS,
@@ -25,6 +28,7 @@ from spatial_replay.text import (
     number_text,
     requirement_text,
     shortened_formula,
+    with_unit,
 )
 
 _RESIDUE = 1e-12
@@ -47,7 +51,7 @@ def sentences_of(
     title = f"`{witness.path[0].name or shortened_formula(witness.path[0].text)}`"
     title += f" for {witness.object}" if witness.object is not None else ""
     title += f" ({requirement})" if requirement else ""
-    numbers = _robustness(witness.lower, witness.upper)
+    numbers = _robustness(witness.lower, witness.upper, witness.unit)
     if witness.settled_ns is not None:
         sentences = [_settled(title, witness.verdict, Instant(witness.settled_ns, first_ns))]
     elif is_open:
@@ -59,10 +63,14 @@ def sentences_of(
     if witness.missed is not None and not is_open:
         # how well a condition held is not how badly its response failed
         is_measured = witness.missed.is_condition and is_decided
-        measured = f": {_what_was_measured(witness.deciding)}" if is_measured and witness.deciding else ""
+        measured = (
+            f": {_what_was_measured(witness.deciding, witness.units)}"
+            if is_measured and witness.deciding
+            else ""
+        )
         sentences.append(Sentence(missed_text(witness.missed, first_ns), f"{measured}."))
         if witness.closest is not None:
-            sentences.append(_closest(*witness.closest, first_ns))
+            sentences.append(_closest(*witness.closest, first_ns, witness.units))
     if witness.deciding is None:
         sentences.append(_dead_end(witness.path[-1], first_ns))
     elif witness.deciding.unknown:
@@ -77,7 +85,7 @@ def sentences_of(
             sentences.append(Sentence(f"{what} is `{witness.deciding.text}`, which ", how))
         sentences.append(Sentence(_flip(witness, witness.deciding, witness.threshold, is_open=is_open)))
     if witness.open_end is not None:
-        sentences.append(_open_end(*witness.open_end, first_ns))
+        sentences.append(_open_end(*witness.open_end, first_ns, witness.units))
     return tuple(sentences)
 
 
@@ -100,6 +108,7 @@ def verdict_sentence(
     verdict: Verdict,
     ends: tuple[float, float],
     *,
+    unit: str = "",
     certain_since: Instant | None = None,
     has_ended: bool = False,
     least: LeastPart | None = None,
@@ -110,6 +119,7 @@ def verdict_sentence(
     Args:
         title: what the result is called.
         ends: of its interval for the finished log.
+        unit: the declared one of these, or "".
         certain_since: since when it is certain.
         has_ended: whether it was pending until the log ended, and is violated for that.
         least: the part that its number is of, if that is another than the first cause.
@@ -117,9 +127,10 @@ def verdict_sentence(
     """
     since = (", certain since ", certain_since) if certain_since is not None else ()
     of = f" (the least robustness is that of `{least.name}`)" if least is not None else ""
-    at = (", least at ", least_at) if least_at is not None else ()
+    is_later = least_at is not None and str(least_at) != str(certain_since)
+    at = (", least at ", least_at) if least_at is not None and is_later else ()
     how = f"{verdict}{_ENDED if has_ended else ''}"
-    return Sentence(f"{title} is {how}: {_robustness(*ends)}", *since, *at, f"{of}.")
+    return Sentence(f"{title} is {how}: {_robustness(*ends, unit)}", *since, *at, f"{of}.")
 
 
 def verdict_text(verdict: Verdict, robustness: float) -> str:
@@ -134,12 +145,17 @@ def divisor_of(atom: Formula) -> float:
     return expression.divisor if isinstance(expression, Scaled) else 1.0
 
 
-def amount_text(number: float, atom: Formula) -> str:
-    """Return a number of an atom in the unit of the log: what `scale` divided it by is said beside it."""
+def amount_text(number: float, atom: Formula, units: Mapping[str, str] = MappingProxyType({})) -> str:
+    """Return a number of an atom in the unit of the log: what `scale` divided it by is said beside it.
+
+    Args:
+        units: those that are declared, see `declared_unit`.
+    """
     divisor, number = divisor_of(atom), without_residue(number, atom)
+    amount = with_unit(number * divisor, declared_unit(atom, units, is_scaled=False))
     if divisor == 1.0:
-        return number_text(number)
-    return f"{number_text(number * divisor)} ({number_text(number)} on its scale of {format_number(divisor)})"
+        return amount
+    return f"{amount} ({number_text(number)} on its scale of {format_number(divisor)})"
 
 
 def without_residue(number: float, atom: Formula) -> float:
@@ -155,10 +171,10 @@ def without_residue(number: float, atom: Formula) -> float:
     return 0.0 if abs(number * divisor_of(atom)) <= _RESIDUE * scale else number
 
 
-def _robustness(lower: float, upper: float) -> str:
+def _robustness(lower: float, upper: float, unit: str) -> str:
     if math.isnan(lower):
         return "robustness not determined"
-    low, high = number_text(lower), number_text(upper)
+    low, high = with_unit(lower, unit), with_unit(upper, unit)
     return f"robustness {low}" if lower == upper else f"robustness between {low} and {high}"
 
 
@@ -175,8 +191,10 @@ def reason_sentence(witness: Witness, *, first_ns: int) -> Sentence:
         return Sentence(missed, ". ", reason) if missed else reason
     if witness.missed is not None and witness.missed.is_condition:
         # how well the condition held is not what went wrong
-        said = Sentence(missed, f": {_what_was_measured(deciding)}.")
-        return said if witness.closest is None else Sentence(said, " ", _closest(*witness.closest, first_ns))
+        said = Sentence(missed, f": {_what_was_measured(deciding, witness.units)}.")
+        if witness.closest is None:
+            return said
+        return Sentence(said, " ", _closest(*witness.closest, first_ns, witness.units))
     how = Sentence(f"`{deciding.text}` ", _how_it_decides(witness, deciding, first_ns))
     return Sentence(missed, ": ", how) if missed else how
 
@@ -187,9 +205,9 @@ def missed_text(missed: MissedResponse, first_ns: int) -> Sentence:
     return Sentence(f"`{missed.condition}` held at ", when, f", but `{missed.response}` did not")
 
 
-def _closest(best: DecidingAtom, time_ns: int, first_ns: int) -> Sentence:
+def _closest(best: DecidingAtom, time_ns: int, first_ns: int, units: Mapping[str, str]) -> Sentence:
     """Return a sentence on what a missed response came to at best."""
-    what = f": {_what_was_measured(best)}."
+    what = f": {_what_was_measured(best, units)}."
     return Sentence(f"The nearest that it came to `{best.text}` was at ", Instant(time_ns, first_ns), what)
 
 
@@ -197,19 +215,19 @@ def _how_it_decides(
     witness: Witness, deciding: DecidingAtom, first_ns: int, *, is_open: bool = False
 ) -> Sentence:
     amount = deciding.value if deciding.lower == deciding.upper else _end(deciding)
-    size = amount_text(abs(amount), deciding.atom)
+    size = amount_text(abs(amount), deciding.atom, witness.units)
     how = f"holds by {size}" if amount >= 0.0 else f"fails by {size}"
     if without_residue(amount, deciding.atom) == 0.0:
         how = "just holds" if amount >= 0.0 else "just fails"
     where = _in_time(witness)
     if witness.path[-1].operator == deciding.atom.relation:
         where = _in_time_of_all(witness, deciding, "so far " if is_open else "")
-    what = _what_was_measured(deciding)
+    what = _what_was_measured(deciding, witness.units)
     return Sentence(f"{how} at ", Instant(witness.time_ns, first_ns), f"{where}: {what}.")
 
 
-def _what_was_measured(deciding: DecidingAtom) -> str:
-    return " and ".join(map(_measured, deciding.measured))
+def _what_was_measured(deciding: DecidingAtom, units: Mapping[str, str]) -> str:
+    return " and ".join(_measured(each, units) for each in deciding.measured)
 
 
 def _end(deciding: DecidingAtom) -> float:
@@ -252,9 +270,9 @@ def _in_time_of_all(witness: Witness, deciding: DecidingAtom, so_far: str) -> st
     return _in_time(witness)
 
 
-def _measured(measured: Measured) -> str:
-    names, value = measured.names, measured.value
-    size = number_text(abs(value))
+def _measured(measured: Measured, units: Mapping[str, str]) -> str:
+    names, value, lengths = measured.names, measured.value, units.get("", "")
+    size = with_unit(abs(value), lengths)
     match measured.quantity:
         case "signed_distance" if math.isinf(value):
             return f"{names[0]} and {names[1]} are infinitely far apart, since a group is empty"
@@ -272,14 +290,14 @@ def _measured(measured: Measured) -> str:
             degrees = math.degrees(math.acos(max(-1.0, min(1.0, 1.0 - value))))
             return f"{names[0]} is turned by {number_text(degrees)}° from {names[1]}"
         case "signal":
-            return f"{names[0]} is {number_text(value)}"
+            return f"{names[0]} is {with_unit(value, units.get(names[0], ''))}"
     if math.isinf(value):
         return f"no object is in {names[0]}"
     axis = measured.quantity[-1]
     if measured.quantity.startswith("centroid"):
-        return f"the centroid of {names[0]} is at {axis} = {number_text(value)}"
+        return f"the centroid of {names[0]} is at {axis} = {with_unit(value, lengths)}"
     edge = _EDGES.get(measured.quantity, "bottom" if measured.quantity == "min_z" else "top")
-    return f"the {edge} edge of {names[0]} is at {axis} = {number_text(value)}"
+    return f"the {edge} edge of {names[0]} is at {axis} = {with_unit(value, lengths)}"
 
 
 def _flip(
@@ -306,7 +324,9 @@ def _flip(
     if change.startswith("anything"):
         margin = f"more than {number_text(abs(threshold.flips_at))}"
     if divisor_of(deciding.atom) != 1.0:
-        margin = amount_text(abs(threshold.flips_at), deciding.atom)
+        margin = amount_text(abs(threshold.flips_at), deciding.atom, witness.units)
+    elif (unit := declared_unit(deciding.atom, witness.units)) not in ("", "1"):
+        margin = f"{margin} {unit}"
     how = "were allowed to fail by" if threshold.flips_at < 0.0 else "had to hold by"
     return f"{would} if `{deciding.text}` {how} {margin}."
 
@@ -361,7 +381,7 @@ def _gap(gap: Gap, first_ns: int) -> Sentence:
 
 
 def _uncertain(witness: Witness, deciding: DecidingAtom, first_ns: int) -> Sentence:
-    low, high = (amount_text(each, deciding.atom) for each in (deciding.lower, deciding.upper))
+    low, high = (amount_text(each, deciding.atom, witness.units) for each in (deciding.lower, deciding.upper))
     return Sentence(
         f"`{deciding.text}` lies between {low} and {high} at ",
         Instant(witness.time_ns, first_ns),
@@ -369,13 +389,13 @@ def _uncertain(witness: Witness, deciding: DecidingAtom, first_ns: int) -> Sente
     )
 
 
-def _open_end(deciding: DecidingAtom, time_ns: int, first_ns: int) -> Sentence:
+def _open_end(deciding: DecidingAtom, time_ns: int, first_ns: int, units: Mapping[str, str]) -> Sentence:
     """Name what leaves the robustness open, where the verdict is known."""
     when = Instant(time_ns, first_ns)
     if deciding.unknown:
         reasons = " and ".join(deciding.unknown)
         return Sentence(f"By how much is open: `{deciding.text}` is unknown at ", when, f", {reasons}.")
-    low, high = (amount_text(each, deciding.atom) for each in (deciding.lower, deciding.upper))
+    low, high = (amount_text(each, deciding.atom, units) for each in (deciding.lower, deciding.upper))
     what = f"By how much is uncertain: `{deciding.text}` lies between {low} and {high} at "
     return Sentence(what, when, ".")
 

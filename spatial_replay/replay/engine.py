@@ -308,7 +308,7 @@ def replayed_specs(
     return tuple(
         SpecResult.from_stream(
             stream,
-            Evidence(stream.instance, files[tree.file].regions, traces),
+            Evidence(stream.instance, files[tree.file].regions, traces, evaluation.units),
             block,
             name=tree.name,
             has_series=has_series,

@@ -18,6 +18,7 @@ from spatial_replay.simulation.world import Execution
 from spatial_replay.simulation.worlds import default_specification, make_world
 from spatial_replay.spec import check_names
 from spatial_replay.spec.formula import Specification
+from spatial_replay.trace.axes import Axes
 from spatial_replay.trace.sample import Sample
 
 
@@ -103,7 +104,9 @@ def record_script(
 def about_run(scenario: str, *, seed: int, noise_m: float, injections: Sequence[Injection]) -> dict[str, str]:
     """Return the metadata about how a run was made."""
     options = {"seed": seed, "noise_m": noise_m, "inject": [str(each) for each in injections]}
-    return {"source": scenario, "seed": str(seed), "options": json.dumps(options)}
+    # worlds are simulated in metres
+    axes = Axes(unit="m").metadata()
+    return {"source": scenario, "seed": str(seed), "options": json.dumps(options), **axes}
 
 
 def _follow_script(

@@ -36,6 +36,7 @@ from spatial_replay.recording.changes import VerdictChange, VerdictChanges
 from spatial_replay.recording.recording import refuse_templates
 from spatial_replay.runs.run_log import RunLog, run_log
 from spatial_replay.spec.formula import Specification
+from spatial_replay.trace.axes import Axes
 
 KeepVideo: TypeAlias = Literal["copy", "h264", "none"]
 """How a log keeps a video: as it came, encoded again, or not at all."""
@@ -134,8 +135,7 @@ def record_seen(
     changes, colours = VerdictChanges(files), AskedColours(files)
     options = {"tags": tags.name, "hold_ns": hold_ns, "keep_video": kept}
     about = {"source": frames.name, "options": json.dumps(options)}
-    if tags.is_image:
-        about["unit"] = tags.unit
+    about |= Axes(unit=tags.unit).metadata()
     samples, last_ns = 0, first.time_ns
     begin(first.time_ns)
     with run_log(output, files, about, inputs, durability=durability) as log:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -53,6 +53,22 @@ def units_of(formula: Formula) -> tuple[Unit, ...]:
         if isinstance(each, Atom):
             found.update(dict.fromkeys(_units(each.expression)))
     return tuple(found)
+
+
+def declared_unit(formula: Formula, declared: Mapping[str, str], *, is_scaled: bool = True) -> str:
+    """Return the declared unit of a formula's number; "" where it has none, several, or none is declared.
+
+    Args:
+        declared: the units of signals by their names, that of lengths by "".
+        is_scaled: whether the number is what `scale` made of it, which has no unit.
+    """
+    found = {
+        ""
+        if each.kind == "orientation" or (is_scaled and each.divisor is not None)
+        else declared.get(each.signal or "", "")
+        for each in units_of(formula)
+    }
+    return found.pop() if len(found) == 1 else ""
 
 
 def is_mixed(units: Sequence[Unit]) -> bool:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from foxglove_schemas_protobuf.Event_pb2 import Event
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap.reader import make_reader
 from mcap.writer import Writer
@@ -17,7 +18,7 @@ from spatial_replay import read_trace
 from spatial_replay.cli import run
 from spatial_replay.logs.schemas.Robustness_pb2 import StandingUpdate
 from spatial_replay.logs.schemas.Specification_pb2 import Specification
-from spatial_replay.logs.topics import SCENE, STANDING
+from spatial_replay.logs.topics import EVENTS, SCENE, STANDING
 
 TURTLES = """\
 sample: {topic: /turtle2/pose}    # the later of the two: no sample without the other
@@ -199,8 +200,8 @@ def test_a_clock_that_jumps_back_is_an_error_or_ends_the_log(
     assert "the log is taken to end there" in said.err
 
 
-def test_a_declared_unit_of_lengths_is_at_axes_in_tables_and_in_what_is_made_of_the_log(
-    data_folder: Path, folder: Path
+def test_a_declared_unit_of_lengths_is_at_axes_in_tables_in_sentences_and_in_what_is_made_of_the_log(
+    data_folder: Path, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (folder / "metres.yaml").write_text("unit: m\n" + TURTLES)
     described = "/spatial/specification"
@@ -217,11 +218,23 @@ def test_a_declared_unit_of_lengths_is_at_axes_in_tables_and_in_what_is_made_of_
             ]
         standing = [StandingUpdate.FromString(data) for topic, data in messages if topic == STANDING]
         assert {each.unit for message in standing for each in (*message.results, *message.nodes)} == {"m"}
+        events = [Event.FromString(data) for topic, data in messages if topic == EVENTS]
+        [end] = [each.metadata for each in events if "`meet` is violated" in each.metadata[-1].value]
+        assert "`turtle1 ovlp turtle2` failed by 1.514 m" in end[-1].value
         drawn = [SceneUpdate.FromString(data) for topic, data in messages if topic == SCENE]
         [arrow] = [each for each in drawn[-1].entities if each.id == "witness"]
         assert arrow.texts[0].text.strip() == "turtle1 ovlp turtle2: -1.53 m"
         [found] = [Specification.FromString(data) for topic, data in messages if topic == described]
         assert {node.unit for result in found.results for node in result.nodes} == {"m"}
+    capsys.readouterr()
+    run(["replay", "annotated.mcap", *spec])
+    run(["explain", "annotated.mcap", *spec])
+    said = capsys.readouterr().out
+    assert "meet  violated   robustness -1.514 m\n" in said
+    assert "`meet` is violated, for the log has ended: robustness -1.514 m." in said
+    assert "fails by 1.514 m at 1.809 s" in said
+    assert "turtle1 and turtle2 are 1.514 m apart" in said
+    assert "were allowed to fail by 1.514 m." in said
     run(["report", "annotated.mcap", "-o", "run.html"])
     page = (folder / "run.html").read_text(encoding="utf-8")
     assert "robustness -1.514 m" in page

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,14 +45,20 @@ class Evidence:
     """The samples of one instance, read again on each request: a log need not fit into memory."""
 
     def __init__(
-        self, instance: Instance, regions: Mapping[str, Outline], traces: Callable[[], Iterable[Trace]]
+        self,
+        instance: Instance,
+        regions: Mapping[str, Outline],
+        traces: Callable[[], Iterable[Trace]],
+        units: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         """Store how to read the samples.
 
         Args:
             traces: iterates over the samples, with those looked back at, in blocks of any length.
+            units: those that the log declares, of signals by their names, of lengths by "".
         """
         self.instance = instance
+        self.units = dict(units)
         self._regions = regions
         self._traces = traces
         self._reach = look_back([instance.formula])

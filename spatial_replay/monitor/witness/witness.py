@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.instances import Instance
@@ -21,6 +22,7 @@ from spatial_replay.monitor.witness.threshold import Obstacle, Threshold, thresh
 from spatial_replay.monitor.witness.unfinished import evaluate_unfinished
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Atom, Formula, Quantified, iter_nodes, operator_of
+from spatial_replay.spec.units import declared_unit
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +68,8 @@ class Witness:
         gaps: of an unknown atom, when what it is about is missing.
         closest: of a missed response, the atom by which it came closest to holding, and the time of its
             sample; None if that is what decides, or if there is no such atom.
+        units: those that the log declares, of signals by their names, of lengths by "".
+        unit: the declared one of `lower` and `upper`, or "".
     """
 
     name: str
@@ -82,6 +86,8 @@ class Witness:
     missed: MissedResponse | None = None
     gaps: tuple[Gap, ...] = ()
     closest: tuple[DecidingAtom, int] | None = None
+    units: Mapping[str, str] = field(default_factory=dict, repr=False, hash=False)
+    unit: str = ""
 
     @property
     def node(self) -> int:
@@ -173,6 +179,8 @@ def find_witness(
         missed,
         evidence.gaps(deciding.atom) if deciding is not None and deciding.unknown else (),
         closest,
+        evidence.units,
+        declared_unit(nodes[node], evidence.units),
     )
 
 
