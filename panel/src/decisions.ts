@@ -1,11 +1,12 @@
 // The panel of a planner's decisions: candidates, the chosen map, and the edges given up.
 
 import {
-  element, inShort, keepInSight, makeDecision, numberText, printable, secondsText,
+  element, inShort, makeDecision, numberText, printable, secondsText,
   type DrawnClock, type DrawnDecision, type DrawnMap, type DrawnTarget,
 } from "report-drawing";
 import { createElement, type ReactElement } from "react";
 
+import { TimedList } from "./event-list";
 import { wide, type DecisionMessage, type GridMessage, type TargetMessage } from "./messages";
 import type { Cursor, View, Viewer } from "./viewer";
 
@@ -32,7 +33,7 @@ export class DecisionsView implements View {
   readonly body = element("div", { class: "panel-body decisions" });
   private readonly card = element("ol", { class: "cards" });
   private readonly pruned = element("div", { class: "tasks" });
-  private readonly list = element("ol", { class: "list" });
+  private readonly list = new TimedList();
   private readonly clock: DrawnClock;
   /** By number; with its outcome once that is known. */
   private readonly decisions = new Map<number, Decision>();
@@ -40,7 +41,6 @@ export class DecisionsView implements View {
   private readonly mapsByTime = new Map<number, GridMessage[]>();
   private cells = 0;
   private mapsRead = 0;
-  private rows = new Map<number, HTMLElement>();
   private shown = "";
   private listed = -1;
 
@@ -53,7 +53,7 @@ export class DecisionsView implements View {
       view: [0, 0], time: 0, seek: (time) => viewer.seek(time), pause: () => undefined,
     };
     this.body.append(this.card, this.pruned,
-      element("details", { open: true }, element("summary", {}, "All decisions"), this.list));
+      element("details", { open: true }, element("summary", {}, "All decisions"), this.list.made));
   }
 
   specify(): void {
@@ -82,12 +82,12 @@ export class DecisionsView implements View {
   show(cursor: Cursor): void {
     const ordered = this.ordered;
     this.showList(ordered);
+    this.list.show(cursor.time);
     let here: Decision | undefined;
     for (const each of ordered) if (each.time <= cursor.time + 1e-9) here = each;
     const maps = here ? this.mapsOf(here) : [];
     const shown = here ? JSON.stringify([here.message.number ?? 0, Boolean(here.message.outcome), maps.length]) : "";
     if (shown === this.shown) return;
-    this.rows.get(JSON.parse(this.shown || "[-1]")[0])?.removeAttribute("aria-current");
     this.shown = shown;
     this.body.dataset.decision = here ? String(here.message.number ?? 0) : "";
     if (!here) {
@@ -99,9 +99,6 @@ export class DecisionsView implements View {
     for (const each of made.querySelectorAll("details")) each.open = true;
     this.card.replaceChildren(made);
     this.pruned.replaceChildren(...givenUp(here.message));
-    const row = this.rows.get(here.message.number ?? 0);
-    row?.setAttribute("aria-current", "true");
-    if (row) keepInSight(this.list, row.parentElement!);
   }
 
   head(): ReactElement {
@@ -118,11 +115,10 @@ export class DecisionsView implements View {
     if (this.listed === ordered.length) return;
     this.listed = ordered.length;
     this.shown = "";
-    this.rows = new Map(ordered.map((each) => [each.message.number ?? 0, element("button", {
+    this.list.fill(ordered.map((each) => each.time), ordered.map((each) => element("button", {
       type: "button", class: "event", onclick: () => this.clock.seek(each.time),
     }, element("span", {}), element("time", {}, secondsText(each.time)),
-    element("span", { class: "sentence" }, inShort(drawnOf(each, []))))]));
-    this.list.replaceChildren(...[...this.rows.values()].map((row) => element("li", {}, row)));
+    element("span", { class: "sentence" }, inShort(drawnOf(each, []))))));
   }
 
   private forgetMaps(): void {

@@ -356,6 +356,22 @@ def test_the_automaton_shows_where_the_run_is(open_page: Open) -> None:
     expect(page.locator(".move.ahead").first).to_be_attached()
 
 
+def test_conditions_at_the_arrows_of_an_automaton_cover_neither_states_nor_each_other(
+    open_page: Open,
+) -> None:
+    page = open_page("planned")
+    assert page.locator("#automaton .guard").count() > 3
+    covered = """() => {
+        const box = (each) => each.getBoundingClientRect();
+        const labels = [...document.querySelectorAll("#automaton .guard")].map(box);
+        const all = [...labels, ...[...document.querySelectorAll("#automaton circle")].map(box)];
+        const apart = (a, b) => a.right <= b.left + 1 || b.right <= a.left + 1
+            || a.bottom <= b.top + 2 || b.bottom <= a.top + 2;
+        return labels.flatMap((a, i) => all.slice(i + 1).filter((b) => !apart(a, b)).map((b) => [a, b]));
+    }"""
+    assert page.evaluate(covered) == []
+
+
 def test_a_result_without_an_automaton_says_why(open_page: Open) -> None:
     expect(open_page("violated").locator("#automaton")).to_contain_text(
         "table_set has no automaton: F[0s, 4s] counts seconds, an automaton counts samples."

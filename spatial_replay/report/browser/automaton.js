@@ -59,7 +59,7 @@ function drawAutomaton(automaton) {
     "aria-label": `Automaton with ${automaton.summary}`, class: wide < 6 * COLUMN ? "small" : null,
   }, svg("defs", {}, tip("tip"), tip("tip-ahead")),
   svg("path", {class: "move", d: `M${x - 46} ${y} H${x - RADIUS - 5}`, "marker-end": "url(#tip)"}),
-  ...moves.map((move) => move.made), ...states.values(), ...moves.map((move) => labelOf(move, places)));
+  ...moves.map((move) => move.made), ...states.values(), ...labelsOf(moves, places));
   return {made, moves, states, set: null};
 }
 
@@ -68,21 +68,38 @@ function tip(id) {
     markerHeight: 9, orient: "auto"}, svg("path", {class: "tip", d: "M0 0 L8 4 L0 8 Z"}));
 }
 
-const LONGEST_LABEL = 18;
+// fits between two states beside each other
+const LONGEST_LABEL = 16;
 
-// The guard of a move, with short names for long propositions, beside its curve.
-function labelOf({source, target, label, guard}, places) {
-  if (!label) return null;
-  const [x, y] = placeOfGuard(places.get(source), places.get(target));
-  const text = label.length > LONGEST_LABEL ? `${label.slice(0, LONGEST_LABEL - 1)}…` : label;
-  return svg("text", {class: "guard", x, y, "text-anchor": "middle", dy: "-0.3em"}, text, svg("title", {}, guard));
+// places along a curve at which a label may stand, the best first
+const SHARES = [0.5, 0.4, 0.6, 0.32, 0.68, 0.25, 0.75];
+const LETTER = 5.6, LINE = 12;
+
+// The guards of the moves, with short names for long propositions, beside their curves: each at the place where it
+// covers least of states and of the labels before it.
+function labelsOf(moves, places) {
+  const taken = [...places.values()].map(([x, y]) => [x - RADIUS, y - RADIUS, x + RADIUS, y + RADIUS]);
+  return moves.filter((move) => move.label).map(({source, target, label, guard}) => {
+    const text = label.length > LONGEST_LABEL ? `${label.slice(0, LONGEST_LABEL - 1)}…` : label;
+    const half = text.length * LETTER / 2;
+    const boxes = SHARES.map((share) => {
+      const [x, y] = alongCurve(places.get(source), places.get(target), share);
+      return [x - half, y - LINE, x + half, y];
+    });
+    const covered = boxes.map((box) => taken.reduce((sum, other) => sum + overlapOf(box, other), 0));
+    const box = boxes[covered.indexOf(Math.min(...covered))];
+    taken.push(box);
+    return svg("text", {class: "guard", x: (box[0] + box[2]) / 2, y: box[3], "text-anchor": "middle", dy: "-0.3em"},
+      text, svg("title", {}, guard));
+  });
 }
 
-function placeOfGuard([x0, y0], [x1, y1]) {
-  const [cx, cy] = controlOf([x0, y0], [x1, y1]);
-  // labels of curves beside each other are not one above the other
-  const spans = Math.round((x1 - x0) / COLUMN);
-  const share = spans === 1 ? 0.5 : spans % 2 ? 0.5 : 0.4, rest = 1 - share;
+function overlapOf([left, top, right, bottom], [l, t, r, b]) {
+  return Math.max(0, Math.min(right, r) - Math.max(left, l)) * Math.max(0, Math.min(bottom, b) - Math.max(top, t));
+}
+
+function alongCurve([x0, y0], [x1, y1], share) {
+  const [cx, cy] = controlOf([x0, y0], [x1, y1]), rest = 1 - share;
   const along = (from, by, to) => rest * rest * from + 2 * rest * share * by + share * share * to;
   return [along(x0, cx, x1), along(y0, cy, y1)];
 }
