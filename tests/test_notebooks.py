@@ -58,6 +58,18 @@ EXPECTED = {
             "violated annotated.mcap drive.bag drive.html drive.yaml",
         ),
     ),
+    "from-a-video-to-a-verdict": Expected(
+        NOTEBOOKS,
+        2,
+        (
+            "8 tags in (600, 800, 3)",
+            "red    within 0.4 mm",
+            "reference tags fit within 0.",
+            "apart: satisfied, truly satisfied; within its bounds: True",
+            "far: violated, truly violated; within its bounds: True",
+            "samples, messages, specifications and results match",
+        ),
+    ),
     "look-into-a-planner-run": Expected(
         NOTEBOOKS,
         5,
