@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from operator import attrgetter
@@ -97,12 +97,27 @@ class ReportedTree(NamedTuple):
     def calls(self, source: str) -> dict[int, str]:
         """Return the text of each node that is a `def` with its arguments, as the file writes it."""
         nodes, written = list(iter_nodes(self.formula)), self.written(source)
-        spans = [node.span for _, _, node in nodes]
-        return {
-            parent: written[parent]
+        spans, defined = [node.span for _, _, node in nodes], set(_DEFINED.findall(source))
+        # what a def stands for has the place of its call
+        expanded = {
+            identifier
             for identifier, parent, _ in nodes
-            if parent is not None and spans[parent] == spans[identifier] and nodes[parent][2].name is None
+            if parent is not None and spans[parent] == spans[identifier]
         }
+        above = {parent for identifier, parent, _ in nodes if identifier in expanded}
+        return {
+            identifier: written[identifier]
+            for identifier, _, node in nodes
+            if node.name is None
+            and identifier not in expanded
+            and (identifier in above or _is_call(node, written[identifier], defined))
+        }
+
+
+def _is_call(node: Formula, written: str, defined: Collection[str]) -> bool:
+    """Return whether a single atom is what a `def` of these names stands for."""
+    found = _CALL.match(written) if isinstance(node, Atom) else None
+    return found is not None and found[1] in defined
 
 
 def reported_trees(
@@ -279,6 +294,10 @@ def logged_specifications(files: Sequence[Specification]) -> list[Specification]
 def specification_attachments(files: Sequence[Specification], prefix: str) -> list[Attachment]:
     """Return the texts of `logged_specifications` as attachments whose names begin with `prefix`."""
     return [Attachment(f"{prefix}{file.filename}", "text/plain", file.source.encode()) for file in files]
+
+
+_DEFINED = re.compile(r"^\s*def\s+(\w+)", re.MULTILINE)
+_CALL = re.compile(r"[(\s]*(\w+)\s*\(")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -313,6 +313,19 @@ def test_named_specs_have_a_row_each_with_their_requirement_and_number(task: Pag
     assert "satisfiedREQ-4poweredthe battery never runs lowrobustness 0.31" in said
 
 
+def test_what_is_written_as_a_def_has_that_name_in_the_tree_and_its_parts_below(tmp_path: Path) -> None:
+    text = """\
+def far(x, y) = x dist y >= 0.1
+def parted(x, y) = far(x, y) or not (x ovlp y)
+spec apart = G (far(a, b) and parted(a, b) and a dist b >= 0.2)
+"""
+    nodes = report_of_samples(tmp_path / "run.html", moving(6), text).facts["results"][0]["nodes"]
+    heads = {node["head"]: node["text"] for node in nodes}
+    assert heads["far(a, b)"] == "a dist b >= 0.1"
+    assert heads["parted(a, b)"] == "(a dist b >= 0.1) or (not (a ovlp b))"
+    assert {"a dist b >= 0.1", "not", "a ovlp b", "a dist b >= 0.2"} < set(heads)
+
+
 def test_the_units_that_a_minimum_is_over_are_named(task: Page) -> None:
     assert "the least of numbers in different units: lengths and battery." in task.within("section#verdicts")
 
