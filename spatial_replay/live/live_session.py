@@ -32,7 +32,7 @@ from spatial_replay.mapping.live_assembler import rehearse
 from spatial_replay.mapping.message_types import TRANSFORM_TYPES, short_type
 from spatial_replay.monitor.monitor import Ending, Monitor
 from spatial_replay.recording.changes import VerdictChanges
-from spatial_replay.recording.recorder import SampleWriter
+from spatial_replay.recording.recorder import Recorder, SampleWriter
 from spatial_replay.recording.recording import RunEvent
 from spatial_replay.spec.formula import Specification
 from spatial_replay.text import counted
@@ -48,6 +48,9 @@ LATE_S: Final = 1.0
 _OFFER_S: Final = 5.0
 _SETTLE_S: Final = 0.3
 """How long the topics of the mapping may take to be offered; and further ones, such as transforms."""
+
+_PAUSE_S: Final = 0.005
+"""How long is waited before a log that is full is asked again."""
 
 _TURN_S: Final = 0.02
 """How long samples are evaluated before what has come is taken in."""
@@ -86,6 +89,8 @@ class LiveSession:
             mapping if mapping is None or isinstance(mapping, LogMapping) else load_mapping(mapping)
         )
         self._recorders = recorders
+        # viewers may miss samples, a log may not
+        self._logs = [each for each in recorders if isinstance(each, Recorder)]
         self._topics = tuple(topics)
         self._max_delay_s, self._dead_man_s = max_delay_s, dead_man_s
         self._monitors = [Monitor(file) for file in self.files]
@@ -395,9 +400,14 @@ class LiveSession:
         turn_s = time.monotonic()
         last_ns = int(trace.times_ns[-1])
         for sample in trace.samples():
+            # what is evaluated is in the log: while that is full, messages are dropped by their own rule
+            while not all(log.reserve() for log in self._logs):
+                await asyncio.sleep(_PAUSE_S)
             now_s = time.monotonic()
             if now_s - arrived_s > LATE_S and sample.time_ns != last_ns:
                 self._dropped += 1
+                for recorder in self._recorders:
+                    recorder.miss(sample)
                 continue
             if now_s - turn_s > _TURN_S:
                 await asyncio.sleep(0)

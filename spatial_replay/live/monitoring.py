@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from os import PathLike
 from pathlib import Path
+from typing import ClassVar
 
 from spatial_replay.errors import UsageError
 from spatial_replay.live.live_session import MAX_DELAY_S, LiveSession
@@ -17,6 +19,12 @@ from spatial_replay.spec.formula import Specification
 
 _WAITING = 65_536
 """Samples, and messages, that may wait for a recorder: a robot waits for no disk."""
+
+
+class _RunRecorder(Recorder):
+    """A recorder of a run that goes on whatever the disk does: it leaves out nothing that it can hold."""
+
+    most_lost_s: ClassVar[float] = math.inf
 
 
 @contextmanager
@@ -37,9 +45,9 @@ def open_recorders(
         raise UsageError("clips take a trigger and a folder; give both")
     about = _about(mapping)
     with ExitStack() as opened:
-        recorders = [
+        recorders: list[Recorder] = [
             opened.enter_context(
-                Recorder(
+                _RunRecorder(
                     path,
                     specifications=files,
                     about=about,

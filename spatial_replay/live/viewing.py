@@ -14,7 +14,7 @@ from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.topics import OBJECTS, SPECIFICATION, protobuf_channel
 from spatial_replay.mapping import LogMapping
 from spatial_replay.recording.recorder import SampleWriter
-from spatial_replay.recording.recorder_log import RunEnd, warm_up
+from spatial_replay.recording.recorder_log import Missed, RunEnd, warm_up
 from spatial_replay.recording.recording import Recording, RunEvent, refuse_templates
 from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.sample import Sample
@@ -59,6 +59,9 @@ class _ViewerLog:
             self._server.send_time(newest_ns)
             if self._specification is not None and is_asked:
                 self._server.publish(_at(self._specification, newest_ns))
+
+    def miss(self, time_ns: int, kind: Missed) -> None:
+        """Viewers miss it unseen."""
 
     def report(self, event: RunEvent) -> None:
         """Send what happens to the run beside its samples."""

@@ -24,7 +24,7 @@ from spatial_replay.logs.output_file import open_output
 from spatial_replay.logs.topics import TRIGGER
 from spatial_replay.monitor.monitor import Monitor
 from spatial_replay.recording.changes import VerdictChanges
-from spatial_replay.recording.recorder_log import GATHER_S, RunEnd, warm_up
+from spatial_replay.recording.recorder_log import GATHER_S, Missed, RunEnd, warm_up
 from spatial_replay.recording.recording import Recording, RunEvent
 from spatial_replay.recording.trigger import EVENT, Trigger, condition_of
 from spatial_replay.spec.formula import Specification
@@ -44,6 +44,7 @@ _MESSAGE_BYTES, _SAMPLE_BYTES, _OBJECT_BYTES, _VERTEX_BYTES = 320, 400, 600, 16
 
 _MOST_STATIC: Final = 256
 _MOST_EVENTS: Final = 256
+_MOST_MISSED: Final = 2**18
 _STATIC: Final = "tf_static"
 
 
@@ -56,12 +57,14 @@ class TriggeredClip:
         reason: what fired, the first if several did while it was written.
         time_ns: when it fired.
         held_s: how much of the time before it the clip has.
+        dropped: samples of its time that were dropped before the recorder could keep them.
     """
 
     path: Path
     reason: str
     time_ns: int
     held_s: float
+    dropped: int
 
 
 class _Held(NamedTuple):
@@ -103,7 +106,7 @@ class _Open:
         self.path, self.reasons, self.at_ns = path, [fired], at_ns
         self.waiting: deque[_Item] = deque()
         self.waiting_bytes = 0
-        self.until_ns = at_ns
+        self.begin_ns = self.until_ns = at_ns
         self.first_ns: int | None = None
         self.last_s = time.monotonic()
         self.channels: Mapping[int, Channel] = {}
@@ -176,7 +179,7 @@ class _Open:
             self._writer.close()
         finally:
             self._stream.close()
-        return TriggeredClip(self.path, self.reasons[0], self.at_ns, held_s)
+        return TriggeredClip(self.path, self.reasons[0], self.at_ns, held_s, end.dropped)
 
 
 class ClipLog:
@@ -213,6 +216,10 @@ class ClipLog:
         self._messages: deque[_Held] = deque()
         self._static: deque[_Held] = deque(maxlen=_MOST_STATIC)
         self._events: deque[_HeldEvent] = deque(maxlen=_MOST_EVENTS)
+        self._missed: dict[Missed, deque[int]] = {
+            "sample": deque(maxlen=_MOST_MISSED),
+            "message": deque(maxlen=_MOST_MISSED),
+        }
         self._channels: Mapping[int, Channel] = {}
         self._bytes = 0
         self._newest_ns = -1
@@ -262,7 +269,11 @@ class ClipLog:
             while self._open.waiting_bytes > self._trigger.most_bytes:
                 self._open.write()
             if not self._open.waiting and self._is_past(self._open.until_ns):
-                self._finish(RunEnd(False, 0, 0))
+                self._finish(is_interrupted=False)
+
+    def miss(self, time_ns: int, kind: Missed) -> None:
+        """Take note of what found no place: a clip of that time counts it."""
+        self._missed[kind].append(time_ns)
 
     def report(self, event: RunEvent) -> None:
         """Take in what happens to the run; fire if any event does."""
@@ -279,13 +290,13 @@ class ClipLog:
             return
         self._open.flush()
         if not self._open.waiting and time.monotonic() - self._open.last_s > self._trigger.after_s + 2.0:
-            self._finish(RunEnd(True, 0, 0))
+            self._finish(is_interrupted=True)
 
     def end(self, end: RunEnd) -> None:
         """Finish the clip that is open."""
         if self._open is not None:
             is_whole = self._newest_ns >= self._open.until_ns
-            self._finish(end._replace(interrupted=end.interrupted or not is_whole))
+            self._finish(is_interrupted=end.interrupted or not is_whole)
 
     def break_off(self, end: RunEnd) -> None:
         """Finish the clip that is open, as far as that is possible."""
@@ -362,7 +373,7 @@ class ClipLog:
             path = self._folder / f"{number:04d}-{slug}.mcap"
             clip = self._open = _Open(path, self._files, self._about, reason, at_ns)
             clip.channels = self._channels
-            begin_ns = at_ns - self._before_ns
+            begin_ns = clip.begin_ns = at_ns - self._before_ns
             for held in self._static:
                 if held.time_ns < begin_ns:
                     clip.put(held._replace(time_ns=max(begin_ns, 0)))
@@ -401,16 +412,27 @@ class ClipLog:
                     f" {self._trigger.before_s:g} s asked for; about {_megabytes(needed * 1.1)} would do"
                 )
 
-    def _finish(self, end: RunEnd) -> None:
+    def _finish(self, *, is_interrupted: bool) -> None:
         clip, self._open = self._open, None
         if clip is None:
             return
+        begin_ns, until_ns = clip.begin_ns, clip.until_ns
+        missed = {
+            kind: sum(begin_ns <= time_ns <= until_ns for time_ns in tuple(times_ns))
+            for kind, times_ns in self._missed.items()
+        }
+        end = RunEnd(is_interrupted, missed["sample"], missed["message"])
         written = clip.finish(end, self._trigger.before_s, self._trigger.after_s)
         self.written = (*self.written, written)
         more = counted(len(clip.reasons) - 1, "further trigger") if len(clip.reasons) > 1 else ""
+        lost = "".join(
+            f"; {counted(count, kind)} of it {'was' if count == 1 else 'were'} dropped"
+            for kind, count in missed.items()
+            if count
+        )
         self._remarks.put(
             f"wrote {clip.path}: {written.held_s:.1f} s before and up to {self._trigger.after_s:g} s after"
-            f" {written.reason}{f', and {more}' if more else ''}"
+            f" {written.reason}{f', and {more}' if more else ''}{lost}"
         )
 
 

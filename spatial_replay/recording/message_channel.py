@@ -46,7 +46,15 @@ class MessageQueue:
     the writing thread.
     """
 
-    def __init__(self, name: str, limit: int, *, blocks: bool, ring: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        name: str,
+        limit: int,
+        *,
+        blocks: bool,
+        ring: Callable[[], None],
+        missed: Callable[[int], None],
+    ) -> None:
         """Begin without channels.
 
         Args:
@@ -54,7 +62,9 @@ class MessageQueue:
             limit: how many messages may wait.
             blocks: whether a message waits for its place, or is dropped.
             ring: wakes the writing thread.
+            missed: takes the time of each message that is dropped.
         """
+        self.missed = missed
         self._name, self._limit, self._blocks, self._ring = name, limit, blocks, ring
         # reentrant, so that a signal handler may write while its own thread does
         self.lock = threading.RLock()
@@ -229,6 +239,7 @@ class MessageChannel:
             self._written += 1
         else:
             self._dropped += 1
+            self._queue.missed(time_ns)
 
     def _checked(self, time_ns: object) -> int:
         try:

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import math
 import queue
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
-from itertools import takewhile
 from os import PathLike
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, ClassVar, Self
 
 from spatial_replay.errors import OutputError, SpatialReplayError, TraceError, UsageError
 from spatial_replay.logs.messages import Channel, Messages
@@ -21,7 +21,7 @@ from spatial_replay.recording.clip_log import ClipLog, TriggeredClip
 from spatial_replay.recording.interruption import terminable, uninterrupted
 from spatial_replay.recording.message_channel import MessageChannel, MessageQueue
 from spatial_replay.recording.message_schema import SchemaLike, check_topic, message_channel
-from spatial_replay.recording.recorder_log import FileLog, RecorderLog, RunEnd
+from spatial_replay.recording.recorder_log import FileLog, RecorderLog, RunEnd, encodable
 from spatial_replay.recording.recording import RunEvent, refuse_templates
 from spatial_replay.recording.trigger import Trigger
 from spatial_replay.spec.formula import Specification
@@ -51,14 +51,17 @@ _PAUSE_S = 0.001
 class SampleWriter:
     """Samples and messages from a caller's threads, on their way to the one thread that writes them."""
 
-    def __init__(self, log: RecorderLog, name: str, waiting: int, *, block: bool) -> None:
+    def __init__(
+        self, log: RecorderLog, name: str, waiting: int, *, block: bool, most_lost_s: float = math.inf
+    ) -> None:
         """Start the writing thread.
 
         Args:
             name: of the log, for errors.
             waiting: how many samples, and how many messages, may wait for the writing thread.
-            block: when that many wait, or 0.8 s of them, let `write` wait, too; otherwise drop what comes,
-                and count it.
+            block: when that many wait, or `most_lost_s` of them, let `write` wait, too; otherwise drop what
+                comes, and count it.
+            most_lost_s: how much time of samples a kill may cost.
         """
         self._log, self._name = log, name
         # unlike a queue with a limit of its own, an interruption never leaves this one locked
@@ -67,8 +70,11 @@ class SampleWriter:
         self._waiting = waiting
         self._enough = max(1, min(waiting, _TOGETHER) // 2)
         self._blocks = block
+        self._most_lost_s = most_lost_s
+        self._is_reserved = False
         self._events: queue.SimpleQueue[RunEvent] = queue.SimpleQueue()
-        self._messages = MessageQueue(name, waiting, blocks=block, ring=self._ring)
+        missed = partial(log.miss, kind="message")
+        self._messages = MessageQueue(name, waiting, blocks=block, ring=self._ring, missed=missed)
         self._dropped = 0
         self._last_ns = -1
         self._unsafe_s: float | None = None
@@ -80,8 +86,18 @@ class SampleWriter:
 
     @property
     def dropped(self) -> int:
-        """How many samples were dropped because the queue was full."""
+        """How many samples were dropped because the queue was full, or given to `miss`."""
         return self._dropped
+
+    @property
+    def messages_dropped(self) -> int:
+        """How many messages were dropped, on all channels."""
+        return self._messages.dropped
+
+    def reserve(self) -> bool:
+        """Return whether the next `write` takes its sample, which it then does at once."""
+        self._is_reserved = self._failure is not None or not self._is_behind()
+        return self._is_reserved
 
     def copy(self, channel: Channel, time_ns: int, payload: bytes) -> None:
         """Hand over a message of another program, as it is: its time becomes that of its publication.
@@ -113,9 +129,10 @@ class SampleWriter:
             at, last = times_apart(sample.time_ns, self._last_ns)
             raise TraceError(f"a sample at {at} follows one at {last}; give times that increase")
         self._last_ns = sample.time_ns
-        while self._is_behind():
+        is_reserved, self._is_reserved = self._is_reserved, False
+        while not is_reserved and self._is_behind():
             if not self._blocks:
-                self._dropped += 1
+                self.miss(sample)
                 return
             self._raise_failure()
             time.sleep(_PAUSE_S)
@@ -124,6 +141,11 @@ class SampleWriter:
         self._queue.put(sample)
         if self._queue.qsize() >= self._enough:
             self._ring()
+
+    def miss(self, sample: Sample) -> None:
+        """Count a sample that is left out."""
+        self._dropped += 1
+        self._log.miss(sample.time_ns, kind="sample")
 
     def report(self, event: RunEvent) -> None:
         """Hand over what happens to the run beside its samples, from the thread that writes these."""
@@ -135,7 +157,7 @@ class SampleWriter:
         if self._queue.qsize() + self._log.backlog >= self._waiting:
             return True
         since = self._unsafe_s
-        return since is not None and time.monotonic() - since > MOST_LOST_S
+        return since is not None and time.monotonic() - since > self._most_lost_s
 
     def close(self, *, interrupted: bool = False) -> None:
         """Write all waiting samples and finish the log; closing twice does nothing.
@@ -207,7 +229,7 @@ class SampleWriter:
             trace = Trace.from_samples(samples)
         except Exception as error:
             # what comes before the sample that cannot be encoded is written
-            sound = list(takewhile(_is_encodable, samples))
+            sound = encodable(samples)
             self._try(lambda: self._log.add(sound, Trace.from_samples(sound), messages))
             self._fail(error)
         else:
@@ -222,17 +244,13 @@ class SampleWriter:
 
     def _fail(self, error: Exception) -> None:
         """Let the next `write` raise an error, which would go unnoticed in this thread."""
-        failure = (
-            error
-            if isinstance(error, SpatialReplayError)
-            else OutputError(
-                f"{self._name} ends here: a sample or message could not be written"
-                f" ({type(error).__name__}: {error})"
-            )
-        )
-        failure.__cause__ = error if failure is not error else error.__cause__
-        self._failure = failure
-        self._messages.fail(failure)
+        if not isinstance(error, SpatialReplayError):
+            what = f"a sample or message could not be written ({type(error).__name__}: {error})"
+            failure = OutputError(f"{self._name} ends here: {what}")
+            failure.__cause__ = error
+            error = failure
+        self._failure = error
+        self._messages.fail(error)
 
     def _ring(self) -> None:
         """Wake the writing thread before its gathering time is over."""
@@ -283,6 +301,8 @@ class Recorder(SampleWriter):
     recorder, in the order in which they happen; or `plan(planner, robot, recorder)` does that.
     """
 
+    most_lost_s: ClassVar[float] = MOST_LOST_S
+
     def __init__(
         self,
         path: str | PathLike[str],
@@ -305,8 +325,8 @@ class Recorder(SampleWriter):
             specifications: evaluated as the samples arrive, without templates; one or several.
             about: further metadata of the log: a seed, where the samples come from.
             waiting: how many samples, and how many messages of channels, may wait for the writing thread.
-            block: when that many wait, or more than 0.8 s of them have not reached the operating system, let
-                `write` wait, too; otherwise drop what comes, and count it in the log.
+            block: when that many wait, or without a trigger more than 0.8 s of them have not reached the
+                operating system, let `write` wait, too; otherwise drop what comes, and count it in the log.
             trigger: when to write what, instead of everything.
             durability: "process" for a log that survives the end of the process; "disk" for one that
                 survives that of the machine, too: then each flush waits for the disk (fsync).
@@ -333,7 +353,9 @@ class Recorder(SampleWriter):
         self._entered = ExitStack()
         self._files = tuple(files)
         self._box: BlackBox | None = None
-        super().__init__(log, self._path.name, waiting, block=block)
+        # what waits for a trigger is in memory anyway
+        most_lost_s = self.most_lost_s if trigger is None else math.inf
+        super().__init__(log, self._path.name, waiting, block=block, most_lost_s=most_lost_s)
         if planner is not None:
             self.attach(planner)
 
@@ -496,11 +518,3 @@ class Recorder(SampleWriter):
     ) -> None:
         with self._entered:
             self.close(interrupted=error is not None)
-
-
-def _is_encodable(sample: Sample) -> bool:
-    try:
-        Trace.from_samples([sample])
-    except Exception:
-        return False
-    return True

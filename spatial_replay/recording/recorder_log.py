@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Final, NamedTuple, Protocol
+from typing import Final, Literal, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 
@@ -38,6 +38,9 @@ _AT_FIRST, _MOST_AT_ONCE = 16, 1024
 """How many samples are evaluated at first before that time is known, and at most."""
 
 
+Missed: TypeAlias = Literal["sample", "message"]
+
+
 class RunEnd(NamedTuple):
     """How a recording ended: whether early, and how many samples and messages found no place."""
 
@@ -47,7 +50,7 @@ class RunEnd(NamedTuple):
 
 
 class RecorderLog(Protocol):
-    """What the thread of a recorder writes to; only that thread calls it, but for `close`."""
+    """What the thread of a recorder writes to; only that thread calls it, but for `miss` and `close`."""
 
     @property
     def gather_s(self) -> float:
@@ -63,6 +66,9 @@ class RecorderLog(Protocol):
 
     def add(self, samples: Sequence[Sample], trace: Trace, messages: Messages) -> None:
         """Write the next samples, given in both forms, and messages."""
+
+    def miss(self, time_ns: int, kind: Missed) -> None:
+        """Take note of what found no place; the threads that write call it."""
 
     def report(self, event: RunEvent) -> None:
         """Write what happens to the run beside its samples."""
@@ -124,6 +130,9 @@ class FileLog:
         if self._unevaluated:
             self._evaluate_some()
 
+    def miss(self, time_ns: int, kind: Missed) -> None:
+        """The end of the log has the counts."""
+
     def report(self, event: RunEvent) -> None:
         """See `RecorderLog`."""
         self._recording.report(event)
@@ -176,6 +185,16 @@ class FileLog:
     def close(self) -> None:
         """See `RecorderLog`."""
         self._stream.close()
+
+
+def encodable(samples: Sequence[Sample]) -> list[Sample]:
+    """Return the samples before the first that cannot be encoded."""
+    sound: list[Sample] = []
+    with suppress(Exception):
+        for sample in samples:
+            Trace.from_samples([sample])
+            sound.append(sample)
+    return sound
 
 
 def warm_up(files: Sequence[Specification], automata: Sequence[SpecAutomaton]) -> None:

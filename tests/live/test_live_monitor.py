@@ -6,6 +6,8 @@ import asyncio
 import json
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -19,6 +21,7 @@ from mcap.reader import make_reader
 import spatial_replay as sr
 from live.robots import (
     MAPPING,
+    MS,
     PATIENCE_S,
     SPEC,
     Player,
@@ -32,6 +35,7 @@ from live.robots import (
     pose,
     robot,
     rude_server,
+    until,
 )
 from spatial_replay import LogError, Sample, Trace, Trigger, UsageError
 from spatial_replay.bags import open_messages
@@ -425,3 +429,66 @@ def test_time_that_jumps_back_is_an_error_in_python(tmp_path: Path) -> None:
         pytest.raises(LogError, match="back"),
     ):
         asyncio.run(updates_of(address, spec, mapped, 9))
+
+
+def test_every_sample_that_was_evaluated_is_in_the_log_however_slow_its_writer_is(tmp_path: Path) -> None:
+    mapped, spec = files(tmp_path, MAPPING, SPEC)
+    output, safe = tmp_path / "live.mcap", sr.load_specification(spec)
+    sent = [pose(number, tick, 2.0) for tick in range(1_500) for number in (2, 1)]
+    found: list[LiveUpdate] = []
+
+    async def watch(address: str) -> None:
+        # of a queue this short, most samples find no place at once
+        with sr.Recorder(output, specifications=[safe], waiting=8, block=False) as recorder:
+            session = LiveSession(address, safe, mapped, recorders=[recorder])
+            async with asyncio.timeout(PATIENCE_S), aclosing(session.updates()) as updates:
+                async for update in updates:
+                    found.append(update)
+                    if update.time_ns == 1_499 * 10 * MS + 1:
+                        break
+            assert recorder.dropped == session.status.dropped
+
+    with rude_server(*sent) as address:
+        asyncio.run(watch(address))
+    assert sr.read_trace(output) == Trace.from_samples(update.sample for update in found)
+
+
+def test_a_monitor_that_was_stopped_for_a_second_has_all_that_it_evaluated_in_its_log_and_clip(
+    tmp_path: Path,
+) -> None:
+    mapped, spec = files(tmp_path, MAPPING, SPEC)
+    output, clips = tmp_path / "live.mcap", tmp_path / "clips"
+    command = [sys.executable, "-m", "spatial_replay", "monitor", "", "--mapping", str(mapped)]
+    command += ["--spec", str(spec), "-o", str(output), "--clips", str(clips), "--trigger", "manual"]
+    with robot() as own:
+        command[4] = own.address
+        process = subprocess.Popen(
+            command,
+            stdout=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "SPATIAL_REPLAY_KERNELS": "interpreted"},
+        )
+        try:
+            until(own.is_heard)
+            # a monitor begins once no further topics are offered
+            time.sleep(0.6)
+            for tick in range(300):
+                own.drive(tick, 2.0)
+                if tick == 100:
+                    process.send_signal(signal.SIGSTOP)
+                if tick == 240:
+                    process.send_signal(signal.SIGCONT)
+                time.sleep(0.01)
+            time.sleep(0.3)
+            process.send_signal(signal.SIGUSR1)
+            time.sleep(0.5)
+            process.send_signal(signal.SIGINT)
+            said, _ = process.communicate(timeout=PATIENCE_S)
+        finally:
+            process.kill()
+    trace = sr.read_trace(output)
+    assert process.returncode == 0
+    assert f"{len(trace)} samples over" in said and "dropped" not in said
+    assert trace.times_ns.tolist() == [tick * 10 * MS + 1 for tick in range(300)]
+    [clip] = clips.iterdir()
+    assert sr.read_trace(clip) == trace
