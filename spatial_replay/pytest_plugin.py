@@ -87,6 +87,7 @@ class ReplayItem(pytest.Item):
     def _failure(self, row: ResultRow) -> str | None:
         """Return what is wrong with a result and what explains it; None if it passes."""
         from spatial_replay.batch.rows import with_damage
+        from spatial_replay.text import requirement_text
 
         failure = row.error
         if row.verdict is not None:
@@ -94,8 +95,9 @@ class ReplayItem(pytest.Item):
         if failure is None:
             return None
         title = row.spec if row.object is None else f"{row.spec}[{row.object}]"
-        sentence = [f"{title}: {row.title}"] if row.title else []
-        return "\n".join([f"{self._log}: {title}: {failure}", *sentence, *row.explanation])
+        about = requirement_text(row.requirement or ", ".join(self._case.requirements), row.title)
+        lines = [f"{self._log}: {title}: {failure}", about, *row.explanation]
+        return "\n".join(filter(None, lines))
 
     def repr_failure(self, excinfo: pytest.ExceptionInfo[BaseException], style: Any = None) -> Any:
         """Return the explanation alone: where it was raised says nothing."""

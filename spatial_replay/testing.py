@@ -7,6 +7,7 @@ from typing import Unpack
 from spatial_replay.api import Evaluating, Log, Specifications, replay_log
 from spatial_replay.batch.suite import Expectation
 from spatial_replay.replay.engine import Replayed
+from spatial_replay.text import requirement_text
 
 
 def assert_satisfied(
@@ -40,7 +41,9 @@ def assert_satisfied(
         if failure is not None:
             title = result.name if result.object is None else f"{result.name}[{result.object}]"
             explanation = result.sentences(replayed.first_ns) if result.can_explain else ()
-            reasons.append("\n".join([f"{replayed.log}: {title}: {failure}", *map(str, explanation)]))
+            about = requirement_text(result.spec.id, result.spec.title)
+            lines = [f"{replayed.log}: {title}: {failure}", about, *map(str, explanation)]
+            reasons.append("\n".join(filter(None, lines)))
     reasons += [f"{replayed.log} is damaged: {fault}" for fault in replayed.faults[:1]]
     if reasons:
         raise AssertionError("\n\n".join(reasons))

@@ -57,6 +57,25 @@ def test_every_log_and_spec_is_a_test_whose_failure_is_what_explain_says(
     assert '<property name="requirement" value="REQ-7"' in (pytester.path / "out.xml").read_text()
 
 
+def test_a_failure_begins_with_the_requirement_as_explain_does(
+    pytester: pytest.Pytester, options: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    (pytester.path / "calm.spatial").write_text('spec calm "REQ-12: stay apart" = G (cup dist plate >= 100)')
+    (pytester.path / "table.replay.yaml").write_text(
+        "cases: [{name: calm, logs: table.jsonl, specs: calm.spatial}]"
+    )
+    result = pytester.runpytest_inprocess(*options)
+    capsys.readouterr()
+    assert run(["explain", "table.jsonl", "--spec", "calm.spatial"]) == 1
+    explained = capsys.readouterr().out.splitlines()[:2]
+    assert explained[0] == "REQ-12: stay apart"
+    said = "table.jsonl: calm: violated, expected satisfied"
+    result.stdout.fnmatch_lines([said, *explained], consecutive=True)
+    with pytest.raises(AssertionError) as raised:
+        assert_satisfied(pytester.path / "table.jsonl", pytester.path / "calm.spatial")
+    assert str(raised.value).splitlines()[:3] == [said, *explained]
+
+
 def test_one_test_is_chosen_by_its_name(pytester: pytest.Pytester, options: list[str]) -> None:
     result = pytester.runpytest_inprocess(*options, "table.replay.yaml::table[table.jsonl-poured]")
     result.assert_outcomes(passed=1)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final, Literal
 
 from spatial_replay.batch.run_table import (
     damage_word,
+    requirement_of,
     result_name,
     summary_text,
     totals,
@@ -74,7 +75,8 @@ def worst_annotations(table: pa.Table, folder: Path = Path()) -> Iterator[str]:
     for row in worst_rows(table, _ANNOTATIONS):
         if row["failure"] is None:
             return
-        name = f"{row['requirement']} {row['spec']}" if row["requirement"] else row["spec"]
+        about = requirement_of(row)
+        name = f"{row['spec']} ({about})" if about else row["spec"]
         message = f"{row['log']}: {row['failure']}. {row['reason']}".rstrip()
         file = row["file"] if is_address(row["file"]) else folder / row["file"]
         yield annotation("error", repository_path(file), row["line"], message, title=name)
@@ -108,7 +110,7 @@ def markdown(table: pa.Table) -> str:
         names = [
             each.group["case"],
             each.group["spec"] or each.group["file"],
-            each.group["requirement"] or "",
+            each.about,
         ]
         numbers = [each.satisfied, each.violated, each.unknown, each.errors, each.failures]
         least = "" if each.least is None else f"{each.least:.6g}"
@@ -120,11 +122,11 @@ def markdown(table: pa.Table) -> str:
             "",
             f"{counted(count, 'result')} failed; the worst:",
             "",
-            "| log | spec | verdict | failure | reason |",
-            "|---|---|---|---|---|",
+            "| log | spec | requirement | verdict | failure | reason |",
+            "|---|---|---|---|---|---|",
         ]
         for row in failing:
-            names = [row["log"], result_name(row["spec"], row["object"])]
+            names = [row["log"], result_name(row["spec"], row["object"]), requirement_of(row)]
             verdict = f"{verdict_word(row)}{damage_word(row)}"
             lines.append(_line([*names, verdict, row["failure"], row["reason"]]))
     return "\n".join([*lines, "", ""])

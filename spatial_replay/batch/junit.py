@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 from xml.sax.saxutils import escape, quoteattr
 
-from spatial_replay.batch.run_table import damage_word, verdict_word
+from spatial_replay.batch.run_table import damage_word, requirement_of, verdict_word
 from spatial_replay.logs.output_file import replacing
 from spatial_replay.text import counted, printable
 
@@ -105,7 +105,8 @@ def _case(
         # errors are about the test, failures about what it tests
         tag = "failure" if row["error"] is None else "error"
         kind = row["error_kind"] or f"{verdict_word(row)}{damage_word(row)}"
-        text = "\n".join([*row["explanation"], *row["vacuous"]]) or row["failure"]
+        texts = [*row["explanation"], *row["vacuous"]] or [row["failure"]]
+        text = "\n".join(filter(None, [requirement_of(row), *texts]))
         text = text if limit is None or len(text) <= limit else text[: limit - 1] + "…"
         message = printable(row["failure"], limit or 1_000)
         yield f"<{tag} type={_quoted(kind)} message={_quoted(message)}>{_text(text)}</{tag}>\n"

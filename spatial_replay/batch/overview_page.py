@@ -16,6 +16,7 @@ from spatial_replay.batch.run_table import (
     Total,
     Values,
     damage_word,
+    requirement_of,
     result_name,
     summary_text,
     totals,
@@ -107,7 +108,7 @@ def _totals(by_spec: Sequence[Total]) -> Html:
     rows = []
     for each in by_spec:
         group = each.group
-        cells = [group["case"], group["spec"] or group["file"], group["requirement"] or ""]
+        cells = [group["case"], group["spec"] or group["file"], each.about]
         numbers_shown = (each.satisfied, each.violated, each.unknown, each.errors, each.failures)
         counts = [f"{count:,}" for count in numbers_shown]
         least = "" if each.least is None else f"{each.least:.6g}"
@@ -129,7 +130,7 @@ def _worst(rows: Sequence[Values], reports: Mapping[tuple[str, str], str]) -> Ht
         element(
             "tr",
             element("td", _linked((row["case"], row["log"]), reports), **{"class": "log"}),
-            element("td", text(result_name(row["spec"], row["object"]))),
+            element("td", *_named(row)),
             _number("td", "" if math.isnan(row["robustness"]) else f"{row['robustness']:.4g}"),
             element("td", text(row["failure"])),
             element("td", *_with_code(row["reason"])),
@@ -137,6 +138,13 @@ def _worst(rows: Sequence[Values], reports: Mapping[tuple[str, str], str]) -> Ht
         for row in rows
     ]
     return element("table", element("thead", head), element("tbody", *body))
+
+
+def _named(row: Values) -> Iterator[Html]:
+    """Yield the name of a result, and below it the requirement that it is about."""
+    yield text(result_name(row["spec"] or row["file"], row["object"]))
+    if about := requirement_of(row):
+        yield element("div", text(about), **{"class": "requirement"})
 
 
 def _with_code(sentence: str) -> Iterator[Html]:
@@ -159,8 +167,9 @@ def _plots(table: pa.Table, by_spec: Sequence[Total]) -> Iterator[Html]:
         finite = numbers[np.isfinite(numbers)]
         if len(finite):
             case = group["case"] if has_cases else None
-            title = " · ".join(filter(None, (case, group["requirement"], group["spec"])))
-            yield element("figure", element("figcaption", text(title)), _histogram(finite))
+            title = " · ".join(filter(None, (case, each.requirement, group["spec"])))
+            caption = element("figcaption", text(title), **_tip(each.about))
+            yield element("figure", caption, _histogram(finite))
 
 
 def _histogram(numbers: Floats) -> Html:
@@ -215,7 +224,8 @@ def _matrix(
     cases = {case for case, _, _ in columns}
     yield element("p", "Marked results fail.")
     titles = [f"{case} · {spec or file}" if len(cases) > 1 else spec or file for case, file, spec in columns]
-    head = [_sortable("log", ""), *(_sortable(title, "number") for title in titles)]
+    abouts = [each.about for each in by_spec]
+    head = [_sortable("log", ""), *map(_sortable, titles, ["number"] * len(titles), abouts)]
     body = []
     for name, of_log in cells.items():
         shown = [_cell(of_log.get(column)) for column in columns]
@@ -245,8 +255,14 @@ def _cell(row: Values | None) -> Html:
     return element("td", shown, title=tip, **{"class": kind, "data-value": value})
 
 
-def _sortable(title: str, kind: str) -> Html:
-    return element("th", element("button", text(title), type="button"), scope="col", **{"class": kind})
+def _sortable(title: str, kind: str, about: str = "") -> Html:
+    button = element("button", text(title), type="button", **_tip(about))
+    return element("th", button, scope="col", **{"class": kind})
+
+
+def _tip(about: str) -> dict[str, str]:
+    """Return the attribute with which a name shows the requirement that it is about."""
+    return {"title": about} if about else {}
 
 
 def _number(tag: str, words: str) -> Html:

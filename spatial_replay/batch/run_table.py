@@ -11,7 +11,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, cast
 
 from spatial_replay.errors import UsageError
-from spatial_replay.text import counted, nearest_hint
+from spatial_replay.text import counted, nearest_hint, requirement_text
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -22,7 +22,7 @@ Values: TypeAlias = dict[str, Any]
 
 VERDICTS: Final = ("satisfied", "violated", "unknown")
 _GROUPS: Final[Mapping[By, tuple[str, ...]]] = MappingProxyType(
-    {"spec": ("case", "file", "spec", "requirement"), "log": ("case", "log")}
+    {"spec": ("case", "file", "spec"), "log": ("case", "log")}
 )
 RANKS: Final[Mapping[str | None, int]] = MappingProxyType(
     {"violated": 0, None: 1, "unknown": 2, "satisfied": 3}
@@ -41,6 +41,7 @@ class Total:
         errors: how many have an error in place of a verdict.
         failures: how many do not pass.
         least: the least robustness among them; None if none is determined.
+        requirement, title: of the spec; None for a log, and where it has none.
     """
 
     group: Values
@@ -50,11 +51,23 @@ class Total:
     errors: int
     failures: int
     least: float | None
+    requirement: str | None = None
+    title: str | None = None
+
+    @property
+    def about(self) -> str:
+        """The requirement of the spec, see `requirement_text`."""
+        return requirement_text(self.requirement, self.title)
 
 
 def result_name(spec: str, object_name: str | None) -> str:
     """Return what a result is called: its spec, with the object of a template."""
     return spec if object_name is None else f"{spec}({object_name})"
+
+
+def requirement_of(row: Values) -> str:
+    """Return the requirement that a row is about, see `requirement_text`."""
+    return requirement_text(row["requirement"], row["title"])
 
 
 def verdict_word(row: Values) -> str:
@@ -113,6 +126,10 @@ def totals(table: pa.Table, by: By = "spec") -> list[Total]:
     columns |= {f"n_{name}": pc.cast(pc.fill_null(flag, False), pa.int64()) for name, flag in counted.items()}
     columns["least"] = pc.if_else(pc.is_nan(number), None, number)
     sums = [(f"n_{name}", "sum") for name in counted]
+    about = ("requirement", "title") if by == "spec" else ()
+    columns |= {name: table.column(name) for name in about}
+    # the first one: what is gone comes last, with that of its time
+    sums += [(name, "first") for name in about]
     # one thread: groups come in the order of their first rows
     grouped = pa.table(columns).group_by(list(_GROUPS[by]), use_threads=False)
     return [
@@ -120,6 +137,7 @@ def totals(table: pa.Table, by: By = "spec") -> list[Total]:
             {name: row[name] for name in _GROUPS[by]},
             **{name: row[f"n_{name}_sum"] for name in counted},
             least=row["least_min"],
+            **{name: row[f"{name}_first"] for name in about},
         )
         for row in grouped.aggregate([*sums, ("least", "min")]).to_pylist()
     ]

@@ -251,9 +251,14 @@ class DaskCluster:
         except ImportError:
             remedy = "pip install 'spatial-replay[cluster]'"
             raise UsageError(f"clusters need Dask, which is not installed: {remedy}") from None
+        client_type = cast(Any, distributed).Client
+        # made before it connects, so that one that cannot is closed here and not when Python ends
+        client = client_type.__new__(client_type)
         try:
-            client = cast(Any, distributed).Client(self._address, timeout=_ANSWER_S, set_as_default=False)
+            client.__init__(self._address, timeout=_ANSWER_S, set_as_default=False)
         except (OSError, ValueError) as error:
+            with suppress(OSError, RuntimeError, CancelledError):
+                client.close()
             raise UsageError(
                 f"--dask {self._address}: no scheduler answers ({str(error).splitlines()[0]:.200}); "
                 "start one with `dask scheduler`, and workers with `dask worker`"

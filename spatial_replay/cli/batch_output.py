@@ -48,6 +48,8 @@ def print_totals(table: pa.Table, by: By) -> None:
             line += ["  ", Coloured(shown, colour) if count and colour else shown]
         least = "not determined" if each.least is None else f"{each.least:.6g}"
         show((*line, f"  {least:>16}"))
+        if each.title:
+            show(f"    {each.title}")
 
 
 def print_worst(table: pa.Table, count: int, *, failing: bool) -> None:
@@ -56,19 +58,25 @@ def print_worst(table: pa.Table, count: int, *, failing: bool) -> None:
     Args:
         failing: only those that fail.
     """
-    from spatial_replay.batch.run_table import damage_word, result_name, verdict_word, worst_rows
+    from spatial_replay.batch.run_table import (
+        damage_word,
+        requirement_of,
+        result_name,
+        verdict_word,
+        worst_rows,
+    )
 
     for row in worst_rows(table, count):
         if failing and row["failure"] is None:
             return
         name = row["spec"] or row["file"]
         name = result_name(name, row["object"])
-        name = f"{name} [{row['requirement']}]" if row["requirement"] else name
         verdict = Coloured(f"{verdict_word(row)}{damage_word(row)}", _COLOURS[verdict_word(row)])
         number = "" if math.isnan(row["robustness"]) else f", robustness {row['robustness']:.6g}"
         show((f"  {row['log']}: {name}: ", verdict, number))
         usual = f"{row['verdict']}, expected satisfied"
-        for line in (None if row["failure"] == usual else row["failure"], row["reason"]):
+        failure = None if row["failure"] == usual else row["failure"]
+        for line in (requirement_of(row), failure, row["reason"]):
             if line:
                 show(*(f"      {each}" for each in line.split("\n")))
 
@@ -111,8 +119,8 @@ def exit_code_from_table(table: pa.Table, fail_on: frozenset[str]) -> ExitCode:
 def _title(total: Total, by: By, with_case: bool) -> str:
     group = total.group
     title = group["log"] if by == "log" else group["spec"] or group["file"]
-    if by == "spec" and group["requirement"]:
-        title = f"{title} [{group['requirement']}]"
+    if total.requirement:
+        title = f"{title} [{total.requirement}]"
     return f"{group['case']}: {title}" if with_case else title
 
 

@@ -20,12 +20,14 @@ from spatial_replay.cli.progress import progress
 from spatial_replay.cli.terminal import show, show_bytes, show_file, show_json, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import LogFile
-from spatial_replay.text import counted, counted_from, escaped
+from spatial_replay.text import counted, counted_from, escaped, requirement_text
 
 if TYPE_CHECKING:
     from spatial_replay.bags.reader import MessageReader
     from spatial_replay.logs.mcap.summary import LogSummary
+    from spatial_replay.logs.source import Source
     from spatial_replay.sources.overview import Overview, Survey
+    from spatial_replay.spec.formula import NamedSpec
     from spatial_replay.spec.overrides import SpecificationText
 
 _EPOCH_LIKELY_NS = 10**18
@@ -101,7 +103,7 @@ def info(
     reader = messages_in(log)
     if suggest_mapping:
         return _print_mapping(log, reader, as_json)
-    surveyed = None
+    surveyed, about = None, {}
     if reader is not None:
         with progress("messages") as advance:
             surveyed = survey(reader, advance)
@@ -110,15 +112,17 @@ def info(
         overview = overview_of_survey(log, surveyed)
     else:
         with progress("samples") as advance:
-            overview = overview_of(open_source(log, **reading), advance)
+            source = open_source(log, **reading)
+            overview = overview_of(source, advance)
+        about = _requirements(source)
     faults = tuple(dict.fromkeys((*overview.faults, *(surveyed.faults if surveyed else ()))))
     remarks = (*(surveyed.remarks if surveyed else ()), *overview.remarks)
     faults, remarks = (counted_from(texts, overview.start_ns or 0) for texts in (faults, remarks))
     warn(*dict.fromkeys((*faults, *remarks)))
     if as_json:
-        show_json(_document(overview, surveyed, faults))
+        show_json(_document(overview, surveyed, faults, about))
     else:
-        show(*_lines(overview, surveyed, bool(faults)))
+        show(*_lines(overview, surveyed, bool(faults), about))
     return ExitCode.DAMAGED if faults else ExitCode.SATISFIED
 
 
@@ -187,14 +191,47 @@ def _print_specification(log: LogFile, name: str) -> int:
 
 def _names_of(text: SpecificationText) -> list[str]:
     """Return the names of the specs in a recorded text."""
+    return [spec.name for spec in _specs_of(text)]
+
+
+def _requirements(source: Source) -> dict[str, NamedSpec]:
+    """Return the specs of requirements that a log was written with, by the names of their results."""
+    from spatial_replay.replay import recorded_texts
+
+    files = [(Path(text.filename).stem, _specs_of(text)) for text in recorded_texts(source)]
+    names = [spec.name for _, specs in files for spec in specs]
+    found: dict[str, NamedSpec] = {}
+    for stem, specs in files:
+        for spec in specs:
+            if spec.id or spec.title:
+                name = f"{stem}.{spec.name}" if names.count(spec.name) > 1 else spec.name
+                # logs of a recorder have the id before the name
+                found |= {name: spec, f"{spec.id} {name}": spec}
+    return found
+
+
+def _verdicts(container: LogSummary, about: Mapping[str, NamedSpec]) -> Iterator[dict[str, str | None]]:
+    """Yield the verdicts stored in a log, each with the requirement that it is about."""
+    from spatial_replay.logs.topics import VERDICTS
+
+    for data in (data for name, data in container.metadata if name == VERDICTS):
+        for result, verdict in data.items():
+            # of a template, without the object
+            spec = about.get(result) or about.get(result.partition("(")[0])
+            requirement, title = (None, None) if spec is None else (spec.id, spec.title)
+            yield {"name": result, "verdict": verdict, "requirement": requirement, "title": title}
+
+
+def _specs_of(text: SpecificationText) -> Sequence[NamedSpec]:
+    """Return the specs in a recorded text."""
     from spatial_replay.errors import SpecificationError
     from spatial_replay.spec import parse_specification
 
     try:
-        return [spec.name for spec in parse_specification(text.text, filename=text.filename).specs]
+        return parse_specification(text.text, filename=text.filename).specs
     except SpecificationError:
         # relations defined in Python: the text can be printed, but not read here
-        return []
+        return ()
 
 
 def _print_mapping(log: LogFile, reader: MessageReader | None, as_json: bool) -> int:
@@ -214,7 +251,9 @@ def _print_mapping(log: LogFile, reader: MessageReader | None, as_json: bool) ->
     return ExitCode.DAMAGED if surveyed.faults else ExitCode.SATISFIED
 
 
-def _document(overview: Overview, survey: Survey | None, faults: tuple[str, ...]) -> dict[str, object]:
+def _document(
+    overview: Overview, survey: Survey | None, faults: tuple[str, ...], about: Mapping[str, NamedSpec]
+) -> dict[str, object]:
     container = overview.container
     document: dict[str, object] = {
         "name": overview.name,
@@ -257,6 +296,7 @@ def _document(overview: Overview, survey: Survey | None, faults: tuple[str, ...]
             for (topic, schema, encoding), messages in _topics(container).items()
         ]
     if container is not None:
+        document["verdicts"] = list(_verdicts(container, about))
         document["metadata"] = [{"name": name, "data": dict(data)} for name, data in container.metadata]
         document["attachments"] = [asdict(each) for each in container.attachments]
     return document
@@ -271,7 +311,9 @@ def _topics(container: LogSummary) -> Mapping[tuple[str, str, str], Sequence[int
     return found
 
 
-def _lines(overview: Overview, survey: Survey | None, damaged: bool) -> Iterator[str]:
+def _lines(
+    overview: Overview, survey: Survey | None, damaged: bool, about: Mapping[str, NamedSpec]
+) -> Iterator[str]:
     counts = counted(overview.samples, "sample")
     if survey is not None and not overview.samples:
         counts = counted(survey.messages, "message")
@@ -299,7 +341,7 @@ def _lines(overview: Overview, survey: Survey | None, damaged: bool) -> Iterator
     if survey is not None:
         yield from _survey_lines(survey, mapped=bool(overview.samples))
     if overview.container is not None:
-        yield from _container_lines(overview.container, topics=survey is None)
+        yield from _container_lines(overview.container, about, topics=survey is None)
 
 
 def _survey_lines(survey: Survey, *, mapped: bool) -> Iterator[str]:
@@ -316,12 +358,15 @@ def _survey_lines(survey: Survey, *, mapped: bool) -> Iterator[str]:
         yield f"to write a first mapping: spatial-replay info {shlex.quote(survey.name)} --suggest-mapping"
 
 
-def _container_lines(container: LogSummary, *, topics: bool) -> Iterator[str]:
+def _container_lines(container: LogSummary, about: Mapping[str, NamedSpec], *, topics: bool) -> Iterator[str]:
     from spatial_replay.logs.topics import VERDICTS
 
-    for data in (data for name, data in container.metadata if name == VERDICTS):
+    if verdicts := list(_verdicts(container, about)):
         yield "verdicts"
-        yield from _table(data.items())
+        yield from _table(
+            (each["name"] or "", each["verdict"] or "", requirement_text(each["requirement"], each["title"]))
+            for each in verdicts
+        )
     if topics:
         yield "topics"
         yield from _table(

@@ -96,8 +96,8 @@ def test_a_damaged_log_fails_whatever_its_verdict_and_every_output_marks_it(
     assert done.code == 3
     assert "the log is damaged: run-0.jsonl:5" in done.out
     assert "8 results: 6 satisfied (3 failed), 2 violated, 4 of damaged logs" in done.out
-    assert "run-0.jsonl: apart [REQ-3]: satisfied (damaged log), robustness 0.2" in done.out
-    assert "run-3.jsonl: apart [REQ-3]: violated (damaged log), robustness -0.2" in done.out
+    assert "run-0.jsonl: apart: satisfied (damaged log), robustness 0.2" in done.out
+    assert "run-3.jsonl: apart: violated (damaged log), robustness -0.2" in done.out
     assert "violated, expected satisfied; the log is damaged: run-3.jsonl:5" in done.out
     for page in ("summary.md", "pages/index.html"):
         assert "(damaged log)" in Path(page).read_text()
@@ -271,6 +271,20 @@ def test_what_cannot_work_is_refused_with_the_remedy(fleet: Path, arguments: lis
         assert "missing.mcap: no such file" in done.err
 
 
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("lgos: logs", "unknown key; did you mean 'logs'?"),
+        ("logs: [logs/run-[0-3].jsonl]", "put patterns in quotes"),
+        ("logs: *.jsonl", "put patterns in quotes"),
+    ],
+)
+def test_a_slip_in_a_suite_gets_its_remedy(fleet: Path, line: str, said: str) -> None:
+    Path("suite.yaml").write_text(f"cases:\n  - name: one\n    specs: gate.spatial\n    {line}\n")
+    done = batch("suite.yaml")
+    assert (done.code, "suite.yaml:4: " in done.err, said in done.err) == (2, True, True), done.err
+
+
 def test_two_batches_do_not_write_to_one_folder(fleet: Path) -> None:
     import fcntl
 
@@ -341,8 +355,7 @@ def test_results_are_summed_up_and_searched(fleet: Path) -> None:
     batch("logs", "--spec", "gate.spatial")
     done = command("results", "results", "--worst", "1")
     assert done.out.startswith("8 results: 6 satisfied, 2 violated\n")
-    assert "apart [REQ-3]" in done.out
-    assert "logs/run-3.jsonl: apart [REQ-3]: violated, robustness -0.2\n" in done.out
+    assert "logs/run-3.jsonl: apart: violated, robustness -0.2\n" in done.out
     assert "cart and person are 0.1 apart" in done.out
     chosen = command("results", "results", "--by", "log", "--where", "spec == apart and robustness < -0.15")
     assert chosen.out.startswith("1 result: 1 violated\n  log ")
@@ -384,10 +397,27 @@ def test_github_gets_annotations_at_the_lines_of_specs_and_a_summary(
     lines = [line for line in done.err.splitlines() if line.startswith("::")]
     assert len(lines) == 2
     assert lines[0].startswith(
-        "::error file=gate.spatial,line=2,title=REQ-3 apart::logs/run-3.jsonl: violated"
+        "::error file=gate.spatial,line=2,title=apart (REQ-3%3A keep 30 cm from people)::"
+        "logs/run-3.jsonl: violated"
     )
     summary = Path("summary.md").read_text()
-    assert "| logs | apart | REQ-3 | 2 | 2 | 0 | 0 | 2 | -0.2 |" in summary
+    assert "| logs | apart | REQ-3: keep 30 cm from people | 2 | 2 | 0 | 0 | 2 | -0.2 |" in summary
+    assert "| logs/run-3.jsonl | apart | REQ-3: keep 30 cm from people | violated |" in summary
+
+
+def test_the_terminal_the_page_and_junit_say_which_requirement_fails(fleet: Path) -> None:
+    done = batch("logs", "--spec", "gate.spatial", "--html", "pages", "--junit", "junit.xml")
+    about = "REQ-3: keep 30 cm from people"
+    for shown in (done.out, command("results", "results").out):
+        totals, _, worst = shown.partition("logs/run-3.jsonl: apart: violated, robustness -0.2\n")
+        assert worst.startswith(f"      {about}\n      `cart dist person >= 0.3` fails")
+        lines = totals.splitlines()
+        (place,) = (number for number, line in enumerate(lines) if line.startswith("  apart [REQ-3] "))
+        assert lines[place + 1] == "    keep 30 cm from people"
+    _, _, worst = Path("pages/index.html").read_text().partition("The worst")
+    assert worst.count(f">{about}<") == 2 and worst.count(f'title="{about}"') == 2
+    texts = [each.text or "" for each in ElementTree.parse("junit.xml").iterfind(".//failure")]
+    assert [text.startswith(f"{about}\n`apart` is violated") for text in texts] == [True] * 2
 
 
 def test_annotations_name_files_from_the_top_of_the_repository(

@@ -210,3 +210,10 @@ def test_a_scheduler_that_does_not_answer_is_an_error(fleet: Path, monkeypatch: 
     pytest.importorskip("distributed")
     done = command("batch", "logs", "--spec", "gate.spatial", "--dask", "tcp://nowhere")
     assert (done.code, "no scheduler answers" in done.err) == (2, True), done.err
+    # a process of its own, since a client that was not closed complains when Python ends
+    words = ["batch", "logs", "--spec", "gate.spatial", "--dask", "nonsense"]
+    ended = subprocess.run(
+        [sys.executable, "-m", "spatial_replay", *words], capture_output=True, text=True, check=False
+    )
+    (line,) = ended.stderr.splitlines()
+    assert ended.returncode == 2 and "--dask nonsense: no scheduler answers" in line

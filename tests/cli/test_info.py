@@ -60,6 +60,31 @@ def test_an_annotated_log_shows_its_verdicts(log: Path, capsys: pytest.CaptureFi
     assert list(metadata["spatial_replay_verdicts"]) == ["charged", "alone"]
 
 
+def test_the_verdicts_of_a_log_say_which_requirements_they_are_about(
+    log: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    spec, other, each = (log.with_name(f"{name}.spatial") for name in ("s", "other", "each"))
+    annotated, recorded = log.with_name("out.mcap"), log.with_name("recorded.mcap")
+    spec.write_text('spec calm "REQ-12: no one is hit" = G (hand dist cube >= 0)\nspec b = F true')
+    other.write_text('spec b "REQ-13: it begins" = F true')
+    each.write_text('spec near(who) "stay near" = G (who dist hand <= 99)')
+    given = [str(log), "--spec", str(spec), "--spec", str(other)]
+    run(["replay", *given, "--spec", str(each), "--each", "who=cube", "-o", str(annotated)])
+    assert run(["record", "tracks", *given, "-o", str(recorded)]) == 0
+    for path, templates in ((annotated, ["  stay near"]), (recorded, [])):
+        capsys.readouterr()
+        assert run(["info", str(path)]) == 0
+        lines = capsys.readouterr().out.splitlines()
+        calm, b, other_b, *rest = lines[lines.index("verdicts") + 1 : lines.index("topics")]
+        assert "calm" in calm and calm.endswith("  REQ-12: no one is hit")
+        assert "s.b" in b and "REQ" not in b
+        assert "other.b" in other_b and other_b.endswith("  REQ-13: it begins")
+        assert [line[-len("  stay near") :] for line in rest] == templates
+        assert run(["info", str(path), "--json"]) == 0
+        verdict = json.loads(capsys.readouterr().out)["verdicts"][0]
+        assert (verdict["requirement"], verdict["title"]) == ("REQ-12", "no one is hit")
+
+
 def test_a_topic_of_several_publishers_is_listed_once(
     data_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
