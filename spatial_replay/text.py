@@ -7,6 +7,7 @@ import math
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 _LONGEST: Final = 300
@@ -14,6 +15,7 @@ _LONGEST: Final = 300
 _LONGEST_FORMULA: Final = 60
 _LONGEST_NAME: Final = 100
 _MOST_NAMES: Final = 2_000
+_MOST_ALIKE: Final = 5
 """Bounds of the comparison, which takes quadratic time: names come from logs and may be hostile."""
 
 
@@ -155,5 +157,11 @@ def nearest_hint(name: str, known: Iterable[str]) -> str:
     if len(name) > _LONGEST_NAME:
         return ""
     candidates = [candidate for candidate in known if len(candidate) <= _LONGEST_NAME][:_MOST_NAMES]
-    matches = difflib.get_close_matches(name, candidates, n=1)
-    return f"did you mean {matches[0]!r}?" if matches else ""
+    close = difflib.get_close_matches(name, candidates, n=_MOST_ALIKE)
+    return f"did you mean {max(close, key=partial(_likeness, name))!r}?" if close else ""
+
+
+def _likeness(name: str, known: str) -> tuple[float, float]:
+    """Return how like two names are, and how like their letters, which those of swapped letters share."""
+    ratio = difflib.SequenceMatcher(None, known, name).ratio()
+    return ratio, difflib.SequenceMatcher(None, sorted(known), sorted(name)).ratio()

@@ -80,7 +80,8 @@ def document_from_text(text: str, what: str = "a mapping", largest: int = LARGES
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         what = error.problem or error.context or "it cannot be read"
-        document.faults.append((mark.line + 1 if mark else 1, f"this is not YAML: {what}"))
+        hint = _pattern_hint(text, error)
+        document.faults.append((mark.line + 1 if mark else 1, f"this is not YAML: {what}{hint}"))
         return document
     except yaml.YAMLError as error:
         document.faults.append((1, f"this is not YAML: {str(error).splitlines()[0]}"))
@@ -88,6 +89,15 @@ def document_from_text(text: str, what: str = "a mapping", largest: int = LARGES
     if node is not None:
         document.value = _value(node, (), document)
     return document
+
+
+def _pattern_hint(text: str, error: yaml.MarkedYAMLError) -> str:
+    """Return the remedy for a pattern of files whose characters mean something else in YAML, or ""."""
+    mark = error.problem_mark
+    is_list = mark is not None and re.fullmatch(r"\S\[", text[max(0, mark.index - 1) : mark.index + 1])
+    if not is_list and error.context != "while scanning an alias":
+        return ""
+    return "; put patterns in quotes: 'logs/run-[0-3]*.mcap'"
 
 
 def _unsupported(events: Iterable[yaml.Event], what: str) -> tuple[int, str] | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from bisect import bisect_right
 from collections.abc import Iterable
@@ -12,6 +11,7 @@ from typing import Literal
 from spatial_replay.errors import SpecificationError
 from spatial_replay.spec.formula import Span
 from spatial_replay.text import escaped
+from spatial_replay.text import nearest_hint as nearest_hint
 
 MAX_FAULTS = 100
 """Faults reported together; beyond, only their number."""
@@ -142,7 +142,6 @@ class Faults:
 
 
 _LONGEST_MESSAGE = 400
-_LONGEST_COMPARED = 64
 
 
 def _cropped(message: str) -> str:
@@ -151,12 +150,3 @@ def _cropped(message: str) -> str:
         return message
     half = _LONGEST_MESSAGE // 2
     return f"{message[:half]} ... {message[-half:]}"
-
-
-def nearest_hint(name: str, known: Iterable[str]) -> str:
-    """Return a hint with the known name most like `name`, or ""."""
-    if len(name) > _LONGEST_COMPARED:
-        return ""
-    comparable = [candidate for candidate in known if len(candidate) <= _LONGEST_COMPARED]
-    matches = difflib.get_close_matches(name, comparable, n=1)
-    return f"did you mean {matches[0]!r}?" if matches else ""
