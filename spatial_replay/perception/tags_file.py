@@ -374,9 +374,9 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
                 (place, "lifted needs a calibrated camera; add camera (tags calibrate measures one)")
             )
     plane = value.get("plane")
-    tags: Any = plane.get("tags") if isinstance(plane, dict) else None
-    if isinstance(plane, dict) and isinstance(tags, dict):
-        for key, entry in tags.items():
+    references = plane.get("tags") if isinstance(plane, dict) else None
+    if isinstance(plane, dict) and isinstance(references, dict):
+        for key, entry in references.items():
             own = ("plane", "tags", key)
             if not key.isdecimal():
                 faults.append((own, f"expected the number of a tag; got {key[:40]!r}"))
@@ -386,7 +386,8 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
             if not own_size and "size" not in value and "size" not in plane:
                 faults.append((own, "the size of the tag is missing; give size for all, or for this one"))
     has_pose = isinstance(camera, dict) and "pose" in camera
-    if plane != "image" and not has_pose and (not isinstance(tags, dict) or len(tags) < LEAST_REFERENCES):
+    are_enough = isinstance(references, dict) and len(references) >= LEAST_REFERENCES
+    if plane != "image" and not has_pose and not are_enough:
         faults.append(
             (
                 ("plane",),

@@ -53,8 +53,7 @@ def pictures_of(source: Source, start_ns: int, end_ns: int, decided_ns: Collecti
         decided_ns: samples whose pictures are among them, as far as there is room.
     """
     path = getattr(source, "path", None)
-    topic = _image_topic(path)
-    if topic is None:
+    if not isinstance(path, LogFile) or (topic := _image_topic(path)) is None:
         return NO_PICTURES
     decided = sorted(decided_ns)[: MOST_PICTURES // 2]
     others = np.linspace(start_ns, end_ns, MOST_PICTURES - len(decided)).astype(np.int64).tolist()
@@ -81,11 +80,15 @@ def picture_values(seen: ReportedPictures, first_ns: int) -> Mapping[str, Any]:
     }
 
 
-def _image_topic(path: object) -> str | None:
+def _image_topic(path: LogFile) -> str | None:
     """Return the topic with images that a layout shows, too: our own, or else the first."""
-    if not isinstance(path, LogFile) or not is_log(path):
+    if not is_log(path):
         return None
-    topics = [each.name for each in open_messages(path).topics() if is_image_type(each.type)]
+    try:
+        topics = [each.name for each in open_messages(path).topics() if is_image_type(each.type)]
+    except LogError:
+        # the replay has said how damaged it is
+        return None
     return CAMERA_VIDEO if CAMERA_VIDEO in topics else next(iter(topics), None)
 
 
