@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
+from difflib import SequenceMatcher
 from types import MappingProxyType
 from typing import Final, Literal, NamedTuple, TypeAlias
 
@@ -95,14 +96,32 @@ class TextVersions:
         """Return the new text with some declarations of the old one, by number; None if it has errors."""
         return self._version(frozenset(changes), is_old=False)
 
-    def line_of_spec(self, name: str, *, is_old: bool) -> TextPlace | None:
-        """Return the line of a spec in one of the texts, if it is one line in both."""
-        pair = [statements.get(("SPEC", name)) for statements in self._statements]
-        for file, found in zip((self.old, self.new), pair, strict=True):
-            if found is None or "\n" in _text(file, found.span):
-                return None
-        found = pair[0 if is_old else 1]
-        return None if found is None else found.place
+    def edited_lines(
+        self, specs: Sequence[tuple[str, str]], spans: tuple[Span | None, Span | None]
+    ) -> tuple[TextPlace | None, TextPlace | None]:
+        """Return a line that differs of the first of some specs that was edited, in either text.
+
+        None stands for a line that the other text does not have, or, twice, for no such spec.
+
+        Args:
+            specs: their names in the old text and in the new one.
+            spans: of several lines that differ, that of either of these is looked for.
+        """
+        for names in specs:
+            found = [of.get(("SPEC", name)) for of, name in zip(self._statements, names, strict=True)]
+            one, other = found
+            if one is not None and other is not None and one.words != other.words:
+                break
+        else:
+            return None, None
+        old = _lines_of(self.old, one.span, spans[0])
+        new = _lines_of(self.new, other.span, spans[1])
+        one_words, other_words = (
+            [tuple(line.place.text.partition("#")[0].split()) for line in lines] for lines in (old, new)
+        )
+        codes = SequenceMatcher(None, one_words, other_words, autojunk=False).get_opcodes()
+        blocks = [(old[a:b], new[c:d]) for kind, a, b, c, d in codes if kind != "equal"]
+        return _chosen(max(blocks, key=lambda block: sum(line.is_wanted for line in (*block[0], *block[1]))))
 
     def _version(self, changes: frozenset[int], *, is_old: bool) -> Specification | None:
         if (is_old, changes) not in self._known:
@@ -136,6 +155,34 @@ class TextVersions:
         with suppress(SpecificationError, UsageError):
             return parse_specification(text, filename=file.filename, profile=profile)
         return None
+
+
+class _Line(NamedTuple):
+    """A line of a statement; wanted is that of a certain place."""
+
+    place: TextPlace
+    is_wanted: bool
+
+
+def _lines_of(file: Specification, statement: Span, span: Span | None) -> list[_Line]:
+    first, last = (file.source.count("\n", 0, at) for at in (statement.start, statement.end))
+    wanted = -1 if span is None or span == Span(0, 0) else file.source.count("\n", 0, span.start)
+    lines = file.source.split("\n")
+    return [
+        _Line(TextPlace(file.filename, number + 1, lines[number].strip()), number == wanted)
+        for number in range(first, last + 1)
+    ]
+
+
+def _chosen(block: tuple[Sequence[_Line], Sequence[_Line]]) -> tuple[TextPlace | None, TextPlace | None]:
+    """Return the wanted line of either text, or else the one as far down as that of the other."""
+    wanted = [number for lines in block for number, line in enumerate(lines) if line.is_wanted]
+    old, new = (
+        next((line.place for line in lines if line.is_wanted), None)
+        or (lines[min(next(iter(wanted), 0), len(lines) - 1)].place if lines else None)
+        for lines in block
+    )
+    return old, new
 
 
 def statements_of(file: Specification) -> dict[_Key, _Statement]:

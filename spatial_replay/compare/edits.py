@@ -2,12 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections import Counter
+from collections.abc import Collection, Hashable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal, NamedTuple, TypeAlias
 
 from spatial_replay.compare.declarations import DeclarationChange
-from spatial_replay.spec.formula import Boolean, Formula, Span, Temporal, Truth
+from spatial_replay.spec.format import format_formula, format_term
+from spatial_replay.spec.formula import (
+    Atom,
+    Boolean,
+    Formula,
+    Group,
+    Quantified,
+    RegionName,
+    Span,
+    Temporal,
+    Term,
+    Truth,
+    iter_nodes,
+    operands_of,
+    operator_of,
+)
+from spatial_replay.spec.walks import base_of, iter_terms
 
 EditKind: TypeAlias = Literal[
     "constant", "region", "group", "definition", "replaced", "added", "removed", "moved", "renamed"
@@ -28,6 +45,8 @@ class Edit:
         depth: of the deepest of them, from 0 at the root.
         subject: the constant, region, group or macro whose declaration was edited, if it was one.
         change: that declaration in both texts; None if the text of a spec was edited.
+        old_specs, new_specs: the specs whose text may have been edited, the innermost first, by their names
+            in both texts; of what was moved, where it was and where it is.
     """
 
     kind: EditKind
@@ -41,6 +60,8 @@ class Edit:
     depth: int
     subject: str | None = None
     change: DeclarationChange | None = None
+    old_specs: tuple[tuple[str, str], ...] = ()
+    new_specs: tuple[tuple[str, str], ...] = ()
 
     @property
     def is_structural(self) -> bool:
@@ -76,6 +97,89 @@ class Origin(NamedTuple):
     change: DeclarationChange | None
     old: frozenset[int]
     new: frozenset[int]
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A node with its id, the names of the specs that it is in, the innermost first, and its depth."""
+
+    node: Formula
+    id: int
+    specs: tuple[str, ...]
+    depth: int
+
+    @property
+    def around(self) -> tuple[str, ...]:
+        """The specs whose text has the node: not the one that it is itself, by name."""
+        return self.specs if self.node.name is None else self.specs[1:] or self.specs
+
+    @property
+    def operands(self) -> list[Place]:
+        """The nodes below, through specs that only repeat another."""
+        found, identifier = [], self.id + 1
+        for operand in operands_of(self.node):
+            specs = self.specs if operand.name is None else (operand.name, *self.specs)
+            found.append(Place(operand, identifier, specs, self.depth + 1))
+            identifier += sum(1 for _ in iter_nodes(operand))
+        return found
+
+    def members(self, operator: str, *, through_names: bool = False) -> list[Place]:
+        """The operands of a conjunction or disjunction, and in place of those that are one, too, theirs.
+
+        Args:
+            through_names: look into specs, too.
+        """
+        found: list[Place] = []
+        for place in self.operands:
+            inner = place.bare if through_names else place
+            is_more = operator_of(inner.node) == operator and (through_names or inner.node.name is None)
+            found += inner.members(operator, through_names=through_names) if is_more else [place]
+        return found
+
+    @property
+    def bare(self) -> Place:
+        """The node itself, or what it only repeats under another name."""
+        place = self
+        while isinstance(place.node, Boolean) and place.node.operator == "spec":
+            place = place.operands[0]
+        return place
+
+
+class Found(NamedTuple):
+    """A place where the trees differ, with what was edited there; `parts` are those within a quantifier."""
+
+    kind: EditKind
+    old: Place | None
+    new: Place | None
+    subject: str | None = None
+    parts: tuple[Found, ...] = ()
+
+    @property
+    def ids(self) -> tuple[range, range]:
+        """The ids of the nodes that differ; of those with another window or name, only their own."""
+        old, new = (_ids(place, self._is_alone) for place in (self.old, self.new))
+        return old, new
+
+    @property
+    def _is_alone(self) -> bool:
+        is_window = self.kind == "constant" and self.new is not None and isinstance(self.new.node, Temporal)
+        return self.kind == "renamed" or is_window
+
+    def follows_from(self, origin: Origin) -> bool:
+        """Say whether an edit of the texts changed it."""
+        return self.kind != "renamed" and not (
+            origin.old.isdisjoint(self.ids[0]) and origin.new.isdisjoint(self.ids[1])
+        )
+
+    def only(self, kind: EditKind) -> Iterator[Place]:
+        """Yield the node if that is the kind, added or removed."""
+        yield from (place for place in (self.old, self.new) if place is not None and self.kind == kind)
+
+
+def _ids(place: Place | None, is_alone: bool) -> range:
+    if place is None:
+        return range(0)
+    return range(place.id, place.id + (1 if is_alone else sum(1 for _ in iter_nodes(place.node))))
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,3 +252,48 @@ def renumbered(merged: Merged, numbers: Mapping[int, int]) -> Merged:
     operands = tuple(renumbered(operand, numbers) for operand in merged.operands)
     edit = None if merged.edit is None else numbers[merged.edit]
     return replace(merged, edit=edit, operands=operands)
+
+
+def kind_of(old: Formula, new: Formula) -> tuple[EditKind, str | None]:
+    """Return what of a node was edited, and the region or group if that is it."""
+    if isinstance(old, Atom) and isinstance(new, Atom) and old.relation == new.relation:
+        if old.text == new.text:
+            for one, other in zip(iter_terms([old]), iter_terms([new]), strict=False):
+                if one != other and isinstance(base_of(other), RegionName):
+                    return "region", format_term(base_of(other))
+                if one != other and isinstance(base_of(other), Group):
+                    return "group", format_term(base_of(other))
+            return "definition", None
+        if _without_numbers(old) == _without_numbers(new):
+            return "constant", None
+    if isinstance(old, Quantified) and format_formula(old) == format_formula(new):
+        return "definition", None
+    return "replaced", None
+
+
+def _without_numbers(atom: Atom) -> Hashable:
+    texts = tuple(each for each in atom.parameters if isinstance(each, str))
+    # the number of a signal's comparison is a text too: NAME, comparison, number
+    texts = texts[:2] if atom.relation == "signal" else texts
+    return texts, len(atom.parameters), tuple(_without_radius(term) for term in atom.terms)
+
+
+def _without_radius(term: Term) -> Hashable:
+    base = base_of(term)
+    return type(term).__name__, format_term(base)
+
+
+def similarity(old: Formula, new: Formula) -> float:
+    """Return how much of what two nodes are about is the same, 0 to 1."""
+    one, other = _subjects(old), _subjects(new)
+    return (one & other).total() / max((one | other).total(), 1)
+
+
+def _subjects(formula: Formula) -> Counter[str]:
+    found = Counter(format_term(base_of(term)) for term in iter_terms([formula]))
+    found.update(
+        str(node.parameters[0])
+        for _, _, node in iter_nodes(formula)
+        if isinstance(node, Atom) and not node.terms
+    )
+    return found

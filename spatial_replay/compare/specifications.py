@@ -25,7 +25,7 @@ from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, LogNames, ReplayOptions, Selection
 from spatial_replay.spec.diagnostics import Diagnostic, nearest_hint
-from spatial_replay.spec.formula import NamedSpec, Outline, Span, Specification
+from spatial_replay.spec.formula import NamedSpec, Outline, Specification
 from spatial_replay.spec.resolve import MAX_SIZE
 from spatial_replay.text import counted, counted_from
 from spatial_replay.trace.sample import FOREVER
@@ -149,9 +149,10 @@ def compare_specifications(
 
     before, after = evaluated(olds, old), evaluated(news, new)
     versions = TextVersions(old, new)
+    names = {spec.name for spec in old.specs}, {spec.name for spec in new.specs}
     trees = {
         id(other.formula): compare_trees(
-            one.formula, other.formula, other.name, regions, tuple(_origins(versions, *pair))
+            one.formula, other.formula, other.name, regions, tuple(_origins(versions, *pair)), names
         )
         for one, other, pair in zip(olds, news, pairs, strict=True)
     }
@@ -339,27 +340,25 @@ def _spec_diff(
         tree,
         tuple(edit for edit, _ in cause),
         tuple(alone),
-        dict(_places(tree.edits, versions, is_old=True)),
-        dict(_places(tree.edits, versions, is_old=False)),
+        *_places(tree.edits, versions),
     )
 
 
 def _places(
-    edits: Sequence[Edit], versions: TextVersions, *, is_old: bool
-) -> Iterator[tuple[Edit, TextPlace]]:
-    """Yield where each edit is in a text: the declaration that changed, or the line of the node."""
-    file = versions.old if is_old else versions.new
-    lines = file.source.splitlines()
+    edits: Sequence[Edit], versions: TextVersions
+) -> tuple[dict[Edit, TextPlace], dict[Edit, TextPlace]]:
+    """Return where each edit is in the two texts: the declaration, or a line of a spec, that changed."""
+    found: tuple[dict[Edit, TextPlace], dict[Edit, TextPlace]] = {}, {}
     for edit in edits:
-        span = edit.old_span if is_old else edit.new_span
-        place = None
+        spans = edit.old_span, edit.new_span
         if edit.change is not None:
-            place = edit.change.old if is_old else edit.change.new
-        elif span is None:
-            # of what was added or removed: the line as it was without
-            place = versions.line_of_spec(edit.spec, is_old=is_old)
-        elif span != Span(0, 0):
-            line = len(file.source[: span.start + 1].splitlines())
-            place = TextPlace(file.filename, line, lines[line - 1].strip())
-        if place is not None:
-            yield edit, place
+            places = edit.change.old, edit.change.new
+        else:
+            places = (
+                versions.edited_lines(edit.old_specs, spans)[0],
+                versions.edited_lines(edit.new_specs, spans)[1],
+            )
+        for by_edit, place in zip(found, places, strict=True):
+            if place is not None:
+                by_edit[edit] = place
+    return found

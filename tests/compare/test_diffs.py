@@ -202,3 +202,33 @@ def test_edits_without_another_meaning_are_no_difference(edits: dict[str, str]) 
     assert text != TWICE
     assert diff.is_empty, diff
     assert "edited" not in repr(diff)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "kind"),
+    [
+        (" and far_off", "", "removed"),
+        ("and far_off", "and (not far_off)", "replaced"),
+        ("far_off", "near", "replaced"),
+        ("cup leftof plate", "cup rightof plate", "replaced"),
+        ("x dist cup <= 1", "x dist cup <= 2", "constant"),
+    ],
+)
+def test_what_was_edited_is_one_edit_with_its_line_though_specs_refer_to_others(
+    before: str, after: str, kind: str
+) -> None:
+    text = """\
+group plates = class "plate"
+spec near = F (cup dist plate <= 1)
+spec far_off = F (cup dist plate >= 4)
+spec whole = F (cup leftof plate and cup ovlp plate) and far_off and G exists x in plates: x dist cup <= 1
+"""
+    declarations, whole = text.split("spec whole")
+    edited = f"{declarations}spec whole{whole.replace(before, after)}"
+    versions = sr.parse_specification(text), sr.parse_specification(edited)
+    diff = sr.diff_specifications(drive(1.0), *versions).spec("whole")
+    (edit,) = diff.edits
+    assert (edit.kind, edit.spec) == (kind, "whole")
+    assert (diff.old_places[edit].line, diff.new_places[edit].line) == (4, 4)
+    assert diff.old_places[edit].text != diff.new_places[edit].text
+    assert edit.kind != "constant" or edit.new == "x dist cup <= 2"

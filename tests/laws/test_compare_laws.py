@@ -76,7 +76,9 @@ region zone = box(-2, -2, {zone}, 2)
 group many = {many}
 def beside(x, y) = x dist y {beside}
 spec calm = G ({low} <= a dist b <= far)
-spec s = calm and (F (beside(a, b) and b ovlp zone) or forall x in many: x enclosedin zone)
+spec met = F (beside(a, b) and b ovlp zone)
+{extra}
+spec s = {whole}
 """
 WRITTEN = {
     "near": ["1", "1.5", "3"],
@@ -85,6 +87,11 @@ WRITTEN = {
     "many": ["a", "a, b", "b, c"],
     "beside": ["<= near", "<= far and x leftof y", ">= near"],
     "low": ["0", "0.5"],
+    "extra": ["spec held = forall x in many: x enclosedin zone", "spec held = F (a leftof b)"],
+    "whole": [
+        *["calm", "calm and (met or held)", "calm and met", "met and held", "calm and (not met)"],
+        *["(not calm) or held", "held and G (calm and met)", "calm and met and a leftof b", "met or held"],
+    ],
 }
 STATEMENTS = {"constant": "const", "region": "region", "group": "group", "definition": "def"}
 
@@ -103,20 +110,28 @@ def edited_texts(draw) -> tuple[str, str]:
 def test_the_lines_that_a_diff_names_are_those_that_were_edited_and_undone_they_undo_it(texts, recording):
     old, new = texts
     trace = recording.trace()
-    (diff,) = sr.diff_specifications(trace, *map(sr.parse_specification, texts)).specs
+    diff = sr.diff_specifications(trace, *map(sr.parse_specification, texts)).spec("s")
     lines = [set(text.splitlines()) for text in texts]
     for edit in diff.edits:
         pair = diff.old_places[edit].text, diff.new_places[edit].text
         assert pair[0] in lines[0] - lines[1]
         assert pair[1] in lines[1] - lines[0]
-        if edit.subject is not None:
-            assert pair[1].startswith(f"{STATEMENTS[edit.kind]} {edit.subject}")
-    assert len({diff.new_places[edit] for edit in diff.edits}) == len(diff.edits)
+        statement = "spec" if edit.subject is None else f"{STATEMENTS[edit.kind]} {edit.subject}"
+        assert pair[1].startswith(statement)
+    declared = [edit for edit in diff.edits if edit.change is not None]
+    assert len({diff.new_places[edit] for edit in declared}) == len(declared)
+    cause, others = (
+        {diff.new_places[edit].text for edit in diff.edits if (edit in diff.cause) == is_cause}
+        for is_cause in (True, False)
+    )
+    # of several edits of a line, one may be the cause alone; what only one text uses, edited itself
+    assume(not cause & others)
+    assume(all(line in cause | others for line in lines[1] - lines[0]))
     for edit in diff.cause:
         old = old.replace(diff.old_places[edit].text, diff.new_places[edit].text)
         new = new.replace(diff.new_places[edit].text, diff.old_places[edit].text)
     for text, wanted in ((old, diff.new), (new, diff.old)):
-        outcome = numbers_of(sr.evaluate(sr.parse_specification(text), trace).result())
+        outcome = numbers_of(sr.evaluate(sr.parse_specification(text), trace).result("s"))
         compared = slice(0, 1) if diff.is_flipped else slice(None)
         assert outcome[compared] == numbers_of(wanted)[compared]
 
