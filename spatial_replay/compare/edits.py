@@ -145,14 +145,14 @@ class Place:
         return place
 
 
-class Found(NamedTuple):
+class FoundSite(NamedTuple):
     """A place where the trees differ, with what was edited there; `parts` are those within a quantifier."""
 
     kind: EditKind
     old: Place | None
     new: Place | None
     subject: str | None = None
-    parts: tuple[Found, ...] = ()
+    parts: tuple[FoundSite, ...] = ()
 
     @property
     def ids(self) -> tuple[range, range]:

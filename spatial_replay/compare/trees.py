@@ -14,7 +14,7 @@ from typing import Any
 from spatial_replay.compare.edits import (
     Edit,
     EditKind,
-    Found,
+    FoundSite,
     Inner,
     Merged,
     Origin,
@@ -79,7 +79,7 @@ class _Comparison:
         self._renamed: set[tuple[str | None, str | None]] = set()
         self._numbers: dict[Hashable, int] = {}
         self._known: dict[int, tuple[Formula, int]] = {}
-        self.sites: list[Found] = []
+        self.sites: list[FoundSite] = []
 
     def meaning(self, node: Formula) -> int:
         """Return a number that nodes of equal meaning share: names and the order of operands do not count."""
@@ -119,10 +119,10 @@ class _Comparison:
         is_equal = self.meaning(old.node) == self.meaning(new.node)
         if is_renamed and not is_equal and (names[0] in self._specs[1] or names[1] in self._specs[0]):
             # another spec stands there, and neither was edited
-            return self._site(Found("replaced", old, new))
+            return self._site(FoundSite("replaced", old, new))
         if is_renamed:
             self._renamed.add(names)
-            self.sites.append(Found("renamed", old, new))
+            self.sites.append(FoundSite("renamed", old, new))
         if is_equal:
             self._align_names(old, new)
             return new.node
@@ -139,15 +139,15 @@ class _Comparison:
             case Temporal(), Temporal() if old.node.operator == new.node.operator:
                 edit = None
                 if old.node.bound != new.node.bound:
-                    edit = self._site(Found("constant", old, new)).edit
+                    edit = self._site(FoundSite("constant", old, new)).edit
                 return Inner(edit, old.node, new.node, self._pairwise(old, new))
             case Quantified(), Quantified() if _ranges_alike(old.node, new.node):
                 kind, subject = kind_of(old.node, new.node)
-                return self._site(Found(kind, old, new, subject, self._parts(old, new)))
+                return self._site(FoundSite(kind, old, new, subject, self._parts(old, new)))
         kind, subject = kind_of(old.node, new.node)
-        return self._site(Found(kind, old, new, subject))
+        return self._site(FoundSite(kind, old, new, subject))
 
-    def _parts(self, old: Place, new: Place) -> tuple[Found, ...]:
+    def _parts(self, old: Place, new: Place) -> tuple[FoundSite, ...]:
         """Return where the bodies of two quantifiers differ, which are evaluated as one."""
         count = len(self.sites)
         bodies = [
@@ -193,7 +193,7 @@ class _Comparison:
             renumbered(merged, numbers),
         )
 
-    def _joined(self, found: Sequence[Found]) -> Iterable[list[int]]:
+    def _joined(self, found: Sequence[FoundSite]) -> Iterable[list[int]]:
         """Join places that follow from one edit of the text of the specs, by number."""
         removed, added = (
             {self.meaning(place.node) for each in found for place in each.only(kind)}
@@ -237,7 +237,7 @@ class _Comparison:
         for numbers in self._joined(own):
             yield self._edit([own[number] for number in numbers])
 
-    def _edit(self, found: Sequence[Found]) -> Edit:
+    def _edit(self, found: Sequence[FoundSite]) -> Edit:
         olds = [each.old for each in found if each.old is not None]
         news = [each.new for each in found if each.new is not None]
         kinds = {each.kind for each in found}
@@ -262,7 +262,7 @@ class _Comparison:
             new_specs=specs[1],
         )
 
-    def _site(self, found: Found) -> Site:
+    def _site(self, found: FoundSite) -> Site:
         self.sites.append(found)
         old, new = (None if place is None else place.node for place in (found.old, found.new))
         return Site(len(self.sites) - 1, old, new)
@@ -272,7 +272,7 @@ class _Comparison:
         for one, other in zip(old.operands, new.operands, strict=False):
             if self.meaning(one.node) == self.meaning(other.node):
                 if one.node.name != other.node.name and None not in (one.node.name, other.node.name):
-                    self.sites.append(Found("renamed", one, other))
+                    self.sites.append(FoundSite("renamed", one, other))
                 self._align_names(one, other)
 
     def _pairwise(self, old: Place, new: Place) -> tuple[Merged, ...]:
@@ -302,11 +302,11 @@ class _Comparison:
         operands: list[Merged] = [
             self.align(olds[partner[number]], new)
             if number in partner
-            else self._site(Found("added", None, new))
+            else self._site(FoundSite("added", None, new))
             for number, new in enumerate(news)
         ]
         left = [old for index, old in enumerate(olds) if index not in taken]
-        operands += [self._site(Found("removed", old, None)) for old in left]
+        operands += [self._site(FoundSite("removed", old, None)) for old in left]
         return Inner(None, old_node, new_node, tuple(operands))
 
 
