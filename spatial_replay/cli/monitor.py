@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import click
+from click.core import ParameterSource
 
 from spatial_replay.cli.application import ExitCode, exit_code_from_verdicts
 from spatial_replay.cli.options import (
@@ -22,6 +23,7 @@ from spatial_replay.cli.options import (
     specs_option,
 )
 from spatial_replay.cli.output import change_line, ending_lines
+from spatial_replay.cli.progress import announcing_compilation
 from spatial_replay.cli.terminal import Line, StatusLine, show, show_diagnostics, show_file, warn
 from spatial_replay.cli.viewer_options import ServingArguments, serving_options
 from spatial_replay.errors import UsageError
@@ -38,6 +40,7 @@ if TYPE_CHECKING:
     from spatial_replay.spec.formula import Specification
 
 _STATUS_S: Final = 0.5
+_DEFAULT: Final = ParameterSource.DEFAULT
 _UNITS: Final = {"kb": 2**10, "mb": 2**20, "gb": 2**30}
 
 
@@ -178,6 +181,9 @@ def monitor(
       spatial-replay monitor ws://robot:8765 --mapping drive.yaml --spec safety.spatial --trigger violated \
 --before 10s --after 5s --clips clips/
     """
+    by_signal = _SignalTrigger()
+    if clips is not None:
+        click.get_current_context().with_resource(by_signal.listening())
     # imported here so that --help stays fast
     from spatial_replay.live import LiveSession, open_recorders
     from spatial_replay.mapping import load_mapping
@@ -188,6 +194,8 @@ def monitor(
         raise UsageError("--topics says which messages are written; add -o FILE or --clips DIR")
     if triggers and clips is None:
         raise UsageError("--trigger writes clips; add --clips DIR")
+    if clips is None:
+        _refuse_given("before_s", "after_s", "ring")
     for option, given in (("--for", length_s), ("--dead-man", dead_man_s), ("--max-delay", max_delay_s)):
         if given is not None and given <= 0:
             raise UsageError(f"{option} is 0; give it a length, as in {option} 2s")
@@ -201,34 +209,91 @@ def monitor(
     if output is not None:
         _refuse_inputs(output, specs, mapping_file)
     with ExitStack() as opened:
-        recorders = opened.enter_context(open_recorders(files, mapping, output, trigger, clips))
-        writers: list[SampleWriter] = [*recorders]
-        fire = next((each.trigger for each in recorders if trigger and each.is_triggered), None)
-        if serves:
-            writers.append(opened.enter_context(_viewing(files, mapping, serving, fire)))
-        session = LiveSession(
-            address,
-            files,
-            mapping,
-            recorders=writers,
-            topics=topics,
-            max_delay_s=max_delay_s,
-            dead_man_s=dead_man_s,
-        )
-        run = _Run(session, recorders, length_s, until, fire)
+        with announcing_compilation():
+            recorders = opened.enter_context(open_recorders(files, mapping, output, trigger, clips))
+            writers: list[SampleWriter] = [*recorders]
+            fire = next((each.trigger for each in recorders if trigger and each.is_triggered), None)
+            if fire is not None:
+                by_signal.attach(fire)
+            if serves:
+                writers.append(opened.enter_context(_viewing(files, mapping, serving, fire)))
+            session = LiveSession(
+                address,
+                files,
+                mapping,
+                recorders=writers,
+                topics=topics,
+                max_delay_s=max_delay_s,
+                dead_man_s=dead_man_s,
+            )
+        run = _Run(session, recorders, length_s, until)
         asyncio.run(run.follow())
     run.show_remarks()
     for clip in (each for recorder in recorders for each in recorder.clips):
-        show(f"clip {clip.path}: {clip.reason} at {time_text(clip.time_ns, run.first_ns)}")
+        lost = f"; {counted(clip.dropped, 'sample')} of its time dropped" if clip.dropped else ""
+        show(f"clip {clip.path}: {clip.reason} at {time_text(clip.time_ns, run.first_ns)}{lost}")
+    _show_losses(writers, session.status.dropped)
     if output is not None:
         show(f"wrote {output}")
     return run.exit_code
 
 
+def _refuse_given(*names: str) -> None:
+    context = click.get_current_context()
+    for parameter in context.command.params:
+        if parameter.name in names and context.get_parameter_source(parameter.name) is not _DEFAULT:
+            raise UsageError(f"{parameter.opts[0]} is about clips; add --clips DIR")
+
+
+def _show_losses(writers: Sequence[SampleWriter], dropped: int) -> None:
+    """Say what logs, clips and viewers lack besides the samples that were not evaluated."""
+    for writer in writers:
+        lost = [counted(writer.dropped - dropped, "sample")] if writer.dropped > dropped else []
+        lost += [counted(writer.messages_dropped, "message")] if writer.messages_dropped else []
+        if lost:
+            show(f"{writer.name} fell behind and lacks {' and '.join(lost)}")
+
+
+class _SignalTrigger:
+    """Fires the trigger at SIGUSR1; one that comes earlier than the recorder fires it once that is there."""
+
+    def __init__(self) -> None:
+        self._fire: Callable[[str], None] | None = None
+        self._is_waiting = False
+
+    @contextmanager
+    def listening(self) -> Iterator[None]:
+        """Take the signal as long as this lasts."""
+        try:
+            before = signal.signal(signal.SIGUSR1, self._take)
+        except ValueError:
+            # only the main thread may handle signals
+            yield
+            return
+        try:
+            yield
+        finally:
+            signal.signal(signal.SIGUSR1, before)
+
+    def attach(self, fire: Callable[[str], None]) -> None:
+        """Fire this from now on."""
+        self._fire = fire
+        if self._is_waiting:
+            fire("SIGUSR1")
+
+    def _take(self, number: int, frame: object) -> None:
+        if self._fire is None:
+            self._is_waiting = True
+        else:
+            self._fire("SIGUSR1")
+
+
 def _trigger(when: tuple[str, ...], before_s: float, after_s: float, ring: int) -> Trigger:
     from spatial_replay.recording.trigger import Trigger
 
-    with naming_option("--clips"):
+    if ring < 2**20:
+        raise UsageError(f"--ring is {ring} bytes; a ring takes 1MB or more")
+    with naming_option("--trigger"):
         return Trigger(when or "violated", before_s, after_s, ring)
 
 
@@ -271,9 +336,8 @@ class _Run:
         recorders: Sequence[Recorder],
         length_s: float | None,
         until: str | None,
-        fire: Callable[[str], None] | None,
     ) -> None:
-        self._session, self._recorders, self._fire = session, recorders, fire
+        self._session, self._recorders = session, recorders
         self._length_s, self._until = length_s, until
         self._status = StatusLine()
         self.first_ns = 0
@@ -284,8 +348,7 @@ class _Run:
         loop = asyncio.get_running_loop()
         with self._signals(loop):
             ticking = asyncio.create_task(self._tick())
-            if self._length_s is not None:
-                loop.call_later(self._length_s, self._session.stop)
+            ending = asyncio.create_task(self._end_in_time())
             try:
                 is_first = True
                 async for update in self._session.updates():
@@ -297,6 +360,7 @@ class _Run:
                         break
             finally:
                 ticking.cancel()
+                ending.cancel()
                 self._status.clear()
         self._show_end()
 
@@ -325,14 +389,17 @@ class _Run:
             for number in (signal.SIGINT, signal.SIGTERM):
                 loop.add_signal_handler(number, stop, number)
                 handled.append(number)
-            if self._fire is not None:
-                loop.add_signal_handler(signal.SIGUSR1, self._fire, "SIGUSR1")
-                handled.append(signal.SIGUSR1)
         try:
             yield
         finally:
             for number in handled:
                 loop.remove_signal_handler(number)
+
+    async def _end_in_time(self) -> None:
+        if self._length_s is not None:
+            await self._session.connected.wait()
+            await asyncio.sleep(self._length_s)
+            self._session.stop()
 
     async def _tick(self) -> None:
         """Write the status line, and what happens without a sample."""

@@ -106,6 +106,8 @@ class LiveSession:
         self._missing: tuple[str, ...] = ()
         self._server: str | None = None
         self._is_connected = False
+        self.connected = asyncio.Event()
+        """Set once the first connection stands."""
         self._samples = self._messages = self._dropped = 0
         self._delay_s = math.nan
         self._time_ns: int | None = None
@@ -167,6 +169,11 @@ class LiveSession:
                 await self._wait(inbox)
                 if listening.done():
                     listening.result()
+                async for update in self._turn(inbox):
+                    yield update
+            if self._assembler is None and self._is_connected and not self.failure:
+                # it ends before all topics are there: then this says which are not
+                self._take_up(inbox, time.monotonic())
                 async for update in self._turn(inbox):
                     yield update
             async for update in self._evaluated(self._finish(), time.monotonic()):
@@ -251,6 +258,7 @@ class LiveSession:
                     if self._server is not None:
                         self._notes.append(f"connected again to {self._address}")
                     self._server, self._is_connected = server, True
+                    self.connected.set()
                     self._offered_s = time.monotonic() + _OFFER_S
                 case Offered(channels):
                     self._channels = channels
@@ -271,11 +279,7 @@ class LiveSession:
             yield update
         now_s = time.monotonic()
         if self._assembler is None and self._is_connected and now_s >= min(self._offered_s, self._settled_s):
-            self._begin()
-            self._early, early = Inbox(), self._early
-            for item in early.take():
-                # it has waited for the beginning, not for evaluation that falls behind
-                inbox.put(item._replace(arrived_s=now_s) if isinstance(item, Received) else item)
+            self._take_up(inbox, now_s)
         if silent := self._silent_topics(now_s):
             self._silent |= {*silent}
             listed = ", ".join(silent)
@@ -383,6 +387,14 @@ class LiveSession:
             f"connected to {self._address}{f' ({self._server})' if self._server else ''}:"
             f" {counted(len(self._planned), 'topic')}"
         )
+
+    def _take_up(self, inbox: Inbox, now_s: float) -> None:
+        """Begin, with what came before."""
+        self._begin()
+        self._early, early = Inbox(), self._early
+        for item in early.take():
+            # it has waited for the beginning, not for evaluation that falls behind
+            inbox.put(item._replace(arrived_s=now_s) if isinstance(item, Received) else item)
 
     def _wanted_before(self, topic: str) -> bool:
         planned, self._planned = self._planned, {}

@@ -233,7 +233,9 @@ class ClipLog:
     @property
     def is_busy(self) -> bool:
         """Whether a clip waits to be written, or a trigger was fired by hand."""
-        return not self._fired.empty() or (self._open is not None and bool(self._open.waiting))
+        return (self._newest_ns >= 0 and not self._fired.empty()) or (
+            self._open is not None and bool(self._open.waiting)
+        )
 
     @property
     def held_bytes(self) -> int:
@@ -262,8 +264,9 @@ class ClipLog:
             if isinstance(item, _HeldSample):
                 self._evaluate(item.sample)
         with suppress(queue.Empty):
-            while True:
-                self._begin(self._fired.get_nowait(), max(self._newest_ns, 0))
+            # before anything came, there is nothing to keep: the first of it fires
+            while self._newest_ns >= 0:
+                self._begin(self._fired.get_nowait(), self._newest_ns)
         if self._open is not None:
             self._open.write()
             while self._open.waiting_bytes > self._trigger.most_bytes:

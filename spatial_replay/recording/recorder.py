@@ -63,7 +63,7 @@ class SampleWriter:
                 comes, and count it.
             most_lost_s: how much time of samples a kill may cost.
         """
-        self._log, self._name = log, name
+        self._log, self.name = log, name
         # unlike a queue with a limit of its own, an interruption never leaves this one locked
         self._queue: queue.SimpleQueue[Sample | None] = queue.SimpleQueue()
         self._bell: queue.SimpleQueue[None] = queue.SimpleQueue()
@@ -123,7 +123,7 @@ class SampleWriter:
         if not isinstance(sample, Sample):
             raise UsageError(f"{sample!r} is not a sample; give a Sample(time_ns, objects)")
         if self._closed:
-            raise UsageError(f"{self._name} is closed; open another recorder")
+            raise UsageError(f"{self.name} is closed; open another recorder")
         self._raise_failure()
         if sample.time_ns <= self._last_ns:
             at, last = times_apart(sample.time_ns, self._last_ns)
@@ -246,7 +246,7 @@ class SampleWriter:
         """Let the next `write` raise an error, which would go unnoticed in this thread."""
         if not isinstance(error, SpatialReplayError):
             what = f"a sample or message could not be written ({type(error).__name__}: {error})"
-            failure = OutputError(f"{self._name} ends here: {what}")
+            failure = OutputError(f"{self.name} ends here: {what}")
             failure.__cause__ = error
             error = failure
         self._failure = error
@@ -379,15 +379,15 @@ class Recorder(SampleWriter):
 
     def _refuse_planner(self, planner: Planner) -> None:
         if self._box is not None:
-            raise UsageError(f"{self._name} has a planner already; open another recorder")
+            raise UsageError(f"{self.name} has a planner already; open another recorder")
         if self._clips is not None or not self._blocks:
             raise UsageError(
-                f"{self._name} may leave samples out, on which decisions depend; open a Recorder without a "
+                f"{self.name} may leave samples out, on which decisions depend; open a Recorder without a "
                 "trigger, and with block=True"
             )
         if planner.specification not in self._files:
             raise UsageError(
-                f"{self._name} does not record {planner.specification.filename}, which is planned for; open "
+                f"{self.name} does not record {planner.specification.filename}, which is planned for; open "
                 "the Recorder with planner=planner"
             )
         if self._last_ns >= 0 or planner.has_observed:
@@ -441,7 +441,7 @@ class Recorder(SampleWriter):
 
     def _require_box(self) -> BlackBox:
         if self._box is None:
-            raise UsageError(f"{self._name} has no planner; open the Recorder with planner=planner")
+            raise UsageError(f"{self.name} has no planner; open the Recorder with planner=planner")
         return self._box
 
     def _write_decision(self, messages: Messages) -> None:
@@ -486,7 +486,7 @@ class Recorder(SampleWriter):
             UsageError: the recorder has none.
         """
         if self._clips is None:
-            raise UsageError(f"{self._name} is written as a whole; open a Recorder with a trigger")
+            raise UsageError(f"{self.name} is written as a whole; open a Recorder with a trigger")
         self._clips.fire(reason)
         self._ring()
 

@@ -20,6 +20,9 @@ MOST_BYTES: Final = 256 * 2**20
 EVENT: Final = "event"
 """The condition that any event fulfils."""
 
+MANUAL: Final = "manual"
+"""The condition that nothing fulfils: such a trigger fires by hand."""
+
 _VERDICTS: Final = ("violated", "satisfied")
 _BELOW: Final = re.compile(r"(?P<name>.+?)\s*<=?\s*(?P<number>[-+]?[\d.]+(?:[eE][-+]?\d+)?)$")
 
@@ -34,6 +37,7 @@ class Trigger:
         when: "violated" or "satisfied" for any spec, "NAME violated" for one; "NAME < 0.2" when its
             robustness falls below a number; "event" for any change of a verdict, or of a sign that lasts;
             "manual" for `Recorder.trigger` alone, which always fires. Several are given as a sequence.
+            Names are checked by the recorder, which has the specifications.
         before_s, after_s: how much time is kept, on the clock of the samples.
         most_bytes: how much memory the ring takes; when that does not hold `before_s`, it is reported.
     """
@@ -50,6 +54,8 @@ class Trigger:
                 raise UsageError(f"{name} is {value!r}; give seconds, 0 or more")
         if self.most_bytes < 2**20:
             raise UsageError(f"most_bytes is {self.most_bytes}; a ring takes 1 MB (1048576) or more")
+        for text in self.texts:
+            _refuse_unknown(text)
 
     @property
     def texts(self) -> list[str]:
@@ -64,7 +70,7 @@ def condition_of(text: str, files: Sequence[Specification]) -> Condition:
         UsageError: it is none, or names no spec.
     """
     words = text.strip()
-    if words == "manual":
+    if words == MANUAL:
         return lambda updates, has_changed: None
     if words == EVENT:
         return lambda updates, has_changed: EVENT if has_changed else None
@@ -96,9 +102,25 @@ def condition_of(text: str, files: Sequence[Specification]) -> Condition:
             number = float(found["number"])
             name = _known(found["name"], names, text)
             return lambda updates, _: f"{name} below {number:g}" if _value(updates, name) < number else None
-    raise UsageError(
-        f"the trigger {text!r} is not understood; write 'violated', 'NAME violated', 'NAME satisfied',"
-        " 'NAME < 0.2', 'event' or 'manual'"
+    raise _not_understood(text)
+
+
+def _refuse_unknown(text: str) -> None:
+    """Check what can be checked of a condition before its specifications are there."""
+    name, _, verdict = text.rpartition(" ")
+    if text in (*_VERDICTS, EVENT, MANUAL) or (name and verdict in _VERDICTS):
+        return
+    with suppress(ValueError, TypeError):
+        float(_BELOW.match(text)["number"])  # type: ignore[index]
+        return
+    raise _not_understood(text)
+
+
+def _not_understood(text: str) -> UsageError:
+    hint = nearest_hint(text, [*_VERDICTS, EVENT, MANUAL])
+    return UsageError(
+        f"the trigger {text!r} is not understood; {f'{hint}; ' if hint else ''}write 'violated',"
+        " 'NAME violated', 'NAME satisfied', 'NAME < 0.2', 'event' or 'manual'"
     )
 
 
