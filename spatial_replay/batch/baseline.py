@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
 
-from spatial_replay.batch.run_table import RANKS, result_name
+from spatial_replay.batch.run_table import RANKS, WORSE, result_name
 from spatial_replay.errors import UsageError
 
 if TYPE_CHECKING:
@@ -115,7 +115,8 @@ def compare(table: pa.Table, baseline: pa.Table, tolerance: Tolerance) -> list[D
 def with_baseline(table: pa.Table, baseline: pa.Table, differences: Sequence[Difference]) -> pa.Table:
     """Return the table of a run in which what is worse than the baseline fails, and what is gone has a row.
 
-    The columns `baseline_verdict` and `baseline_robustness` say what each result was.
+    The columns `baseline_verdict` and `baseline_robustness` say what each result was, and
+    `worse_than_baseline` whether it is worse now, or gone.
 
     Args:
         differences: see `compare`.
@@ -142,6 +143,7 @@ def with_baseline(table: pa.Table, baseline: pa.Table, differences: Sequence[Dif
     for name, kind, values in (
         (BASELINE_VERDICT, pa.string(), [verdict for verdict, _ in was]),
         (BASELINE_ROBUSTNESS, pa.float64(), [number for _, number in was]),
+        (WORSE, pa.bool_(), [key in worse for key in keys]),
     ):
         table = table.append_column(name, pa.array(values, kind))
     places = {key: place for place, key in enumerate(_keys(baseline))} if gone else {}
@@ -165,6 +167,7 @@ def _gone_row(row: dict[str, Any], difference: Difference) -> dict[str, Any]:
         "seconds": 0.0,
         BASELINE_VERDICT: difference.before,
         BASELINE_ROBUSTNESS: difference.before_robustness,
+        WORSE: True,
     }
 
 

@@ -21,6 +21,8 @@ Values: TypeAlias = dict[str, Any]
 """A row of a table: values by column."""
 
 VERDICTS: Final = ("satisfied", "violated", "unknown")
+WORSE: Final = "worse_than_baseline"
+"""A column of a table that was compared with a baseline: whether a result is worse than there, or gone."""
 _GROUPS: Final[Mapping[By, tuple[str, ...]]] = MappingProxyType(
     {"spec": ("case", "file", "spec"), "log": ("case", "log")}
 )
@@ -41,6 +43,7 @@ class Total:
         errors: how many have an error in place of a verdict.
         failures: how many do not pass.
         least: the least robustness among them; None if none is determined.
+        worse: how many are worse than a baseline, or gone; None without one.
         requirement, title: of the spec; None for a log, and where it has none.
     """
 
@@ -51,6 +54,7 @@ class Total:
     errors: int
     failures: int
     least: float | None
+    worse: int | None = None
     requirement: str | None = None
     title: str | None = None
 
@@ -123,6 +127,8 @@ def totals(table: pa.Table, by: By = "spec") -> list[Total]:
         "errors": pc.is_valid(table.column("error")),
         "failures": pc.is_valid(table.column("failure")),
     }
+    if WORSE in table.column_names:
+        counted["worse"] = table.column(WORSE)
     columns |= {f"n_{name}": pc.cast(pc.fill_null(flag, False), pa.int64()) for name, flag in counted.items()}
     columns["least"] = pc.if_else(pc.is_nan(number), None, number)
     sums = [(f"n_{name}", "sum") for name in counted]

@@ -157,7 +157,7 @@ def batch(
     if outputs.json_file is not None:
         write_json_lines(result.table, outputs.json_file, inputs)
     if outputs.json_file != "-":
-        _print(found, folder)
+        _print(result, found, folder)
     _warn_of_names(found.table)
     if is_github():
         for line in worst_annotations(result.table, suite.folder):
@@ -284,17 +284,29 @@ def _run(
         raise
 
 
-def _print(result: BatchResult, folder: str) -> None:
-    from spatial_replay.batch.run_table import summary_text
+def _print(result: BatchResult, found: BatchResult, folder: str) -> None:
+    """Print the results of a run, compared with a baseline or not, as all other outputs show them.
+
+    Args:
+        found: the same without the comparison.
+    """
+    import pyarrow.compute as pc
+
+    from spatial_replay.batch.run_table import WORSE, summary_text
 
     known = result.logs - result.evaluated
     news = f"{result.evaluated:,} evaluated now, {known:,} known" if known else "all evaluated now"
-    show(f"{counted(result.logs, 'log')}, {summary_text(result.table)} ({news})")
+    # a log that is gone is on the page and in the summary, too
+    gone = len(set(result.table["log"].to_pylist()) - set(found.table["log"].to_pylist()))
+    news = f"{news}, {gone:,} gone" if gone else news
+    show(f"{counted(result.logs + gone, 'log')}, {summary_text(result.table)} ({news})")
     print_totals(result.table, "spec")
     failures = len(result.failures)
     if failures:
-        shown = f"{failures:,} failed" if failures <= _WORST else f"{failures:,} failed, the worst {_WORST}"
-        show(f"{shown}:")
+        shown = f"{failures:,} failed"
+        if WORSE in result.table.column_names:
+            shown += f", {pc.sum(result.table[WORSE]).as_py():,} of them worse than the baseline, or gone"
+        show(f"{shown}, the worst {_WORST}:" if failures > _WORST else f"{shown}:")
         print_worst(result.table, _WORST, failing=True)
     show(f"wrote {folder}")
 
@@ -318,11 +330,7 @@ def _print_differences(differences: Sequence[Difference], to_errors: bool) -> bo
     """Print what differs from the baseline, and return whether any of it fails."""
     worse = [each for each in differences if each.fails]
     better = len(differences) - len(worse)
-    heads = (
-        [f"{len(worse):,} worse than the baseline, or gone"]
-        if worse
-        else ["nothing is worse than the baseline"]
-    )
+    heads = ["worse than the baseline, or gone" if worse else "nothing is worse than the baseline"]
     heads += [f"{better:,} better: --update-baseline keeps that"] if better else []
     show("; ".join(heads) + (":" if worse else ""), err=to_errors)
     for each in worse[:_MOST_DIFFERENCES]:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from spatial_replay.batch.run_table import By, Total
 
 _COLOURS: Final = MappingProxyType(
-    {**VERDICT_COLOURS, **dict.fromkeys(("error", "errors", "failures", "gone"), "red")}
+    {**VERDICT_COLOURS, **dict.fromkeys(("error", "errors", "failures", "worse", "gone"), "red")}
 )
 _KIND_CODES: Final = {"usage": ExitCode.USAGE, "log": ExitCode.DAMAGED, "machine": ExitCode.INTERNAL}
 _BATCH: Final = 10_000
@@ -28,14 +28,19 @@ _BATCH: Final = 10_000
 
 
 def print_totals(table: pa.Table, by: By) -> None:
-    """Print how many results there are of each verdict, for each spec or for each log."""
+    """Print how many results there are of each verdict, for each spec or for each log.
+
+    Of a table that was compared with a baseline, also how many are worse than there, or gone.
+    """
     # imported here so that --help stays fast
-    from spatial_replay.batch.run_table import totals
+    from spatial_replay.batch.run_table import WORSE, totals
 
     rows = totals(table, by)
     titles = [_title(each, by, len({each.group["case"] for each in rows}) > 1) for each in rows]
     names = ["satisfied", "violated", "unknown", "errors", "failures"]
     heads = [*names[:-1], "failed"]
+    if WORSE in table.column_names:
+        names, heads = [*names, "worse"], [*heads, "worse"]
     width = max([len(by), *map(len, titles)])
     show(f"  {by:<{width}}  {'  '.join(f'{head:>9}' for head in heads)}  least robustness")
     for title, each in zip(titles, rows, strict=True):

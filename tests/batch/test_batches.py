@@ -312,12 +312,21 @@ def test_what_is_worse_than_a_baseline_or_gone_fails_in_every_output(
     outputs = ["--junit", "junit.xml", "--json", "rows.jsonl", "--html", "pages"]
     done = batch(*first, "--baseline", "main", "--tolerance", "6%", *outputs)
     assert done.code == 1
-    _, _, listed = done.out.partition("worse than the baseline, or gone")
+    shown, _, listed = done.out.partition("\nworse than the baseline, or gone")
     assert [line.split(":")[0].strip() for line in listed.splitlines()[1:]] == [
         "logs/run-1.jsonl", "logs/run-3.jsonl", "logs/run-3.jsonl", "logs/run-2.jsonl",
     ]  # fmt: skip
     root = ElementTree.parse("junit.xml").getroot()
     assert (root.get("tests"), root.get("failures")) == ("8", "4")
+    # the terminal has the totals of the other outputs
+    totals = "8 results: 5 satisfied (1 failed), 1 violated, 2 gone"
+    assert shown.startswith(f"4 logs, {totals} (all evaluated now, 1 gone)\n"), shown
+    assert "\n4 failed, 4 of them worse than the baseline, or gone:\n" in shown
+    heads, apart, _, arrives, *_ = (line.split() for line in shown.splitlines()[1:])
+    assert heads[5:7] == ["failed", "worse"]
+    assert (apart[-3:-1], arrives[-3:-1]) == (["2", "2"], ["2", "2"])
+    for other in ("summary.md", "pages/index.html"):
+        assert totals in Path(other).read_text()
     rows = [json.loads(line) for line in Path("rows.jsonl").read_text().splitlines()]
     summary, page = Path("summary.md").read_text(), Path("pages/index.html").read_text()
     for log, spec, said, was in (
@@ -329,7 +338,8 @@ def test_what_is_worse_than_a_baseline_or_gone_fails_in_every_output(
         cases = root.iterfind(f"testsuite[@name='logs.{spec}']/testcase[@name='{name}']/failure")
         assert [said in str(each.get("message")) for each in cases] == [True]
         (row,) = (row for row in rows if (row["log"], row["spec"]) == (name, spec))
-        assert said in row["failure"] and row["baseline_robustness"] == pytest.approx(was)
+        assert row["worse_than_baseline"] and said in row["failure"]
+        assert row["baseline_robustness"] == pytest.approx(was)
         assert any(
             line.startswith("::error") and name in line and said in line for line in done.err.split("\n")
         )
