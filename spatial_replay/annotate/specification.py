@@ -43,6 +43,9 @@ DIMENSIONLESS = "1"
 MIXED = "mixed"
 FOOTPRINT_UNITS = ""
 
+_DEFINED = re.compile(r"^\s*def\s+(\w+)", re.MULTILINE)
+_CALL = re.compile(r"[(\s]*(\w+)\s*\(")
+
 
 class ReportedTree(NamedTuple):
     """One result, as the tree that /spatial/robustness has numbers for.
@@ -294,10 +297,6 @@ def logged_specifications(files: Sequence[Specification]) -> list[Specification]
 def specification_attachments(files: Sequence[Specification], prefix: str) -> list[Attachment]:
     """Return the texts of `logged_specifications` as attachments whose names begin with `prefix`."""
     return [Attachment(f"{prefix}{file.filename}", "text/plain", file.source.encode()) for file in files]
-
-
-_DEFINED = re.compile(r"^\s*def\s+(\w+)", re.MULTILINE)
-_CALL = re.compile(r"[(\s]*(\w+)\s*\(")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

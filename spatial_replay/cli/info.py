@@ -15,7 +15,7 @@ import click
 
 from spatial_replay.cli.application import ExitCode
 from spatial_replay.cli.options import JsonCommand, LogPath, ReadArguments, reading_options
-from spatial_replay.cli.output import decision_lines, decision_rows
+from spatial_replay.cli.output import MANY, WORST_FIRST, counts_text, decision_lines, decision_rows
 from spatial_replay.cli.progress import progress
 from spatial_replay.cli.terminal import show, show_bytes, show_file, show_json, warn
 from spatial_replay.errors import UsageError
@@ -362,10 +362,15 @@ def _container_lines(container: LogSummary, about: Mapping[str, NamedSpec], *, t
     from spatial_replay.logs.topics import VERDICTS
 
     if verdicts := list(_verdicts(container, about)):
-        yield "verdicts"
+        kinds = [(each["verdict"] or "").split(",")[0] for each in verdicts]
+        is_known = len(kinds) > MANY and set(kinds) <= set(WORST_FIRST)
+        places = sorted(
+            range(len(kinds)), key=lambda place: WORST_FIRST.index(kinds[place]) if is_known else 0
+        )
+        yield f"verdicts: {counts_text(kinds)}" if is_known else "verdicts"
         yield from _table(
             (each["name"] or "", each["verdict"] or "", requirement_text(each["requirement"], each["title"]))
-            for each in verdicts
+            for each in (verdicts[place] for place in places)
         )
     if topics:
         yield "topics"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import accumulate, pairwise
 from pathlib import Path
 from types import MappingProxyType
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from spatial_replay.recording.changes import VerdictChange
     from spatial_replay.replay import Replayed
 
-_WORST_FIRST: Final = ("violated", "unknown", "satisfied")
-_MANY: Final = 6
+WORST_FIRST: Final = ("violated", "unknown", "satisfied")
+MANY: Final = 6
 """Results that are printed in the order of the file; more are counted and sorted."""
 _MOST_SHOWN: Final = 20
 """Results that are printed; of more, as templates have, the worst of them, and how many others there are."""
@@ -74,7 +74,9 @@ def print_verdicts(replayed: Replayed, output: Path | None, window_ns: int | Non
     """Print one line for each result, and another one for a sliding window."""
     span = time_text(replayed.end_ns, replayed.start_ns)
     damaged = ", damaged: verdicts are over what could be read" if replayed.faults else ""
-    counts = f": {_counts(replayed.results)}" if len(replayed.results) > _MANY else ""
+    counts = (
+        f": {counts_text(each.verdict for each in replayed.results)}" if len(replayed.results) > MANY else ""
+    )
     show(f"{replayed.log}: {counted(replayed.samples, 'sample')} over {span}{damaged}{counts}")
     results, others = worst_of(replayed.results)
     # escaped here, so that what is printed is as wide as what is measured
@@ -116,10 +118,10 @@ def write_document(
         stream.write(text.encode() + b"\n")
 
 
-def _counts(results: Sequence[SpecResult]) -> str:
-    """Return how many results have each verdict, the worst first."""
-    counts = Counter(str(result.verdict) for result in results)
-    return ", ".join(f"{counts[verdict]:,} {verdict}" for verdict in _WORST_FIRST if counts[verdict])
+def counts_text(verdicts: Iterable[str]) -> str:
+    """Return how many of some verdicts are of each kind, the worst first."""
+    counts = Counter(map(str, verdicts))
+    return ", ".join(f"{counts[verdict]:,} {verdict}" for verdict in WORST_FIRST if counts[verdict])
 
 
 def are_many(results: Sequence[SpecResult]) -> bool:
@@ -129,7 +131,7 @@ def are_many(results: Sequence[SpecResult]) -> bool:
 
 def worst_of(results: Sequence[SpecResult]) -> tuple[Sequence[SpecResult], Sequence[SpecResult]]:
     """Return the results to print and, of too many, the others; the worst first where they are several."""
-    if len(results) > _MANY:
+    if len(results) > MANY:
         results = sorted(results, key=_severity)
     shown = _SHOWN if are_many(results) else len(results)
     return results[:shown], results[shown:]
@@ -137,13 +139,15 @@ def worst_of(results: Sequence[SpecResult]) -> tuple[Sequence[SpecResult], Seque
 
 def others_text(others: Sequence[SpecResult]) -> str:
     """Return the line about results that are not printed."""
-    return f"… and {len(others):,} more: {_counts(others)}; --json has all, --each VAR=OBJECT shows one"
+    one = ", --each VAR=OBJECT shows one" if any(each.object is not None for each in others) else ""
+    counts = counts_text(each.verdict for each in others)
+    return f"… and {len(others):,} more: {counts}; --json has all{one}"
 
 
 def _severity(result: SpecResult) -> tuple[int, float]:
     """Return what to sort results by: the worst verdict first, and then the least robustness."""
     number = result.upper if math.isnan(result.robustness) else result.robustness
-    return _WORST_FIRST.index(str(result.verdict)), number
+    return WORST_FIRST.index(str(result.verdict)), number
 
 
 def _titled(result: SpecResult) -> str:

@@ -42,6 +42,24 @@ def test_samples_objects_and_signals_are_listed(log: Path, capsys: pytest.Captur
     assert "battery" in said
 
 
+def test_many_verdicts_of_a_log_are_counted_and_the_worst_come_first(
+    log: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    spec, annotated = log.with_name("s.spatial"), log.with_name("out.mcap")
+    limits = [-1, 9, -1, 9, -1, -1, 9]
+    spec.write_text("".join(f"spec s{k} = G (battery >= {limit})\n" for k, limit in enumerate(limits)))
+    assert run(["replay", str(log), "--spec", str(spec), "-o", str(annotated)]) == 1
+    capsys.readouterr()
+    assert run(["info", str(annotated)]) == 0
+    said = capsys.readouterr().out
+    head, *lines = said[said.index("verdicts") :].splitlines()[: len(limits) + 1]
+    counts = [line.split()[1].rstrip(",") for line in lines]
+    assert counts == sorted(counts, key=["violated", "unknown", "satisfied"].index)
+    assert len(set(counts)) > 1
+    kinds = dict.fromkeys(counts)
+    assert head == "verdicts: " + ", ".join(f"{counts.count(kind)} {kind}" for kind in kinds)
+
+
 def test_an_annotated_log_shows_its_verdicts(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
     spec, annotated = log.with_name("s.spatial"), log.with_name("out.mcap")
     spec.write_text("spec charged = G (battery >= 0.6)\nspec alone = G (hand dist hand <= 1)\n")
