@@ -450,7 +450,7 @@ class _Run:
         return False
 
     def _show_end(self) -> None:
-        for note in self._session.take_notes():
+        for note in self._session.take_notes(last=True):
             show(f"  {note}")
         status = self._session.status
         warn(*self._session.remarks)

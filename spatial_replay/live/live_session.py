@@ -139,8 +139,10 @@ class LiveSession:
         """Return the result of each spec if the run ends with the newest sample."""
         return tuple(each for monitor in self._monitors for each in monitor.endings())
 
-    def take_notes(self) -> tuple[str, ...]:
-        """Return what happened since the last update, if anything did."""
+    def take_notes(self, *, last: bool = False) -> tuple[str, ...]:
+        """Return what happened since the last update, if anything did; at last, how often besides."""
+        if last and self._assembler is not None:
+            self._notes += self._assembler.take_faults(last=True)
         notes, self._notes = tuple(self._notes), []
         return notes
 

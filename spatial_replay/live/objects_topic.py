@@ -8,7 +8,7 @@ import numpy as np
 
 from spatial_replay.bags.columns import DISORDER_NS, Message
 from spatial_replay.logs.objects.decode import decode_objects
-from spatial_replay.logs.read_options import FaultList
+from spatial_replay.logs.read_options import FaultKinds
 from spatial_replay.logs.topics import OBJECTS
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import ABSENT, Trace
@@ -23,7 +23,7 @@ class ObjectsAssembler:
 
     def __init__(self, name: str) -> None:
         self._name = name
-        self._faults = FaultList()
+        self._faults = FaultKinds()
         self._newest_ns = -1
         self._classes: dict[str, str | None] = {}
         self.is_finished = False
@@ -64,9 +64,9 @@ class ObjectsAssembler:
         """Return the remaining samples: none."""
         return Trace.empty()
 
-    def take_faults(self) -> tuple[str, ...]:
-        """Return what was lost since the last call."""
-        return self._faults.take()
+    def take_faults(self, *, last: bool = False) -> tuple[str, ...]:
+        """Return what was lost since the last call, the first of each kind; at last, how many more."""
+        return self._faults.take(last=last)
 
     def take_remarks(self) -> tuple[str, ...]:
         """Return what is remarkable where nothing was lost: nothing."""

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from fractions import Fraction
 from os import PathLike, fspath
 from reprlib import repr as shortened
-from typing import Literal, cast, get_args
+from typing import Final, Literal, cast, get_args
 
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.footprint import Concave
@@ -137,6 +138,8 @@ def frame_times(rate: float) -> Fraction:
 
 
 MOST_FAULTS = 100
+_NUMBER: Final = re.compile(r"\d[\d.,]*")
+_FURTHER: Final = "something else"
 """How many faults of one log are reported one by one; the others are counted."""
 
 _MORE = re.compile(r"… and (\d+) more faults? of")
@@ -180,3 +183,38 @@ class FaultList:
             more = self._count - MOST_FAULTS
             taken.append(f"… and {more} more fault{'s' if more > 1 else ''} of this kind or another")
         return tuple(taken)
+
+
+class FaultKinds(FaultList):
+    """Faults of a run that goes on: the first of each kind is a line, the others are counted for the end.
+
+    Of one kind are those of a topic whose texts differ in numbers alone.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._first: dict[str, str] = {}
+        self._more: Counter[str] = Counter()
+
+    def add(self, fault: str) -> None:
+        """Add a fault with its place."""
+        place, at, what = str(fault).partition(" at ")
+        kind = f"{place}{at}{_NUMBER.sub('0', what)}"
+        if kind in self._first:
+            self._more[kind] += 1
+        elif len(self._first) < MOST_FAULTS:
+            self._first[kind] = str(fault)
+            super().add(fault)
+        else:
+            self._more[_FURTHER] += 1
+
+    def take(self, *, last: bool = False) -> tuple[str, ...]:
+        """Return the first faults of kinds since the last call; with `last`, also how many more."""
+        taken = super().take()
+        if not last:
+            return taken
+        counts, self._more = self._more, Counter()
+        more = (
+            f"… and {count:,} more like this: {self._first.get(kind, kind)}" for kind, count in counts.items()
+        )
+        return (*taken, *more)

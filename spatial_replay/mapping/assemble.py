@@ -64,6 +64,7 @@ class Assembler:
             ends there.
         arrived: takes the messages of each topic as they arrive: its reader, their times on its clock, and
             their contents, decoded where frames matter.
+        faults: takes what is lost, in place of a new list.
     """
 
     def __init__(
@@ -77,13 +78,14 @@ class Assembler:
         on_time_jump: OnTimeJump = "error",
         concave: Concave = "decompose",
         arrived: Callable[[TopicReader, Integers, Sequence[Any]], None] | None = None,
+        faults: FaultList | None = None,
     ) -> None:
         self._plan = plan
         self._arrived = arrived
         self._name = name
         self._window_ns = start_ns or 0, FOREVER if end_ns is None else end_ns
         self._on_time_jump = on_time_jump
-        self._faults = FaultList()
+        self._faults = FaultList() if faults is None else faults
         for topic, reason in plan.lost:
             # some reasons start with the topic already
             what = reason.removeprefix(f"topic {topic!r}: ")
@@ -230,9 +232,9 @@ class Assembler:
         self._settled_ns = LATEST_NS
         return trace
 
-    def take_faults(self) -> tuple[str, ...]:
+    def take_faults(self, *, last: bool = False) -> tuple[str, ...]:
         """Return what was lost since the last call, each with its place."""
-        return self._faults.take(last=self._settled_ns == LATEST_NS)
+        return self._faults.take(last=last or self._settled_ns == LATEST_NS)
 
     def move_faults(self, other: FaultList) -> None:
         """Move what `take_faults` would return to another list, with the count of faults beyond its limit."""

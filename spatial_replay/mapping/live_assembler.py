@@ -23,6 +23,7 @@ from spatial_replay.bags.columns import Message
 from spatial_replay.bags.topic import Decoder, Topic
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.geometry.footprint import Concave
+from spatial_replay.logs.read_options import FaultKinds
 from spatial_replay.mapping.assemble import Assembler
 from spatial_replay.mapping.mapping_file import parse_mapping
 from spatial_replay.mapping.reading_plan import ReadingPlan
@@ -116,6 +117,7 @@ class LiveAssembler:
             on_time_jump="split",
             concave=concave,
             arrived=self._note_arrived,
+            faults=FaultKinds(),
         )
         self._moving = frozenset(moving)
         # what is sent once and stays is not waited for
@@ -203,9 +205,9 @@ class LiveAssembler:
         """Return counts of stale objects and missing transforms, after `finish`."""
         return self._assembler.take_remarks()
 
-    def take_faults(self) -> tuple[str, ...]:
-        """Return what was lost since the last call, each with its place."""
-        return self._assembler.take_faults()
+    def take_faults(self, *, last: bool = False) -> tuple[str, ...]:
+        """Return what was lost since the last call, the first of each kind; at last, how many more."""
+        return self._assembler.take_faults(last=last)
 
     def _note_arrived(self, reader: TopicReader, times_ns: Integers, contents: Sequence[Any]) -> None:
         name = reader.name

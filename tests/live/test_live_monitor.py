@@ -526,3 +526,18 @@ def test_options_of_clips_are_checked_before_anything_is_connected(
     mapped, spec = files(tmp_path, MAPPING, SPEC)
     assert run(["monitor", "ws://127.0.0.1:9", "--mapping", str(mapped), "--spec", str(spec), *options]) == 2
     assert said in capsys.readouterr().err
+
+
+def test_messages_that_do_not_fit_are_said_once_and_counted_at_the_end(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mapped, spec = files(tmp_path, MAPPING, SPEC)
+    bad = [frame(2, tick * 10 * MS + 2, b'{"x": "far"}') for tick in range(30)]
+    good = [(pose(2, tick, 2.0), pose(1, tick)) for tick in range(31)]
+    # the last sample is a violation, at which the run ends
+    sent = [*good[0], *(each for pair in zip(bad, good[1:], strict=True) for each in (pair[0], *pair[1]))]
+    with rude_server(*sent, pose(2, 40), pose(1, 40)) as address:
+        command = ["monitor", address, "--mapping", str(mapped), "--spec", str(spec), "--until", "violated"]
+        assert run(command) == 1
+    said = [line for line in capsys.readouterr().out.splitlines() if ": /vase at " in line]
+    assert len(said) == 2 and "and 29 more like this" in said[1]
