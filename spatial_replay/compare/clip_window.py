@@ -9,6 +9,7 @@ before the window, where a clip has no samples.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -21,7 +22,7 @@ from spatial_replay.logs.source import Source
 from spatial_replay.monitor.atoms.delays import look_back
 from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene
-from spatial_replay.monitor.causes import find_causes
+from spatial_replay.monitor.causes import conjuncts_of, find_causes
 from spatial_replay.monitor.offline import OfflineNodes, evaluate_offline
 from spatial_replay.monitor.online.codes import in_channels
 from spatial_replay.monitor.result import SpecResult
@@ -204,7 +205,8 @@ class _Part:
         """Return the part that fails first, given that the verdict becomes certain when it did in the log."""
         if self._cause is None:
             return None
-        conjuncts = self._result.conjuncts_of(self._node)
+        parts = conjuncts_of(self._nodes[self._node], "")
+        conjuncts = [replace(each, node=self._node + each.node) for each in parts]
         final, values = np.zeros((len(self._nodes), 2)), np.zeros(len(self._nodes))
         settled_ns = np.full((len(self._nodes), 2), NEVER, np.int64)
         prefix, certain_ns = None, self._certain_ns or 0

@@ -237,7 +237,7 @@ class SpecResult(Displayed):
         """Return why a node is violated or unknown, as `causes` does for the root."""
         return self._causes(node, self._settled_witness)
 
-    def conjuncts_of(self, node: int) -> list[Conjunct]:
+    def _conjuncts_of(self, node: int) -> list[Conjunct]:
         """Return the parts of a node that have to hold for it to hold."""
         formula = next(each for identifier, _, each in iter_nodes(self.formula) if identifier == node)
         own = conjuncts_of(formula, self._name_of(node))
@@ -251,7 +251,7 @@ class SpecResult(Displayed):
         if final_verdict(*self.final[node].tolist()) is Verdict.SATISFIED:
             return ()
         named = {**self.evidence.instance.named, self.name: self.spec}
-        return find_causes(self.conjuncts_of(node), self.values, self.final, self.settled_ns, witness, named)
+        return find_causes(self._conjuncts_of(node), self.values, self.final, self.settled_ns, witness, named)
 
     def to_pandas(self) -> Any:
         """Return the numbers of each sample as a pandas DataFrame, indexed by `time_ns`.
@@ -426,7 +426,7 @@ class SpecResult(Displayed):
         if not causes:
             return None
         name = self._name_of(node)
-        return find_least(self.conjuncts_of(node), self.values, self.final, causes[0], name)
+        return find_least(self._conjuncts_of(node), self.values, self.final, causes[0], name)
 
     def _least_at_ns(self, causes: Sequence[Cause]) -> int | None:
         first = causes[0] if causes else None
