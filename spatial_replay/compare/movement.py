@@ -15,16 +15,11 @@ from spatial_replay.geometry.arrays import Booleans, Floats, Integers
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.measure import MeasureRequest, Operand, measure
 from spatial_replay.text import Instant, Sentence, counted, number_text
+from spatial_replay.trace.other_units import OTHER_UNITS, require_same_units
 from spatial_replay.trace.trace import Trace
-
-_OTHER_UNITS: Final = 8.0
-"""Where every common object is so many times as large in one run, that run is in another unit."""
 
 _PAIRS_AT_ONCE: Final = 16_384
 """Observations that are compared at once: few enough for the processor's cache."""
-
-_MOST_SIZES: Final = 256
-"""Samples of an object that its size is the median of."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +64,7 @@ class SignalDiff:
     @property
     def has_other_unit(self) -> bool:
         """Whether it seems to be in another unit in B: percent instead of parts, millimetres for metres."""
-        return self.ratio >= _OTHER_UNITS or self.ratio <= 1.0 / _OTHER_UNITS
+        return self.ratio >= OTHER_UNITS or self.ratio <= 1.0 / OTHER_UNITS
 
 
 def compare_signals(a: Trace, b: Trace, alignment: Alignment) -> tuple[SignalDiff, ...]:
@@ -109,7 +104,7 @@ def compare_objects(a: Trace, b: Trace, alignment: Alignment) -> tuple[ObjectDif
             f"the runs have no object in common: A has {_listed(a.names)}; B has {_listed(b.names)}. "
             "Map the same things to the same names"
         )
-    _check_units(a, b, names)
+    require_same_units(a, b)
     # (P, K) observations
     one, other = (
         trace.rows[rows][:, [trace.names.index(name) for name in names]]
@@ -217,33 +212,6 @@ def _compare_shapes(
         x = other_x / (other_end - other_begin) - x / (end - begin)
         y = other_y / (other_end - other_begin) - y / (end - begin)
         shift[k] = x * x + y * y
-
-
-def _check_units(a: Trace, b: Trace, names: Sequence[str]) -> None:
-    """Refuse runs whose common objects are all many times as large in one as in the other."""
-    ratios, example = [], ""
-    for name in names:
-        one, other = _size(a, name), _size(b, name)
-        if min(one, other) > 0.0:
-            ratios.append(one / other)
-            times, which = (ratios[0], "A") if ratios[0] > 1.0 else (1.0 / ratios[0], "B")
-            example = example or f"{name} is {times:,.0f} times as large in {which}"
-    if ratios and (min(ratios) >= _OTHER_UNITS or max(ratios) <= 1.0 / _OTHER_UNITS):
-        raise UsageError(
-            f"the runs seem to be in other units: {example}. Read both in one unit, by a mapping with `scale`"
-        )
-
-
-def _size(trace: Trace, name: str) -> float:
-    """Return the median extent of an object, radii included; 0 where it is a point or never observed."""
-    rows = trace.rows[:, trace.names.index(name)]
-    rows = rows[rows >= 0]
-    if not len(rows):
-        return 0.0
-    batch = trace.footprints.select(rows[:: -(-len(rows) // _MOST_SIZES)])
-    start = batch.vertex_start[batch.part_start[:-1]]
-    spans = [np.maximum.reduceat(x, start) - np.minimum.reduceat(x, start) for x in batch.vertices.T]
-    return float(np.median(np.hypot(*spans) + 2.0 * np.maximum.reduceat(batch.radius, batch.part_start[:-1])))
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -86,9 +86,9 @@ class LogDiff(Displayed):
             yield f"  the same {counted(self.samples[0], 'sample')}"
             return
         if self.alignment is not None:
-            pairs = counted(len(self.alignment.a), "pair")
+            paired = [len(set(rows.tolist())) for rows in (self.alignment.a, self.alignment.b)]
             counts = " | ".join(counted(count, "sample") for count in self.samples)
-            yield f"  {counts}; {self.alignment}: {pairs} of samples"
+            yield f"  {counts}; {self.alignment}: {paired[0]:,} of A beside {paired[1]:,} of B"
         start_ns = self.starts_ns[0]
         for each in self.objects[:_MOST_LISTED]:
             yield f"  {each.name}: {movement_sentence(each, start_ns)}"

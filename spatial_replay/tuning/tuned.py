@@ -18,6 +18,7 @@ from spatial_replay.spec.diagnostics import nearest_hint
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import constant_writer
 from spatial_replay.text import counted, json_number
+from spatial_replay.trace.other_units import require_same_units
 from spatial_replay.tuning.direction import Direction
 from spatial_replay.tuning.margins import LabelledRun, Margins, Point
 from spatial_replay.tuning.search import Found, Search
@@ -276,7 +277,7 @@ def tune_runs(
 
     Raises:
         UsageError: no good run, too many runs, a constant that cannot be tuned, a run that does not fit the
-            specification.
+            specification, runs in other units.
     """
     _check(specification, runs)
     varied = varied_constants(specification, ranges)
@@ -302,6 +303,8 @@ def _check(specification: Specification, runs: Sequence[LabelledRun]) -> None:
     samples = sum(len(run.trace) for run in runs)
     if samples > MOST_SAMPLES:
         raise UsageError(f"the runs have {samples} samples, more than {MOST_SAMPLES}; tune on some of them")
+    for run in runs[1:]:
+        require_same_units(runs[0].trace, run.trace, (runs[0].name, run.name))
 
 
 def _with_values(
