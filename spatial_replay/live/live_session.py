@@ -175,7 +175,10 @@ class LiveSession:
                     yield update
             if self._assembler is None and self._is_connected and not self.failure:
                 # it ends before all topics are there: then this says which are not
-                self._take_up(inbox, time.monotonic())
+                async for update in self._turn(inbox):
+                    yield update
+                if self._assembler is None:
+                    self._take_up(inbox, time.monotonic())
                 async for update in self._turn(inbox):
                     yield update
             async for update in self._evaluated(self._finish(), time.monotonic()):
