@@ -85,6 +85,8 @@ def clip(
     show(_summary(found))
     for title in found.changed:
         warn(f"{title} has another verdict in the clip than in the log; only {', '.join(found.kept)} is kept")
+    if found.added:
+        warn(f"{', '.join(found.added)}: fails in the clip alone, which has not all samples of the log")
     return ExitCode.DAMAGED if found.whole.faults else ExitCode.SATISFIED
 
 

@@ -54,6 +54,19 @@ class Clip:
             if verdicts.get(result.title) is not result.verdict
         )
 
+    @property
+    def added(self) -> tuple[str, ...]:
+        """The named parts that fail in the clip alone, of results with the verdict of the log."""
+        known = {result.title: result for result in self.whole.results}
+        parts = (
+            cause.spec
+            for result in self.replayed.results
+            if result.title not in self.changed
+            for cause in result.causes
+            if cause.spec not in {each.spec for each in known[result.title].causes}
+        )
+        return tuple(dict.fromkeys(parts))
+
 
 def cut_clip(
     source: Source,

@@ -219,6 +219,27 @@ def test_a_clip_fails_for_the_reason_that_settled_the_verdict_not_only_with_the_
         assert result.worst.deciding.text == "gap >= 0.5"
 
 
+def test_a_clip_says_which_parts_fail_in_it_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("run.spatial").write_text(
+        "spec safe = G (gap >= 0.5)\nspec deliver = F (done >= 1)\nspec task = safe and deliver\n"
+    )
+    with sr.Recorder("run.mcap") as recorder:
+        for index in range(9):
+            recorder.write(sr.Sample(index * 10**9, {}, {"gap": -9.0 * (index == 1), "done": index - 7.0}))
+    code, _, err = said(capsys, "clip", "run.mcap", "--spec", "run.spatial", "-o", "bug.mcap")
+    assert code == 0
+    assert "deliver: fails in the clip alone" in err
+    whole, cut = (
+        sr.evaluate(sr.load_specification("run.spatial"), sr.read_trace(path)).result()
+        for path in ("run.mcap", "bug.mcap")
+    )
+    assert [cause.spec for cause in whole.causes] == ["safe"]
+    assert [cause.spec for cause in cut.causes] == ["safe", "deliver"]
+
+
 def test_a_verdict_that_needs_the_whole_log_is_said_to(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
