@@ -118,9 +118,15 @@ def main() -> NoReturn:
     signal.signal(signal.SIGTERM, _interrupt)
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _interrupt)
+    signal.signal(signal.SIGALRM, _interrupt)
+    sys.unraisablehook = _interrupt_again
     # little of a short run is garbage, and looking for it a hundred times takes a twentieth of the run
     gc.set_threshold(50_000, 20, 20)
     sys.exit(run())
+
+
+_AGAIN_S = 0.05
+"""How long after an interruption that was ignored the next one comes."""
 
 
 class _Interruption(KeyboardInterrupt):
@@ -133,6 +139,14 @@ class _Interruption(KeyboardInterrupt):
 
 def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
     raise _Interruption
+
+
+def _interrupt_again(ignored: sys.UnraisableHookArgs) -> None:
+    """Interrupt a moment later where an interruption was ignored, as within a callback of the compiler."""
+    if isinstance(ignored.exc_value, _Interruption):
+        signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
+    else:
+        sys.__unraisablehook__(ignored)
 
 
 def run(arguments: Sequence[str] | None = None) -> int:

@@ -218,3 +218,27 @@ def test_the_bar_shows_that_code_is_being_compiled(tmp_path: Path) -> None:
     said = standard_error_on_terminal(command, tmp_path, variables)
     assert "samples" in said
     assert "compiling" not in said
+
+
+_INTERRUPTED_IN_A_CALLBACK = """
+import ctypes, os, signal, sys, time
+from spatial_replay.cli.application import main
+from spatial_replay.runs import warmup
+
+def warm_up_kernels(*_, **__):
+    # no exception can leave a callback, as those of the compiler
+    ctypes.CFUNCTYPE(None)(lambda: os.kill(os.getpid(), signal.SIGTERM))()
+    time.sleep(60)
+
+warmup.warm_up_kernels = warm_up_kernels
+sys.argv = ["spatial-replay", "warmup"]
+main()
+"""
+
+
+def test_an_interruption_that_comes_within_the_compiler_counts():
+    done = subprocess.run(
+        [sys.executable, "-c", _INTERRUPTED_IN_A_CALLBACK],
+        capture_output=True, text=True, check=False, timeout=50,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr.strip()) == (130, "spatial-replay: error: interrupted")
