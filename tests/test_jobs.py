@@ -111,7 +111,7 @@ def test_a_loop_stops_its_robot_at_the_first_violation_and_its_log_says_why(
     names: dict[str, object] = {}
     follow("your-own-loop.md", names, capsys)
     because = names["robot"].stopped_because  # type: ignore[attr-defined]
-    assert because.startswith("robot is 0.00269151 too close to vase: ")
+    assert because.startswith("robot is 0.002692 too close to vase: ")
     explained = names["replayed"].explain()  # type: ignore[attr-defined]
     assert explained.index("robot dist vase >= 0.05") < explained.index("robot enclosedin goal")
     assert Path("run.html").stat().st_size > 10_000

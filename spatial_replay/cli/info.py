@@ -263,7 +263,7 @@ def _document(
         "end_ns": overview.end_ns,
         "damaged": bool(faults),
         "faults": faults,
-        "axes": {"y": "up", "source": asdict(overview.axes)},
+        "axes": {"y": "up", "source": _declared(asdict(overview.axes))},
         "objects": [asdict(each) for each in overview.objects],
         "signals": overview.signals,
     }
@@ -300,6 +300,11 @@ def _document(
         document["metadata"] = [{"name": name, "data": dict(data)} for name, data in container.metadata]
         document["attachments"] = [asdict(each) for each in container.attachments]
     return document
+
+
+def _declared(axes: dict[str, object]) -> dict[str, object]:
+    """Return axes as JSON, without a unit where none is declared."""
+    return {name: value for name, value in axes.items() if name != "unit" or value}
 
 
 def _topics(container: LogSummary) -> Mapping[tuple[str, str, str], Sequence[int]]:

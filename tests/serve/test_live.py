@@ -333,7 +333,7 @@ def test_a_specification_without_constants_has_parameters_too() -> None:
     with open_server(loaded.evaluate(), port=0) as server:
 
         async def looking(own: Viewer) -> None:
-            names = ["playback.time", "playback.play", "playback.speed", "playback.loop"]
+            names = ["playback.time", "playback.play", "playback.speed", "playback.loop", "scene.arrow"]
             assert sorted(await own.parameters()) == sorted(names)
 
         watch(server, looking)
