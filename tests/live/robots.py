@@ -25,7 +25,7 @@ from spatial_replay.bags import open_messages
 from spatial_replay.bags.decoders import channel_of
 from spatial_replay.logs.topics import EVENTS
 
-PATIENCE_S = 90
+PATIENCE_S = 300.0
 PLAYER = Path(__file__).with_name("player.py")
 MS = 10**6
 
