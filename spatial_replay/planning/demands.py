@@ -1,4 +1,4 @@
-"""Demands: what has to hold in one sample, by how much, and the samples that planners foresee."""
+"""Demands: what has to hold in one sample, and by how much; samples with objects elsewhere."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import Final, NamedTuple, TypeAlias
 from spatial_replay.geometry.footprint import TrackedObject
 from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene
-from spatial_replay.planning.decisions import Target
 from spatial_replay.planning.maps import Cube, moved_object
 from spatial_replay.spec.formula import Boolean, Formula, Outline, Truth, expand
 from spatial_replay.trace.sample import Sample
@@ -96,20 +95,3 @@ def with_moved(sample: Sample, poses: Mapping[str, Pose]) -> Sample:
         if isinstance(tracked, TrackedObject):
             objects[name] = moved_object(tracked, x, y, turn)
     return Sample(sample.time_ns, objects, sample.signals, sample.unknown)
-
-
-class Foreseen(NamedTuple):
-    """A sample that is expected after motions.
-
-    Attributes:
-        moved: the poses of the objects moved, by name and in order.
-    """
-
-    sample: Sample
-    moved: tuple[tuple[str, Pose], ...] = ()
-
-    def after(self, target: Target) -> Foreseen:
-        """Return the scene after a motion."""
-        pose = target.x, target.y, target.turn
-        moved = {**dict(self.moved), target.name: pose}
-        return Foreseen(with_moved(self.sample, {target.name: pose}), tuple(sorted(moved.items())))

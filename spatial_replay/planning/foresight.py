@@ -15,18 +15,15 @@ from typing import Final
 
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.guards import Transition
-from spatial_replay.geometry.footprint import TrackedObject
 from spatial_replay.planning.arrangements import Arranger, Cell
-from spatial_replay.planning.candidates import AVOIDED_CELLS, Movables, by_cost, target_in
+from spatial_replay.planning.candidates import AVOIDED_CELLS, Movables, by_cost
 from spatial_replay.planning.decisions import Candidate, Consideration, Edge, Reason, Target
 from spatial_replay.planning.demands import (
     Budget,
     Demand,
-    Foreseen,
     Pose,
     alternatives,
     demands_of,
-    values_in,
     with_moved,
 )
 from spatial_replay.planning.edges import (
@@ -36,9 +33,11 @@ from spatial_replay.planning.edges import (
     equivalent_edges,
     idle_transitions,
 )
-from spatial_replay.planning.maps import Cubes, centre_of, concerns, gradient_map, proposition_maps
+from spatial_replay.planning.expectations import Expectations, Foreseen
+from spatial_replay.planning.maps import concerns, gradient_map, proposition_maps
+from spatial_replay.planning.ordering import MotionOrder
 from spatial_replay.planning.settings import Settings
-from spatial_replay.spec.formula import Atom, Formula, Outline, SignedDistance, TrackedName
+from spatial_replay.spec.formula import Formula, Outline
 from spatial_replay.trace.sample import Sample
 
 MOST_MAPS: Final = 150
@@ -67,15 +66,13 @@ class Foresight:
         Args:
             failed: gives the places where an object could not be brought.
         """
+        self._expected = Expectations(automaton, formulas, regions, settings, failed, Budget(MOST_MAPS))
         self._automaton, self._formulas, self._regions = automaton, formulas, regions
         self._settings, self._failed = settings, failed
         self._pruned: set[Edge] = set()
-        self._budget = Budget(MOST_MAPS)
         self._known: dict[tuple[int, tuple[tuple[str, Pose], ...]], tuple[Target, ...] | None] = {}
-        self._movables: dict[tuple[tuple[str, Pose], ...], Movables] = {}
         self._first: Foreseen | None = None
         self._why: dict[str, None] = {}
-        self._symbols: dict[tuple[tuple[str, Pose], ...], Symbol] = {}
         self._ruled_out: frozenset[Edge] = frozenset()
 
     def decide(
@@ -93,9 +90,8 @@ class Foresight:
             movables: of the newest sample.
             pruned: the edges given up so far.
         """
-        self._first = scene = Foreseen(movables.sample)
+        self._first = scene = self._expected.begin(movables)
         self._pruned = set(pruned)
-        self._movables[()] = movables
         self._why.clear()
         state = path[0].source
         second_best: Consideration | None = None
@@ -134,13 +130,13 @@ class Foresight:
         return self._known[key]
 
     def _found(self, scene: Foreseen, state: int) -> tuple[Target, ...] | None:
-        automaton, symbol = self._automaton, self._symbol(scene)
+        automaton, symbol = self._automaton, self._expected.symbol(scene)
         idle = idle_transitions(automaton, state, symbol)
         pruned = self._pruned - idle.edges
         for _ in range(_MOST_EDGES):
             pruned |= self._ruled_out
             path = next(automaton.paths(state, pruned), None)
-            if path is None or self._budget.left <= 0:
+            if path is None or self._expected.budget.left <= 0:
                 return None
             if ahead := idle.along(path):
                 return self._ahead(scene, ahead[-1])
@@ -158,17 +154,17 @@ class Foresight:
         self, scene: Foreseen, path: tuple[Transition, ...], consideration: Consideration
     ) -> Iterator[tuple[tuple[Target, ...], tuple[Foreseen, int]]]:
         """Yield motions that take the first edge of a path, and where they lead."""
-        movables = self._movables_in(scene)
+        movables = self._expected.movables(scene)
         candidates: list[Candidate] = []
         for name in movables.names_for(consideration.progress):
-            if not self._budget.spend():
+            if not self._expected.budget.spend():
                 return
             candidates.append(movables.candidate(name, consideration, self._failed(name)))
         for number in by_cost(candidates, self._settings):
             target = candidates[number].target
             if target is not None:
                 after = scene.after(target)
-                states = self._automaton.step_set({path[0].source}, self._symbol(after))
+                states = self._automaton.step_set({path[0].source}, self._expected.symbol(after))
                 if states == {path[0].target}:
                     yield (target,), (after, path[0].target)
         if not any(each.target for each in candidates):
@@ -184,7 +180,7 @@ class Foresight:
         """Return the motions that follow some others to acceptance; none if what is seen does not say."""
         for target in motions:
             scene = scene.after(target)
-        states = self._automaton.step_set({state}, self._symbol(scene))
+        states = self._automaton.step_set({state}, self._expected.symbol(scene))
         if len(states) > 1:
             return ()
         return self._ahead(scene, aim if aim in states else min(states))
@@ -204,8 +200,8 @@ class Foresight:
             if any((each.source, each.target) in self._ruled_out for each in aims):
                 continue
             for demands in self._demands_of(scene, aims):
-                about = Arranger(scene.sample, self._regions, self._settings, demands, self._budget)
-                if self._budget.left <= 0 or about.why_hopeless():
+                about = Arranger(scene.sample, self._regions, self._settings, demands, self._expected.budget)
+                if self._expected.budget.left <= 0 or about.why_hopeless():
                     continue
                 arrangements = about.arrangements(self._settings.motions)
                 for cells in islice(arrangements, _MOST_ORDERED):
@@ -213,7 +209,7 @@ class Foresight:
 
     def _demands_of(self, scene: Foreseen, aims: Sequence[Transition]) -> Iterator[tuple[Demand, ...]]:
         """Yield what has to hold for some edges to be taken, as conjunctions: all progress, no trap."""
-        never = self._traps(aims[0].source)
+        never = self._expected.traps(aims[0].source)
         kept: list[Demand] = []
         least = self._settings.constraint_margin * (1.0 + 1e-9) + _STRICTLY
         for cube in never:
@@ -229,24 +225,13 @@ class Foresight:
             for demands in demands_of(literals, self._formulas, self._settings.margin):
                 yield (*demands, *kept)
 
-    def _traps(self, state: int) -> Cubes:
-        """Return the guards of the transitions by which acceptance is lost."""
-        automaton = self._automaton
-        lost = (automaton.transition(state, each) for each in automaton.successors[state])
-        return tuple(
-            cube
-            for each in lost
-            if each is not None and each.target not in automaton.can_accept
-            for cube in each.guard
-        )
-
     def _can_be_taken_in_turns(self, scene: Foreseen, edge: Transition) -> bool:
         """Return whether moving one object after the other can take an edge, and no other one before.
 
         This looks at propositions alone: each motion may change those about one object.
         """
-        symbol = self._symbol(scene)
-        movables = self._movables_in(scene)
+        symbol = self._expected.symbol(scene)
+        movables = self._expected.movables(scene)
         for cube in edge.guard:
             false = [number for number, wanted in cube if symbol[number] is not wanted]
             wanted = {number: value for number, value in cube if number in false}
@@ -295,15 +280,10 @@ class Foresight:
         for name, (x, y, _) in poses.items():
             if any((x - u) ** 2 + (y - v) ** 2 <= near**2 for u, v in self._failed(name)):
                 return
-        robustness = self._robustness(about.sample_with(cells), aims[0].guard)
-        order = _Order(self, scene, aims, consideration, cells, poses, robustness)
-        if (found := order.motions(scene, aims[0].source, frozenset(poses))) is not None:
-            motions, after, state = found
-            yield motions, (after, state)
-
-    def _robustness(self, sample: Sample, cubes: Cubes) -> float:
-        lower, upper = values_in(sample, self._formulas, self._regions)
-        return max(min((lower[n] if w else -upper[n] for n, w in cube), default=0.0) for cube in cubes)
+        robustness = self._expected.robustness(about.sample_with(cells), aims[0].guard)
+        order = MotionOrder(self._expected, scene, aims, consideration, poses, robustness)
+        if (found := order.found()) is not None:
+            yield found.motions, (found.scene, found.state)
 
     def _begun(
         self,
@@ -338,26 +318,12 @@ class Foresight:
 
     # --------------------------------------------------------------------------------------- what is seen
 
-    def _symbol(self, scene: Foreseen) -> Symbol:
-        if scene.moved not in self._symbols:
-            bounds = zip(*values_in(scene.sample, self._formulas, self._regions), strict=True)
-            self._symbols[scene.moved] = tuple(
-                None if low < 0.0 <= high else low >= 0.0 for low, high in bounds
-            )
-        return self._symbols[scene.moved]
-
-    def _movables_in(self, scene: Foreseen) -> Movables:
-        if scene.moved not in self._movables:
-            about = self._formulas, self._regions, scene.sample, self._settings
-            self._movables[scene.moved] = Movables(*about)
-        return self._movables[scene.moved]
-
     @cached_property
     def _hopeless(self) -> frozenset[Edge]:
         """The edges that need what no arrangement of the objects can bring about."""
         if self._first is None:
             return frozenset()
-        symbol = self._symbol(self._first)
+        symbol = self._expected.symbol(self._first)
         literals = {
             literal for each in self._automaton.transitions for cube in each.guard for literal in cube
         }
@@ -386,116 +352,6 @@ class Foresight:
                     return ""
                 why = "no arrangement of objects brings it about"
         return why
-
-
-class _Order:
-    """The search for an order of motions in which each is possible."""
-
-    def __init__(
-        self,
-        foresight: Foresight,
-        scene: Foreseen,
-        aims: Sequence[Transition],
-        consideration: Consideration,
-        cells: Mapping[str, Cell],
-        poses: Mapping[str, Pose],
-        robustness: float,
-    ) -> None:
-        self._of, self._begin, self._aims = foresight, scene, aims
-        self._consideration, self._cells, self._poses = consideration, cells, poses
-        self._robustness = robustness
-        self._dead: set[frozenset[str]] = set()
-        automaton = foresight._automaton
-        symbol = foresight._symbol(scene)
-        self._idle = set(idle_transitions(automaton, aims[0].source, symbol).states)
-
-    def motions(
-        self, scene: Foreseen, state: int, left: frozenset[str]
-    ) -> tuple[tuple[Target, ...], Foreseen, int] | None:
-        """Return the motions of the objects left, and the scene and the state after them."""
-        if not left:
-            return ((), scene, state) if self._is_done(state) else None
-        if left in self._dead:
-            return None
-        is_first = len(left) == len(self._poses)
-        for name in sorted(left):
-            if (target := self._target(scene, state, name, is_first)) is None:
-                continue
-            after = scene.after(target)
-            if (reached := self._reached(after, state, is_first)) is None:
-                continue
-            if (found := self.motions(after, reached, left - {name})) is not None:
-                return (target, *found[0]), found[1], found[2]
-        self._dead.add(left)
-        return None
-
-    def _is_done(self, state: int) -> bool:
-        automaton = self._of._automaton
-        if len(self._aims) > 1:
-            return state in automaton.accepting
-        return state == self._aims[0].target or (state in automaton.can_accept and state not in self._idle)
-
-    def _reached(self, scene: Foreseen, state: int, is_first: bool) -> int | None:
-        """Return the state after a motion; None if that is not one on the way."""
-        automaton, symbol = self._of._automaton, self._of._symbol(scene)
-        allowed = self._idle | {self._aims[0].target}
-        for _ in range(len(self._aims)):
-            states = automaton.step_set({state}, symbol)
-            (after,) = states if len(states) == 1 else (-1,)
-            if after not in automaton.can_accept:
-                return None
-            if (is_first or len(self._aims) == 1) and after not in allowed:
-                return None
-            if after == state:
-                break
-            state = after
-        return state
-
-    def _target(self, scene: Foreseen, state: int, name: str, is_first: bool) -> Target | None:
-        """Return the motion of an object to its place; None if it is not possible now."""
-        of = self._of
-        settings = of._settings
-        is_strict = is_first or len(self._aims) == 1
-        constraints = self._consideration.constraints.cubes if is_strict else of._traps(state)
-        if settings.skill == "push" or is_first:
-            movables = of._movables_in(scene)
-            if not of._budget.spend():
-                return None
-            maps = movables.maps_of(name)
-            cubes = self._aims[0].guard, constraints
-            gradient = gradient_map(maps, *cubes, settings.workspace, settings.constraint_margin)
-            tracked = scene.sample.objects[name]
-            if not isinstance(tracked, TrackedObject):
-                return None
-            found = target_in(gradient, tracked, settings, self._poses[name])
-            if isinstance(found, Target):
-                found = movables.with_way(found, constraints)
-            return None if isinstance(found, str) else replace(found, robustness=self._robustness)
-        return self._placed(scene, name, constraints)
-
-    def _placed(self, scene: Foreseen, name: str, constraints: Cubes) -> Target | None:
-        """Return the motion of an object that is carried, if there is room for it at its place."""
-        of, (x, y, turn) = self._of, self._poses[name]
-        tracked = scene.sample.objects[name]
-        if not isinstance(tracked, TrackedObject):
-            return None
-        there = with_moved(scene.sample, {name: (x, y, turn)})
-        workspace = of._settings.workspace
-        others = [each for each in there.objects if each != name and each not in workspace.supports]
-        apart = [Atom("", "dist", SignedDistance(TrackedName(name), TrackedName(each))) for each in others]
-        lower, upper = values_in(there, [*of._formulas, *apart], of._regions)
-        if any(each <= workspace.clearance for each in lower[len(of._formulas) :]):
-            return None
-        for cube in constraints:
-            if (
-                min((upper[n] if w else -lower[n] for n, w in cube), default=0.0)
-                >= -of._settings.constraint_margin
-            ):
-                return None
-        yaw = None if tracked.yaw is None else tracked.yaw + turn
-        target = Target(name, x, y, turn, yaw, (centre_of(tracked.footprint), (x, y)), self._robustness)
-        found = of._movables_in(scene).with_way(target, constraints)
-        return None if isinstance(found, str) else found
 
 
 def _chosen(consideration: Consideration, number: int, motions: tuple[Target, ...]) -> Consideration:
