@@ -16,7 +16,6 @@ from spatial_replay.text import (
     counted,
     escaped,
     json_number,
-    number_text,
     requirement_text,
     time_text,
     with_unit,
@@ -62,12 +61,11 @@ def ending_lines(endings: Sequence[Ending]) -> Iterator[Line]:
 
 def _ending_numbers(ending: Ending) -> str:
     robustness, lower, upper = ending.robustness, ending.lower, ending.upper
+    low, high = with_unit(lower, ending.unit), with_unit(upper, ending.unit)
     if math.isnan(robustness):
-        return f"robustness not determined, between {number_text(lower)} and {number_text(upper)}"
-    between = (
-        "" if lower == upper == robustness else f", between {number_text(lower)} and {number_text(upper)}"
-    )
-    return f"robustness {number_text(robustness)}{between}"
+        return f"robustness not determined, between {low} and {high}"
+    between = "" if lower == upper == robustness else f", between {low} and {high}"
+    return f"robustness {with_unit(robustness, ending.unit)}{between}"
 
 
 def print_verdicts(replayed: Replayed, output: Path | None, window_ns: int | None = None) -> None:

@@ -208,6 +208,12 @@ record.add_command(video)
 @constants_option
 @profile_option
 @reading_options
+@click.option(
+    "--unit",
+    metavar="UNIT",
+    default="",
+    help="Unit of lengths, for sentences, axes and viewers: m, px.  [default: what the file declares]",
+)
 def tracks(
     file: LogFile,
     output: Path,
@@ -216,6 +222,7 @@ def tracks(
     constants: Mapping[str, float | str],
     profile: str | None,
     reading: ReadArguments,
+    unit: str,
 ) -> int:
     """Record the objects of any readable log: tracks, annotations, scenarios, bags with a mapping.
 
@@ -224,7 +231,7 @@ def tracks(
     \b
     Examples:
       spatial-replay record tracks blocks.jsonl.gz -o run.mcap
-      spatial-replay record tracks people.csv -o run.mcap --spec social.spatial
+      spatial-replay record tracks people.csv -o run.mcap --spec social.spatial --unit m
       spatial-replay record tracks annotations.txt -o run.mcap --lost keep
     """
     # imported here so that --help stays fast
@@ -235,7 +242,9 @@ def tracks(
     source = open_source(file, **reading)
     files = load_spec_options(specs, profile, constants)
     with progress("samples") as advance:
-        recorded = record_source(source, output, files, inputs=inputs, advance=advance, durability=durability)
+        recorded = record_source(
+            source, output, files, inputs=inputs, unit=unit, advance=advance, durability=durability
+        )
     warn_of_input(recorded)
     seconds = (recorded.end_ns - recorded.start_ns) / 1e9
     show(

@@ -93,7 +93,8 @@ class LiveSession:
         self._logs = [each for each in recorders if isinstance(each, Recorder)]
         self._topics = tuple(topics)
         self._max_delay_s, self._dead_man_s = max_delay_s, dead_man_s
-        self._monitors = [Monitor(file) for file in self.files]
+        units = {} if self._mapping is None else self._mapping.axes.units_with(self._mapping.signal_units)
+        self._monitors = [Monitor(file, units=units) for file in self.files]
         self._changes = VerdictChanges(self.files)
         rehearse()
         self._assembler: LiveAssembler | ObjectsAssembler | None = None

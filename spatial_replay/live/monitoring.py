@@ -67,7 +67,7 @@ def _about(mapping: LogMapping | None) -> Mapping[str, str]:
     if mapping is None:
         return {"source": "live"}
     named = {"mapping": mapping.name, "mapping_sha256": mapping.sha256}
-    return {"source": "live", **named, **mapping.axes.metadata()}
+    return {"source": "live", **named, **mapping.metadata()}
 
 
 async def monitor(

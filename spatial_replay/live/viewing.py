@@ -181,4 +181,4 @@ def layout_of_run(files: Sequence[Specification], mapping: LogMapping | None) ->
 
 
 def _axes(mapping: LogMapping | None) -> Mapping[str, str]:
-    return {} if mapping is None else mapping.axes.metadata()
+    return {} if mapping is None else mapping.metadata()

@@ -15,6 +15,7 @@ from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.messages import BLOCK_SAMPLES, Attachment, Block
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.trace.axes import OUR_AXES, Axes
+from spatial_replay.trace.declared_units import signal_units_metadata
 from spatial_replay.trace.sample import FOREVER, Sample
 from spatial_replay.trace.trace import Trace, window_of
 
@@ -66,6 +67,16 @@ class MemorySource(_Bare):
     trace: Trace
     name: str = "memory"
     kind: str = "memory"
+
+    @property
+    def axes(self) -> Axes:
+        """Ours, with the unit that the trace declares."""
+        return Axes(unit=self.trace.units.get("", ""))
+
+    @property
+    def signal_units(self) -> Mapping[str, str]:
+        """The units that the trace declares, by signal."""
+        return {name: unit for name, unit in self.trace.units.items() if name}
 
     @classmethod
     def from_samples(cls, samples: Iterable[Sample], name: str = "memory") -> MemorySource:
@@ -180,8 +191,12 @@ def axes_of(source: Source) -> Axes:
 
 def units_of(source: Source) -> Mapping[str, str]:
     """Return the units that a source declares: for its signals by their names, for lengths by ""."""
-    unit = axes_of(source).unit
-    return {**getattr(source, "signal_units", {}), **({"": unit} if unit else {})}
+    return axes_of(source).units_with(getattr(source, "signal_units", {}))
+
+
+def units_metadata(source: Source) -> dict[str, str]:
+    """Return the entries for the metadata of a log with the axes and units of its source."""
+    return axes_of(source).metadata() | signal_units_metadata(units_of(source))
 
 
 def reading_options(source: Source) -> dict[str, object]:

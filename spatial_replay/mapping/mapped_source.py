@@ -69,8 +69,7 @@ class MappedSource:
     @property
     def signal_units(self) -> Mapping[str, str]:
         """The units that the mapping declares, by signal."""
-        signals = [signal for topic in self.mapping.topics for signal in topic.signals]
-        return {signal.name: signal.unit for signal in signals if signal.unit}
+        return self.mapping.signal_units
 
     @property
     def options(self) -> Mapping[str, object]:

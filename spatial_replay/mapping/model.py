@@ -13,6 +13,7 @@ from typing import Literal, TypeAlias
 
 from spatial_replay.errors import UsageError
 from spatial_replay.trace.axes import OUR_AXES, Axes
+from spatial_replay.trace.declared_units import signal_units_metadata
 
 Clock: TypeAlias = Literal["log", "publish", "header"]
 """Which time of a message counts: when it was recorded, when it was sent, or the stamp inside it."""
@@ -161,6 +162,16 @@ class LogMapping:
     max_age_ns: int | None = None
     axes: Axes = OUR_AXES
     origin: tuple[float, float] | None = None
+
+    @property
+    def signal_units(self) -> Table[str, str]:
+        """The units that are declared, by signal."""
+        signals = [signal for topic in self.topics for signal in topic.signals]
+        return {signal.name: signal.unit for signal in signals if signal.unit}
+
+    def metadata(self) -> dict[str, str]:
+        """Return the entries for the metadata of a log of these messages: axes and units."""
+        return self.axes.metadata() | signal_units_metadata(self.signal_units)
 
 
 UNITS_NS = {"ns": 1, "us": 10**3, "ms": 10**6, "s": 10**9}

@@ -198,7 +198,9 @@ def evaluate(
         semantics,
     )
     results = tuple(
-        SpecResult.from_stream(own, Evidence(own.instance, specification.regions, lambda: [trace]), block)
+        SpecResult.from_stream(
+            own, Evidence(own.instance, specification.regions, lambda: [trace], trace.units), block
+        )
         for own, block in zip(stream.streams, stream.extend(trace), strict=True)
     )
     return Evaluation(

@@ -19,7 +19,9 @@ from spatial_replay.monitor.verdict import Verdict, final_verdict, online_verdic
 from spatial_replay.monitor.violation import Settled, Violation, ViolationLog, rehearse
 from spatial_replay.spec.formula import NamedSpec, Specification, iter_nodes
 from spatial_replay.spec.load import require_specification
+from spatial_replay.spec.units import declared_unit
 from spatial_replay.text import times_apart
+from spatial_replay.trace.declared_units import checked_units
 from spatial_replay.trace.sample import Sample, require_time
 
 
@@ -46,11 +48,13 @@ class SpecUpdate:
     Attributes:
         numbers: (N, 4): value, now, lower and upper of each node; None before the monitor's start.
         names: the name of each node, or None.
+        unit: the declared one of its robustness, or "".
     """
 
     spec: NamedSpec
     numbers: Floats | None
     names: tuple[str | None, ...] = field(repr=False)
+    unit: str = ""
 
     @cached_property
     def nodes(self) -> tuple[NodeUpdate, ...]:
@@ -124,6 +128,7 @@ class Ending(NamedTuple):
     Attributes:
         robustness: the value of the root on the samples so far; NaN if it is not determined.
         lower, upper: the ends of the value's interval over the finished log.
+        unit: the declared one of these, or "".
     """
 
     spec: NamedSpec
@@ -131,6 +136,7 @@ class Ending(NamedTuple):
     robustness: float
     lower: float
     upper: float
+    unit: str = ""
 
 
 class Monitor:
@@ -142,27 +148,35 @@ class Monitor:
     """
 
     def __init__(
-        self, specification: Specification, *, semantics: str = "ltlf", start_ns: int | None = None
+        self,
+        specification: Specification,
+        *,
+        semantics: str = "ltlf",
+        start_ns: int | None = None,
+        units: Mapping[str, str] | None = None,
     ) -> None:
         """Start before the first sample, with everything compiled: the first time on a machine, that takes
         many seconds.
 
         Args:
             start_ns: samples before this time are only there to be looked back at (`a[-3]`).
+            units: for sentences: of signals by their names, of lengths by "".
 
         Raises:
-            UsageError: something else than a specification, unknown semantics, a start that is no time, or a
-                template: it stands for objects that are not known yet.
+            UsageError: something else than a specification, unknown semantics, a start that is no time, units
+                that are not texts, or a template: it stands for objects that are not known yet.
         """
         require_specification(specification)
         checked = checked_semantics(semantics, [specification])
         require_time(start_ns, "start_ns")
+        known = checked_units(units)
         templates = [spec for spec in specification.results if spec.parameter is not None]
         if templates:
             names = ", ".join(f"{spec.name}({spec.parameter})" for spec in templates)
             raise UsageError(f"{names} is a template; name its object, or evaluate it over a log")
         self._specs = specification.results
         self._names = tuple(tuple(node.name for _, _, node in iter_nodes(s.formula)) for s in self._specs)
+        self._units = tuple(declared_unit(spec.formula, known) for spec in self._specs)
         self._places = _places_of_names(self._names)
         compile_ahead()
         # a trial run loads every kernel now, so that no sample has to wait for one
@@ -174,18 +188,14 @@ class Monitor:
         if checked == "ltlf":
             rehearse(specification)
         self._live = LiveStream(specification, checked, start_ns or 0)
-        self._violations = ViolationLog(specification, start_ns or 0) if checked == "ltlf" else None
+        self._violations = ViolationLog(specification, start_ns or 0, known) if checked == "ltlf" else None
         self._last_ns = -1
         self._numbers: list[Floats | None] = [None] * len(self._specs)
 
     def endings(self) -> tuple[Ending, ...]:
         """Return the result of each spec if the run ends here; unknown before the first sample."""
-        return tuple(
-            Ending(spec, Verdict.UNKNOWN, _robustness(last), float("-inf"), float("inf"))
-            if final is None
-            else Ending(spec, final_verdict(*final[0].tolist()), _robustness(last), *final[0].tolist())
-            for spec, final, last in zip(self._specs, self._live.finals, self._numbers, strict=True)
-        )
+        known = zip(self._specs, self._live.finals, self._numbers, self._units, strict=True)
+        return tuple(_ending(spec, final, last, unit) for spec, final, last, unit in known)
 
     def update(self, sample: Sample) -> Update:
         """Add the next sample and return its numbers and verdicts.
@@ -205,10 +215,10 @@ class Monitor:
         self._last_ns = time_ns
         self._numbers = numbers = self._live.extend(sample)
         specs = []
-        for spec, each, names in zip(self._specs, numbers, self._names, strict=True):
+        for spec, each, names, unit in zip(self._specs, numbers, self._names, self._units, strict=True):
             # bypasses the constructors of frozen values, which would take as long as the kernel
             of_spec = object.__new__(SpecUpdate)
-            of_spec.__dict__.update(spec=spec, numbers=each, names=names)
+            of_spec.__dict__.update(spec=spec, numbers=each, names=names, unit=unit)
             specs.append(of_spec)
         settled: tuple[Settled, ...] = ()
         satisfied: tuple[Settled, ...] = ()
@@ -230,6 +240,14 @@ def _places_of_names(names: tuple[tuple[str | None, ...], ...]) -> Mapping[str, 
             if name is not None:
                 places.setdefault(name, (index, identifier))
     return MappingProxyType(places)
+
+
+def _ending(spec: NamedSpec, final: Floats | None, last: Floats | None, unit: str) -> Ending:
+    """Return a result from the interval (N, 2) of each node at the end and the numbers after a sample."""
+    if final is None:
+        return Ending(spec, Verdict.UNKNOWN, _robustness(last), float("-inf"), float("inf"), unit)
+    lower, upper = final[0].tolist()
+    return Ending(spec, final_verdict(lower, upper), _robustness(last), lower, upper, unit)
 
 
 def _robustness(numbers: Floats | None) -> float:

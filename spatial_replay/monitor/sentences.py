@@ -133,9 +133,9 @@ def verdict_sentence(
     return Sentence(f"{title} is {how}: {_robustness(*ends, unit)}", *since, *at, f"{of}.")
 
 
-def verdict_text(verdict: Verdict, robustness: float) -> str:
-    """Return a verdict with its number, as metadata of a log has it: "violated, robustness -0.03"."""
-    number = "not determined" if math.isnan(robustness) else number_text(robustness)
+def verdict_text(verdict: Verdict, robustness: float, unit: str) -> str:
+    """Return a verdict with its number, as metadata of a log has it: "violated, robustness -0.03 m"."""
+    number = "not determined" if math.isnan(robustness) else with_unit(robustness, unit)
     return f"{verdict}, robustness {number}"
 
 

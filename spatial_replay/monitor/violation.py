@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -29,7 +29,8 @@ from spatial_replay.monitor.witness.witness import Witness, find_witness
 from spatial_replay.spec.checks import object_names, signal_names
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import NamedSpec, Number, Specification
-from spatial_replay.text import Instant, Sentence, number_text
+from spatial_replay.spec.units import declared_unit
+from spatial_replay.text import Instant, Sentence, with_unit
 from spatial_replay.trace.sample import FOREVER, Sample
 from spatial_replay.trace.trace import Trace
 
@@ -52,6 +53,7 @@ class Violation:
         witness: the atom that settled it, and what would flip it; None if that lies further back than the
             samples that the monitor keeps.
         first_ns: the time that the sentences count from: that of the monitor's first sample.
+        unit: the declared one of `robustness`, or "".
     """
 
     spec: str
@@ -61,6 +63,7 @@ class Violation:
     robustness: float
     witness: Witness | None
     first_ns: int
+    unit: str = ""
 
     @property
     def atom(self) -> DecidingAtom | None:
@@ -90,14 +93,14 @@ class Violation:
     def __str__(self) -> str:
         if self.atom is None or self.witness is None:
             since = Instant(self.time_ns, self.first_ns)
-            return f"`{self.spec}` is violated since {since}, by {number_text(-self.robustness)}"
+            return f"`{self.spec}` is violated since {since}, by {with_unit(-self.robustness, self.unit)}"
         missed = self.witness.missed
         if missed is not None and missed.is_condition:
             return missed_text(missed, self.first_ns)
         number = _settling(self.atom)
-        short = _short(
-            self.atom, self.spec, abs(without_residue(number, self.atom.atom)) * divisor_of(self.atom.atom)
-        )
+        amount = abs(without_residue(number, self.atom.atom)) * divisor_of(self.atom.atom)
+        unit = declared_unit(self.atom.atom, self.witness.units, is_scaled=False)
+        short = _short(self.atom, self.spec, with_unit(amount, unit))
         return f"{short}: {_deciding_words(self.atom, self.witness, self.first_ns)}"
 
 
@@ -108,11 +111,11 @@ def _settling(atom: DecidingAtom) -> float:
 def _deciding_words(atom: DecidingAtom, witness: Witness, first_ns: int) -> str:
     """Return an atom, its number, and when it decided."""
     number = _settling(atom)
-    how = f"{'holds' if number >= 0.0 else 'fails'} by {amount_text(abs(number), atom.atom)}"
+    how = f"{'holds' if number >= 0.0 else 'fails'} by {amount_text(abs(number), atom.atom, witness.units)}"
     return f"`{atom.text}` {how} at {Instant(witness.time_ns, first_ns)}"
 
 
-def _short(atom: DecidingAtom, spec: str, amount: float) -> str:
+def _short(atom: DecidingAtom, spec: str, amount: str) -> str:
     """Return what is wrong in a few words: in which direction a distance or a signal is off."""
     signed = [(sign, part) for sign, part in atom.branch if not isinstance(part, Number)]
     if len(signed) == 1 and len(atom.measured) == 1:
@@ -122,9 +125,9 @@ def _short(atom: DecidingAtom, spec: str, amount: float) -> str:
         if measured.quantity == "signed_distance":
             first, second = measured.names
             where = f"too close to {second}" if needs_more else f"too far from {second}"
-            return f"{first} is {number_text(amount)} {where}"
+            return f"{first} is {amount} {where}"
         if measured.quantity == "signal":
-            return f"{measured.names[0]} is {number_text(amount)} too {'low' if needs_more else 'high'}"
+            return f"{measured.names[0]} is {amount} too {'low' if needs_more else 'high'}"
     return f"`{spec}` is violated"
 
 
@@ -148,6 +151,7 @@ class Settled:
     start: int
     is_whole: bool
     first_ns: int
+    units: Mapping[str, str]
 
     @cached_property
     def violation(self) -> Violation:
@@ -159,6 +163,7 @@ class Settled:
             self.number,
             self.witness,
             self.first_ns,
+            declared_unit(self.conjunct.formula, self.units),
         )
 
     @property
@@ -199,7 +204,7 @@ class Settled:
             first -= 1
         trace = Trace.from_samples(self.samples[first:])
         instance = Instance(self.spec, None, self.program, {}, start_ns, FOREVER)
-        evidence = Evidence(instance, self.specification.regions, lambda: [trace])
+        evidence = Evidence(instance, self.specification.regions, lambda: [trace], self.units)
         leaves = evidence.columns(self.program.leaves)
         return find_witness(evidence, leaves, evidence.times_ns(), self.conjunct.node, goes_on=True)
 
@@ -213,7 +218,7 @@ def rehearse(specification: Specification) -> None:
         program = compile_formula(spec.formula)
         for conjunct in conjuncts_of(spec.formula, spec.name):
             trial = Settled(
-                spec, program, specification, conjunct, Verdict.VIOLATED, 0.0, (sample,), 0, True, 0
+                spec, program, specification, conjunct, Verdict.VIOLATED, 0.0, (sample,), 0, True, 0, {}
             )
             _ = trial.violation.sentences, trial.reason
 
@@ -226,8 +231,9 @@ class ViolationLog:
         satisfied: the results that are satisfied.
     """
 
-    def __init__(self, specification: Specification, start_ns: int) -> None:
-        """Start before the first sample."""
+    def __init__(self, specification: Specification, start_ns: int, units: Mapping[str, str]) -> None:
+        """Start before the first sample; `units` are those that are declared."""
+        self._units = units
         self._specification = specification
         self._start_ns = start_ns
         self._samples: deque[Sample] = deque(maxlen=REMEMBERED)
@@ -282,4 +288,5 @@ class ViolationLog:
             next(k for k, each in enumerate(samples) if each.time_ns >= self._start_ns),
             not self._dropped,
             self._first_ns,
+            self._units,
         )

@@ -191,7 +191,7 @@ def draw_result(result: SpecResult, ax: Axes | None = None) -> Axes:
     _name_curves(ax, curves, has_band)
     ax.set_title(_title(result), loc="left", fontsize=10)
     ax.set_xlabel("time from the first sample in s")
-    ax.set_ylabel(plain(f"robustness [{unit_words(unit_of(result.formula, {}))}]"))
+    ax.set_ylabel(plain(f"robustness [{unit_words(unit_of(result.formula, result.evidence.units))}]"))
     ax.spines[["top", "right"]].set_visible(False)
     return ax
 

@@ -67,8 +67,9 @@ def draw_trace(trace: Trace, ax: Axes | None = None, specification: Specificatio
         if len(shown) <= _MOST_LABELS:
             [(x, y)] = _centres(trace, rows[-1:]).tolist()
             ax.text(x, y, plain(trace.names[column]), fontsize=8, ha="center", va="center")
-    ax.set_xlabel("x [footprint units]")
-    ax.set_ylabel("y [footprint units]")
+    unit = plain(trace.units.get("", "footprint units"))
+    ax.set_xlabel(f"x [{unit}]")
+    ax.set_ylabel(f"y [{unit}]")
     ax.set_title(plain(_title(trace)), loc="left", fontsize=10)
     return ax
 

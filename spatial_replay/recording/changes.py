@@ -66,7 +66,9 @@ class VerdictChanges:
         about = requirement_text(spec.spec.id, spec.spec.title)
         title = f"`{name}` ({about})" if about else f"`{name}`"
         reasons = [each.reason for each in update.satisfied if each.spec is spec.spec]
-        sentence = change_sentence(title, period, reasons[0] if period.code == SATISFIED and reasons else "")
+        sentence = change_sentence(
+            title, period, reasons[0] if period.code == SATISFIED and reasons else "", spec.unit
+        )
         if period.code == VIOLATED:
             own = {node for node in spec.names if node is not None} | {name}
             reasons = [str(each) for each in update.violations if each.spec in own]

@@ -29,6 +29,7 @@ from spatial_replay.recording.recording import Recording, RunEvent
 from spatial_replay.recording.trigger import EVENT, Trigger, condition_of
 from spatial_replay.spec.formula import Specification
 from spatial_replay.text import counted
+from spatial_replay.trace.axes import units_from_metadata
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
 
@@ -209,7 +210,8 @@ class ClipLog:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise OutputError(f"{folder}: {system_reason(error)}") from None
-        self._monitors = [Monitor(file) for file in files]
+        units = units_from_metadata(self._about)
+        self._monitors = [Monitor(file, units=units) for file in files]
         self._changes = VerdictChanges(files)
         warm_up(files, ())
         self._samples: deque[_HeldSample] = deque()

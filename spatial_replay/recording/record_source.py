@@ -5,20 +5,21 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 
-from spatial_replay.errors import LogError, OutputError
+from spatial_replay.errors import LogError, OutputError, UsageError
 from spatial_replay.logs.mcap.writer import LogWriter
 from spatial_replay.logs.output_file import Durability, open_output, refuse_inputs
-from spatial_replay.logs.source import Source, axes_of, read_blocks, reading_options
+from spatial_replay.logs.source import Source, axes_of, read_blocks, reading_options, units_of
 from spatial_replay.recording.interruption import leaving, uninterrupted
 from spatial_replay.recording.recording import Recording, refuse_templates
 from spatial_replay.spec import check_names
 from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.formula import Specification
 from spatial_replay.text import counted_from
+from spatial_replay.trace.declared_units import checked_units, signal_units_metadata
 from spatial_replay.trace.trace import Trace
 
 
@@ -52,6 +53,7 @@ def record_source(
     files: Sequence[Specification] = (),
     *,
     inputs: Sequence[Path] = (),
+    unit: str = "",
     advance: Callable[[int], None] = lambda samples: None,
     durability: Durability = "process",
 ) -> Recorded:
@@ -62,11 +64,13 @@ def record_source(
 
     Args:
         inputs: files that the output must not be.
+        unit: that of lengths, for readers, where the source declares none.
         advance: called with the number of samples of each block that is done.
         durability: "disk" for a log of which the disk has each chunk as soon as it is written.
 
     Raises:
-        UsageError: the output is an input, or a specification cannot be recorded.
+        UsageError: the output is an input, a specification cannot be recorded, or the source declares another
+            unit.
         LogError: the source has no sample, or it cannot be read to its end.
         OutputError: the output cannot be written.
     """
@@ -77,7 +81,7 @@ def record_source(
     # a source without samples raises here, before the output is touched
     first = next(traces)
     about = {"source": source.name, "options": json.dumps(reading_options(source))}
-    about |= axes_of(source).metadata()
+    about |= _units_metadata(source, unit)
     stream = open_output(output, durability)
     try:
         with leaving(output), stream:
@@ -88,6 +92,15 @@ def record_source(
             output.unlink(missing_ok=True)
         raise
     return tally.recorded(files)
+
+
+def _units_metadata(source: Source, unit: str) -> dict[str, str]:
+    """Return the entries for the log's metadata with axes and units; `unit` is that of lengths, if given."""
+    axes = axes_of(source)
+    if unit and axes.unit not in ("", unit):
+        raise UsageError(f"{source.name} declares lengths in {axes.unit}, and not in {unit}; leave that out")
+    unit = checked_units({"": unit})[""] if unit else axes.unit
+    return replace(axes, unit=unit).metadata() | signal_units_metadata(units_of(source))
 
 
 def _traces(source: Source, tally: _Tally) -> Iterator[Trace]:

@@ -26,6 +26,8 @@ from spatial_replay.recording.recording import RunEvent, refuse_templates
 from spatial_replay.recording.trigger import Trigger
 from spatial_replay.spec.formula import Specification
 from spatial_replay.text import times_apart
+from spatial_replay.trace.axes import units_metadata
+from spatial_replay.trace.declared_units import checked_units
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
 
@@ -309,6 +311,7 @@ class Recorder(SampleWriter):
         *,
         specifications: Specification | Sequence[Specification] = (),
         about: Mapping[str, str] | None = None,
+        units: Mapping[str, str] | None = None,
         waiting: int = 4096,
         block: bool = True,
         trigger: Trigger | None = None,
@@ -324,6 +327,7 @@ class Recorder(SampleWriter):
             path: replaced if it exists; with a trigger, the folder that its logs are written to.
             specifications: evaluated as the samples arrive, without templates; one or several.
             about: further metadata of the log: a seed, where the samples come from.
+            units: for sentences, axes and viewers: of signals by their names, of lengths by "".
             waiting: how many samples, and how many messages of channels, may wait for the writing thread.
             block: when that many wait, or without a trigger more than 0.8 s of them have not reached the
                 operating system, let `write` wait, too; otherwise drop what comes, and count it in the log.
@@ -333,8 +337,8 @@ class Recorder(SampleWriter):
             planner: observes the samples that are written; its decisions are recorded, see `next_step`.
 
         Raises:
-            UsageError: a specification that cannot be recorded, a limit below 1, a trigger that names none of
-                the specs, a planner together with a trigger or without `block`.
+            UsageError: a specification that cannot be recorded, units that are not texts, a limit below 1, a
+                trigger that names none of the specs, a planner together with a trigger or without `block`.
             OutputError: the file cannot be written.
         """
         if waiting < 1:
@@ -343,6 +347,7 @@ class Recorder(SampleWriter):
         if planner is not None and planner.specification not in files:
             files.insert(0, planner.specification)
         refuse_templates(files)
+        about = {**(about or {}), **units_metadata(checked_units(units))}
         self._path = Path(path)
         self._clips: ClipLog | None = None
         if trigger is None:

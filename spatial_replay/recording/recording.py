@@ -30,7 +30,8 @@ from spatial_replay.monitor.instances import find_instances
 from spatial_replay.monitor.sentences import verdict_text
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.spec.formula import Specification
-from spatial_replay.trace.axes import Axes
+from spatial_replay.spec.units import declared_unit
+from spatial_replay.trace.axes import Axes, units_from_metadata
 from spatial_replay.trace.sample import FOREVER
 from spatial_replay.trace.trace import Trace
 
@@ -77,7 +78,7 @@ class Recording:
             files,
             [find_instances(file, {}, (), 0, FOREVER) for file in files],
             known=known,
-            units={"": self._axes.unit} if self._axes.unit else {},
+            units=units_from_metadata(about or {}),
         )
         self._samples = self._messages = self._end_ns = 0
         self._topics: set[str] = set()
@@ -186,9 +187,15 @@ class Recording:
         self._sink.add_attachment(layout.name, layout.media_type, layout.data)
         streams = self._evaluation.streams
         if self._samples and streams:
-            texts = [verdict_text(each.verdict, float(each.robustness[0])) for each in streams]
-            names = [tree.title for tree in self._evaluation.trees]
-            self._sink.add_metadata(VERDICTS, dict(zip(names, texts, strict=True)))
+            texts = {
+                tree.title: verdict_text(
+                    each.verdict,
+                    float(each.robustness[0]),
+                    declared_unit(tree.formula, self._evaluation.units),
+                )
+                for tree, each in zip(self._evaluation.trees, streams, strict=True)
+            }
+            self._sink.add_metadata(VERDICTS, texts)
         self._sink.add_metadata(ENDING, ending)
         self._sink.add_metadata(CERTIFICATE, self._hashes.certificate(self._files))
 

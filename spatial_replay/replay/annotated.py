@@ -12,7 +12,7 @@ from spatial_replay import __version__
 from spatial_replay.annotate.certificate import specifications_json
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.messages import Sink
-from spatial_replay.logs.source import Source, axes_of, reading_options
+from spatial_replay.logs.source import Source, reading_options, units_metadata
 from spatial_replay.logs.topics import (
     AUTOMATA,
     AUTOMATA_PREFIX,
@@ -80,9 +80,10 @@ def run_replay(
         replayed = replay.run(sink.write_messages, layer=layer, advance=advance)
         layout = replay.layout()
         sink.add_attachment(layout.name, layout.media_type, layout.data)
-        sink.add_metadata(
-            VERDICTS, {each.title: verdict_text(each.verdict, each.robustness) for each in replayed.results}
-        )
+        texts = {
+            each.title: verdict_text(each.verdict, each.robustness, each.unit) for each in replayed.results
+        }
+        sink.add_metadata(VERDICTS, texts)
         sink.add_metadata(CERTIFICATE, replayed.certificate)
     return replayed
 
@@ -141,7 +142,7 @@ def _begin(sink: Sink, source: Source, replay: Replay, options: ReplayOptions, *
         "specifications": specifications_json(replay.files),
         "options": json.dumps(_recorded_options(source, options, layer=layer)),
     }
-    about |= axes_of(source).metadata()
+    about |= units_metadata(source)
     recorded = {key: value for key, value in before.items() if key not in about and key != "source"}
     if not is_replayed and "options" in before:
         recorded["recorded_options"] = before["options"]

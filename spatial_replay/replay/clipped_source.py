@@ -16,7 +16,7 @@ from spatial_replay.bags.topic import Topic
 from spatial_replay.errors import LogError
 from spatial_replay.logs.mcap.reader import McapSource
 from spatial_replay.logs.messages import Attachment, Block, Channel, Messages, merge, select
-from spatial_replay.logs.source import Source, axes_of, read_blocks
+from spatial_replay.logs.source import Source, axes_of, read_blocks, units_of
 from spatial_replay.logs.topics import OBJECTS
 from spatial_replay.mapping.field_paths import get_field
 from spatial_replay.mapping.message_types import TRANSFORM_TYPES, short_type
@@ -50,6 +50,10 @@ class _ClippedSource:
     @property
     def axes(self) -> Axes:
         return axes_of(self.source)
+
+    @property
+    def signal_units(self) -> Mapping[str, str]:
+        return {name: unit for name, unit in units_of(self.source).items() if name}
 
     def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
         """See `Source.iter_blocks`."""

@@ -131,7 +131,7 @@ def record_seen(
         raise LogError("; ".join([f"{frames.name} has no frame that can be read", *frames.faults[:1]]))
     # reference tags that do not fit raise here, before the output is touched
     begun = observer.observe(first)
-    monitors = [Monitor(file) for file in files]
+    monitors = [Monitor(file, units={"": tags.unit}) for file in files]
     changes, colours = VerdictChanges(files), AskedColours(files)
     options = {"tags": tags.name, "hold_ns": hold_ns, "keep_video": kept}
     about = {"source": frames.name, "options": json.dumps(options)}

@@ -28,7 +28,7 @@ from spatial_replay.logs.formats.drone import FRAMES_A_SECOND, is_annotations, i
 from spatial_replay.logs.formats.tracks import iter_jsonl, open_text
 from spatial_replay.logs.read_options import Lost, OnTimeJump, ReadOptions, count_of
 from spatial_replay.logs.remote import BAG_METADATA, LogFile, RemoteFile, is_web, log_file
-from spatial_replay.logs.source import IterTraces, Source, TrackSource, reading_only
+from spatial_replay.logs.source import IterTraces, Source, TrackSource, reading_only, units_of
 from spatial_replay.logs.topics import MAGIC
 from spatial_replay.text import counted_from
 from spatial_replay.trace.axes import Axes
@@ -131,7 +131,7 @@ def read_trace(
         others = count_of(trace.faults) - 1
         more = f"\n… and {others} more" if others else ""
         raise LogError(f"{faults[0]}{more}; allow_damage=True reads the rest")
-    return replace(trace, remarks=remarks, faults=faults)
+    return replace(trace, remarks=remarks, faults=faults, units=units_of(source))
 
 
 def _require_path(value: object) -> None:
@@ -284,10 +284,10 @@ def _tracks(iter_traces: IterTraces) -> Callable[[LogFile, str, ReadOptions], So
 
 
 def _track_source(
-    path: LogFile, kind: str, options: ReadOptions, iter_traces: IterTraces, *, y_down: bool
+    path: LogFile, kind: str, options: ReadOptions, iter_traces: IterTraces, *, y_down: bool, unit: str = ""
 ) -> Source:
-    """Return the source of a file; `y_down` says what is usual in its format."""
-    axes = Axes("down" if (y_down if options.y_down is None else options.y_down) else "up")
+    """Return the source of a file; `y_down` and `unit` say what is usual in its format."""
+    axes = Axes("down" if (y_down if options.y_down is None else options.y_down) else "up", unit=unit)
     return TrackSource(
         Path(path), kind, options.concave, iter_traces, MappingProxyType(options.given()), axes
     )
@@ -302,7 +302,7 @@ def _open_annotations(path: LogFile, kind: str, options: ReadOptions) -> Source:
 def _open_scenario(path: LogFile, kind: str, options: ReadOptions) -> Source:
     from spatial_replay.logs.formats.commonroad import iter_scenario
 
-    return _track_source(path, kind, options, iter_scenario, y_down=False)
+    return _track_source(path, kind, options, iter_scenario, y_down=False, unit="m")
 
 
 def _open_messages(path: LogFile, kind: str, options: ReadOptions) -> Source:

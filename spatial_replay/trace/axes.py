@@ -15,6 +15,7 @@ import numpy as np
 
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.geometry.batch import FootprintBatch
+from spatial_replay.trace.declared_units import signal_units_from_metadata, signal_units_metadata
 from spatial_replay.trace.trace import Trace
 
 AXES_KEY = "source_axes"
@@ -51,6 +52,10 @@ class Axes:
             return {}
         unit = {"unit": self.unit} if self.unit else {}
         return {AXES_KEY: json.dumps({"scale": self.scale, **unit, "y": self.y})}
+
+    def units_with(self, of_signals: Mapping[str, str]) -> dict[str, str]:
+        """Return all that is declared: the units of signals by their names, and that of lengths by ""."""
+        return {**of_signals, **({"": self.unit} if self.unit else {})}
 
     def __str__(self) -> str:
         turned = " (down in the source)" if self.y == "down" else ""
@@ -97,3 +102,13 @@ class Axes:
 
 OUR_AXES = Axes()
 """Those of samples: y up."""
+
+
+def units_metadata(units: Mapping[str, str]) -> dict[str, str]:
+    """Return the entries for the metadata of a log whose samples have these units."""
+    return Axes(unit=units.get("", "")).metadata() | signal_units_metadata(units)
+
+
+def units_from_metadata(about: Mapping[str, str]) -> dict[str, str]:
+    """Return the units that a log's metadata declare: of signals by their names, of lengths by ""."""
+    return Axes.from_metadata(about).units_with(signal_units_from_metadata(about))

@@ -15,6 +15,7 @@ from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
 from spatial_replay.lazy import Displayed
 from spatial_replay.text import times_apart
+from spatial_replay.trace.declared_units import checked_units
 from spatial_replay.trace.measurement_cache import MeasurementCache
 from spatial_replay.trace.sample import Sample
 
@@ -31,8 +32,8 @@ class Trace(Displayed):
     that is not finite is stored too, so that nothing is lost, but under the row number -2 - row: the
     object is unknown there (unreadable).
 
-    Two traces are equal if they hold the same samples; `faults`, `remarks`, the order of observations and
-    names that no sample uses do not matter.
+    Two traces are equal if they hold the same samples; `faults`, `remarks`, `units`, the order of
+    observations and names that no sample uses do not matter.
 
     Attributes:
         times_ns: (T,) int64.
@@ -46,6 +47,7 @@ class Trace(Displayed):
         signals: numeric signals by name, each (T,) float64, NaN where unknown.
         faults: messages about samples lost or left out while reading, each with its place.
         remarks: other messages about the log, where nothing was lost.
+        units: those that are declared, of signals by their names, of lengths by "".
         cache: measurements already taken from this trace.
 
     Raises:
@@ -63,6 +65,7 @@ class Trace(Displayed):
     signals: Mapping[str, Floats] = field(default_factory=dict)
     faults: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
+    units: Mapping[str, str] = field(default_factory=dict)
     cache: MeasurementCache = field(default_factory=MeasurementCache, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -72,6 +75,7 @@ class Trace(Displayed):
             object.__setattr__(self, name, read_only_floats(getattr(self, name)))
         signals = {name: read_only_floats(self.signals[name]) for name in sorted(self.signals)}
         object.__setattr__(self, "signals", MappingProxyType(signals))
+        object.__setattr__(self, "units", MappingProxyType(dict(self.units)))
         _check_shapes(self)
         _check_times(self.times_ns)
 
@@ -114,11 +118,15 @@ class Trace(Displayed):
         return cls(none, (), none.reshape(0, 0), FootprintBatch.unknown(0), numbers, numbers, none, ())
 
     @classmethod
-    def from_samples(cls, samples: Iterable[Sample]) -> Trace:
+    def from_samples(cls, samples: Iterable[Sample], *, units: Mapping[str, str] | None = None) -> Trace:
         """Build the trace of the given samples, in their order.
+
+        Args:
+            units: for sentences and axes: of signals by their names, of lengths by "".
 
         Raises:
             TraceError: times that do not increase.
+            UsageError: units that are not texts.
         """
         listed = list(samples)
         names = tuple(sorted({name for each in listed for name in (*each.objects, *each.unknown)}))
@@ -155,6 +163,7 @@ class Trace(Displayed):
             class_code=np.array([classes.index(name) for name in named], np.int64),
             classes=classes,
             signals={name: np.array(values, np.float64) for name, values in columns.items()},
+            units=checked_units(units),
         )
 
     def samples(self) -> Iterator[Sample]:
@@ -264,6 +273,7 @@ class Trace(Displayed):
             },
             faults=tuple(fault for trace in traces for fault in trace.faults),
             remarks=tuple(remark for trace in traces for remark in trace.remarks),
+            units={name: unit for trace in traces for name, unit in trace.units.items()},
         )
 
 

@@ -72,6 +72,7 @@ def test_a_time_step_is_a_sample(write: Write) -> None:
     assert part.vertices.round(9).tolist() == [[3, 3], [3, 7], [1, 7], [1, 3]]
     assert found[2].objects["42"].yaw == pi / 2
     assert found[2].objects["42"].class_name == "car"
+    assert read_trace(write(scenario(moving, standing))).units == {"": "m"}
     assert all(sample.objects["43"].footprint == Footprint.box(7, 8, 11, 10) for sample in found)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from math import inf, nan
+from typing import Any
 
 import numpy as np
 import pytest
@@ -274,3 +275,34 @@ def test_an_argument_that_is_no_trace_is_refused(given):
     with pytest.raises(UsageError, match=r"trace is .*; give a Trace, from read_trace\(path\)") as caught:
         evaluate(parse_specification("F a ovlp b"), given)
     assert f"trace is {given!r};" in str(caught.value)
+
+
+# ------------------------------------------------------------------------------------------------------ units
+
+
+UNITS = {"": "m", "p": "V"}
+
+
+def test_sentences_and_numbers_have_the_units_that_the_samples_declare() -> None:
+    spec = parse_specification("spec near = G a dist b <= 2\nspec high = G p >= 2")
+    samples = list(points(a=[0, 0], b=[1, 5], signals={"p": [3, 1.5]}).samples())
+    declared = evaluate(spec, Trace.from_samples(samples, units=UNITS))
+    assert [each.unit for each in declared] == ["m", "V"]
+    assert "a and b are 5 m apart" in declared.explain()
+    assert "p is 1.5 V" in declared.explain()
+    monitor = Monitor(spec, units=UNITS)
+    *_, update = map(monitor.update, samples)
+    assert [str(each) for each in update.violations] == [
+        "a is 3 m too far from b: `a dist b <= 2` fails by 3 m at 1.000 s",
+        "p is 0.5 V too low: `p >= 2` fails by 0.5 V at 1.000 s",
+    ]
+    assert [each.unit for each in monitor.endings()] == ["m", "V"]
+    assert " m " not in evaluate(spec, Trace.from_samples(samples)).explain()
+
+
+@pytest.mark.parametrize("units", ["m", {"": ""}, {"p": 3}, {1: "m"}, {"": "m" * 65}])
+def test_units_that_are_no_texts_by_names_are_refused(units: Any) -> None:
+    with pytest.raises(UsageError, match="unit"):
+        Trace.from_samples([], units=units)
+    with pytest.raises(UsageError, match="unit"):
+        Monitor(parse_specification("G p >= 2"), units=units)

@@ -12,8 +12,9 @@ from pathlib import Path
 import pytest
 
 from replay.runs import SPECIFICATION, PiecewiseSource, content_of, run, write_tracks
-from spatial_replay import LogError, OutputError, Trace, UsageError, parse_specification, read_trace
+from spatial_replay import LogError, OutputError, Recorder, Trace, UsageError, parse_specification, read_trace
 from spatial_replay.logs import Block
+from spatial_replay.logs.topics import VERDICTS
 from spatial_replay.recording import ENDING, record_source
 from spatial_replay.replay import run_replay
 from spatial_replay.sources import open_source
@@ -54,6 +55,25 @@ def test_the_reading_of_polygons_is_recorded_in_the_log_and_its_copies(tmp_path:
 
 def _about(path: Path) -> dict[str, str]:
     return dict(content_of(path).metadata)["spatial_replay"]
+
+
+def test_units_stay_with_a_log_its_copies_and_its_verdicts(tmp_path: Path) -> None:
+    tracks, spec = write_tracks(run(), tmp_path / "run.jsonl"), parse_specification(SPECIFICATION)
+    record_source(open_source(tracks), tmp_path / "bare.mcap", [spec])
+    record_source(open_source(tracks), tmp_path / "run.mcap", [spec], unit="m")
+    run_replay(open_source(tmp_path / "run.mcap"), [spec], output=tmp_path / "again.mcap")
+    for log in (tmp_path / "run.mcap", tmp_path / "again.mcap"):
+        assert read_trace(log).units == {"": "m"}
+        assert read_trace(log) == read_trace(tmp_path / "bare.mcap")
+        verdicts = dict(open_source(log).metadata())[VERDICTS]
+        assert verdicts["reach"].endswith(" m")
+    assert b"source_axes" not in (tmp_path / "bare.mcap").read_bytes()
+    with pytest.raises(UsageError, match="declares lengths in m, and not in px"):
+        record_source(open_source(tmp_path / "run.mcap"), tmp_path / "px.mcap", unit="px")
+    with Recorder(tmp_path / "own.mcap", specifications=spec, units={"": "m", "battery": "V"}) as recorder:
+        for sample in run().samples():
+            recorder.write(sample)
+    assert read_trace(tmp_path / "own.mcap").units == {"": "m", "battery": "V"}
 
 
 def test_names_that_no_sample_has_are_reported(tmp_path: Path) -> None:

@@ -233,8 +233,12 @@ def test_a_unit_that_is_declared_is_shown(tmp_path: Path, data_folder: Path) -> 
         "  /turtle1/pose: {shape: {disc: 0.5}, signals: {speed: {field: linear_velocity, unit: m/s}}}\n"
     )
     source = open_source(data_folder / "bags/two_turtles.bag", mapping=tmp_path / "turtles.yaml")
-    write_report(source, [sr.parse_specification("spec slow = G (speed <= 9)")], tmp_path / "run.html")
-    assert page_of(tmp_path / "run.html").facts["results"][0]["nodes"][0]["unit"] == "m/s"
+    specs = [sr.parse_specification("spec slow = G (speed <= 9)")]
+    run_replay(source, specs, output=tmp_path / "annotated.mcap")
+    again = open_source(tmp_path / "annotated.mcap")
+    for log, page in ((source, "run.html"), (again, "again.html")):
+        write_report(log, specs, tmp_path / page)
+        assert page_of(tmp_path / page).facts["results"][0]["nodes"][0]["unit"] == "m/s"
 
 
 def test_a_damaged_log_is_said_to_be_so_first(tmp_path: Path) -> None:

@@ -44,6 +44,7 @@ from spatial_replay.logs.remote import LogFile, RemoteFile, open_file
 from spatial_replay.logs.topics import ALL, DERIVED, METADATA, OBJECTS, RECOVERY, is_kept
 from spatial_replay.text import Instant, Sentence
 from spatial_replay.trace.axes import Axes
+from spatial_replay.trace.declared_units import signal_units_from_metadata
 from spatial_replay.trace.sample import LATEST_NS
 from spatial_replay.trace.trace import Trace
 
@@ -116,6 +117,11 @@ class McapSource:
     def axes(self) -> Axes:
         """Those of what the log was recorded from; its samples have ours."""
         return Axes.from_metadata(dict(self.metadata()).get(METADATA, {}))
+
+    @property
+    def signal_units(self) -> Mapping[str, str]:
+        """The units that are declared, by signal."""
+        return signal_units_from_metadata(dict(self.metadata()).get(METADATA, {}))
 
     @property
     def begin_ns(self) -> int | None:
