@@ -27,7 +27,6 @@ from spatial_replay.recording.trigger import Trigger
 from spatial_replay.spec.formula import Specification
 from spatial_replay.text import times_apart
 from spatial_replay.trace.axes import units_metadata
-from spatial_replay.trace.declared_units import checked_units
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
 
@@ -290,7 +289,8 @@ class Recorder(SampleWriter):
     that arrives while the log is closed waits until that is done.
 
     With a trigger, nothing is written until it fires. What came before it waits in memory, and each firing
-    leaves one log around it.
+    leaves one log around it. With a planner, its decisions are recorded as well: samples, decisions and
+    outcomes go through the recorder, in their order; or `plan(planner, robot, recorder)` does that.
 
     Use as:
 
@@ -298,9 +298,6 @@ class Recorder(SampleWriter):
             joints = recorder.channel("/joint_states")
             joints.write(time_ns, {"position": [0.1, 0.2]})
             recorder.write(sample)
-
-    With a planner, its decisions are recorded as well: samples, decisions and outcomes go through the
-    recorder, in the order in which they happen; or `plan(planner, robot, recorder)` does that.
     """
 
     most_lost_s: ClassVar[float] = MOST_LOST_S
@@ -347,7 +344,7 @@ class Recorder(SampleWriter):
         if planner is not None and planner.specification not in files:
             files.insert(0, planner.specification)
         refuse_templates(files)
-        about = {**(about or {}), **units_metadata(checked_units(units))}
+        about = {**(about or {}), **units_metadata(units)}
         self._path = Path(path)
         self._clips: ClipLog | None = None
         if trigger is None:
@@ -386,15 +383,11 @@ class Recorder(SampleWriter):
         if self._box is not None:
             raise UsageError(f"{self.name} has a planner already; open another recorder")
         if self._clips is not None or not self._blocks:
-            raise UsageError(
-                f"{self.name} may leave samples out, on which decisions depend; open a Recorder without a "
-                "trigger, and with block=True"
-            )
+            remedy = "open a Recorder without a trigger, and with block=True"
+            raise UsageError(f"{self.name} may leave samples out, on which decisions depend; {remedy}")
         if planner.specification not in self._files:
-            raise UsageError(
-                f"{self.name} does not record {planner.specification.filename}, which is planned for; open "
-                "the Recorder with planner=planner"
-            )
+            name, remedy = planner.specification.filename, "open the Recorder with planner=planner"
+            raise UsageError(f"{self.name} does not record {name}, which is planned for; {remedy}")
         if self._last_ns >= 0 or planner.has_observed:
             raise UsageError("decisions depend on all samples; attach a new planner before the first one")
 

@@ -15,7 +15,11 @@ import numpy as np
 
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.geometry.batch import FootprintBatch
-from spatial_replay.trace.declared_units import signal_units_from_metadata, signal_units_metadata
+from spatial_replay.trace.declared_units import (
+    checked_units,
+    signal_units_from_metadata,
+    signal_units_metadata,
+)
 from spatial_replay.trace.trace import Trace
 
 AXES_KEY = "source_axes"
@@ -104,8 +108,13 @@ OUR_AXES = Axes()
 """Those of samples: y up."""
 
 
-def units_metadata(units: Mapping[str, str]) -> dict[str, str]:
-    """Return the entries for the metadata of a log whose samples have these units."""
+def units_metadata(units: Mapping[str, str] | None) -> dict[str, str]:
+    """Return the entries for the metadata of a log whose samples have these units.
+
+    Raises:
+        UsageError: units that are not texts by names.
+    """
+    units = checked_units(units)
     return Axes(unit=units.get("", "")).metadata() | signal_units_metadata(units)
 
 
