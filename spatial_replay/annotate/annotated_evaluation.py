@@ -29,7 +29,8 @@ if TYPE_CHECKING:
     from spatial_replay.annotate.automaton_state import SpecAutomaton
     from spatial_replay.annotate.foxglove_layout import LayoutContents
     from spatial_replay.annotate.rings import SceneBounds
-    from spatial_replay.annotate.scene_update import SceneFrames, SceneState
+    from spatial_replay.annotate.scene.scene_frames import SceneFrames
+    from spatial_replay.annotate.scene.scene_update import SceneState
 
 _MOST_NAMED: Final = 10
 """The most results that an error lists."""

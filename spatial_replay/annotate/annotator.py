@@ -19,8 +19,9 @@ from spatial_replay.annotate.automaton_state import (
 from spatial_replay.annotate.events import EncodedEvent, EventReporter, encoded_occurrence
 from spatial_replay.annotate.requirements import requirements_of
 from spatial_replay.annotate.robustness import encode_robustness
-from spatial_replay.annotate.scene_entities import encode_frame
-from spatial_replay.annotate.scene_update import SceneEncoder, SceneFrames, SceneState
+from spatial_replay.annotate.scene.scene_entities import encode_frame
+from spatial_replay.annotate.scene.scene_frames import SceneFrames
+from spatial_replay.annotate.scene.scene_update import SceneEncoder, SceneState
 from spatial_replay.annotate.specification import ReportedTree, encode_specification
 from spatial_replay.annotate.standing import FinalStanding, StandingEncoder
 from spatial_replay.annotate.violations import EvaluatedResult, leaf_pairs, violated_since

@@ -13,7 +13,7 @@ import numpy as np
 
 from spatial_replay.annotate.automaton_state import AutomatonRun
 from spatial_replay.annotate.robustness import Codes, standing_codes
-from spatial_replay.annotate.scene_update import spaced
+from spatial_replay.annotate.scene.scene_update import spaced
 from spatial_replay.annotate.specification import ReportedTree, unit_of
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.objects.wire import WireTemplate, payloads_of

@@ -38,7 +38,7 @@ from spatial_replay.trace.trace import Trace
 
 if TYPE_CHECKING:
     from spatial_replay.annotate.automaton_state import SpecAutomaton
-    from spatial_replay.annotate.scene_update import SceneFrames
+    from spatial_replay.annotate.scene.scene_frames import SceneFrames
 
 _KEPT_BYTES, _MOST_KEPT_BYTES = 2**22, 2**26
 """Samples of up to so many bytes for each result, and in all, stay in memory: each is explained by itself."""

@@ -20,7 +20,7 @@ from spatial_replay.annotate.annotator import Annotator
 from spatial_replay.annotate.curves import encode_curves
 from spatial_replay.annotate.foxglove_layout import live_layout_attachment
 from spatial_replay.annotate.rings import SceneBounds
-from spatial_replay.annotate.scene_update import SceneState
+from spatial_replay.annotate.scene.scene_update import SceneState
 from spatial_replay.annotate.specification import logged_specifications
 from spatial_replay.errors import SpecificationError, UsageError
 from spatial_replay.logs.messages import Attachment

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from spatial_replay.annotate.annotator import shown_regions
-from spatial_replay.annotate.scene_update import scene_start
+from spatial_replay.annotate.scene.scene_update import scene_start
 from spatial_replay.logs.messages import Channel, Messages, join, merge, select
 from spatial_replay.replay.loaded_log import Evaluated
 from spatial_replay.replay.own_messages import MessageCursor, latest_messages

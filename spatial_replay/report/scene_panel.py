@@ -10,8 +10,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from spatial_replay.annotate.requirements import ClassMembers, Requirement
-from spatial_replay.annotate.scene_entities import OBJECT, REGION
-from spatial_replay.annotate.scene_update import DrawnEntity, DrawnViolation, SceneFrame, SceneFrames
+from spatial_replay.annotate.scene.scene_frames import DrawnEntity, DrawnViolation, SceneFrame, SceneFrames
+from spatial_replay.annotate.scene.scene_template import OBJECT, REGION
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.report.compact import Packing
 from spatial_replay.spec.formula import ANY_CLASS

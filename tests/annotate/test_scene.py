@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from spatial_replay import ConvexPart, Footprint, Sample, Trace, TrackedObject, parse_specification
 from spatial_replay.annotate.requirements import requirements_of
-from spatial_replay.annotate.scene_update import PERIOD_NS, SceneEncoder
+from spatial_replay.annotate.scene.scene_update import PERIOD_NS, SceneEncoder
 from spatial_replay.annotate.violations import EvaluatedResult, leaf_pairs
 from spatial_replay.monitor.instances import find_instances
 from spatial_replay.monitor.stream import EvaluationStream, SeriesBlock

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from spatial_replay.annotate.scene_update import cell_colours
+from spatial_replay.annotate.scene.scene_frames import cell_colours
 
 MAPS = arrays(np.float64, (3, 4), elements=st.floats())
 

@@ -17,7 +17,7 @@ from spatial_replay import (
     SpecResult,
     parse_specification,
 )
-from spatial_replay.annotate.scene_update import DrawnViolation, SceneFrames
+from spatial_replay.annotate.scene.scene_frames import DrawnViolation, SceneFrames
 from spatial_replay.logs import MemorySource, Messages
 from spatial_replay.logs.topics import EVENT_LOG, EVENTS
 from spatial_replay.replay import Replay, document_from_replay

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from spatial_replay.annotate.scene_update import DrawnEntity, SceneFrame
+from spatial_replay.annotate.scene.scene_frames import DrawnEntity, SceneFrame
 from spatial_replay.report.compact import json_text, sentence_parts, singles
 from spatial_replay.report.data import NodeSeries, choose_samples
 from spatial_replay.report.scene_panel import MOST_CORNERS, MOST_FRAMES, SceneCollector

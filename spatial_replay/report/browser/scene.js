@@ -118,9 +118,9 @@ function drawScene(context, clock, scene, layers, width, height) {
   const colourAt = coloursOf(clock, scene, frame);
   scene.entities.forEach((entity, place) => drawEntity(context, entity, frame, at, labels, colourAt(entity, place)));
   if (decision) drawPlan(context, clock, decision, at);
-  if (layers.labels) drawLabels(context, labels, width);
+  const names = layers.labels ? drawLabels(context, labels, width) : [];
   const violation = pointerAt(clock) ?? violationAt(clock, scene, frame);
-  if (violation) drawViolation(context, violation, at, width);
+  if (violation) drawViolation(context, violation, at, names, [width, height]);
 }
 
 // The arrow of the scene, if it is of the chosen result.
@@ -146,7 +146,7 @@ function coloursOf({run, result: chosen}, scene, frame) {
   return (entity, index) => mixed(run.palette, least.get(index), scene.scale);
 }
 
-// The colour of a robustness, as annotate/scene_update.py mixes it.
+// The colour of a robustness, as annotate/scene/scene_frames.py mixes it.
 function mixed(palette, number, scale) {
   const parts = (name) => [1, 3, 5].map((start) => parseInt(palette[name].slice(start, start + 2), 16));
   const grey = parts("neutral");
@@ -184,7 +184,7 @@ function drawEntity(context, entity, frame, at, labels, [red, green, blue]) {
   labels.push({text: entity.name, box, isRegion});
 }
 
-// Names of objects, then those of regions; one that would cover another is left out.
+// Names of objects, then those of regions; one that would cover another is left out. Returns where they are.
 function drawLabels(context, labels, width) {
   const taken = [];
   for (const label of labels.toSorted((one, other) => one.isRegion - other.isRegion)) {
@@ -192,11 +192,16 @@ function drawLabels(context, labels, width) {
     const name = label.text.length > 32 ? `${label.text.slice(0, 31)}…` : label.text;
     const half = context.measureText(name).width / 2;
     const [x, y] = placeOfLabel(label, half, width);
-    const covers = ([left, right, row]) => x - half < right && x + half > left && Math.abs(y - row) < 13;
-    if (taken.some(covers)) continue;
+    if (covers(taken, x, y, half)) continue;
     taken.push([x - half, x + half, y]);
     outlined(context, name, x, y, colour(label.isRegion ? "quiet" : "ink"));
   }
+  return taken;
+}
+
+// Whether a text around a place would cover one that is there.
+function covers(taken, x, y, half) {
+  return taken.some(([left, right, row]) => x - half < right && x + half > left && Math.abs(y - row) < 13);
 }
 
 // The middle of a name: within what is large enough for it, else above; a region's in its lower left corner.
@@ -218,7 +223,7 @@ function outlined(context, text, x, y, fill) {
   context.fillText(text, x, y);
 }
 
-function drawViolation(context, {ends, label, text: atom}, at, width) {
+function drawViolation(context, {ends, label, text: atom}, at, names, [width, height]) {
   const [x0, y0, x1, y1] = [at.x(ends[0]), at.y(ends[1]), at.x(ends[2]), at.y(ends[3])];
   const length = Math.hypot(x1 - x0, y1 - y0), angle = Math.atan2(y1 - y0, x1 - x0);
   const head = Math.min(11, length / 2);
@@ -236,10 +241,16 @@ function drawViolation(context, {ends, label, text: atom}, at, width) {
   context.closePath();
   context.fill();
   context.font = `600 ${FONT}`;
-  const number = label.replace("-", "−"), text = atom ? `${shortened(atom, 48)}: ${number}` : number;
-  const half = context.measureText(text).width / 2 + 4;
-  const x = Math.min(Math.max((x0 + x1) / 2, half), width - half);
-  outlined(context, text, x, Math.max((y0 + y1) / 2 - 12, 10), colour("negative-text"));
+  const number = label.replace("-", "−");
+  const halfOf = (words) => context.measureText(words).width / 2 + 4;
+  const texts = atom ? [48, 32, 20, 12].map((most) => `${shortened(atom, most)}: ${number}`) : [];
+  const text = [...texts, number].find((words) => 2 * halfOf(words) <= width) ?? number;
+  const half = halfOf(text), x = Math.min(Math.max((x0 + x1) / 2, half), width - half);
+  // above the arrow's middle, else as near to it as no name is
+  const rows = [-12, 15, -27, 30, -42, 45, -57, 60, -72, 75].map((step) => (y0 + y1) / 2 + step)
+    .filter((row) => row >= 10 && row <= height - 10);
+  const row = rows.find((each) => !covers(names, x, each, half)) ?? rows[0] ?? 10;
+  outlined(context, text, x, row, colour("negative-text"));
 }
 
 function drawPlan(context, clock, {target, outcome, time}, at) {

@@ -12,25 +12,30 @@ from types import MappingProxyType
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from spatial_replay.annotate.rings import Rings, extents, outlines_of, rings_of
-from spatial_replay.annotate.scene_entities import (
+from spatial_replay.annotate.rings import extents, outlines_of, rings_of
+from spatial_replay.annotate.scene.scene_frames import (
+    ABSENT,
+    DELETED,
+    FIRST_FORM,
+    SceneContent,
+    SceneFrames,
+    colours,
+)
+from spatial_replay.annotate.scene.scene_template import (
     LEVELS,
-    OBJECT,
-    REGION,
     Banner,
     DrawnObject,
     Region,
     SceneLayout,
     SceneTemplate,
-    border_of,
     make_template,
     words_of_object,
     words_of_region,
     words_of_witness,
 )
-from spatial_replay.annotate.scene_text import banners_of, causes_of, labelled_objects, robustness_text
+from spatial_replay.annotate.scene.scene_text import banners_of, causes_of, labelled_objects, robustness_text
 from spatial_replay.annotate.violations import (
     EvaluatedResult,
     Presence,
@@ -39,41 +44,10 @@ from spatial_replay.annotate.violations import (
     worst_robustness,
 )
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.logs.objects.wire import payloads_of
 from spatial_replay.monitor.atoms.terms import footprint_from_outline
-from spatial_replay.palette import NEGATIVE, NEUTRAL, POSITIVE
 from spatial_replay.spec.formula import Outline
 from spatial_replay.trace.trace import Trace
-
-_LEAST: Final = 0.4
-"""How far the colour of the slightest robustness is from grey, so that its sign shows."""
-
-_OPACITY: Final = 0.6
-"""Of a map's cells, so that the scene above them stays visible."""
-
-
-def colours(robustness: ArrayLike, scale: ArrayLike) -> Floats:
-    """Return the colours (..., 3) of robustness (...): full at `scale`, grey where NaN.
-
-    Args:
-        scale: above 0, in the unit of the robustness; one, or an array that goes with it.
-    """
-    values = np.asarray(robustness, np.float64)[..., None]
-    share = _LEAST + (1.0 - _LEAST) * np.minimum(np.abs(values) / np.asarray(scale)[..., None], 1.0)
-    hue = np.where(values >= 0.0, POSITIVE, NEGATIVE)
-    mixed = np.where(np.isnan(values), NEUTRAL, NEUTRAL + share * (hue - NEUTRAL))
-    # the steps of a screen: finer ones are invisible and compress badly
-    return np.asarray(np.round(mixed * 255.0) / 255.0)
-
-
-def cell_colours(robustness: Floats) -> NDArray[np.uint8]:
-    """Return the colours (..., 4) of cells (...): full where the map is largest, transparent where NaN."""
-    largest = float(np.abs(robustness[np.isfinite(robustness)]).max(initial=0.0))
-    opacity = np.where(np.isnan(robustness), 0.0, _OPACITY)
-    shares = np.concatenate([colours(robustness, largest or 1.0), opacity[..., None]], axis=-1)
-    return np.asarray(np.round(255.0 * shares), np.uint8)
-
 
 PERIOD_NS: Final = 20_000_000
 """The least time between two messages; viewers warn of more."""
@@ -86,8 +60,6 @@ _UNSCALED: Final = 1.0
 """The scale before any object is shown, and that of a scene of points, which have no size."""
 
 _MOST_TEMPLATES: Final = 256
-_ABSENT, _DELETED, _FIRST_FORM = -1, 0, 1
-
 _NOWHERE: Final = (0.0, 0.0)
 _BANNER_LIFT: Final = 0.06
 """How far the banner is above the scene, by the scene's height."""
@@ -123,106 +95,6 @@ def scene_start(trace: Trace, regions: Mapping[str, Outline]) -> SceneState:
     """
     rows = trace.rows[spaced(trace.times_ns, None)]
     return SceneEncoder(regions).scaled(SceneState(), trace, rows)[0]
-
-
-class DrawnEntity(NamedTuple):
-    """An object or a region in one message.
-
-    Attributes:
-        rings: its outlines, (n, 2) each.
-        colour: red, green and blue, 0 to 255.
-        class_name: of an object that has one.
-    """
-
-    rings: tuple[Floats, ...]
-    colour: tuple[int, int, int]
-    class_name: str | None = None
-
-
-class DrawnViolation(NamedTuple):
-    """The arrow at the first violation in one message.
-
-    Attributes:
-        ends: (2, 2), from where to where it points.
-        label: what decides it and the robustness, as it is written beside the arrow.
-        result: which of the results is violated.
-        node: id of the requirement that is violated.
-        robustness: that of the requirement, in the sign that counts.
-        leaf: what decides it, an index among the leaves of the result's program.
-    """
-
-    ends: Floats
-    label: str
-    result: int
-    node: int
-    robustness: float
-    leaf: int = -1
-
-
-class SceneFrame(NamedTuple):
-    """What one message shows.
-
-    Attributes:
-        entities: by their ids.
-        violation: None without an arrow.
-        is_violated: whether a requirement on an object or a region is violated.
-    """
-
-    entities: Mapping[str, DrawnEntity]
-    violation: DrawnViolation | None
-    is_violated: bool
-
-    @property
-    def corners(self) -> int:
-        """How many corners its outlines have."""
-        return sum(len(ring) for each in self.entities.values() for ring in each.rings)
-
-
-@dataclass(frozen=True, eq=False)
-class SceneFrames:
-    """What S messages show.
-
-    Attributes:
-        times_ns: (S,) int64.
-        objects, regions: (S, objects) and (S, regions), the worst robustness of their requirements.
-        object_colours, region_colours: the same with a last axis of red, green and blue, 0 to 1.
-        scale: the robustness at which colours are full.
-    """
-
-    times_ns: Integers
-    objects: Floats
-    regions: Floats
-    object_colours: Floats
-    region_colours: Floats
-    scale: float
-    _presence: Presence
-    _content: _SceneContent
-    _regions: tuple[Region, ...]
-    _unit: str = ""
-
-    def frame(self, index: int) -> SceneFrame:
-        """Return what one of the messages shows."""
-        entities = {
-            REGION + region.name: DrawnEntity(tuple(border_of(region)), _bytes(colour))
-            for region, colour in zip(self._regions, self.region_colours[index], strict=True)
-        }
-        content = self._content
-        for column, name in enumerate(content.names):
-            if content.forms[index, column] >= _FIRST_FORM:
-                rings = content.rings.rings_of(int(content.observations[index, column]))
-                colour = _bytes(self.object_colours[index, column])
-                code = int(self._presence.class_code[index, column])
-                class_name = self._presence.classes[code] if code >= 0 else None
-                entities[OBJECT + name] = DrawnEntity(rings, colour, class_name)
-        found, violation = content.violations, None
-        if found.is_shown[index]:
-            robustness = float(found.robustness[index])
-            which, node, leaf = (int(each[index]) for each in (found.result, found.node, found.leaf))
-            number = robustness_text(robustness, self._unit)
-            label = f"{content.causes[content.arrow[index] - _FIRST_FORM]}: {number}"
-            violation = DrawnViolation(found.points[index], label, which, node, robustness, leaf)
-        is_violated = bool((self.objects[index] < 0.0).any() or (self.regions[index] < 0.0).any())
-        return SceneFrame(entities, violation, is_violated)
 
 
 class SceneMessages(NamedTuple):
@@ -291,7 +163,7 @@ class SceneEncoder:
             encoded = templates[layout].fill(times_ns[samples], words)
             for sample, payload in zip(samples.tolist(), payloads_of(encoded), strict=True):
                 payloads[sample] = payload
-        last = content.forms[-1] >= _FIRST_FORM
+        last = content.forms[-1] >= FIRST_FORM
         after = SceneState(
             written_ns=int(times_ns[-1]),
             shown=tuple(
@@ -335,7 +207,7 @@ class SceneEncoder:
         self,
         layout: SceneLayout,
         samples: Integers,
-        content: _SceneContent,
+        content: SceneContent,
         objects: Floats,
         regions: Floats,
         scale: float,
@@ -357,35 +229,6 @@ class SceneEncoder:
         return np.concatenate([np.empty((len(samples), 0)), *columns], axis=1)
 
 
-class _SceneContent(NamedTuple):
-    """What S messages hold.
-
-    Attributes:
-        names: objects that are shown, or have just been.
-        rows: (S, names), rows of the trace; below 0 where an object is absent.
-        forms: (S, names), `_ABSENT`, `_DELETED`, or from `_FIRST_FORM` on the number of its form.
-        styles: (S, names), its level, and whether it has a label as the last bit; -1 where it is absent.
-        observations: (S, names), rows of `rings` and `footprints`.
-        violations: of the S samples.
-        arrow: (S,), the same as `forms` for the arrow at the worst violation; its forms are `causes`.
-        causes: what decides violations, in words.
-        banner: (S,), which of `banners`.
-    """
-
-    names: tuple[str, ...]
-    rows: Integers
-    forms: Integers
-    styles: Integers
-    observations: Integers
-    footprints: FootprintBatch
-    rings: Rings
-    violations: Violations
-    arrow: Integers
-    causes: tuple[str, ...]
-    banner: Integers
-    banners: tuple[Banner | None, ...]
-
-
 def _words_of_arrow(found: Violations, samples: Integers, scale: float, unit: str) -> list[Floats]:
     z = np.fmax(found.top[samples], 0.0) + 3.0 * _LIFT * scale
     labels = [robustness_text(number, unit) for number in found.robustness[samples].tolist()]
@@ -394,11 +237,6 @@ def _words_of_arrow(found: Violations, samples: Integers, scale: float, unit: st
 
 def _region(name: str, outline: Outline) -> Region:
     return Region(name, outline, tuple(outlines_of(footprint_from_outline(outline))))
-
-
-def _bytes(colour: Floats) -> tuple[int, int, int]:
-    red, green, blue = (round(255.0 * share) for share in colour.tolist())
-    return red, green, blue
 
 
 def spaced(times_ns: Integers, written_ns: int | None) -> Integers:
@@ -442,21 +280,21 @@ def _content(
     results: Sequence[EvaluatedResult],
     has_label: NDArray[np.bool_],
     banners: tuple[Integers, tuple[Banner | None, ...]],
-) -> _SceneContent:
+) -> SceneContent:
     is_present = rows >= 0
     was_present = np.concatenate([[[name in before.shown for name in names]], is_present[:-1]])
     footprints = trace.footprints.select(rows[is_present])
     rings = rings_of(footprints, _POINT * scale)
     observations = np.full(rows.shape, -1, np.int64)
     observations[is_present] = np.arange(len(footprints))
-    forms = np.where(was_present, _DELETED, _ABSENT)
-    forms[is_present] = _FIRST_FORM + rings.form
+    forms = np.where(was_present, DELETED, ABSENT)
+    forms[is_present] = FIRST_FORM + rings.form
     styles = np.full(rows.shape, -1, np.int64)
     styles[is_present] = 2 * _levels(extents(footprints), scale) + has_label[is_present]
     was_pointing = np.append(before.is_pointing, found.is_shown[:-1])
     causes, cause = causes_of(results, found)
-    witness = np.where(found.is_shown, _FIRST_FORM + cause, np.where(was_pointing, _DELETED, _ABSENT))
-    return _SceneContent(
+    witness = np.where(found.is_shown, FIRST_FORM + cause, np.where(was_pointing, DELETED, ABSENT))
+    return SceneContent(
         names, rows, forms, styles, observations, footprints, rings, found, witness, causes, *banners
     )
 
@@ -474,7 +312,7 @@ def _class_codes(trace: Trace, rows: Integers) -> Integers:
     return codes
 
 
-def _by_layout(content: _SceneContent) -> Iterator[tuple[SceneLayout, Integers]]:
+def _by_layout(content: SceneContent) -> Iterator[tuple[SceneLayout, Integers]]:
     """Yield the layouts, each with its samples (S,)."""
     keys = np.column_stack([content.forms, content.styles, content.arrow, content.banner])
     if (keys == keys[0]).all():
@@ -485,17 +323,17 @@ def _by_layout(content: _SceneContent) -> Iterator[tuple[SceneLayout, Integers]]
         yield _layout(content, row), np.flatnonzero(which.reshape(-1) == number)
 
 
-def _layout(content: _SceneContent, key: NDArray[np.int64]) -> SceneLayout:
+def _layout(content: SceneContent, key: NDArray[np.int64]) -> SceneLayout:
     count = len(content.names)
     arrow, banner = key[-2:].tolist()
     listed: list[tuple[str, int, int]] = list(
         zip(content.names, key[:count].tolist(), key[count : 2 * count].tolist(), strict=True)
     )
     shown = tuple(
-        DrawnObject(name, content.rings.forms[form - _FIRST_FORM], style >> 1, bool(style & 1))
+        DrawnObject(name, content.rings.forms[form - FIRST_FORM], style >> 1, bool(style & 1))
         for name, form, style in listed
-        if form >= _FIRST_FORM
+        if form >= FIRST_FORM
     )
-    deleted = tuple(name for name, form, _ in listed if form == _DELETED)
-    cause = None if arrow == _DELETED else "" if arrow == _ABSENT else content.causes[arrow - _FIRST_FORM]
+    deleted = tuple(name for name, form, _ in listed if form == DELETED)
+    cause = None if arrow == DELETED else "" if arrow == ABSENT else content.causes[arrow - FIRST_FORM]
     return SceneLayout(deleted, shown, cause, content.banners[banner])

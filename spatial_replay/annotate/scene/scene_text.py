@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spatial_replay.annotate.robustness import standing_codes
-from spatial_replay.annotate.scene_entities import LABEL_LENGTH, Banner
+from spatial_replay.annotate.scene.scene_template import LABEL_LENGTH, Banner
 from spatial_replay.annotate.violations import EvaluatedResult, Violations
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.schemas.Robustness_pb2 import (
