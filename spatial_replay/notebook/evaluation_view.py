@@ -30,7 +30,7 @@ from spatial_replay.notebook.specification_view import tree_cell
 from spatial_replay.palette import CURVES, NEGATIVE, NEUTRAL, POSITIVE, hexadecimal
 from spatial_replay.spec.format import iter_branches
 from spatial_replay.spec.formula import iter_nodes
-from spatial_replay.text import counted
+from spatial_replay.text import counted, with_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -72,15 +72,17 @@ def _title_of(result: SpecResult) -> str:
     return result.name if result.object is None else f"{result.name} for {result.object}"
 
 
-def _robustness_text(value: float, lower: float, upper: float) -> str:
-    """Return a robustness, or its interval if it is unknown."""
-    return f"{value:.4g}" if value == value else f"{lower:.4g} to {upper:.4g}"
+def _robustness_text(value: float, lower: float, upper: float, unit: str = "") -> str:
+    """Return a robustness with its unit, or its interval if it is unknown."""
+    return (
+        with_unit(value, unit) if value == value else f"{with_unit(lower, unit)} to {with_unit(upper, unit)}"
+    )
 
 
 def _results_table(results: Sequence[SpecResult]) -> Html:
     rows = []
     for each in results:
-        robustness = _robustness_text(each.robustness, each.lower, each.upper)
+        robustness = _robustness_text(each.robustness, each.lower, each.upper, each.unit)
         name, verdict = element("b", _title_of(each)), verdict_mark(each.verdict)
         rows.append((name, verdict, robustness, _first_satisfied(each)))
     return table(["result", "verdict", "robustness", "first satisfied"], rows)
@@ -268,5 +270,5 @@ def _apart(places: Sequence[float]) -> list[float]:
 
 
 def _title(result: SpecResult) -> str:
-    robustness = _robustness_text(result.robustness, result.lower, result.upper)
+    robustness = _robustness_text(result.robustness, result.lower, result.upper, result.unit)
     return plain(f"{_title_of(result)}: {result.verdict}, robustness {robustness}")

@@ -44,6 +44,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Path]:
     report_of_recording(folder / "violated.html", "table.jsonl", "table_edited.spatial")
     report_of_recording(folder / "satisfied.html", "table.jsonl", "table.spatial")
     report_of_recording(folder / "planned.html", "push.mcap")
+    report_of_recording(folder / "edited.html", "push.mcap", "push_edited.spatial")
     broken = folder / "broken.mcap"
     broken.write_bytes((RECORDINGS / "push.mcap").read_bytes()[:300_000])
     source = open_source(broken)
@@ -118,9 +119,16 @@ def open_page(browser: Browser, pages: Mapping[str, Path]) -> Iterator[Open]:
         complaints.append(str(error))
 
     def opened(
-        name: str, *, width: int = 1280, height: int = 900, scheme: str = "light", at: str = ""
+        name: str,
+        *,
+        width: int = 1280,
+        height: int = 900,
+        scheme: str = "light",
+        at: str = "",
+        script: str = "",
     ) -> Page:
         page = browser.new_page(viewport={"width": width, "height": height}, color_scheme=scheme)
+        page.add_init_script(script)
         page.on("console", heard)
         page.on("pageerror", failed)
         page.on("dialog", lambda dialog: complaints.append(dialog.message))
@@ -473,6 +481,34 @@ def test_nothing_is_wider_than_the_screen(open_page: Open, name: str, width: int
     page.evaluate("document.querySelectorAll('details').forEach((each) => { each.open = true; })")
     assert page.evaluate("document.documentElement.scrollWidth") == width
     assert page.locator(".transport").evaluate("each => each.getBoundingClientRect().bottom") <= 760
+
+
+# what each canvas writes, in the order in which it does: the text, where, and how wide
+WRITTEN = """
+const fill = CanvasRenderingContext2D.prototype.fillText;
+window.written = new Map();
+const clear = CanvasRenderingContext2D.prototype.clearRect;
+CanvasRenderingContext2D.prototype.clearRect = function (...box) {
+  window.written.set(this.canvas, []);
+  return clear.apply(this, box);
+};
+CanvasRenderingContext2D.prototype.fillText = function (text, x, y) {
+  window.written.get(this.canvas)?.push([text, x, y, this.measureText(text).width]);
+  return fill.call(this, text, x, y);
+};
+"""
+
+
+@pytest.mark.parametrize("name", ["violated", "edited"])
+def test_the_label_of_the_arrow_covers_no_name_on_a_narrow_screen(open_page: Open, name: str) -> None:
+    page = open_page(name, width=390, script=WRITTEN)
+    page.get_by_label("trails").uncheck()
+    *names, (label, x, y, width) = page.evaluate("written.get(document.querySelector('.stage'))")
+    assert " dist " in label
+    assert x - width / 2 >= 0
+    assert x + width / 2 <= page.locator(".stage").evaluate("each => each.clientWidth")
+    for other, left, top, size in names:
+        assert abs(y - top) >= 13 or abs(x - left) >= (width + size) / 2, other
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
