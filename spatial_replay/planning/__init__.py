@@ -12,6 +12,8 @@ from spatial_replay.lazy import loaded_when_used
 if TYPE_CHECKING:
     from spatial_replay.planning.decision_log import PLAN_METADATA, BlackBox, plan_metadata
     from spatial_replay.planning.decisions import Candidate, Executor, Outcome, Reason, Step, Target
+    from spatial_replay.planning.map_layers import MapLayers, map_layers
+    from spatial_replay.planning.map_messages import map_fields
     from spatial_replay.planning.maps import (
         FREE,
         GradientMap,
@@ -37,6 +39,7 @@ __all__ = [
     "GradientMap",
     "Grid",
     "LoggedStep",
+    "MapLayers",
     "Outcome",
     "Planner",
     "Reason",
@@ -46,6 +49,8 @@ __all__ = [
     "Workspace",
     "centre_of",
     "gradient_map",
+    "map_fields",
+    "map_layers",
     "moved_object",
     "plan_metadata",
     "planner_of",
@@ -63,6 +68,8 @@ __getattr__, __dir__ = loaded_when_used(
     {
         "decision_log": ("PLAN_METADATA", "BlackBox", "plan_metadata"),
         "decisions": ("Candidate", "Executor", "Outcome", "Reason", "Step", "Target"),
+        "map_layers": ("MapLayers", "map_layers"),
+        "map_messages": ("map_fields",),
         "maps": ("FREE", "GradientMap", "centre_of", "gradient_map", "moved_object", "proposition_maps"),
         "paths": ("shortest_path",),
         "planner": ("MOST_MOTIONS", "Planner"),

@@ -15,6 +15,7 @@ import numpy as np
 from spatial_replay.errors import TraceError
 from spatial_replay.geometry.footprint import TrackedObject
 from spatial_replay.planning.decisions import Candidate, Consideration, Guards, Reason, Target
+from spatial_replay.planning.map_layers import near
 from spatial_replay.planning.maps import (
     CONSTRAINED,
     FREE,
@@ -36,9 +37,6 @@ from spatial_replay.planning.workspace import Grid, Workspace
 from spatial_replay.spec.formula import Formula, Outline
 from spatial_replay.trace.sample import Sample
 
-AVOIDED_CELLS = 2.0
-"""Distance in cells that a new target keeps from a place where an attempt failed."""
-
 
 def find_target(
     gradient: GradientMap,
@@ -54,7 +52,7 @@ def find_target(
         failed: places (x, y) where earlier attempts failed.
     """
     holds = (gradient.blocked == FREE) & (gradient.robustness >= settings.margin)
-    good = holds & ~_near(failed, gradient.grid)
+    good = holds & ~near(failed, gradient.grid)
     if not good.any():
         return _why_nowhere(gradient, settings, bool(failed))
     if settings.skill == "place":
@@ -140,16 +138,6 @@ def _target(
     return Target(gradient.name, x, y, turn, yaw, waypoints, float(gradient.robustness[place]))
 
 
-def _near(failed: Collection[tuple[float, float]], grid: Grid) -> np.ndarray:
-    """Return (rows, columns): whether each cell is near a place where an attempt failed."""
-    near = np.zeros(grid.shape, np.bool_)
-    centres = grid.centres()
-    for place in failed:
-        away = np.hypot(*(centres - np.array(place)).T)
-        near |= (away <= AVOIDED_CELLS * grid.cell_size).reshape(grid.shape)
-    return near
-
-
 def _why_nowhere(gradient: GradientMap, settings: Settings, has_failed: bool) -> str:
     enough = gradient.robustness >= settings.margin
     if not enough.any():
@@ -223,8 +211,8 @@ class Movables:
         if isinstance(target, Target):
             target = self.with_way(target, consideration.constraints.cubes)
         if isinstance(target, str):
-            return Candidate(name, gradient, None, target)
-        return Candidate(name, gradient, target)
+            return Candidate(name, gradient, None, target, failed=tuple(failed))
+        return Candidate(name, gradient, target, failed=tuple(failed))
 
     def with_way(self, target: Target, constraints: Cubes) -> Target | str:
         """Return the target of a carried object with a way that keeps the constraints, or why there is none.

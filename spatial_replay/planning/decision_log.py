@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from foxglove_schemas_protobuf.Grid_pb2 import Grid as GridMessage
 from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
-from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
 from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.message import DecodeError, Message
 
 from spatial_replay.annotate.rings import outlines_of
 from spatial_replay.annotate.scene.scene_entities import FRAME
-from spatial_replay.annotate.scene.scene_frames import cell_colours
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.footprint import TrackedObject
 from spatial_replay.logs.messages import Messages, merge, messages_of
@@ -26,6 +23,7 @@ from spatial_replay.logs.schemas.PlanDecision_pb2 import (
     PlanDecision,
     PlanEdge,
     PlanGuard,
+    PlanLoss,
     PlanMap,
     PlanOutcome,
     PlanTarget,
@@ -43,25 +41,24 @@ from spatial_replay.planning.decisions import (
     Target,
     wait_outcome,
 )
-from spatial_replay.planning.maps import GradientMap, centre_of, moved_object
+from spatial_replay.planning.map_layers import MapLayers, map_layers
+from spatial_replay.planning.map_messages import TurnedMap, explain, map_digest, map_message, maps_of
+from spatial_replay.planning.maps import centre_of, moved_object
 from spatial_replay.planning.planner import Planner
-from spatial_replay.planning.settings import text_from_settings
+from spatial_replay.planning.settings import Settings, text_from_settings
 from spatial_replay.trace.sample import Sample
 
 PLAN_METADATA: Final = "spatial_replay_plan"
 """Name of the metadata record with the settings and the specification that decisions depend on."""
 
+PLAN_VERSION: Final = 2
+"""What decisions and maps say: 1, the maps as they are; 2, also what they are made of, and how acceptance was
+lost. Logs without a version have 1."""
+
 _DECISIONS: Final = protobuf_channel(PLAN_DECISION, PlanDecision)
 _MAPS: Final = protobuf_channel(GRADIENT_MAP, GridMessage)
 _PATHS: Final = protobuf_channel(PLAN_PATH, SceneUpdate)
 _CHANNELS: Final = (_DECISIONS, _MAPS, _PATHS)
-
-CELL: Final = np.dtype([("robustness", "<f4"), ("colour", "u1", (4,))])
-"""A map's cell: its robustness, NaN where it is blocked, and red, green, blue and alpha."""
-
-_COLOURS: Final = ("red", "green", "blue", "alpha")
-_DEPTH: Final = 0.1
-"""Depth of a map below the plane, in cells, so that it does not hide the regions in the plane."""
 
 _KINDS: MappingProxyType[Kind, PlanDecision.Kind.ValueType] = MappingProxyType(
     {
@@ -84,9 +81,14 @@ class BlackBox:
     equal bytes, so that a log can be verified by recomputing it.
     """
 
-    def __init__(self, planner: Planner) -> None:
-        """Begin before the first sample."""
+    def __init__(self, planner: Planner, *, version: int = PLAN_VERSION) -> None:
+        """Begin before the first sample.
+
+        Args:
+            version: of what messages say, see `PLAN_VERSION`.
+        """
         self.planner = planner
+        self._version = version
         self._written = dict.fromkeys(_CHANNELS, 0)
         self._sample: Sample | None = None
         self._step: Step | None = None
@@ -121,8 +123,15 @@ class BlackBox:
         self._step = step
         self._tracked = self._object_moved()
         self._travelled = [] if self._tracked is None else [centre_of(self._tracked.footprint)]
-        self._decision = decision_message(step, self.planner.automaton.name, self._written[_MAPS])
-        maps = [map_message(turned, step.time_ns) for turned in maps_of(step)]
+        layers: dict[Candidate, MapLayers] = {}
+        if self._version > 1:
+            found = (each for edge in step.considered for each in edge.candidates)
+            layers = {each: map_layers(each.map, each.failed) for each in found}
+        about = self.planner.automaton.name, self.planner.settings
+        self._decision = decision_message(step, *about, self._written[_MAPS], layers)
+        if self._version > 1 and step.lost is not None:
+            self._decision.lost.CopyFrom(PlanLoss(time_ns=step.lost.time_ns, text=step.lost.text))
+        maps = [map_message(each, step.time_ns, layers.get(each.candidate)) for each in maps_of(step)]
         path = path_message(step.target, self._tracked, step.time_ns)
         return step, self._messages(step.time_ns, [*ended, self._decision], maps, [path])
 
@@ -187,6 +196,7 @@ def plan_metadata(planner: Planner, filename: str) -> dict[str, str]:
         "settings": text_from_settings(planner.settings),
         "file": filename,
         "specification": planner.automaton.name,
+        "version": str(PLAN_VERSION),
     }
 
 
@@ -211,70 +221,22 @@ def latest_decisions(decisions: Iterable[PlanDecision]) -> tuple[PlanDecision, .
     return tuple(by_number[number] for number in sorted(by_number))
 
 
-class TurnedMap(NamedTuple):
-    """A candidate's map for one orientation of the object, the index into the map's turns."""
-
-    candidate: Candidate
-    turn: int
-
-
-def maps_of(step: Step) -> list[TurnedMap]:
-    """Return all maps that a step depends on, by edge, in the order in which a log has them.
-
-    The chosen object in its target orientation comes last, since a viewer shows the last message of a topic.
-    """
-    return [
-        TurnedMap(candidate, turn)
-        for edge in step.considered
-        for candidate in sorted(edge.candidates, key=lambda each: each.is_chosen)
-        for turn in sorted(range(len(candidate.map.turns)), key=lambda turn: _is_aim(candidate, turn))
-    ]
-
-
-def _is_aim(candidate: Candidate, turn: int) -> bool:
-    """Return whether the target has this orientation."""
-    return candidate.target is not None and candidate.target.turn == candidate.map.turns[turn]
-
-
-def map_message(turned: TurnedMap, time_ns: int) -> GridMessage:
-    """Return a map as a message, drawn under the scene; blocked cells are transparent."""
-    gradient = turned.candidate.map
-    grid, values = gradient.grid, gradient.values[turned.turn]
-    cells = np.empty(values.shape, CELL)
-    cells["robustness"] = values
-    cells["colour"] = cell_colours(values)
-    message = GridMessage(
-        frame_id=FRAME,
-        column_count=grid.columns,
-        row_stride=CELL.itemsize * grid.columns,
-        cell_stride=CELL.itemsize,
-        data=cells.tobytes(),
-    )
-    message.timestamp.FromNanoseconds(time_ns)
-    message.pose.position.x, message.pose.position.y = grid.xmin, grid.ymin
-    message.pose.position.z = -_DEPTH * grid.cell_size
-    message.pose.orientation.w = 1.0
-    message.cell_size.x = message.cell_size.y = grid.cell_size
-    message.fields.add(name="robustness", offset=0, type=PackedElementField.FLOAT32)
-    for offset, name in enumerate(_COLOURS, 4):
-        message.fields.add(name=name, offset=offset, type=PackedElementField.UINT8)
-    return message
-
-
-def map_digest(gradient: GradientMap) -> bytes:
-    """Return the SHA-256 of a map's values: little-endian float64 by turn, row and column, NaN if blocked."""
-    return hashlib.sha256(np.ascontiguousarray(gradient.values, "<f8").tobytes()).digest()
-
-
-def decision_message(step: Step, specification: str, first_map: int) -> PlanDecision:
+def decision_message(
+    step: Step,
+    specification: str,
+    settings: Settings,
+    first_map: int,
+    layers: Mapping[Candidate, MapLayers],
+) -> PlanDecision:
     """Return a decision as a message, without an outcome.
 
     Args:
         first_map: the number of the step's first map in the log.
+        layers: the maps taken apart; empty for messages as older logs have them.
     """
     numbers = {turned: number for number, turned in enumerate(maps_of(step), first_map)}
     pruned = (PrunedEdge(source=edge[0], target=edge[1], reason=str(reason)) for edge, reason in step.pruned)
-    return PlanDecision(
+    message = PlanDecision(
         time_ns=step.time_ns,
         number=step.number,
         specification=specification,
@@ -285,6 +247,11 @@ def decision_message(step: Step, specification: str, first_map: int) -> PlanDeci
         pruned=pruned,
         reason=step.reason,
     )
+    for edge, of_edge in zip(step.considered, message.considered, strict=True):
+        for each, of_candidate in zip(edge.candidates, of_edge.candidates, strict=True):
+            if each in layers:
+                explain(of_candidate, each, layers[each], settings)
+    return message
 
 
 def _edge(consideration: Consideration, numbers: Mapping[TurnedMap, int]) -> PlanEdge:

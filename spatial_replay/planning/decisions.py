@@ -96,6 +96,7 @@ class Candidate:
         target: where it would go; None if it was rejected.
         rejected: why it was rejected; empty if it was not.
         is_chosen: whether this is the object to move.
+        failed: places (x, y) where earlier motions failed, from which a target stays away.
     """
 
     name: str
@@ -103,6 +104,7 @@ class Candidate:
     target: Target | None
     rejected: str = ""
     is_chosen: bool = False
+    failed: tuple[tuple[float, float], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,6 +135,19 @@ class Consideration:
 
 
 @dataclass(frozen=True, slots=True)
+class Loss:
+    """How acceptance was lost.
+
+    Attributes:
+        time_ns: of the sample after which the specification could not be satisfied any more.
+        text: what it had that the specification forbids; empty if too little was known to say.
+    """
+
+    time_ns: int
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
 class Step(Displayed):
     """A decision.
 
@@ -146,6 +161,7 @@ class Step(Displayed):
         pruned: all edges pruned so far, each with its reason.
         reason: the decision as a sentence.
         ahead: the states that a wait expects from time alone; empty if it waits for an observation.
+        lost: when and by what acceptance was lost; None while the specification can be satisfied.
     """
 
     number: int
@@ -157,6 +173,7 @@ class Step(Displayed):
     pruned: tuple[tuple[Edge, Reason], ...]
     reason: str
     ahead: tuple[int, ...] = ()
+    lost: Loss | None = None
 
     @property
     def aim(self) -> Consideration | None:

@@ -149,6 +149,27 @@ def _guards(automaton: Automaton, transitions: Iterable[Transition]) -> Guards:
     return Guards(cubes, texts)
 
 
+def loss_text(automaton: Automaton, states: Collection[int], before: Symbol, symbol: Symbol) -> str:
+    """Return what a sample has that takes the automaton where it cannot accept; empty if it is not known.
+
+    Args:
+        states: of the automaton before the sample.
+        before, symbol: the propositions of the sample before, () if there is none, and of this one.
+    """
+    taken = [
+        cube
+        for source in sorted(states)
+        for target in automaton.successors[source]
+        if target not in automaton.can_accept and (edge := automaton.transition(source, target)) is not None
+        for cube in edge.guard
+        if all(symbol[number] is wanted for number, wanted in cube)
+    ]
+    cube = min(taken, key=len, default=())
+    # what has just changed says more than what was so before
+    changed = [each for each in cube if before and before[each[0]] is not symbol[each[0]]]
+    return " and ".join(automaton.propositions[number].literal(value) for number, value in changed or cube)
+
+
 def worst_state(automaton: Automaton, states: Iterable[int]) -> int | None:
     """Return the state farthest from acceptance; None if no state can reach it."""
     paths = {state: next(automaton.paths(state), None) for state in states}

@@ -16,7 +16,7 @@ from typing import Final
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.guards import Transition
 from spatial_replay.planning.arrangements import Arranger, Cell
-from spatial_replay.planning.candidates import AVOIDED_CELLS, Movables, by_cost
+from spatial_replay.planning.candidates import Movables, by_cost
 from spatial_replay.planning.decisions import Candidate, Consideration, Edge, Reason, Target
 from spatial_replay.planning.demands import (
     Budget,
@@ -33,9 +33,7 @@ from spatial_replay.planning.edges import (
     equivalent_edges,
     idle_transitions,
 )
-from spatial_replay.planning.expectations import Expectations, Foreseen
-from spatial_replay.planning.maps import concerns, gradient_map, proposition_maps
-from spatial_replay.planning.ordering import MotionOrder
+from spatial_replay.planning.candidates import Movables, by_cost
 from spatial_replay.planning.settings import Settings
 from spatial_replay.spec.formula import Formula, Outline
 from spatial_replay.trace.sample import Sample

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Final, TypeAlias
+from dataclasses import dataclass, field, replace
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,6 +68,7 @@ class GradientMap(Displayed):
         blocked: (A, rows, columns) uint8, `FREE` or why the object must not be there (see `REASONS`).
         clearance: (A, rows, columns), signed distance to the nearest obstacle; +inf without obstacles.
         turns: (A,) angles in radians by which the object is turned.
+        made_of: what it was computed from, for `map_layers`.
     """
 
     name: str
@@ -76,6 +77,7 @@ class GradientMap(Displayed):
     blocked: NDArray[np.uint8]
     clearance: Floats
     turns: Floats
+    made_of: MapParts = field(repr=False)
 
     @property
     def values(self) -> Floats:
@@ -117,7 +119,7 @@ def gradient_map(
     then = maps if after is None else after
     robustness = np.full(shape, -np.inf)
     for cube in progress:
-        np.maximum(robustness, _holds(then.lower, then.upper, cube, shape), out=robustness)
+        np.maximum(robustness, cube_robustness(then.lower, then.upper, cube, shape), out=robustness)
     danger = danger_of(maps, constraints)
     blocked = np.zeros(shape, np.uint8)
     # later assignments win: a cell is reported as constrained even if it is also occupied or out of reach
@@ -125,19 +127,24 @@ def gradient_map(
     blocked[~np.broadcast_to(workspace.within_reach(maps.grid), shape)] = OUT_OF_REACH
     blocked[maps.clearance <= workspace.clearance] = OCCUPIED
     blocked[danger >= -margin] = CONSTRAINED
-    return GradientMap(maps.name, maps.grid, robustness, blocked, maps.clearance, maps.turns)
+    parts = MapParts(maps, then, progress, constraints)
+    return GradientMap(maps.name, maps.grid, robustness, blocked, maps.clearance, maps.turns, parts)
 
 
 def danger_of(maps: PropositionMaps, constraints: Cubes) -> Floats:
     """Return (A, rows, columns): the greatest robustness that a constraint may have in each cell."""
     danger = np.full(maps.clearance.shape, -np.inf)
     for cube in constraints:
-        np.maximum(danger, _holds(maps.upper, maps.lower, cube, danger.shape), out=danger)
+        np.maximum(danger, cube_robustness(maps.upper, maps.lower, cube, danger.shape), out=danger)
     return danger
 
 
-def _holds(positive: Floats, negative: Floats, cube: Cube, shape: tuple[int, ...]) -> Floats:
-    """Return the robustness of a cube: the minimum over its literals."""
+def cube_robustness(positive: Floats, negative: Floats, cube: Cube, shape: tuple[int, ...]) -> Floats:
+    """Return the robustness of a cube: the minimum over its literals.
+
+    Args:
+        positive, negative: bounds of propositions, for those that have to hold, and that must not.
+    """
     least = np.full(shape, np.inf)
     for number, wanted in cube:
         np.minimum(least, positive[number] if wanted else -negative[number], out=least)
@@ -153,7 +160,10 @@ class PropositionMaps:
         grid: the cells.
         lower, upper: (P, A, rows, columns), bounds of the robustness; -inf and +inf if it is unknown.
         clearance: (A, rows, columns), signed distance to the nearest obstacle; +inf without obstacles.
+        nearest: (A, rows, columns), that obstacle by its number in `obstacles`.
         turns: (A,) angles in radians by which the object is turned.
+        obstacles: names of what may be in the way; the last one, "", stands for those of the workspace.
+        about: what was measured.
     """
 
     name: str
@@ -161,7 +171,27 @@ class PropositionMaps:
     lower: Floats
     upper: Floats
     clearance: Floats
+    nearest: NDArray[np.int64]
     turns: Floats
+    obstacles: tuple[str, ...]
+    about: Measured = field(repr=False)
+
+
+class Measured(NamedTuple):
+    """What maps were measured of: propositions with their regions, and the sample whose object moves."""
+
+    propositions: tuple[Formula, ...]
+    regions: Mapping[str, Outline]
+    sample: Sample
+
+
+class MapParts(NamedTuple):
+    """What a gradient map was computed from: maps as now and after other motions, progress, constraints."""
+
+    now: PropositionMaps
+    then: PropositionMaps
+    progress: Cubes
+    constraints: Cubes
 
 
 def proposition_maps(
@@ -192,7 +222,8 @@ def proposition_maps(
     moves = np.array([concerns(each, name) for each in propositions], np.bool_)
     concerned = [each for each, is_moving in zip(propositions, moves, strict=True) if is_moving]
     others = [each for each, is_moving in zip(propositions, moves, strict=True) if not is_moving]
-    distances = _obstacle_distances(propositions, sample, name, workspace)
+    obstacles = [each for each in sorted(sample.objects) if each not in (name, *workspace.supports)]
+    distances = _obstacle_distances(propositions, name, obstacles)
     shape = (len(turns), *cells.shape)
     over_cells = _intervals(everywhere, [*concerned, *distances], regions)
     # propositions that do not depend on the object have the same value in every cell
@@ -202,11 +233,16 @@ def proposition_maps(
         values = np.empty((len(propositions), len(everywhere)))
         values[moves], values[~moves] = moving[: len(concerned)], still
         ends.append(values.reshape(len(propositions), *shape))
-    clearance = over_cells[0][len(concerned) :].min(axis=0, initial=np.inf)
+    static = np.full(len(everywhere), np.inf)
     if workspace.obstacles:
-        clearance = np.minimum(clearance, _to_static(everywhere, name, workspace))
+        static = _to_static(everywhere, name, workspace)
+    clearances = np.vstack((over_cells[0][len(concerned) :], static))
+    nearest = clearances.argmin(axis=0)
+    clearance = clearances.min(axis=0).reshape(shape)
     lower, upper = ends
-    return PropositionMaps(name, cells, lower, upper, clearance.reshape(shape), turns)
+    about = Measured(tuple(propositions), regions, sample)
+    ways = nearest.reshape(shape), turns, (*obstacles, "")
+    return PropositionMaps(name, cells, lower, upper, clearance, *ways, about)
 
 
 def _intervals(
@@ -217,9 +253,7 @@ def _intervals(
     return leaves[0], leaves[min(1, len(leaves) - 1)]
 
 
-def _obstacle_distances(
-    propositions: Sequence[Formula], sample: Sample, name: str, workspace: Workspace
-) -> list[Atom]:
+def _obstacle_distances(propositions: Sequence[Formula], name: str, obstacles: Sequence[str]) -> list[Atom]:
     """Return atoms for the distance from the object to each other object in its way.
 
     A distance is at most 0 exactly if the object's centre lies in the Minkowski sum of the other object and
@@ -228,12 +262,11 @@ def _obstacle_distances(
     atoms_read = (each for one in propositions for each in iter_formulas(one) if isinstance(each, Atom))
     measured = {part for each in atoms_read for part in iter_expressions(each.expression)}
     atoms = []
-    for other in sorted(sample.objects):
-        if other != name and other not in workspace.supports:
-            one, two = TrackedName(name), TrackedName(other)
-            # in the order of a proposition's own measurement, so that the kernel computes it only once
-            swapped = SignedDistance(two, one)
-            atoms.append(Atom("", "dist", swapped if swapped in measured else SignedDistance(one, two)))
+    for other in obstacles:
+        one, two = TrackedName(name), TrackedName(other)
+        # in the order of a proposition's own measurement, so that the kernel computes it only once
+        swapped = SignedDistance(two, one)
+        atoms.append(Atom("", "dist", swapped if swapped in measured else SignedDistance(one, two)))
     return atoms
 
 

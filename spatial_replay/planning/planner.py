@@ -14,13 +14,23 @@ from spatial_replay.automata.guards import Transition
 from spatial_replay.errors import TraceError, UsageError
 from spatial_replay.geometry.footprint import TrackedObject
 from spatial_replay.planning.candidates import Movables, with_choice
-from spatial_replay.planning.decisions import Consideration, Edge, Kind, Outcome, Reason, Step, Target
+from spatial_replay.planning.decisions import (
+    Consideration,
+    Edge,
+    Kind,
+    Loss,
+    Outcome,
+    Reason,
+    Step,
+    Target,
+)
 from spatial_replay.planning.edges import (
     Observer,
     Symbol,
     consideration_of,
     equivalent_edges,
     idle_transitions,
+    loss_text,
     refuse_template,
     why_no_path,
     worst_state,
@@ -88,6 +98,7 @@ class Planner:
         self._observer = Observer(self._formulas, specification.regions)
         self._symbol: Symbol = ()
         self._stop_reason = ""
+        self._lost: Loss | None = None
         self._pruned: dict[Edge, Reason] = {}
         self._attempts = _Attempts()
         self._running: Step | None = None
@@ -160,8 +171,12 @@ class Planner:
         if self._sample is None:
             refuse_unknown(self._settings.movable or (), sample, self._formulas)
         before, self._sample = self._sample, sample
+        states, symbol = self._states, self._symbol
         self._symbol = self._observer.symbol(sample)
-        self._states = self.automaton.step_set(self._states, self._symbol)
+        self._states = self.automaton.step_set(states, self._symbol)
+        if self._lost is None and self._states.isdisjoint(self.automaton.can_accept):
+            text = loss_text(self.automaton, states, symbol, self._symbol)
+            self._lost = Loss(sample.time_ns, text)
         self._stop_reason = self._why_stop(before, sample)
         # a wait ends early if the automaton is not where time alone should have taken it
         self._ahead = self._ahead[1:] if not self._states.isdisjoint(self._ahead[:1]) else ()
@@ -306,7 +321,8 @@ class Planner:
         number, self._steps = self._steps, self._steps + 1
         pruned = tuple(sorted(self._pruned.items()))
         time_ns = self._newest().time_ns
-        return Step(number, time_ns, kind, self.states, tuple(considered), None, pruned, reason)
+        lost = self._lost
+        return Step(number, time_ns, kind, self.states, tuple(considered), None, pruned, reason, lost=lost)
 
     def _newest(self) -> Sample:
         if self._sample is None:

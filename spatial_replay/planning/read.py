@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from os import PathLike
 from typing import Final, NamedTuple
@@ -16,6 +16,7 @@ from spatial_replay.logs.source import Source, read_blocks
 from spatial_replay.logs.topics import GRADIENT_MAP, PLAN_DECISION, PLAN_PATH, RECORDED_PREFIX
 from spatial_replay.planning.decision_log import (
     PLAN_METADATA,
+    PLAN_VERSION,
     BlackBox,
     decision_from_payload,
     latest_decisions,
@@ -72,9 +73,7 @@ def planner_of(source: Source) -> Planner:
         UsageError: the log holds no plan.
         LogError: the settings or the specification of the plan cannot be read.
     """
-    about = dict(source.metadata()).get(PLAN_METADATA)
-    if about is None:
-        raise _without_decisions(source)
+    about = _plan_of(source)
     texts = {attachment.name: attachment.data for attachment in source.attachments()}
     name = RECORDED_PREFIX + about.get("file", "")
     if name not in texts:
@@ -85,6 +84,34 @@ def planner_of(source: Source) -> Planner:
     return Planner(
         specification, settings_from_text(about.get("settings", "")), name=about.get("specification")
     )
+
+
+def _plan_of(source: Source) -> Mapping[str, str]:
+    about = dict(source.metadata()).get(PLAN_METADATA)
+    if about is None:
+        raise _without_decisions(source)
+    return about
+
+
+def _version_of(source: Source) -> int:
+    """Return what messages of a log's planner say."""
+    text = _plan_of(source).get("version", "1")
+    if not text.isdecimal() or not 1 <= int(text) <= PLAN_VERSION:
+        raise LogError(
+            f"the plan in {source.name} has version {text[:20]!r}, and this version of spatial-replay "
+            f"recomputes 1 to {PLAN_VERSION}; use a newer one"
+        )
+    return int(text)
+
+
+def rerun_of(source: Source) -> Rerun:
+    """Return the planned run of a log, to repeat it from before its first sample.
+
+    Raises:
+        UsageError: the log holds no plan.
+        LogError: the settings or the specification of the plan cannot be read.
+    """
+    return Rerun(planner_of(source), _version_of(source))
 
 
 def _without_decisions(source: Source) -> UsageError:
@@ -118,7 +145,7 @@ def read_steps(log: str | PathLike[str]) -> tuple[LoggedStep, ...]:
         MissingFileError, LogError: the log cannot be read, or has other decisions than those recomputed.
     """
     source = open_source(log)
-    rerun = Rerun(planner_of(source))
+    rerun = rerun_of(source)
     steps: dict[int, LoggedStep] = {}
     for sample, messages in iter_moments(read_blocks(source)):
         if sample is not None:
@@ -209,9 +236,13 @@ class Rerun:
         is_moving: whether its motion has not been concluded yet.
     """
 
-    def __init__(self, planner: Planner) -> None:
-        """Begin before the first sample."""
-        self.box = BlackBox(planner)
+    def __init__(self, planner: Planner, version: int = PLAN_VERSION) -> None:
+        """Begin before the first sample.
+
+        Args:
+            version: of what messages say, see `PLAN_VERSION`.
+        """
+        self.box = BlackBox(planner, version=version)
         self.last: Step | None = None
         self.is_moving = False
 

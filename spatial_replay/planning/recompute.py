@@ -13,8 +13,9 @@ from spatial_replay.logs.messages import Block
 from spatial_replay.logs.schemas.PlanDecision_pb2 import PlanDecision
 from spatial_replay.logs.source import Source, read_blocks
 from spatial_replay.logs.topics import ENDING, METADATA, PLAN_DECISION
-from spatial_replay.planning.decision_log import decision_from_payload, maps_of
+from spatial_replay.planning.decision_log import decision_from_payload
 from spatial_replay.planning.decisions import Step
+from spatial_replay.planning.map_messages import maps_of
 from spatial_replay.planning.planner import Planner
 from spatial_replay.planning.read import (
     PLANNER_TOPICS,
@@ -22,7 +23,7 @@ from spatial_replay.planning.read import (
     Rerun,
     iter_moments,
     planner_messages,
-    planner_of,
+    rerun_of,
 )
 from spatial_replay.text import counted
 
@@ -57,7 +58,7 @@ def recompute_decisions(source: Source, advance: Callable[[int], None] = lambda 
         UsageError: the log holds no plan, or begins within the run.
         LogError: the settings or the specification of the plan cannot be read.
     """
-    extent, comparison = _run_extent(source), _Comparison(planner_of(source))
+    extent, comparison = _run_extent(source), _Comparison(rerun_of(source))
     faults: list[str] = []
     samples = 0
 
@@ -93,8 +94,8 @@ class _Comparison:
         differences: between the messages; after the first ones, nothing more is compared.
     """
 
-    def __init__(self, planner: Planner) -> None:
-        self.rerun = Rerun(planner)
+    def __init__(self, rerun: Rerun) -> None:
+        self.rerun = rerun
         self.began_within = False
         self.decisions = self.maps = 0
         self.differences: list[str] = []

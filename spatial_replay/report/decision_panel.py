@@ -23,6 +23,7 @@ from spatial_replay.logs.schemas.PlanDecision_pb2 import (
 )
 from spatial_replay.planning.decision_log import decision_from_payload, latest_decisions
 from spatial_replay.planning.decisions import Reason
+from spatial_replay.planning.map_messages import map_fields
 from spatial_replay.report.compact import Packing, singles
 from spatial_replay.text import number_text
 
@@ -167,12 +168,11 @@ def _is_chosen(owner: _Owner | None, decision: PlanDecision, maps: int) -> bool:
 
 def _drawn(grid: Grid, owner: _Owner | None, is_chosen: bool) -> _Drawn | None:
     """Return a map's robustness; None if the sizes in the message are inconsistent or empty."""
-    columns, cell, row = grid.column_count, grid.cell_stride, grid.row_stride
-    rows = len(grid.data) // row if row else 0
-    offset = next((field.offset for field in grid.fields if field.name.startswith("robustness")), cell)
-    if not rows or not columns or cell * columns > row or offset + 4 > cell:
+    fields = map_fields(grid)
+    numbers = fields.get("robustness")
+    if numbers is None:
         return None
-    numbers = np.ndarray((rows, columns), "<f4", grid.data, offset, (row, cell))
+    rows, columns = numbers.shape
     x, y = grid.pose.position.x, grid.pose.position.y
     high = x + columns * grid.cell_size.x, y + rows * grid.cell_size.y
     if not np.isfinite([x, y, *high]).all() or high[0] <= x or high[1] <= y:

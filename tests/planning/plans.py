@@ -7,7 +7,14 @@ from dataclasses import replace
 import spatial_replay as sr
 from planning.kinematics import BLOCKS, PUSHING, Table
 from spatial_replay import Planner, Settings
-from spatial_replay.planning import PLAN_METADATA, BlackBox, Grid, Workspace, text_from_settings
+from spatial_replay.planning import (
+    PLAN_METADATA,
+    BlackBox,
+    Grid,
+    Workspace,
+    plan_metadata,
+    text_from_settings,
+)
 from spatial_replay.runs.run_log import run_log
 
 PUSH = Settings(
@@ -47,7 +54,7 @@ def record_plan_of(
     specification = replace(sr.parse_specification(text), filename="task.spatial")
     box = BlackBox(Planner(specification, settings))
     with run_log(path, [specification]) as log:
-        about = {"file": "task.spatial", "specification": box.planner.automaton.name}
+        about = plan_metadata(box.planner, "task.spatial")
         log.add_metadata(
             PLAN_METADATA, {**about, "settings": text_from_settings(recorded_settings or settings)}
         )

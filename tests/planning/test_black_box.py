@@ -27,7 +27,7 @@ from spatial_replay.planning import (
     settings_from_text,
     text_from_settings,
 )
-from spatial_replay.planning.decision_log import CELL
+from spatial_replay.planning.map_messages import map_fields
 from spatial_replay.replay import ReplayOptions, Window, load_files, run_replay, verify_certificate
 from spatial_replay.sources import open_source
 
@@ -147,8 +147,8 @@ TURNED = "F (fork oriented[0.01] cup and fork rightof cup) and F (fork above cup
 
 def values_of(message):
     """(rows, columns): the numbers of a grid; blocked cells are clear."""
-    cells = np.frombuffer(message.data, CELL).reshape(-1, message.column_count)
-    assert np.array_equal(cells["colour"][..., 3] == 0, np.isnan(cells["robustness"]))
+    cells = map_fields(message)
+    assert np.array_equal(cells["alpha"] == 0, np.isnan(cells["robustness"]))
     return cells["robustness"]
 
 
@@ -221,6 +221,12 @@ def test_the_maps_of_the_recorded_push_explain_the_pruned_edge():
     value = value_at(maps[chosen.maps[0].number], first.target.x, first.target.y)
     assert value == np.float32(first.target.robustness)
     assert value >= needed
+
+
+def test_decisions_of_the_recorded_push_are_recomputed_byte_for_byte():
+    recomputed = recompute_decisions(open_source(RECORDED))
+    assert recomputed.differences == ()
+    assert recomputed.decisions > 2
 
 
 def test_the_planned_path_is_drawn_first_and_then_the_travelled_one(tmp_path):

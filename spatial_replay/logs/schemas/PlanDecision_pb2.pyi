@@ -66,6 +66,7 @@ class PlanDecision(google.protobuf.message.Message):
     PRUNED_FIELD_NUMBER: builtins.int
     REASON_FIELD_NUMBER: builtins.int
     OUTCOME_FIELD_NUMBER: builtins.int
+    LOST_FIELD_NUMBER: builtins.int
     time_ns: builtins.int
     """Time in nanoseconds of the sample that it was made on."""
     number: builtins.int
@@ -95,6 +96,10 @@ class PlanDecision(google.protobuf.message.Message):
     def outcome(self) -> global___PlanOutcome:
         """How it went; absent when the decision is made."""
 
+    @property
+    def lost(self) -> global___PlanLoss:
+        """When and by what acceptance was lost; absent while the specification can be satisfied."""
+
     def __init__(
         self,
         *,
@@ -108,15 +113,40 @@ class PlanDecision(google.protobuf.message.Message):
         pruned: collections.abc.Iterable[global___PrunedEdge] | None = ...,
         reason: builtins.str = ...,
         outcome: global___PlanOutcome | None = ...,
+        lost: global___PlanLoss | None = ...,
     ) -> None: ...
-    def HasField(self, field_name: typing.Literal["_number", b"_number", "_time_ns", b"_time_ns", "number", b"number", "outcome", b"outcome", "target", b"target", "time_ns", b"time_ns"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["_number", b"_number", "_time_ns", b"_time_ns", "considered", b"considered", "kind", b"kind", "number", b"number", "outcome", b"outcome", "pruned", b"pruned", "reason", b"reason", "specification", b"specification", "states", b"states", "target", b"target", "time_ns", b"time_ns"]) -> None: ...
+    def HasField(self, field_name: typing.Literal["_number", b"_number", "_time_ns", b"_time_ns", "lost", b"lost", "number", b"number", "outcome", b"outcome", "target", b"target", "time_ns", b"time_ns"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["_number", b"_number", "_time_ns", b"_time_ns", "considered", b"considered", "kind", b"kind", "lost", b"lost", "number", b"number", "outcome", b"outcome", "pruned", b"pruned", "reason", b"reason", "specification", b"specification", "states", b"states", "target", b"target", "time_ns", b"time_ns"]) -> None: ...
     @typing.overload
     def WhichOneof(self, oneof_group: typing.Literal["_number", b"_number"]) -> typing.Literal["number"] | None: ...
     @typing.overload
     def WhichOneof(self, oneof_group: typing.Literal["_time_ns", b"_time_ns"]) -> typing.Literal["time_ns"] | None: ...
 
 global___PlanDecision = PlanDecision
+
+@typing.final
+class PlanLoss(google.protobuf.message.Message):
+    """The sample after which the specification could not be satisfied any more."""
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    TIME_NS_FIELD_NUMBER: builtins.int
+    TEXT_FIELD_NUMBER: builtins.int
+    time_ns: builtins.int
+    """Its time in nanoseconds."""
+    text: builtins.str
+    """What it had that the specification forbids, in words."""
+    def __init__(
+        self,
+        *,
+        time_ns: builtins.int | None = ...,
+        text: builtins.str = ...,
+    ) -> None: ...
+    def HasField(self, field_name: typing.Literal["_time_ns", b"_time_ns", "time_ns", b"time_ns"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["_time_ns", b"_time_ns", "text", b"text", "time_ns", b"time_ns"]) -> None: ...
+    def WhichOneof(self, oneof_group: typing.Literal["_time_ns", b"_time_ns"]) -> typing.Literal["time_ns"] | None: ...
+
+global___PlanLoss = PlanLoss
 
 @typing.final
 class PlanEdge(google.protobuf.message.Message):
@@ -226,6 +256,9 @@ class PlanCandidate(google.protobuf.message.Message):
     REJECTED_FIELD_NUMBER: builtins.int
     CHOSEN_FIELD_NUMBER: builtins.int
     MAPS_FIELD_NUMBER: builtins.int
+    CONJUNCTS_FIELD_NUMBER: builtins.int
+    CAUSES_FIELD_NUMBER: builtins.int
+    ROOM_FIELD_NUMBER: builtins.int
     object: builtins.str
     best: builtins.float
     """Greatest robustness of the progress set at a cell that is not blocked; -infinity if all are."""
@@ -243,6 +276,18 @@ class PlanCandidate(google.protobuf.message.Message):
     def maps(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___PlanMap]:
         """Where its gradient map is to be found, by the ways in which it may be turned."""
 
+    @property
+    def conjuncts(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___PlanConjunct]:
+        """What the progress set is made of. A cell of the map names by number, from 1, the one that limits it."""
+
+    @property
+    def causes(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___PlanCause]:
+        """What keeps the object out of cells. A blocked cell of the map names it by number, from 1."""
+
+    @property
+    def room(self) -> global___PlanRoom:
+        """What the room around its target costs; absent if it costs nothing."""
+
     def __init__(
         self,
         *,
@@ -253,12 +298,140 @@ class PlanCandidate(google.protobuf.message.Message):
         rejected: builtins.str = ...,
         chosen: builtins.bool = ...,
         maps: collections.abc.Iterable[global___PlanMap] | None = ...,
+        conjuncts: collections.abc.Iterable[global___PlanConjunct] | None = ...,
+        causes: collections.abc.Iterable[global___PlanCause] | None = ...,
+        room: global___PlanRoom | None = ...,
     ) -> None: ...
-    def HasField(self, field_name: typing.Literal["_best", b"_best", "best", b"best", "target", b"target"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["_best", b"_best", "best", b"best", "chosen", b"chosen", "map_sha256", b"map_sha256", "maps", b"maps", "object", b"object", "rejected", b"rejected", "target", b"target"]) -> None: ...
+    def HasField(self, field_name: typing.Literal["_best", b"_best", "best", b"best", "room", b"room", "target", b"target"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["_best", b"_best", "best", b"best", "causes", b"causes", "chosen", b"chosen", "conjuncts", b"conjuncts", "map_sha256", b"map_sha256", "maps", b"maps", "object", b"object", "rejected", b"rejected", "room", b"room", "target", b"target"]) -> None: ...
     def WhichOneof(self, oneof_group: typing.Literal["_best", b"_best"]) -> typing.Literal["best"] | None: ...
 
 global___PlanCandidate = PlanCandidate
+
+@typing.final
+class PlanConjunct(google.protobuf.message.Message):
+    """A part of the progress set that is not made of others: a relation of the specification, or its negation."""
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    TEXT_FIELD_NUMBER: builtins.int
+    LIMITS_FIELD_NUMBER: builtins.int
+    AT_TARGET_FIELD_NUMBER: builtins.int
+    text: builtins.str
+    """In words; the field of the map with its robustness is named like this, behind its number."""
+    limits: builtins.int
+    """How many free cells, over all turns, it limits: the progress set has just its robustness there."""
+    at_target: builtins.float
+    """Its robustness in the target's cell; absent without a target."""
+    def __init__(
+        self,
+        *,
+        text: builtins.str = ...,
+        limits: builtins.int | None = ...,
+        at_target: builtins.float | None = ...,
+    ) -> None: ...
+    def HasField(self, field_name: typing.Literal["_at_target", b"_at_target", "_limits", b"_limits", "at_target", b"at_target", "limits", b"limits"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["_at_target", b"_at_target", "_limits", b"_limits", "at_target", b"at_target", "limits", b"limits", "text", b"text"]) -> None: ...
+    @typing.overload
+    def WhichOneof(self, oneof_group: typing.Literal["_at_target", b"_at_target"]) -> typing.Literal["at_target"] | None: ...
+    @typing.overload
+    def WhichOneof(self, oneof_group: typing.Literal["_limits", b"_limits"]) -> typing.Literal["limits"] | None: ...
+
+global___PlanConjunct = PlanConjunct
+
+@typing.final
+class PlanCause(google.protobuf.message.Message):
+    """What keeps an object out of cells."""
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    class _Kind:
+        ValueType = typing.NewType("ValueType", builtins.int)
+        V: typing_extensions.TypeAlias = ValueType
+
+    class _KindEnumTypeWrapper(google.protobuf.internal.enum_type_wrapper._EnumTypeWrapper[PlanCause._Kind.ValueType], builtins.type):
+        DESCRIPTOR: google.protobuf.descriptor.EnumDescriptor
+        KIND_UNSPECIFIED: PlanCause._Kind.ValueType  # 0
+        KIND_CONSTRAINT: PlanCause._Kind.ValueType  # 1
+        """Something of the constraint set would hold."""
+        KIND_OBJECT: PlanCause._Kind.ValueType  # 2
+        """An object stands there."""
+        KIND_OBSTACLE: PlanCause._Kind.ValueType  # 3
+        """An obstacle of the workspace stands there."""
+        KIND_REACH: PlanCause._Kind.ValueType  # 4
+        """It is out of the robot's reach."""
+        KIND_UNKNOWN: PlanCause._Kind.ValueType  # 5
+        """Something of the progress set is not known."""
+        KIND_FAILED: PlanCause._Kind.ValueType  # 6
+        """A motion to a place near it has failed."""
+
+    class Kind(_Kind, metaclass=_KindEnumTypeWrapper): ...
+    KIND_UNSPECIFIED: PlanCause.Kind.ValueType  # 0
+    KIND_CONSTRAINT: PlanCause.Kind.ValueType  # 1
+    """Something of the constraint set would hold."""
+    KIND_OBJECT: PlanCause.Kind.ValueType  # 2
+    """An object stands there."""
+    KIND_OBSTACLE: PlanCause.Kind.ValueType  # 3
+    """An obstacle of the workspace stands there."""
+    KIND_REACH: PlanCause.Kind.ValueType  # 4
+    """It is out of the robot's reach."""
+    KIND_UNKNOWN: PlanCause.Kind.ValueType  # 5
+    """Something of the progress set is not known."""
+    KIND_FAILED: PlanCause.Kind.ValueType  # 6
+    """A motion to a place near it has failed."""
+
+    KIND_FIELD_NUMBER: builtins.int
+    TEXT_FIELD_NUMBER: builtins.int
+    CELLS_FIELD_NUMBER: builtins.int
+    kind: global___PlanCause.Kind.ValueType
+    text: builtins.str
+    """What would hold, or the object; else empty."""
+    cells: builtins.int
+    """How many cells, over all turns."""
+    def __init__(
+        self,
+        *,
+        kind: global___PlanCause.Kind.ValueType = ...,
+        text: builtins.str = ...,
+        cells: builtins.int | None = ...,
+    ) -> None: ...
+    def HasField(self, field_name: typing.Literal["_cells", b"_cells", "cells", b"cells"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["_cells", b"_cells", "cells", b"cells", "kind", b"kind", "text", b"text"]) -> None: ...
+    def WhichOneof(self, oneof_group: typing.Literal["_cells", b"_cells"]) -> typing.Literal["cells"] | None: ...
+
+global___PlanCause = PlanCause
+
+@typing.final
+class PlanRoom(google.protobuf.message.Message):
+    """A target that leaves room around the object, where more robustness was possible with less."""
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    WANTED_FIELD_NUMBER: builtins.int
+    POSSIBLE_FIELD_NUMBER: builtins.int
+    CLEARANCE_FIELD_NUMBER: builtins.int
+    wanted: builtins.float
+    """The room that the settings ask for, in footprint units."""
+    possible: builtins.float
+    """The greatest robustness possible, and the room there."""
+    clearance: builtins.float
+    def __init__(
+        self,
+        *,
+        wanted: builtins.float | None = ...,
+        possible: builtins.float | None = ...,
+        clearance: builtins.float | None = ...,
+    ) -> None: ...
+    def HasField(self, field_name: typing.Literal["_clearance", b"_clearance", "_possible", b"_possible", "_wanted", b"_wanted", "clearance", b"clearance", "possible", b"possible", "wanted", b"wanted"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["_clearance", b"_clearance", "_possible", b"_possible", "_wanted", b"_wanted", "clearance", b"clearance", "possible", b"possible", "wanted", b"wanted"]) -> None: ...
+    @typing.overload
+    def WhichOneof(self, oneof_group: typing.Literal["_clearance", b"_clearance"]) -> typing.Literal["clearance"] | None: ...
+    @typing.overload
+    def WhichOneof(self, oneof_group: typing.Literal["_possible", b"_possible"]) -> typing.Literal["possible"] | None: ...
+    @typing.overload
+    def WhichOneof(self, oneof_group: typing.Literal["_wanted", b"_wanted"]) -> typing.Literal["wanted"] | None: ...
+
+global___PlanRoom = PlanRoom
 
 @typing.final
 class PlanMap(google.protobuf.message.Message):
