@@ -33,7 +33,10 @@ from spatial_replay.planning.edges import (
     equivalent_edges,
     idle_transitions,
 )
-from spatial_replay.planning.candidates import Movables, by_cost
+from spatial_replay.planning.expectations import Expectations, Foreseen
+from spatial_replay.planning.map_layers import AVOIDED_CELLS
+from spatial_replay.planning.maps import concerns, gradient_map, proposition_maps
+from spatial_replay.planning.ordering import MotionOrder
 from spatial_replay.planning.settings import Settings
 from spatial_replay.spec.formula import Formula, Outline
 from spatial_replay.trace.sample import Sample

@@ -47,7 +47,7 @@ _NUMBERS: Final = 1 << 24
 """Numbers of a kind that a code has room for."""
 
 
-class Cause(NamedTuple):
+class BlockedBy(NamedTuple):
     """What keeps an object out of cells.
 
     Attributes:
@@ -83,7 +83,7 @@ class MapLayers:
     conjuncts: tuple[str, ...]
     robustness: Floats
     limiting: NDArray[np.int64]
-    causes: tuple[Cause, ...]
+    causes: tuple[BlockedBy, ...]
     blocked_by: NDArray[np.int64]
 
 
@@ -186,7 +186,7 @@ def _measured(maps: PropositionMaps, formulas: Sequence[Formula]) -> tuple[Float
 
 def _causes(
     gradient: GradientMap, failed: Collection[tuple[float, float]]
-) -> tuple[tuple[Cause, ...], NDArray[np.int64]]:
+) -> tuple[tuple[BlockedBy, ...], NDArray[np.int64]]:
     """Return what blocks cells, and the number of its cause for each."""
     maps, blocked = gradient.made_of.now, gradient.blocked
     codes = np.full(blocked.shape, -1, np.int64)
@@ -209,7 +209,7 @@ def _causes(
         if kind == "object" and not name:
             kind = "obstacle"
         blocked_by[codes == code] = min(place, MOST_CAUSES - 1)
-        causes.append(Cause(kind, name, count))
+        causes.append(BlockedBy(kind, name, count))
     return tuple(causes[:MOST_CAUSES]), blocked_by
 
 

@@ -174,10 +174,10 @@ class PropositionMaps:
     nearest: NDArray[np.int64]
     turns: Floats
     obstacles: tuple[str, ...]
-    about: Measured = field(repr=False)
+    about: MapSubject = field(repr=False)
 
 
-class Measured(NamedTuple):
+class MapSubject(NamedTuple):
     """What maps were measured of: propositions with their regions, and the sample whose object moves."""
 
     propositions: tuple[Formula, ...]
@@ -240,7 +240,7 @@ def proposition_maps(
     nearest = clearances.argmin(axis=0)
     clearance = clearances.min(axis=0).reshape(shape)
     lower, upper = ends
-    about = Measured(tuple(propositions), regions, sample)
+    about = MapSubject(tuple(propositions), regions, sample)
     ways = nearest.reshape(shape), turns, (*obstacles, "")
     return PropositionMaps(name, cells, lower, upper, clearance, *ways, about)
 
