@@ -18,7 +18,8 @@ Every message names the wrong value, its place and the remedy.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from os import PathLike, fspath, strerror
 from typing import Final, Protocol, Self
 
@@ -34,6 +35,24 @@ def system_reason(error: Exception) -> str:
     # names that are not found have numbers below 0, of another list
     words = strerror(number) if number is not None and number > 0 else getattr(error, "strerror", None)
     return (words or str(error) or type(error).__name__).lower()
+
+
+@contextmanager
+def importing(what: str, *, extra: str) -> Iterator[None]:
+    """Import optional libraries: a context in which they are imported.
+
+    Args:
+        what: what needs them: "videos need PyAV".
+        extra: of this package, which installs them.
+
+    Raises:
+        UsageError: one is not installed.
+    """
+    try:
+        yield
+    except ImportError:
+        remedy = f"pip install 'spatial-replay[{extra}]'"
+        raise UsageError(f"{what}, which is not installed: {remedy}") from None
 
 
 class SpatialReplayError(Exception):

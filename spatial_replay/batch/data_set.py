@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 
 from spatial_replay.batch.result_files import ResultFiles, result_files
 from spatial_replay.batch.rows import ResultRow
-from spatial_replay.errors import LogError, MissingFileError, UsageError
+from spatial_replay.errors import LogError, MissingFileError, UsageError, importing
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -366,11 +366,6 @@ def _key_of(name: str) -> str:
 
 
 def _pyarrow() -> Any:
-    try:
+    with importing("results are Parquet files, which need pyarrow", extra="parquet"):
         import pyarrow
-    except ImportError:
-        raise UsageError(
-            "results are Parquet files, which need pyarrow; install it with: "
-            "pip install 'spatial-replay[parquet]'"
-        ) from None
     return pyarrow

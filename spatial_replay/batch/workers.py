@@ -27,7 +27,7 @@ from itertools import islice
 from multiprocessing.connection import Connection
 from typing import Any, Final, Protocol, TypeAlias, TypeVar, cast
 
-from spatial_replay.errors import ClusterError, UsageError
+from spatial_replay.errors import ClusterError, UsageError, importing
 
 _Task = TypeVar("_Task")
 _Result = TypeVar("_Result")
@@ -246,11 +246,8 @@ class DaskCluster:
     @contextmanager
     def _connected(self) -> Iterator[Any]:
         """Connect a client, which closes whatever has become of the cluster."""
-        try:
+        with importing("clusters need Dask", extra="cluster"):
             import distributed
-        except ImportError:
-            remedy = "pip install 'spatial-replay[cluster]'"
-            raise UsageError(f"clusters need Dask, which is not installed: {remedy}") from None
         client_type = cast(Any, distributed).Client
         # made before it connects, so that one that cannot is closed here and not when Python ends
         client = client_type.__new__(client_type)

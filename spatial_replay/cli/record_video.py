@@ -70,7 +70,8 @@ def duration_ns(context: click.Context, parameter: click.Parameter, text: str | 
     "hold_ns",
     metavar="T",
     callback=duration_ns,
-    help="Keep a hidden object where it was for so long, ever less certain, such as 200ms.  [default: 0s]",
+    help="Keep a hidden object where it was for so long, ever less certain, such as 200ms."
+    "  [default: hold of the tags file, or 0s]",
 )
 @click.option("--rate", metavar="HZ", type=float, help="Frames a second, for a video without time stamps.")
 @click.option(
@@ -130,7 +131,7 @@ def video(
             tags,
             output,
             files,
-            hold_ns=hold_ns or 0,
+            hold_ns=hold_ns,
             keep=keep,
             inputs=local_files(given),
             begin=first_ns.append,

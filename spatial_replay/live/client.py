@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, NamedTuple, TypeAlias
 
-from spatial_replay.errors import LogError, RemoteError, UsageError, system_reason
+from spatial_replay.errors import LogError, RemoteError, UsageError, importing, system_reason
 from spatial_replay.live.protocol import (
     SUBPROTOCOLS,
     Advertised,
@@ -22,15 +22,10 @@ from spatial_replay.live.protocol import (
 )
 from spatial_replay.logs.messages import Channel
 
-try:
+with importing("a running robot is listened to with websockets", extra="live"):
     from websockets.asyncio.client import ClientConnection, connect
     from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus, InvalidURI
     from websockets.typing import Subprotocol
-except ImportError:
-    raise UsageError(
-        "a running robot is listened to with websockets, which is not installed: pip install"
-        " 'spatial-replay[live]'"
-    ) from None
 
 LARGEST_FRAME: Final = 64 * 2**20
 """The most bytes of one frame; a server that sends more is disconnected."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from spatial_replay.errors import UsageError
+from spatial_replay.errors import importing
 from spatial_replay.logs.messages import MemorySink, Messages
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.topics import OBJECTS, SPECIFICATION, protobuf_channel
@@ -146,12 +146,8 @@ def open_viewing(
         UsageError: nothing can listen there, a text that is no origin, or the library for it is not
             installed.
     """
-    try:
+    with importing("serving takes foxglove-sdk", extra="live"):
         from spatial_replay.serve.server import RunServer
-    except ImportError:
-        raise UsageError(
-            "serving takes foxglove-sdk, which is not installed: pip install 'spatial-replay[live]'"
-        ) from None
     channels = [*Recording(MemorySink(), files).channels, protobuf_channel(OBJECTS, ObjectStates)]
     viewing: Viewing | None = None
 

@@ -20,7 +20,7 @@ from types import MappingProxyType
 from typing import Any, BinaryIO, Final, TypeAlias, cast
 from urllib.parse import unquote, urlsplit
 
-from spatial_replay.errors import MissingFileError, RemoteError, SpatialReplayError, UsageError
+from spatial_replay.errors import MissingFileError, RemoteError, SpatialReplayError, UsageError, importing
 from spatial_replay.logs.byte_ranges import MOST_HELD_BYTES, HeldBytes, Range, RangeStream, joined_ranges
 
 _CREDENTIALS: Final = {
@@ -343,12 +343,10 @@ def obstore_library() -> Any:
     Raises:
         UsageError: it is not installed.
     """
-    try:
+    with importing("addresses need obstore", extra="remote"):
         import obstore
         import obstore.exceptions
         import obstore.store
-    except ImportError:
-        raise UsageError("addresses need obstore; pip install 'spatial-replay[remote]'") from None
     return obstore
 
 

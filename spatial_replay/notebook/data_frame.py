@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from spatial_replay.errors import UsageError
+from spatial_replay.errors import UsageError, importing
 from spatial_replay.monitor.evaluate import Evaluation
 from spatial_replay.monitor.result import SpecResult
 
@@ -53,9 +53,6 @@ def _of_result(result: SpecResult) -> Any:
 
 
 def _pandas() -> Any:
-    try:
+    with importing("a DataFrame needs pandas", extra="notebook"):
         import pandas
-    except ImportError:
-        remedy = "pip install 'spatial-replay[notebook]'"
-        raise UsageError(f"a DataFrame needs pandas, which is not installed: {remedy}") from None
     return pandas

@@ -12,7 +12,7 @@ from io import BytesIO
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, Literal
 
-from spatial_replay.errors import UsageError
+from spatial_replay.errors import UsageError, importing
 from spatial_replay.palette import NEGATIVE, NEUTRAL, POSITIVE, hexadecimal
 from spatial_replay.text import printable
 
@@ -37,11 +37,8 @@ def new_panels(
     Raises:
         UsageError: matplotlib is not installed.
     """
-    try:
+    with importing("figures need matplotlib", extra="notebook"):
         from matplotlib import pyplot
-    except ImportError:
-        remedy = "pip install 'spatial-replay[notebook]'"
-        raise UsageError(f"figures need matplotlib, which is not installed: {remedy}") from None
     _, grid = pyplot.subplots(rows, columns, figsize=size, squeeze=False, sharex=same_x, layout="constrained")
     return tuple(grid.flat)
 

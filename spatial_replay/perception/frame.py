@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+import struct
 from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 Image = NDArray[np.uint8]
 """(height, width) grey or (height, width, 3) blue, green, red."""
+
+LARGEST_PICTURE: Final = 64_000_000
+"""Pixels of one image; no camera has more, and a damaged header may claim it."""
+
+_PNG: Final = b"\x89PNG\r\n\x1a\n"
+_JPEG_FRAMES: Final = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+"""Markers of the segments of a JPEG that have its size."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,3 +35,50 @@ class Frame:
     image: Image
     data: bytes = field(default=b"", repr=False)
     is_key: bool = False
+
+
+def encoded_size(data: bytes) -> tuple[int, int] | None:
+    """Return width and height that a JPEG, PNG or WebP image claims; None for anything else.
+
+    Nothing is decoded: an image that claims too much can be refused for what it would cost.
+    """
+    try:
+        if data.startswith(_PNG):
+            width, height = struct.unpack_from(">II", data, 16)
+            return width, height
+        if data.startswith(b"\xff\xd8"):
+            return _jpeg_size(data)
+        if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
+            return _webp_size(data)
+    except (struct.error, IndexError):
+        pass
+    return None
+
+
+def _jpeg_size(data: bytes) -> tuple[int, int] | None:
+    at = 2
+    while data[at] == 0xFF:
+        marker = data[at + 1]
+        if marker == 0xFF:
+            # filled up
+            at += 1
+            continue
+        if marker in _JPEG_FRAMES:
+            height, width = struct.unpack_from(">HH", data, at + 5)
+            return width, height
+        at += 2 + int(struct.unpack_from(">H", data, at + 2)[0])
+    return None
+
+
+def _webp_size(data: bytes) -> tuple[int, int] | None:
+    kind = data[12:16]
+    if kind == b"VP8X":
+        width, height = (int.from_bytes(data[at : at + 3], "little") + 1 for at in (24, 27))
+        return width, height
+    if kind == b"VP8L":
+        bits = struct.unpack_from("<I", data, 21)[0]
+        return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+    if kind == b"VP8 ":
+        width, height = struct.unpack_from("<HH", data, 26)
+        return width & 0x3FFF, height & 0x3FFF
+    return None

@@ -17,10 +17,10 @@ from spatial_replay.logs.downloads import local_copy
 from spatial_replay.logs.remote import LogFile
 from spatial_replay.logs.topics import is_image_type
 from spatial_replay.mapping.message_types import short_type
-from spatial_replay.perception.frame import Frame, Image
+from spatial_replay.perception.frame import LARGEST_PICTURE, Frame, Image
 from spatial_replay.perception.opencv import decode_image
 from spatial_replay.perception.video import H264Decoder, VideoFile, has_key
-from spatial_replay.text import nearest_hint
+from spatial_replay.text import nearest_hint, time_text
 
 _CHANNELS: Final[Mapping[str, tuple[int, tuple[int, ...]]]] = MappingProxyType(
     {
@@ -34,8 +34,6 @@ _CHANNELS: Final[Mapping[str, tuple[int, tuple[int, ...]]]] = MappingProxyType(
     }
 )
 """Encodings of raw images: bytes of a pixel, and which of them are blue, green and red, or grey."""
-
-_LARGEST: Final = 64_000_000
 
 
 class ImageTopic:
@@ -71,9 +69,10 @@ class ImageTopic:
 
     def __iter__(self) -> Iterator[Frame]:
         decoder = H264Decoder() if "CompressedVideo" in self._type else None
-        last_ns = -1
+        last_ns = first_ns = -1
         for message in self._reader.iter_messages({self.topic}):
-            place = f"{self.name}: {self.topic} at {message.log_time_ns} ns"
+            first_ns = message.log_time_ns if first_ns < 0 else first_ns
+            place = f"{self.name}: {self.topic} after {time_text(message.log_time_ns, first_ns)}"
             try:
                 value: Any = self._decode(message.payload)
                 image = _image(value, self._type, decoder)
@@ -175,7 +174,7 @@ def _image(value: Any, type_name: str, decoder: H264Decoder | None) -> Image | N
         raise LogError(f"the encoding {encoding!r:.40} is not known; known are {', '.join(_CHANNELS)}")
     size, order = _CHANNELS[encoding]
     step = int(value.step) or width * size
-    if not (0 < width * height <= _LARGEST and width * size <= step and step * height <= len(data)):
+    if not (0 < width * height <= LARGEST_PICTURE and width * size <= step and step * height <= len(data)):
         raise LogError(f"an image of {width} x {height} ({encoding}) does not fit its {len(data)} bytes")
     rows = np.frombuffer(data, np.uint8, step * height).reshape(height, step)[:, : width * size]
     pixels = rows.reshape(height, width, size)

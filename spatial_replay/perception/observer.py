@@ -58,17 +58,25 @@ class TagObserver:
 
     An object whose tags are hidden is unknown, and so is one whose tag cannot be where it appears; when held,
     a hidden one stays where it was for a while, with an uncertainty that grows by its highest speed.
+
+    Attributes:
+        tags: the tags file.
+        hold_ns: how long a hidden object is held.
     """
 
-    def __init__(self, tags: TagsFile, *, hold_ns: int = 0) -> None:
+    def __init__(self, tags: TagsFile, *, hold_ns: int | None = None) -> None:
         """Prepare the detector.
+
+        Args:
+            hold_ns: how long a hidden object is held; None for what the tags file says.
 
         Raises:
             UsageError: a time below 0; OpenCV is not installed.
         """
+        hold_ns = tags.hold_ns if hold_ns is None else hold_ns
         if hold_ns < 0:
             raise UsageError(f"objects are held for {hold_ns} ns; give 0 or more")
-        self.tags, self._hold_ns = tags, hold_ns
+        self.tags, self.hold_ns = tags, hold_ns
         self._detector = TagDetector(tags.family)
         self._plane: Plane | None = None
         self._size: tuple[int, int] | None = None
@@ -198,7 +206,7 @@ class TagObserver:
                 self._hidden.pop(each.name, None)
             elif each.name in self._last:
                 since_ns, last = self._last[each.name]
-                if time_ns - since_ns <= self._hold_ns:
+                if time_ns - since_ns <= self.hold_ns:
                     grown = last.uncertainty + each.fastest * (time_ns - since_ns) / 1e9
                     held[each.name] = TrackedObject(
                         last.footprint, last.class_name, last.yaw, last.height, grown
@@ -225,8 +233,8 @@ class TagObserver:
         name, frames = self.tags.name, counted(self._frames, "frame")
         if self._frames and not self._seen:
             lines.append(
-                f"no tag of family {self.tags.family} is in any of {frames}; check the family, the light, and"
-                " that tags are 20 pixels or larger, with a white rim"
+                f"no tag of family {self.tags.family} is in any of {frames}; check the family, the light,"
+                " that tags are 20 pixels or larger, with a white rim, and that the camera looks from above"
             )
             return tuple(lines)
         unmapped = [number for number in sorted(self._seen) if number not in self.tags.ids]
@@ -255,7 +263,9 @@ class TagObserver:
         return tuple(lines)
 
 
-def observe_frames(frames: Iterable[Frame], tags: TagsFile, *, hold_ns: int = 0) -> Iterator[Observation]:
+def observe_frames(
+    frames: Iterable[Frame], tags: TagsFile, *, hold_ns: int | None = None
+) -> Iterator[Observation]:
     """Yield what frames show, one by one; see `TagObserver`."""
     observer = TagObserver(tags, hold_ns=hold_ns)
     for frame in frames:

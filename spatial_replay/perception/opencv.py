@@ -15,10 +15,10 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from spatial_replay.errors import LogError, UsageError
+from spatial_replay.errors import LogError, UsageError, importing
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.perception.corners import refined_corners
-from spatial_replay.perception.frame import Image
+from spatial_replay.perception.frame import LARGEST_PICTURE, Image, encoded_size
 
 FAMILIES: Final[Mapping[str, str]] = MappingProxyType(
     {
@@ -212,9 +212,15 @@ def decode_image(data: bytes) -> Image:
     """Decode a JPEG, PNG or WebP image to blue, green, red.
 
     Raises:
-        LogError: it is damaged, or none of these.
+        LogError: it is damaged, none of these, or has more pixels than `LARGEST_PICTURE`.
     """
     cv2 = _load()
+    size = encoded_size(data)
+    if size is None:
+        raise LogError("an image is damaged, or neither JPEG nor PNG nor WebP")
+    # before anything is decoded: a few bytes may claim to be gigabytes
+    if size[0] * size[1] > LARGEST_PICTURE:
+        raise LogError(f"an image of {size[0]} x {size[1]} is too large")
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
     except cv2.error:
@@ -284,12 +290,8 @@ def _load() -> Any:
     Raises:
         UsageError: it is not installed.
     """
-    try:
+    with importing("cameras need OpenCV", extra="vision"):
         import cv2
-    except ImportError:
-        raise UsageError(
-            "cameras need OpenCV, which is not installed: pip install 'spatial-replay[vision]'"
-        ) from None
     # one thread: results that do not depend on the machine, and no fight with the caller's threads
     cv2.setNumThreads(1)
     return cv2

@@ -28,8 +28,9 @@ USUAL_CORNER_ERROR: Final = 0.3
 _WORST_RESIDUAL: Final = 3.0
 """Pixels by which a reference tag may be off; more is no noise but a wrong place."""
 
-_LEAST_SLANT: Final = math.sin(math.radians(5.0))
-"""A plane that is seen at less than this, the sine of an angle, is seen edge-on."""
+_LEAST_SLANT: Final = math.sin(math.radians(8.0))
+"""A plane that is seen at less than this, the sine of an angle, is seen edge-on; further down, no tags are
+found."""
 
 _STEP: Final = 1e-6
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Final
 
-from spatial_replay.errors import OutputError, UsageError
+from spatial_replay.errors import OutputError, UsageError, importing
 from spatial_replay.perception.opencv import tag_cells
 from spatial_replay.perception.tags_file import ReferenceTag
 
@@ -76,12 +76,8 @@ class TagSheet:
             UsageError: fpdf2 is not installed, or the family lacks a tag.
             OutputError: the file cannot be written.
         """
-        try:
+        with importing("sheets of tags need fpdf2", extra="vision"):
             from fpdf import FPDF
-        except ImportError:
-            raise UsageError(
-                "sheets of tags need fpdf2, which is not installed: pip install 'spatial-replay[vision]'"
-            ) from None
         width, height = PAPERS[self.paper]
         pdf = FPDF(unit="mm", format=(width, height))
         pdf.set_auto_page_break(False)

@@ -21,6 +21,7 @@ from spatial_replay.geometry.footprint import Footprint
 from spatial_replay.logs.remote import log_file
 from spatial_replay.mapping.yaml_document import Document, Place, checked_document, read_yaml_text
 from spatial_replay.perception.opencv import Camera
+from spatial_replay.trace.time_points import duration_ns_from_text
 
 SCHEMA_FILE: Final = "tags.schema.json"
 LEAST_REFERENCES: Final = 4
@@ -107,6 +108,7 @@ class TagsFile:
         corner_error: standard deviation of a corner in pixels; None to measure it.
         reference_error: how far a reference tag may be from its place, in footprint units.
         sigmas: standard deviations that the stated uncertainty covers.
+        hold_ns: how long a hidden object stays where it was, ever less certain.
         by_id: the object that a tag is on, and how.
         text: its text.
     """
@@ -121,6 +123,7 @@ class TagsFile:
     corner_error: float | None = None
     reference_error: float = 0.0
     sigmas: float = 4.0
+    hold_ns: int = 0
     by_id: Mapping[int, tuple[TaggedObject, MountedTag]] = field(default_factory=lambda: MappingProxyType({}))
     text: str = field(default="", repr=False)
 
@@ -181,6 +184,7 @@ def parse_tags(text: str, name: str = "tags") -> TagsFile:
         corner_error=value.get("corner_error"),
         reference_error=0.0 if is_image else _length(plane.get("error", 0.0)),
         sigmas=float(value.get("sigmas", 4.0)),
+        hold_ns=duration_ns_from_text(value["hold"]) if "hold" in value else 0,
         by_id=MappingProxyType({tag.id: (each, tag) for each in objects for tag in each.tags}),
         text=text,
     )

@@ -12,12 +12,13 @@ from contextlib import suppress
 from fractions import Fraction
 from functools import cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final, Self
 
 import numpy as np
 
-from spatial_replay.errors import LogError, MissingFileError, OutputError, UsageError
-from spatial_replay.perception.frame import Frame, Image
+from spatial_replay.errors import LogError, MissingFileError, OutputError, UsageError, importing
+from spatial_replay.perception.frame import LARGEST_PICTURE, Frame, Image
 from spatial_replay.text import counted
 
 _KEY_FRAMES: Final = 30
@@ -28,8 +29,9 @@ _TICK: Final = Fraction(1, 90_000)
 _IDR, _SEQUENCE_PARAMETERS = 5, 7
 """Kinds of units in H.264."""
 
-_LARGEST: Final = 64_000_000
-"""Pixels of one frame; no camera has more, and a damaged header may claim it."""
+_DECODER: Final = MappingProxyType({"max_pixels": str(LARGEST_PICTURE)})
+_MOST_BOXES: Final = 1000
+"""Boxes of an .mp4 that are looked at for its index."""
 
 
 class VideoFile:
@@ -67,9 +69,14 @@ class VideoFile:
         try:
             self._container = av.open(str(path))
         except (av.FFmpegError, ValueError) as error:
+            if _lacks_index(path):
+                raise LogError(
+                    f"{self.name} has no index, which is written when a recording ends: it was not closed, or"
+                    " it breaks off; give the whole file, or record as .mkv or .ts, which need none"
+                ) from None
             raise LogError(
-                f"{self.name} is no video that can be read ({_reason(error)}); a file that was not closed"
-                " properly lacks its index: give the whole file, or record as .mkv or .ts"
+                f"{self.name} is no video that can be read ({_reason(error)}); give a file of a camera, such"
+                " as .mp4, .mkv or .avi, or a log with --topic"
             ) from None
         streams = self._container.streams.video
         if not streams:
@@ -83,9 +90,13 @@ class VideoFile:
                 f"{self.name} has a video that no codec here decodes; convert it, as with"
                 f" ffmpeg -i {self.name} -c:v libx264 table.mp4"
             )
+        if context.width * context.height > LARGEST_PICTURE:
+            self.close()
+            raise LogError(f"{self.name}: its frames of {context.width} x {context.height} are too large")
         # one thread, one frame out for one in
         self._stream.thread_type = "NONE"
         self._stream.thread_count = 1
+        context.options = dict(_DECODER)
 
     @property
     def copy_fault(self) -> str | None:
@@ -99,7 +110,7 @@ class VideoFile:
 
     def __iter__(self) -> Iterator[Frame]:
         av = _load()
-        last_ns, first, count = -1, None, 0
+        last_ns, first, count, widest_ns = -1, None, 0, 0
         damaged, is_damaged = 0, False
         try:
             length_ns = self._length_ns()
@@ -116,6 +127,7 @@ class VideoFile:
                 if time_ns <= last_ns:
                     self._add_fault(f"{self.name}: frame {count} is not after the one before it; left out")
                     continue
+                widest_ns = max(widest_ns, time_ns - last_ns) if last_ns >= 0 else 0
                 last_ns = time_ns
                 yield Frame(time_ns, frame.to_ndarray(format="bgr24"), packet, has_key(packet))
             if damaged > is_damaged:
@@ -123,7 +135,8 @@ class VideoFile:
             if is_damaged:
                 at = "in its first frame" if last_ns < 0 else f"after {last_ns / 1e9:.3f} s, within a frame"
                 self._add_fault(f"{self.name} breaks off {at}")
-            elif count > 1 and last_ns + 2 * (last_ns // (count - 1)) < length_ns:
+            # the last frame is shown as long as any other, however uneven they are
+            elif widest_ns and last_ns + widest_ns * 3 // 2 < length_ns:
                 ends = f"{last_ns / 1e9:.3f} s, though its header says {length_ns / 1e9:.3f} s"
                 self._add_fault(f"{self.name} breaks off after {ends}")
         except (av.FFmpegError, EOFError) as error:
@@ -140,6 +153,10 @@ class VideoFile:
         if self.copy_fault is None:
             convert = av.bitstream.BitStreamFilterContext("h264_mp4toannexb", self._stream)
         for packet in self._container.demux(self._stream):
+            # an .avi has no stamps but the order of decoding; without B frames it is that of showing, too,
+            # and what FFmpeg guesses is one frame late
+            if self._container.format.name == "avi" and not self._stream.codec_context.has_b_frames:
+                packet.pts = packet.dts
             # the filter takes the packet's content, and its time with it
             pts = packet.pts
             if packet.is_corrupt:
@@ -152,7 +169,7 @@ class VideoFile:
             if convert is not None and packet.size:
                 packets[pts] = b"".join(bytes(each) for each in convert.filter(packet))
             for frame in frames:
-                if frame.width * frame.height > _LARGEST:
+                if frame.width * frame.height > LARGEST_PICTURE:
                     raise LogError(f"{self.name}: a frame of {frame.width} x {frame.height} is too large")
                 yield packets.pop(frame.pts, b""), frame
 
@@ -229,6 +246,7 @@ class H264Decoder:
     def __init__(self) -> None:
         """Open the decoder; frames before the first key frame are not decoded."""
         self._context = _load().CodecContext.create("h264", "r")
+        self._context.options = dict(_DECODER)
         self._context.thread_count = 1
         self._is_ready = False
 
@@ -249,7 +267,7 @@ class H264Decoder:
         if not frames:
             return None
         width, height = frames[-1].width, frames[-1].height
-        if width * height > _LARGEST:
+        if width * height > LARGEST_PICTURE:
             raise LogError(f"a frame of {width} x {height} is too large")
         return np.asarray(frames[-1].to_ndarray(format="bgr24"), np.uint8)
 
@@ -315,6 +333,21 @@ def has_key(data: bytes) -> bool:
     return False
 
 
+def _lacks_index(path: Path) -> bool:
+    """Return whether a file is an .mp4 or .mov without the box that says where its frames are."""
+    with path.open("rb") as file:
+        size, at, kinds = path.stat().st_size, 0, []
+        while at + 8 <= size and len(kinds) < _MOST_BOXES:
+            file.seek(at)
+            head = file.read(16)
+            length, kind = int.from_bytes(head[:4]), head[4:8]
+            # 1: the length follows, as eight bytes; 0: up to the end
+            length = {0: size - at, 1: int.from_bytes(head[8:])}.get(length, length)
+            kinds.append(kind)
+            at += max(length, 8)
+    return kinds[:1] == [b"ftyp"] and b"moov" not in kinds
+
+
 def _reason(error: BaseException) -> str:
     reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
     return f"{reason!s:.200}".lower()
@@ -327,13 +360,9 @@ def _load() -> Any:
     Raises:
         UsageError: it is not installed.
     """
-    try:
+    with importing("videos need PyAV", extra="vision"):
         import av
         import av.bitstream
-    except ImportError:
-        raise UsageError(
-            "videos need PyAV, which is not installed: pip install 'spatial-replay[vision]'"
-        ) from None
     # its messages would go to the terminal; errors are raised
     with suppress(AttributeError):
         av.logging.set_level(None)

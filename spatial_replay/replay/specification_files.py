@@ -10,7 +10,7 @@ from pathlib import Path
 from threading import Lock
 from typing import Final, NamedTuple
 
-from spatial_replay.errors import MissingFileError, SpatialReplayError, UsageError
+from spatial_replay.errors import MissingFileError, SpatialReplayError, UsageError, importing
 from spatial_replay.logs.output_file import replacing
 from spatial_replay.spec import parse_specification
 from spatial_replay.spec.format import format_duration
@@ -109,11 +109,8 @@ class SpecificationFiles:
         Raises:
             UsageError: the library that watches files is not installed.
         """
-        try:
+        with importing("--watch needs watchfiles", extra="live"):
             from watchfiles import watch
-        except ImportError:
-            remedy = "pip install 'spatial-replay[live]'"
-            raise UsageError(f"--watch needs watchfiles, which is not installed: {remedy}") from None
         places = {path.absolute() for path in self.paths} | {path.resolve() for path in self.paths}
         names = {path.name for path in places}
         for _ in watch(

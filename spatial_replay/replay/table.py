@@ -16,7 +16,7 @@ import numpy as np
 from google.protobuf.message import DecodeError
 
 from spatial_replay.annotate.robustness import RobustnessSeries, decode_robustness
-from spatial_replay.errors import LogError, UsageError
+from spatial_replay.errors import LogError, UsageError, importing
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.mcap.reader import McapSource
 from spatial_replay.logs.output_file import replacing
@@ -271,13 +271,9 @@ def _csv_writer(stream: Any, titles: Sequence[str], automata: Sequence[str]) -> 
 
 
 def _parquet_writer(stream: Any, titles: Sequence[str], automata: Sequence[str]) -> Write:
-    try:
+    with importing("Parquet, unlike .csv, needs pyarrow", extra="parquet"):
         import pyarrow as pa
         from pyarrow import parquet
-    except ImportError as error:
-        raise UsageError(
-            "Parquet needs pyarrow; pip install 'spatial-replay[parquet]', or write a .csv"
-        ) from error
     time, *numbers = titles
     schema = pa.schema(
         [

@@ -31,6 +31,15 @@ _FIRST_REFERENCE: Final = 100
 _EXPOSURE: Final = 0.25
 """The share of the time between two frames in which light is gathered, half of it before a sample's time."""
 
+_FASTEST: Final[Mapping[str, float]] = MappingProxyType({"push": 0.12, "place": 0.5})
+"""Metres a second that the robot moves objects at most, and a little more: what it hides may be so fast."""
+
+_NUDGED: Final = 0.01
+"""The same of what it only bumps into."""
+
+_HOLD: Final = "10s"
+"""How long hidden objects are held: what has become too uncertain to matter is as good as unknown."""
+
 _COARSE: Final = 2
 """Pixels along each edge that share one of the simulator's picture, which costs most of the time."""
 
@@ -193,9 +202,11 @@ def tags_text(world: Tabletop) -> str:
             parts.append(f"height: [{bottom:g}, {top:g}]")
         if world.skill == "place" and body.movable:
             parts.append("lifted: true")
+        parts.append(f"fastest: {_FASTEST[world.skill] if body.movable else _NUDGED:g}")
         lines.append(f"  {body.name}: {{{', '.join(parts)}}}")
     lines += ["plane:", f"  size: {view.reference:g}", "  tags:"]
     lines += [f"    {_FIRST_REFERENCE + index}: [{x:g}, {y:g}]" for index, (x, y) in enumerate(view.places)]
+    lines.append(f"hold: {_HOLD}")
     return "\n".join(lines) + "\n" + camera_text(view.camera)
 
 

@@ -96,7 +96,7 @@ def record_seen(
     output: Path,
     files: Sequence[Specification] = (),
     *,
-    hold_ns: int = 0,
+    hold_ns: int | None = None,
     keep: KeepVideo | None = None,
     inputs: Sequence[Path] = (),
     begin: Callable[[int], None] = lambda first_ns: None,
@@ -107,7 +107,8 @@ def record_seen(
     """Record the objects that frames show, with verdicts; equal frames give equal bytes.
 
     Args:
-        hold_ns: how long a hidden object stays where it was, with growing uncertainty.
+        hold_ns: how long a hidden object stays where it was, with growing uncertainty; None for what the
+            tags file says.
         keep: how the log keeps the video; None copies it where that is possible, and encodes it otherwise.
         inputs: files that the output must not be.
         begin: takes the time of the first frame.
@@ -133,7 +134,7 @@ def record_seen(
     begun = observer.observe(first)
     monitors = [Monitor(file, units={"": tags.unit}) for file in files]
     changes, colours = VerdictChanges(files), AskedColours(files)
-    options = {"tags": tags.name, "hold_ns": hold_ns, "keep_video": kept}
+    options = {"tags": tags.name, "hold_ns": observer.hold_ns, "keep_video": kept}
     about = {"source": frames.name, "options": json.dumps(options)}
     about |= Axes(unit=tags.unit).metadata()
     samples, last_ns = 0, first.time_ns

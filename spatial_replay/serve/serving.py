@@ -10,7 +10,7 @@ from threading import Thread
 from typing import TYPE_CHECKING
 
 from spatial_replay.annotate.curves import CURVES_CHANNEL
-from spatial_replay.errors import SpatialReplayError, UsageError
+from spatial_replay.errors import SpatialReplayError, importing
 from spatial_replay.replay.loaded_log import EditedFiles, Evaluated
 from spatial_replay.replay.playback import Playback
 from spatial_replay.serve.player import SPECIFICATION, Level, Note, Player
@@ -105,12 +105,8 @@ def open_server(
             installed.
         LogError: the log cannot be read.
     """
-    try:
+    with importing("serving takes foxglove-sdk", extra="live"):
         from spatial_replay.serve.server import LiveServer
-    except ImportError:
-        raise UsageError(
-            "serving takes foxglove-sdk, which is not installed: pip install 'spatial-replay[live]'"
-        ) from None
     playback = Playback(evaluated)
     playback.seek(playback.start_ns)
     session = Session(evaluated.loaded, playback.start_ns, playback.end_ns)

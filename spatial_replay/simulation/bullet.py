@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from spatial_replay.errors import UsageError
+from spatial_replay.errors import UsageError, importing
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.simulation.kinematics import JOINTS
 from spatial_replay.simulation.shapes import Box, Pose, Shape
@@ -218,14 +218,11 @@ def _load() -> ModuleType:
     Raises:
         UsageError: it is not installed.
     """
-    try:
-        with _without_greeting():
-            import pybullet
-    except ImportError as error:
-        raise UsageError(
-            "simulated worlds need PyBullet, which is not installed: pip install 'spatial-replay[sim]' "
-            "(wheels exist for Python 3.11)"
-        ) from error
+    with (
+        importing("simulated worlds need PyBullet (it has wheels for Python 3.11)", extra="sim"),
+        _without_greeting(),
+    ):
+        import pybullet
     module: ModuleType = pybullet
     return module
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from spatial_replay.errors import UsageError
+from spatial_replay.errors import importing
 
 _GENERATIONS, _CANDIDATES = 15, 6
 """Bounds of an evolution: its generations, and candidates of each for every number."""
@@ -50,11 +50,8 @@ def evolve(
     Raises:
         UsageError: SciPy is not installed.
     """
-    try:
+    with importing("tuning several constants needs SciPy", extra="tune"):
         from scipy.optimize import differential_evolution
-    except ImportError:
-        remedy = "pip install 'spatial-replay[tune]'"
-        raise UsageError(f"tuning several constants needs SciPy, which is not installed: {remedy}") from None
     differential_evolution(
         lambda shares: cost([round(share * size) for share, size in zip(shares, sizes, strict=True)]),
         [(0.0, 1.0)] * len(sizes),

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from spatial_replay import Trace, read_trace
+from spatial_replay import Trace, evaluate, read_trace
 from spatial_replay.cli import run
+from spatial_replay.simulation.worlds import default_specification
 
 for each in ("av", "cv2", "pybullet", "py_trees"):
     pytest.importorskip(each)
@@ -45,6 +46,17 @@ def test_the_truth_of_a_run_is_within_what_its_video_says(
             off = [np.linalg.norm(corners - corner, axis=1).min() for corner in true[name]]
             stated.append(found.uncertainty[row])
             assert max(off) <= stated[-1]
+    # what the specification of the world says of the video is never the opposite of the truth
+    specification = default_specification(world)
+    for true, read in zip(
+        evaluate(specification, there).results, evaluate(specification, found).results, strict=True
+    ):
+        for node, its in zip(true.nodes, read.nodes, strict=True):
+            assert {str(node.verdict), str(its.verdict)} != {"satisfied", "violated"}
+            known = ~np.isnan(node.value)
+            # a yaw has no uncertainty in samples: `oriented` is as exact as it was seen
+            if "oriented" not in node.text:
+                assert ((its.lower <= node.value) & (node.value <= its.upper))[known].all()
     # centimetres for what may be lifted, millimetres for what stays on the table
     assert np.median(stated) < (0.025 if world != "push" else 0.002)
 

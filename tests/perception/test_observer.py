@@ -21,9 +21,9 @@ from perception.filmed import (
 )
 from spatial_replay import TrackedObject, UsageError
 from spatial_replay.perception import Frame, TagObserver, observe_frames, parse_tags
-from spatial_replay.perception.opencv import Camera, TagDetector, corners_from_apriltag, projection
-from spatial_replay.perception.plane import plane_from_references, rotations
-from spatial_replay.perception.rendering import Flaws, Plate
+from spatial_replay.perception.opencv import Camera, TagDetector, corners_from_apriltag
+from spatial_replay.perception.plane import rotations
+from spatial_replay.perception.rendering import Flaws, Plate, render
 from spatial_replay.perception.tags_file import pose_looking_at
 
 pytest.importorskip("cv2")
@@ -162,6 +162,11 @@ def test_a_hidden_object_is_unknown_and_a_held_one_ever_less_certain() -> None:
     stated = [each.objects["red"].uncertainty for each in held[1:4]]
     grown = 0.5 * PERIOD_NS / 1e9
     assert np.diff(stated) == pytest.approx([grown, grown])
+    # the tags file may say so as well; who asks for another time gets that
+    own = parse_tags(TABLE + "fastest: 0.5\nhold: 40ms\n")
+    for hold_ns, frames in ((None, 3), (0, 2), (2 * PERIOD_NS, 4)):
+        samples = [seen.sample for seen in observe_frames(film(poses_at, 5), own, hold_ns=hold_ns)]
+        assert sum("red" in each.objects for each in samples) == frames
 
 
 def test_what_is_strange_about_tags_is_listed_at_the_end() -> None:
@@ -187,20 +192,36 @@ def test_reference_tags_that_do_not_fit_are_an_error_that_names_the_worst() -> N
 
 @pytest.mark.parametrize("camera", [False, True])
 def test_a_plane_that_is_seen_edge_on_is_refused(camera: bool) -> None:
-    tags = parse_tags(TABLE if camera else FLAT, "tags.yaml")
-    corners = np.concatenate([each.corners for each in tags.references])
-    points = np.concatenate([corners, np.zeros((len(corners), 1))], axis=1)
+    places = {
+        number: (x, y)
+        for number, (x, y) in enumerate([(-0.15, -0.3), (0.15, -0.3), (0.15, 0.3), (-0.15, 0.3)], 10)
+    }
+    text = f"""
+size: 20cm
+objects: {{red: {{tag: 0, disc: 50mm}}}}
+plane: {{tags: {{{", ".join(f"{number}: [{x}, {y}]" for number, (x, y) in places.items())}}}}}
+"""
+    lens = Camera((1100.0, 1100.0), (639.5, 359.5), (1280, 720))
+    tags = parse_tags(
+        text + ("camera: {size: [1280, 720], focal: [1100, 1100]}" if camera else ""), "tags.yaml"
+    )
+    scene = [plate(number, x, y, 0.0, 0.0, size=0.2) for number, (x, y) in places.items()]
 
-    def seen_at(degrees: float) -> dict[int, np.ndarray]:
+    def seen_at(degrees: float) -> TagObserver:
         slant = math.radians(degrees)
-        eye = np.array([0.49 + math.cos(slant), 0.0, math.sin(slant)])
-        pose = pose_looking_at(eye, np.array([0.49, 0.0, 0.0]), np.array([0.0, 0.0, 1.0]))
-        pixels, _ = projection(points, pose, LENS)
-        return {each.id: part for each, part in zip(tags.references, pixels.reshape(-1, 4, 2), strict=True)}
+        eye = np.array([math.cos(slant), 0.0, math.sin(slant)])
+        pose = pose_looking_at(eye, np.zeros(3), np.array([0.0, 0.0, 1.0]))
+        observer = TagObserver(tags)
+        observer.observe(Frame(0, render("36h11", [scene], lens, pose)))
+        return observer
 
-    assert plane_from_references(tags, seen_at(15.0)).worst[1] < 0.1
+    fit = seen_at(15.0).fit
+    assert fit is not None
+    assert fit.worst[1] < 0.3
     with pytest.raises(UsageError, match=r"tags\.yaml: the plane is seen edge-on, .* from further above"):
-        plane_from_references(tags, seen_at(3.0))
+        seen_at(8.5)
+    # still flatter, tags are no longer found
+    assert "and that the camera looks from above" in seen_at(3.0).remarks()[0]
 
 
 def test_a_camera_that_moves_is_noticed_and_places_stay_right() -> None:

@@ -12,6 +12,7 @@ from mcap.reader import make_reader
 from perception.filmed import TABLE, approaching, film, write_approach
 from spatial_replay import Monitor, Recorder, load_specification, read_trace, replay_log
 from spatial_replay.cli import run
+from spatial_replay.perception import Frame
 
 pytest.importorskip("av")
 pytest.importorskip("cv2")
@@ -219,6 +220,77 @@ def _write_streamed(video: Path, output: Path) -> None:
                 container.mux(packet)
 
 
+def test_a_video_that_misses_its_last_frame_breaks_off(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import av
+
+    whole = folder / "whole.mkv"
+    _write_streamed(folder / "table.mp4", whole)
+    with av.open(str(whole)) as container:
+        at = [packet.pos for packet in container.demux(video=0) if packet.size]
+    (folder / "less.mkv").write_bytes(whole.read_bytes()[: at[-1]])
+    output = folder / "less.mcap"
+    assert (
+        run(["record", "video", f"{folder}/less.mkv", "--tags", f"{folder}/tags.yaml", "-o", f"{output}"])
+        == 3
+    )
+    assert "less.mkv breaks off after 0.400 s, though its header says 0.480 s" in capsys.readouterr().err
+    assert len(read_trace(output)) == COUNT - 1
+
+
+@pytest.mark.parametrize("ending", ["mp4", "mkv", "avi"])
+def test_uneven_frames_keep_their_stamps_and_the_video_is_whole(ending: str, folder: Path) -> None:
+    from spatial_replay.perception import open_frames
+    from spatial_replay.perception.video import VideoWriter
+
+    times_ns = [40_000_000 * tick for tick in (0, 1, 2, 10, 11, 12, 20, 21, 22, 23)]
+    with VideoWriter(folder / f"uneven.{ending}", 25) as writer:
+        for time_ns, frame in zip(times_ns, film(approaching(10), 10), strict=True):
+            writer.write(Frame(time_ns, frame.image))
+    frames = open_frames(folder / f"uneven.{ending}")
+    assert [frame.time_ns for frame in frames] == times_ns
+    assert frames.faults == []
+
+
+def test_images_that_claim_to_be_gigabytes_are_left_out_before_they_are_decoded(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    from spatial_replay.perception.opencv import encode_jpeg
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    time, header = store.types["builtin_interfaces/msg/Time"], store.types["std_msgs/msg/Header"]
+    compressed = store.types["sensor_msgs/msg/CompressedImage"]
+    jpeg = encode_jpeg(next(film(approaching(2), 1)).image, 1000, 98)
+    size = jpeg.index(b"\xff\xc0") + 5
+    claims = [
+        jpeg,
+        jpeg[:size] + b"\xff\xff\xff\xff" + jpeg[size + 4 :],
+        b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + (60_000).to_bytes(4) * 2 + bytes(9),
+        b"RIFF\x60\0\0\0WEBPVP8X\x0a\0\0\0" + bytes(4) + b"\xff\xff\xff\xff\xff\xff",
+        b"BM" + bytes(60),
+    ]
+    with Writer(folder / "claims", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        topic = writer.add_connection("/camera/jpeg", compressed.__msgtype__, typestore=store)
+        for index, data in enumerate(claims):
+            message = compressed(header(time(5, index), "camera"), "jpeg", np.frombuffer(data, np.uint8))
+            stamp_ns = 10**18 + index * 500_000_000
+            writer.write(topic, stamp_ns, store.serialize_cdr(message, compressed.__msgtype__))
+    output = folder / "claims.mcap"
+    assert (
+        run(["record", "video", f"{folder}/claims", "--tags", f"{folder}/tags.yaml", "-o", f"{output}"]) == 3
+    )
+    said = capsys.readouterr().err
+    assert "/camera/jpeg after 0.500 s: an image of 65535 x 65535 is too large; left out" in said
+    assert "after 1.000 s: an image of 60000 x 60000 is too large" in said
+    assert "after 1.500 s: an image of 16777216 x 16777216 is too large" in said
+    assert "after 2.000 s: an image is damaged, or neither JPEG nor PNG nor WebP" in said
+    assert len(read_trace(output)) == 1
+
+
 def test_a_video_without_time_stamps_asks_for_its_rate(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -236,7 +308,12 @@ def test_a_video_without_time_stamps_asks_for_its_rate(
 
 
 BAD = {
-    "no video": (["bad.mp4"], 3, "bad.mp4 is no video that can be read"),
+    "no video": (["bad.mkv"], 3, "bad.mkv is no video that can be read"),
+    "a recording that was not ended": (
+        ["bad.mp4"],
+        3,
+        "bad.mp4 has no index, which is written when a recording",
+    ),
     "not there": (["none.mp4"], 2, "no such file"),
     "a log without images": (["plain.mcap"], 2, "has no topic with images"),
     "no such topic": (["run.mcap", "--topic", "/camera/vide"], 2, "did you mean '/camera/video'?"),
@@ -253,7 +330,9 @@ def test_bad_input_is_refused_in_words_and_nothing_is_written(
     folder: Path, what: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     arguments, code, said = BAD[what]
-    (folder / "bad.mp4").write_bytes(b"\x00\x00\x00\x18ftypmp42" + bytes(range(256)) * 9)
+    (folder / "bad.mkv").write_bytes(bytes(range(256)) * 9)
+    # an .mp4 up to its frames: the index would follow them
+    (folder / "bad.mp4").write_bytes(b"\0\0\0\x18ftypmp42" + bytes(12) + b"\0\0\x10\0mdat" + bytes(900))
     (folder / "a.jsonl").write_text('{"time_ns": 0, "objects": []}\n')
     run(["record", "tracks", f"{folder}/a.jsonl", "-o", f"{folder}/plain.mcap"])
     _write_mpeg(folder / "mpeg.avi")
