@@ -51,13 +51,19 @@ def _fill_edges(vertices: Floats, edges: Floats, start: int, stop: int) -> None:
 
 
 @inlined
+def fill_row(rows: Rows, row: int) -> None:
+    """Compute the edges of a row, which `rows_distance` reads."""
+    for p in range(rows.part_start[row], rows.part_start[row + 1]):
+        _fill_edges(rows.vertices, rows.edges, rows.vertex_start[p], rows.vertex_start[p + 1])
+
+
+@inlined
 def _fill_rows(rows: Rows, members: Integers, is_filled: NDArray[np.bool_]) -> None:
     """Compute the edges of the rows among `members` that have none yet."""
     for row in members:
         if row >= 0 and not is_filled[row]:
             is_filled[row] = True
-            for p in range(rows.part_start[row], rows.part_start[row + 1]):
-                _fill_edges(rows.vertices, rows.edges, rows.vertex_start[p], rows.vertex_start[p + 1])
+            fill_row(rows, row)
 
 
 @inlined
@@ -161,7 +167,7 @@ def _centroid(vertices: Floats, start: int, stop: int) -> tuple[float, float]:
 
 
 @inlined
-def _rows_distance(rows: Rows, a: int, b: int, enlargement: float) -> float:
+def rows_distance(rows: Rows, a: int, b: int, enlargement: float) -> float:
     """Return the signed distance of rows a and b, as upright prisms if both have heights."""
     start = rows.vertex_start
     least = np.inf
@@ -224,7 +230,7 @@ def _union_distance(
         for j in range(second[0], second[1]):
             a, b = members[i], members[j]
             if a >= 0 and b >= 0:
-                least = min(least, _rows_distance(rows, a, b, enlargement))
+                least = min(least, rows_distance(rows, a, b, enlargement))
     return least
 
 

@@ -89,3 +89,59 @@ def test_more_kinds_of_crowds_than_a_monitor_has_plans_for():
         for t, crowd in enumerate([*crowds, *reversed(crowds)])
     ]
     assert_monitor_agrees(specification, samples)
+
+
+CLOSEST = """\
+group people = class "person"
+group everyone = all
+spec apart = G (forall x, y in people: {apart})
+spec met = F (exists x, y in everyone: {met})
+"""
+
+
+@settings(max_examples=40)
+@given(
+    samples=crowds(max_size=4),
+    distance=st.integers(-8, 40).map(lambda value: value / 8),
+    grown=st.sampled_from([0, 0.5]),
+)
+def test_the_closest_two_decide_as_all_pairs_do(samples, distance, grown):
+    apart = f"not (enlarge(y, {grown}) dist x <= {distance})"
+    met = f"x dist enlarge(y, {grown}) <= {distance}"
+    closest = parse_specification(CLOSEST.format(apart=apart, met=met))
+    # a conjunction has more than one distance, so that every pair is measured
+    pairwise = parse_specification(CLOSEST.format(apart=f"{apart} and {apart}", met=f"{met} and {met}"))
+    trace = Trace.from_samples(samples)
+    for quick, thorough in zip(evaluate(closest, trace), evaluate(pairwise, trace), strict=True):
+        assert quick.series.tobytes() == thorough.series.tobytes()
+        assert (quick.lower, quick.upper, quick.verdict) == (thorough.lower, thorough.upper, thorough.verdict)
+        by_closest, by_pairs = (each.witness().deciding for each in (quick, thorough))
+        assert (by_closest and by_closest.objects) == (by_pairs and by_pairs.objects)
+    assert_monitor_agrees(closest, samples)
+
+
+def test_the_closest_of_many_decide_as_all_pairs_do():
+    at, everyone = Random(1), "group people = all\nspec apart = G (forall x, y in people: {body})"
+    body = "x dist y >= 0.25"
+    closest = parse_specification(everyone.format(body=body))
+    pairwise = parse_specification(everyone.format(body=f"{body} and {body}"))
+    shapes = (
+        lambda x, y: Footprint.disc(x, y, 0.25),
+        lambda x, y: Footprint.box(x, y, x + at.uniform(0.1, 2), y + 0.5),
+        lambda x, y: Footprint.polygon([(x, y), (x + 2, y), (x + 2, y + 2), (x + 1, y + 0.5)]),
+    )
+    samples = []
+    for number in range(6):
+        size = 40 if number % 2 else 8  # sparse, and so crowded that most overlap
+        objects = {
+            f"p{each}": TrackedObject(
+                at.choice(shapes)(at.uniform(-size, size), at.uniform(-size, size)),
+                uncertainty=at.choice((0.0, 0.3)) if number > 2 else 0.0,
+            )
+            for each in range(24)
+        }
+        samples.append(Sample(number * 10**8, objects))
+    trace = Trace.from_samples(samples)
+    (quick,), (thorough,) = evaluate(closest, trace), evaluate(pairwise, trace)
+    assert quick.series.tobytes() == thorough.series.tobytes()
+    assert quick.witness().deciding.objects == thorough.witness().deciding.objects

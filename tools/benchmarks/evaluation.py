@@ -7,6 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import spatial_replay as sr
 
 PUBLISHED_S = 34.3e-3
@@ -49,4 +51,58 @@ def bench_blocks(measure: Any) -> None:
         runs=21,
         limit_s=1e-6,
         reference_s=PUBLISHED_S,
+    )
+
+
+CROWD = """
+group people = class "person"
+spec apart = G (forall p, q in people: p dist q >= 0.5)
+"""
+
+
+def bench_crowd(bench: Any) -> None:
+    """200 people, every pair of them at least half a metre apart: 39,800 bindings a sample."""
+    at = np.random.default_rng(1)
+    places, steps = at.uniform(0, 60, (200, 2)), at.normal(0, 0.1, (200, 2))
+    samples = []
+    for number in range(300):
+        objects = {
+            f"p{each}": sr.TrackedObject(sr.Footprint.disc(x, y, 0.25), class_name="person")
+            for each, (x, y) in enumerate((places + number * steps).tolist())
+        }
+        samples.append(sr.Sample(number * 10**8, objects))
+    trace, specification = sr.Trace.from_samples(samples), sr.parse_specification(CROWD)
+
+    def all_centres(_: object) -> None:
+        for number in range(100):
+            now = places + number * steps
+            np.hypot(*(now[:, None] - now[None]).transpose(2, 0, 1))
+
+    centres = bench.measure("all centres by numpy alone", all_centres, per=100, unit="sample", runs=11)
+    sr.evaluate(specification, replace(trace))
+    bench.measure(
+        "evaluated",
+        lambda fresh: sr.evaluate(specification, fresh),
+        prepare=lambda: replace(trace),
+        per=len(trace),
+        unit="sample",
+        runs=11,
+        limit_s=0.001,
+        reference_s=centres.median_s,
+    )
+
+    def monitored(_: object) -> None:
+        monitor = sr.Monitor(specification)
+        for sample in samples:
+            monitor.update(sample)
+
+    monitored(None)
+    bench.measure(
+        "monitored",
+        monitored,
+        per=len(samples),
+        unit="sample",
+        runs=5,
+        limit_s=0.001,
+        reference_s=centres.median_s,
     )

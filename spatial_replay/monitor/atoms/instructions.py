@@ -7,6 +7,7 @@ read from measurements, signals and constants.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import permutations
 from math import inf, perm
 from typing import Any, NamedTuple, Protocol
@@ -16,6 +17,7 @@ import numpy as np
 from spatial_replay.compiled import elementwise, long_kernel
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Flags, Floats, Integers
+from spatial_replay.monitor.atoms.closest_pair import ClosestPair, number_of_closest
 from spatial_replay.monitor.atoms.terms import Bindings
 from spatial_replay.spec.formula import (
     Atom,
@@ -48,6 +50,7 @@ HOLDS = 7  # a number as an interval: all of the reals where it is not a number
 AND, OR = 8, 9  # intervals
 AND_MEMBER, OR_MEMBER = 10, 11  # a, and b where members c is 1, anything where it is -1
 DIVIDE = 12  # a by constant b, which is positive
+CLOSEST = 13  # closest pair a, as an interval
 
 TILE = 128
 """Samples processed together: few, so that their columns stay in the processor's cache."""
@@ -61,6 +64,7 @@ def run_instructions(
     values: Floats,
     spreads: Floats,
     signals: Floats,
+    closest: Floats,
     members: Flags,
     outputs: Integers,
     leaves: Floats,
@@ -87,6 +91,8 @@ def run_instructions(
                             target[k] += spreads[a, t + k]
                     elif op == SIGNAL:
                         target[k] = signals[a, t + k]
+                    elif op == CLOSEST:
+                        target[k] = closest[a, channel, t + k]
                     elif op == ADD:
                         target[k] = first[k] + second[k]
                     elif op == NEGATE:
@@ -156,7 +162,8 @@ class LeafCode:
 
     Attributes:
         rows: operation, a, b, c of each instruction, with its number.
-        constants, measurements, signals, members: what instructions read, with the number they know it by.
+        constants, measurements, signals, closest, members: what instructions read, with the number that they
+            know it by.
     """
 
     def __init__(self, groups: OpenGroups) -> None:
@@ -166,6 +173,7 @@ class LeafCode:
         self.constants: dict[float, int] = {}
         self.measurements: dict[Measurement, int] = {}
         self.signals: dict[str, int] = {}
+        self.closest: dict[ClosestPair, int] = {}
         self.members: dict[Membership, int] = {}
 
     def add_leaves(self, leaves: Sequence[Formula], bindings: Bindings) -> list[int]:
@@ -218,6 +226,8 @@ class LeafCode:
                 for other in others:
                     row = self._row(op, row, other)
                 return row
+        if isinstance(expression, ClosestPair):
+            return self._row(CLOSEST, self.closest.setdefault(expression, len(self.closest)))
         measurement = map_terms(expression, lambda term: substitute_term(term, bindings))
         return self._row(MEASURED, self.measurements.setdefault(measurement, len(self.measurements)))
 
@@ -239,6 +249,8 @@ class LeafCode:
     def _quantified(self, formula: Quantified, bindings: Bindings) -> int:
         is_forall = formula.quantifier == "forall"
         group: Any = substitute_term(formula.group, bindings)
+        if (found := number_of_closest(replace(formula, group=group))) is not None:
+            return self._row(HOLDS, self._expression(found[1], bindings))
         names = self._groups.candidates(group)
         self._check_bindings(formula, len(names))
         op = AND_MEMBER if is_forall else OR_MEMBER

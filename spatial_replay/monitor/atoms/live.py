@@ -140,6 +140,7 @@ def _arrays(frame: PlanContext, rows: PlanRows, code: LeafCode, outputs: Sequenc
     required = [
         [row for term in measured_terms(each) for row in rows.required(term)] for each in measurements
     ]
+    closest = [rows.of_term(each.group) for each in code.closest]
     members = [rows.of_membership(each) for each in code.members]
     regions = FootprintBatch.from_footprints(
         [footprint_from_outline(outline) for outline in frame.regions.values()],
@@ -163,6 +164,10 @@ def _arrays(frame: PlanContext, rows: PlanRows, code: LeafCode, outputs: Sequenc
         yaws=np.array(yaws, np.int64).reshape(len(yaws), 3),
         required_start=_starts(required),
         required=_whole(row for among in required for row in among),
+        closest_start=_starts(closest),
+        closest_rows=_whole(each.row for among in closest for each in among),
+        closest_classes=_whole(each.class_code for among in closest for each in among),
+        closest_enlargement=np.array([each.enlargement for each in code.closest], np.float64),
         member_start=_starts(members),
         member_rows=_whole(each.row for among in members for each in among),
         member_classes=_whole(each.class_code for among in members for each in among),

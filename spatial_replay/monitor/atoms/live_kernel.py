@@ -13,6 +13,7 @@ import numpy as np
 
 from spatial_replay.compiled import inlined, kernel, merged
 from spatial_replay.geometry.arrays import Flags, Floats, Integers
+from spatial_replay.geometry.closest import closest_rows
 from spatial_replay.geometry.kernels import measure_rows
 from spatial_replay.geometry.measure import misalignment_of
 from spatial_replay.monitor.atoms.instructions import run_instructions
@@ -40,6 +41,8 @@ class PlanArrays(NamedTuple):
             `first` and `second` (-1: none).
         yaws: (Y, 3), the number of each measurement between orientations, and its two rows.
         required_start, required: the rows without which each measurement is unknown.
+        closest_start, closest_rows, closest_classes, closest_enlargement: the rows of each closest pair's
+            group, the class that each must have, and the enlargement of both.
         member_start, member_rows, member_classes: the rows that must be there for each binding, and classes.
         is_group: for each binding, 1 where it stands for a group itself: not known without its row.
         code, constants, outputs: what `run_instructions` takes.
@@ -62,6 +65,10 @@ class PlanArrays(NamedTuple):
     yaws: Integers
     required_start: Integers
     required: Integers
+    closest_start: Integers
+    closest_rows: Integers
+    closest_classes: Integers
+    closest_enlargement: Floats
     member_start: Integers
     member_rows: Integers
     member_classes: Integers
@@ -121,10 +128,14 @@ def _unpacked(plan: PackedPlan) -> PlanArrays:
         whole[at[34] : at[35]],
         whole[at[36] : at[37]],
         whole[at[38] : at[39]],
-        whole[at[40] : at[41]],
-        whole[at[42] : at[43]].reshape((-1, 4)),
-        numbers[at[44] : at[45]],
+        numbers[at[40] : at[41]],
+        whole[at[42] : at[43]],
+        whole[at[44] : at[45]],
         whole[at[46] : at[47]],
+        whole[at[48] : at[49]],
+        whole[at[50] : at[51]].reshape((-1, 4)),
+        numbers[at[52] : at[53]],
+        whole[at[54] : at[55]],
     )
 
 
@@ -264,6 +275,40 @@ def _measure(plan: PlanArrays, rows: SampleRows, values: Floats, spreads: Floats
                 values[k, 0] = np.nan
 
 
+@merged
+def _closest(plan: PlanArrays, rows: SampleRows, closest: Floats) -> None:
+    """Fill `closest` (K, 4, 1), as `measurements.leaf_values` computes it."""
+    if len(closest) == 0:
+        return
+    classes, places = rows.classes, rows.places
+    here = len(classes) - len(places)
+    uncertainty = np.zeros(len(classes))
+    for k in range(len(places)):
+        uncertainty[here + k] = places[k, UNCERTAINTY]
+    found = np.empty((1, 3))
+    for k in range(len(closest)):
+        begin, end = plan.closest_start[k], plan.closest_start[k + 1]
+        members = np.empty((1, end - begin), np.int64)
+        for m in range(begin, end):
+            is_there = _is_there(classes, plan.closest_rows[m], plan.closest_classes[m])
+            members[0, m - begin] = plan.closest_rows[m] if is_there else ABSENT
+        closest_rows(
+            rows.part_start,
+            rows.vertex_start,
+            rows.vertices,
+            rows.radius,
+            rows.bottom,
+            rows.top,
+            members,
+            uncertainty,
+            plan.closest_enlargement[k],
+            np.empty((len(rows.vertices), 3)),
+            found,
+        )
+        closest[k, 0, 0] = closest[k, 1, 0] = found[0, 0]
+        closest[k, 2, 0], closest[k, 3, 0] = found[0, 1], found[0, 2]
+
+
 @inlined
 def _members(plan: PlanArrays, classes: Integers, members: Flags) -> None:
     """Fill `members` (M, 1): whether each binding is one (1, 0), or that is not known (-1)."""
@@ -275,9 +320,12 @@ def _members(plan: PlanArrays, classes: Integers, members: Flags) -> None:
 
 
 @inlined
-def _channels_of(values: Floats, spreads: Floats, signals: Floats, members: Flags) -> int:
+def _channels_of(values: Floats, spreads: Floats, signals: Floats, closest: Floats, members: Flags) -> int:
     """Return the number of channels needed: 4 with uncertainty, 2 with anything unknown, else 1."""
     channels = 1
+    for k in range(len(closest)):
+        if closest[k, 2, 0] != closest[k, 0, 0] or closest[k, 3, 0] != closest[k, 0, 0]:
+            return 4
     for k in range(len(values)):
         if spreads[k, 0] != 0.0:
             return 4
@@ -302,9 +350,13 @@ def leaves_of_plan(packed_plan: PackedPlan, numbers: Floats) -> Floats:
     _measure(plan, rows, values, spreads)
     members = np.empty((len(plan.is_group), 1), np.int8)
     _members(plan, rows.classes, members)
-    channels = _channels_of(values, spreads, rows.signals, members)
+    closest = np.empty((len(plan.closest_enlargement), 4, 1))
+    _closest(plan, rows, closest)
+    channels = _channels_of(values, spreads, rows.signals, closest, members)
     leaves = np.empty((channels, len(plan.outputs), 1))
-    run_instructions(plan.code, plan.constants, values, spreads, rows.signals, members, plan.outputs, leaves)
+    run_instructions(
+        plan.code, plan.constants, values, spreads, rows.signals, closest, members, plan.outputs, leaves
+    )
     return leaves
 
 

@@ -7,7 +7,9 @@ from collections.abc import Hashable, Sequence
 import numpy as np
 
 from spatial_replay.geometry.arrays import Flags, Floats
+from spatial_replay.geometry.closest import closest_pairs
 from spatial_replay.geometry.measure import MeasureRequest, Operand, Quantity, measure, misalignment
+from spatial_replay.monitor.atoms.closest_pair import ClosestPair
 from spatial_replay.monitor.atoms.instructions import LeafCode, Membership, run_instructions
 from spatial_replay.monitor.atoms.terms import Bindings, TraceScene
 from spatial_replay.spec.formula import (
@@ -23,6 +25,7 @@ from spatial_replay.spec.formula import (
     Term,
 )
 from spatial_replay.spec.walks import base_of, map_terms, measured_terms
+from spatial_replay.trace.trace import ABSENT
 
 
 def measured(scene: TraceScene, measurements: Sequence[Measurement]) -> tuple[Floats, Floats]:
@@ -139,8 +142,11 @@ def leaf_values(scene: TraceScene, leaves: Sequence[Formula], bindings: Bindings
     ).reshape(len(code.signals), len(scene))
     members = np.array([_flags(scene, each) for each in code.members], np.int8)
     members = members.reshape(len(code.members), len(scene))
+    closest = np.array([_closest(scene, each) for each in code.closest]).reshape(-1, 4, len(scene))
     is_known = np.isfinite(values).all() and np.isfinite(signals).all() and not (members < 0).any()
-    channels = 4 if spreads.any() else 1 if is_known else 2
+    is_known = is_known and (closest[:, 0] == closest[:, 1]).all()
+    is_sure = not spreads.any() and (closest[:, :2] == closest[:, 2:]).all()
+    channels = 4 if not is_sure else 1 if is_known else 2
     result = np.empty((channels, len(outputs), len(scene)))
     run_instructions(
         np.array(list(code.rows), np.int64).reshape(len(code.rows), 4),
@@ -148,11 +154,30 @@ def leaf_values(scene: TraceScene, leaves: Sequence[Formula], bindings: Bindings
         values,
         spreads,
         signals,
+        closest,
         members,
         np.array(outputs, np.int64),
         result,
     )
     return result
+
+
+def _closest(scene: TraceScene, pair: ClosestPair) -> Floats:
+    """Compute the ends of a closest pair's distance, (4, T), or take them from the trace's cache."""
+    cache, key = scene.trace.cache, (scene.skip, pair)
+    found = cache.get(key)
+    if found is None:
+        operand = scene.resolve(pair.group).operand
+        trace = scene.trace
+        least, low, high = closest_pairs(scene.batch, operand.rows, trace.uncertainty, pair.enlargement).T
+        # one that cannot be read may be anywhere, and so may be the closest
+        is_hidden = (operand.rows < ABSENT).any(axis=1) & ((operand.rows != ABSENT).sum(axis=1) > 1)
+        found = np.array(
+            (np.where(is_hidden, -np.inf, least), least, np.where(is_hidden, -np.inf, low), high)
+        )
+        found.flags.writeable = False
+        cache.put(key, found)
+    return found
 
 
 def _flags(scene: TraceScene, membership: Membership) -> Flags:

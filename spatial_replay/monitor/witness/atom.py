@@ -9,8 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from spatial_replay.geometry.closest import candidate_pairs
 from spatial_replay.geometry.contact import Contact, contact, enlarged, protrusion_contact
 from spatial_replay.geometry.footprint import Footprint
+from spatial_replay.monitor.atoms.closest_pair import closest_pair_of
 from spatial_replay.monitor.atoms.measurements import leaf_values, measured, quantity_of
 from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.monitor.online.codes import low_and_high
@@ -219,8 +221,21 @@ def _bodies(scene: TraceScene, formula: Quantified) -> Iterator[Formula]:
     """Iterate over the body for each binding of the variables to members of the group."""
     names, members, _ = scene.members(formula.group)
     present = [name for name, is_member in zip(names, members[0].tolist(), strict=True) if is_member]
-    for bound in permutations(present, len(formula.variables)):
+    for bound in _may_decide(scene, formula, present):
         yield substitute(formula.body, dict(zip(formula.variables, map(TrackedName, bound), strict=True)))
+
+
+def _may_decide(scene: TraceScene, formula: Quantified, present: Sequence[str]) -> Iterable[tuple[str, ...]]:
+    """Return the bindings among which is one that decides a quantifier: of distances, those of near pairs."""
+    pair = closest_pair_of(formula)
+    everyone = permutations(present, len(formula.variables))
+    if pair is None or len(present) < 3:
+        return everyone
+    rows = np.array([scene.resolve(TrackedName(name)).operand.rows[0, 0] for name in present])
+    if (rows < 0).any():
+        return everyone
+    found = candidate_pairs(scene.batch, rows, scene.trace.uncertainty, pair.enlargement)
+    return [(present[a], present[b]) for a, b in found.tolist()]
 
 
 # ------------------------------------------------------------------------------------------ expressions
