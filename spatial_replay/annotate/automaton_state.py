@@ -311,8 +311,7 @@ def automata_attachments(automata: Sequence[SpecAutomaton], prefix: str) -> list
         if each.automaton is None:
             continue
         texts = {_STORED: ("application/json", stored_text(each.automaton, each.specification, each.spec))}
-        literals = sum(len(cube) for move in each.automaton.transitions for cube in move.guard)
-        if literals <= _MOST_LITERALS:
+        if _has_few_literals(each.automaton):
             texts[".dot"] = ("text/vnd.graphviz", each.automaton.to_dot())
             texts[".hoa"] = ("text/plain", each.automaton.to_hoa())
         for suffix, (kind, text) in texts.items():
@@ -320,6 +319,15 @@ def automata_attachments(automata: Sequence[SpecAutomaton], prefix: str) -> list
                 Attachment(f"{AUTOMATA_PREFIX}{prefix}{each.name}{suffix}", kind, text.encode())
             )
     return attachments
+
+
+def _has_few_literals(automaton: Automaton) -> bool:
+    literals = 0
+    for move in automaton.iter_transitions():
+        literals += sum(map(len, move.guard))
+        if move.is_cut or literals > _MOST_LITERALS:
+            return False
+    return True
 
 
 def _is_stored(attachment: Attachment) -> bool:

@@ -3,26 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spatial_replay.automata.diagrams import LEAF
-from spatial_replay.automata.guards import (
-    Moves,
-    Transition,
-    guard_words,
-    moves_of,
-    successors_of,
-    transitions_of,
-)
-from spatial_replay.automata.minimise import Machine
+from spatial_replay.automata.guards import Moves, Successors, Transition, guard_words
+from spatial_replay.automata.minimise import Machine, above_of, sources_of
 from spatial_replay.automata.propositions import Proposition
 from spatial_replay.compiled import elementwise, kernel
-from spatial_replay.errors import UsageError
+from spatial_replay.errors import NoAutomatonError, UsageError
 from spatial_replay.geometry.arrays import Flags, Integers
 from spatial_replay.lazy import Displayed, drawn_as_svg
 
@@ -31,6 +23,12 @@ MAX_PROPOSITIONS = 64
 
 MAX_ROWS = 200_000
 """How many states an automaton has at most, and how many decisions."""
+
+_OF_MOVES = {"_moves", "_above", "distances", "can_accept", "can_reject", "transitions", "is_listable"}
+"""What of an automaton depends on its moves alone, and is worked out once."""
+
+MAX_LISTED = 100_000
+"""How many transitions are listed at most, and how many cubes their guards have together."""
 
 
 @dataclass(frozen=True)
@@ -67,24 +65,49 @@ class Automaton(Displayed):
         """All moves, by source and target; the guards of one source exclude each other.
 
         Raises:
-            NoAutomatonError: finding them takes more than `MAX_VISITS`, or their guards too many cubes; never
-                for an automaton from `automaton()`, which checks that.
+            NoAutomatonError: more than 100 000 transitions, or cubes of their guards; `iter_transitions`,
+                `successors` and `transition` have them one by one.
         """
-        return transitions_of(self._moves, self.successors)
+        found, cubes = [], 0
+        for each in self.iter_transitions():
+            found.append(each)
+            cubes += len(each.guard)
+            if each.is_cut or max(len(found), cubes) > MAX_LISTED:
+                what = "transitions" if len(found) > MAX_LISTED else "cubes in the guards of its transitions"
+                raise NoAutomatonError(f"{self.name} has more than {MAX_LISTED} {what}")
+        return tuple(found)
 
     @cached_property
-    def successors(self) -> tuple[tuple[int, ...], ...]:
-        """For each state, those that one sample can lead to.
+    def is_listable(self) -> bool:
+        """Whether `transitions` has them all, and raises no error."""
+        # counted before the guards are worked out, which takes longer
+        count = 0
+        for state in self.states:
+            count += len(self.successors[state])
+            if count > MAX_LISTED:
+                return False
+        try:
+            return bool(self.transitions)
+        except NoAutomatonError:
+            return False
 
-        Raises:
-            NoAutomatonError: as `transitions`.
-        """
-        return successors_of(self._moves)
+    def iter_transitions(self) -> Iterator[Transition]:
+        """Iterate over all moves, by source and target; each is worked out when it is consumed."""
+        moves = self._moves
+        return (
+            moves.transition(state, target) for state in self.states for target in moves.successors(state)
+        )
 
-    @property
+    @cached_property
+    def successors(self) -> Sequence[tuple[int, ...]]:
+        """For each state, those that one sample can lead to, in order; worked out when they are asked for."""
+        return Successors(self._moves)
+
+    @cached_property
     def has_returns(self) -> bool:
         """Whether samples lead to the initial state, so that runs end there."""
-        return any(self.initial in targets for targets in self.successors)
+        before = ~self.initial
+        return before in self.entries or any(before in (low, high) for _, low, high in self.decisions)
 
     @cached_property
     def can_accept(self) -> frozenset[int]:
@@ -160,7 +183,8 @@ class Automaton(Displayed):
 
     def transition(self, source: int, target: int) -> Transition | None:
         """Return the move from one state to another, if one sample can lead there."""
-        return self._transitions_by_ends.get((source, target))
+        known = source in self.states and target in self.successors[source]
+        return self._moves.transition(source, target) if known else None
 
     def paths(
         self, state: int, without: Collection[tuple[int, int]] = ()
@@ -192,11 +216,22 @@ class Automaton(Displayed):
                 for target in self.successors[here]
                 if (here, target) not in left_out and distances.get(target) == distances[here] - 1
             ]
-            paths.extend((*path, self._transitions_by_ends[here, target]) for target in reversed(nearer))
+            paths.extend((*path, self._moves.transition(here, target)) for target in reversed(nearer))
 
-    def guard_words(self, transition: Transition) -> str:
-        """Return a transition's guard as a sentence of the specification language."""
-        return guard_words(transition.guard, self.propositions)
+    def guard_words(self, transition: Transition, longest: int | None = None) -> str:
+        """Return a transition's guard as a sentence of the specification language.
+
+        Args:
+            longest: characters after which it is cut.
+        """
+        return guard_words(transition, self.propositions, longest)
+
+    def renamed(self, propositions: Sequence[Proposition]) -> Automaton:
+        """Return the automaton with other names for its propositions."""
+        result = replace(self, propositions=tuple(propositions))
+        # names change no move: what was worked out is kept
+        result.__dict__.update({name: self.__dict__[name] for name in _OF_MOVES & self.__dict__.keys()})
+        return result
 
     def _repr_svg_(self) -> str | None:
         return drawn_as_svg(self)
@@ -214,24 +249,31 @@ class Automaton(Displayed):
         return hoa_text(self)
 
     @cached_property
-    def _transitions_by_ends(self) -> dict[tuple[int, int], Transition]:
-        return {(each.source, each.target): each for each in self.transitions}
-
-    @property
     def _moves(self) -> Moves:
-        return moves_of(self.entries, self.decisions)
+        return Moves(self.entries, self.decisions)
+
+    @cached_property
+    def _above(self) -> dict[int, list[int]]:
+        return above_of(self.entries, self.decisions)
 
     def _distances(self, goal: Collection[int], without: Collection[tuple[int, int]] = ()) -> dict[int, int]:
         """Return for each state that can reach a goal, how many samples that takes."""
+        # moves that cannot be taken are few: where one begins, those that are left are looked up one by one
+        left_out: dict[int, set[int]] = {}
+        for source, target in without:
+            if source in self.states:
+                left_out.setdefault(source, set()).add(target)
         before: dict[int, list[int]] = {}
-        for source, targets in enumerate(self.successors):
-            for target in targets:
-                if (source, target) not in without:
+        for source, targets in left_out.items():
+            for target in self.successors[source]:
+                if target not in targets:
                     before.setdefault(target, []).append(source)
         distances = dict.fromkeys(sorted(goal), 0)
         waiting = list(distances)
+        visited: set[int] = set()
         for state in waiting:
-            for source in before.get(state, ()):
+            direct = sources_of(self._above, (state,), visited)
+            for source in (*(each for each in direct if each not in left_out), *before.get(state, ())):
                 if source not in distances:
                     distances[source] = distances[state] + 1
                     waiting.append(source)
@@ -254,22 +296,9 @@ class Automaton(Displayed):
 
 def automaton_of(machine: Machine, name: str, propositions: Sequence[Proposition]) -> Automaton:
     """Return a machine that is `least` as a value."""
-    decisions: list[tuple[int, int, int]] = []
-    places: dict[int, int] = {}
-
-    def place(node: int) -> int:
-        if node not in places:
-            variable, low, high = machine.diagrams[node]
-            if variable == LEAF:
-                places[node] = ~low
-            else:
-                decisions.append((variable, place(low), place(high)))
-                places[node] = len(decisions) - 1
-        return places[node]
-
-    entries = tuple(place(node) for node in machine.moves)
-    accepting = frozenset(state for state, accepts in enumerate(machine.accepting) if accepts)
-    return Automaton(name, tuple(propositions), accepting, entries, tuple(decisions))
+    accepting = frozenset(np.flatnonzero(machine.accepting).tolist())
+    decisions = tuple(map(tuple, machine.decisions.tolist()))
+    return Automaton(name, tuple(propositions), accepting, tuple(machine.moves.tolist()), decisions)
 
 
 FALSE, TRUE, UNKNOWN = 0, 1, -1

@@ -14,7 +14,7 @@ from spatial_replay.automata.automaton import MAX_PROPOSITIONS, MAX_ROWS, Automa
 from spatial_replay.automata.ltlf import Skeleton, no_automaton
 from spatial_replay.automata.minimise import least
 from spatial_replay.automata.mona import compiled_by_mona
-from spatial_replay.automata.progression import progressed
+from spatial_replay.automata.products import composed
 from spatial_replay.automata.propositions import Propositions
 from spatial_replay.errors import NoAutomatonError, UsageError
 from spatial_replay.spec.diagnostics import SourceText, nearest_hint
@@ -62,7 +62,7 @@ def automaton_from(data: bytes, specification: Specification, spec: NamedSpec) -
     if entries is None or accepting is None or decisions is None or len(propositions) > MAX_PROPOSITIONS:
         return None
     automaton = Automaton(spec.name, tuple(propositions), frozenset(accepting), tuple(entries), decisions)
-    return automaton if _is_sound(automaton) and _has_guards(automaton) else None
+    return automaton if _is_sound(automaton) else None
 
 
 def _canonical(specification: Specification, spec: NamedSpec) -> str:
@@ -98,13 +98,6 @@ def _is_sound(automaton: Automaton) -> bool:
             for row, (proposition, low, high) in enumerate(rows)
         )
     )
-
-
-def _has_guards(automaton: Automaton) -> bool:
-    try:
-        return bool(automaton.transitions)
-    except NoAutomatonError:
-        return False
 
 
 Compiler: TypeAlias = Literal["own", "mona"]
@@ -168,7 +161,7 @@ def _compiled(
         if each == "mona" and (before := next(stored, None)) is not None:
             return before
         try:
-            compiled = progressed if each == "own" else compiled_by_mona
+            compiled = composed if each == "own" else compiled_by_mona
             machine = compiled(skeleton, count)
         except NoAutomatonError as error:
             reasons.append(f"{_NAMES[each]}: {error}")
@@ -186,7 +179,7 @@ def _read(stored: Iterable[bytes], specification: Specification, spec: NamedSpec
 
 
 def _checked(automaton: Automaton) -> Automaton:
-    """Return an automaton that is small enough, its transitions worked out.
+    """Return an automaton that is small enough.
 
     Raises:
         NoAutomatonError: it is too large.
@@ -194,8 +187,6 @@ def _checked(automaton: Automaton) -> Automaton:
     rows = max(len(automaton.entries), len(automaton.decisions))
     if rows > MAX_ROWS:
         raise NoAutomatonError(f"it takes {rows} states or decisions, at most {MAX_ROWS} are kept")
-    # a cached property: computed here, so that its error is raised here
-    _ = automaton.transitions
     return automaton
 
 

@@ -17,6 +17,11 @@ from spatial_replay.text import counted
 if TYPE_CHECKING:
     from spatial_replay.automata.automaton import Automaton
 
+MOST_STATES = 60
+"""States that a drawing shows at most, and a text of an automaton whose transitions cannot all be listed."""
+MOST_MOVES = 300
+LONGEST_GUARD = 300
+"""The most moves there, and characters of a guard."""
 _DRAWING_S = 120.0
 """Seconds that Graphviz may take."""
 _LONGEST_LABEL = 12
@@ -28,14 +33,19 @@ _LEGEND_WIDTH = 100
 
 
 def words_text(automaton: Automaton) -> str:
-    """Describe states, what they mean, and their moves in words."""
+    """Describe states, what they mean, and their moves in words.
+
+    Of an automaton whose transitions cannot all be listed, it has the states nearest to the start.
+    """
     lines = [f"automaton of {automaton.name}: {size_words(automaton)}"]
     lines += [f"  {each.name} means {each.text}" for each in automaton.propositions if each.name is not None]
-    for state, transitions in enumerate(_by_source(automaton)):
+    for state, transitions in _by_source(automaton).items():
         lines.append(f"  state {state}: {state_words(automaton, state)}")
         for each in transitions:
             to = "stays" if each.target == state else f"to {each.target}"
-            lines.append(f"    {to} if {automaton.guard_words(each)}")
+            lines.append(f"    {to} if {_guard_text(automaton, each)}")
+    if not automaton.is_listable:
+        lines.append(f"  … {_left_out(automaton)}")
     return "\n".join(lines)
 
 
@@ -72,7 +82,7 @@ def abbreviated(automaton: Automaton) -> Automaton:
         each if len(each.label) <= _LONGEST_LABEL else replace(each, name=next(names))
         for each in automaton.propositions
     )
-    return replace(automaton, propositions=tuple(short))
+    return automaton.renamed(tuple(short))
 
 
 def meanings(automaton: Automaton) -> list[str]:
@@ -83,10 +93,12 @@ def meanings(automaton: Automaton) -> list[str]:
 def dot_text(automaton: Automaton) -> str:
     """Return the automaton for Graphviz, with guards in words and long propositions in a legend.
 
-    Accepting states have a double outline; those that accept permanently are blue, traps are vermillion.
+    Accepting states have a double outline; those that accept permanently are blue, traps are vermillion. Of
+    an automaton whose transitions cannot all be listed, it has the states nearest to the start.
     """
     short = abbreviated(automaton)
-    return _digraph(short, meanings(short))
+    cut = () if automaton.is_listable else (_left_out(automaton),)
+    return _digraph(short, [*meanings(short), *cut])
 
 
 def _digraph(automaton: Automaton, legend: Sequence[str] = ()) -> str:
@@ -101,12 +113,13 @@ def _digraph(automaton: Automaton, legend: Sequence[str] = ()) -> str:
     if legend:
         text = "".join(f"{_escaped(line)}\\l" for each in legend for line in _legend_lines(each))
         lines.append(f'  graph [fontname="Helvetica", fontsize=11, labelloc=b, labeljust=l, label="{text}"];')
-    for state in automaton.states:
+    moves = _by_source(automaton)
+    for state in moves:
         shape = "doublecircle" if state in automaton.accepting else "circle"
         colour, about = state_colour(automaton, state), _quoted(state_words(automaton, state))
         lines.append(f'  {state} [shape={shape}, fillcolor="{colour}", tooltip={about}];')
-    for each in automaton.transitions:
-        label = "\\n".join(map(_escaped, _broken(automaton.guard_words(each))))
+    for each in (move for state in moves.values() for move in state):
+        label = "\\n".join(map(_escaped, _broken(_guard_text(automaton, each))))
         lines.append(f'  {each.source} -> {each.target} [label="{label}"];')
     return "\n".join([*lines, "}", ""])
 
@@ -117,7 +130,15 @@ def hoa_text(automaton: Automaton) -> str:
     That format is about infinite runs and has no acceptance for finite ones. So the accepting states are
     written as the acceptance set 0 of a Büchi automaton: a finite run is accepted iff it ends in a state of
     that set. The header `finite-runs`, which readers may ignore, says so.
+
+    Raises:
+        UsageError: its transitions are too many to be listed.
     """
+    if not automaton.is_listable:
+        raise UsageError(
+            f"the Hanoi format has every transition of {automaton.name}, of which there are too many "
+            f"({size_words(automaton)}); text and .dot files show the states nearest to the start"
+        )
     numbers = range(len(automaton.propositions))
     names = [_quoted(each.label) for each in automaton.propositions]
     lines = [
@@ -132,7 +153,7 @@ def hoa_text(automaton: Automaton) -> str:
         'finite-runs: "accepted iff they end in a state of set 0"',
         "--BODY--",
     ]
-    for state, transitions in enumerate(_by_source(automaton)):
+    for state, transitions in _by_source(automaton).items():
         lines.append(f"State: {state} {{0}}" if state in automaton.accepting else f"State: {state}")
         lines += [f"  [{_hoa_guard(each)}] {each.target}" for each in transitions]
     return "\n".join([*lines, "--END--", ""])
@@ -180,12 +201,26 @@ def _graphviz(automaton: Automaton, text: str, form: str) -> str:
     return done.stdout.decode()
 
 
-def _by_source(automaton: Automaton) -> list[list[Transition]]:
-    """Return for each state, the moves from it."""
-    moves: list[list[Transition]] = [[] for _ in automaton.states]
-    for each in automaton.transitions:
-        moves[each.source].append(each)
+def _by_source(automaton: Automaton) -> dict[int, list[Transition]]:
+    """Return for each state that is shown, the moves from it to others that are."""
+    shown = automaton.states if automaton.is_listable else automaton.states[:MOST_STATES]
+    ends = [(state, target) for state in shown for target in automaton.successors[state] if target in shown]
+    moves: dict[int, list[Transition]] = {state: [] for state in shown}
+    for source, target in ends if automaton.is_listable else ends[:MOST_MOVES]:
+        move = automaton.transition(source, target)
+        if move is not None:
+            moves[source].append(move)
     return moves
+
+
+def _left_out(automaton: Automaton) -> str:
+    most = len(automaton.states[:MOST_STATES])
+    rest = f"{counted(len(automaton.states) - most, 'more state')}, " if len(automaton.states) > most else ""
+    return f"{rest}more transitions and the rest of long guards are left out: there are too many"
+
+
+def _guard_text(automaton: Automaton, move: Transition) -> str:
+    return automaton.guard_words(move, None if automaton.is_listable else LONGEST_GUARD)
 
 
 def _hoa_guard(transition: Transition) -> str:

@@ -6,12 +6,8 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Final, NamedTuple
 
 from spatial_replay.automata.automaton import Automaton
-from spatial_replay.automata.dot_hoa import size_words, state_words
+from spatial_replay.automata.dot_hoa import LONGEST_GUARD, MOST_MOVES, MOST_STATES, size_words, state_words
 
-MOST_STATES: Final = 60
-"""States that a drawing shows, at most."""
-_MOST_MOVES: Final = 300
-_LONGEST_GUARD: Final = 300
 _SWEEPS: Final = 4
 
 
@@ -68,8 +64,9 @@ def draw_automaton(automaton: Automaton, visited: Collection[int] = ()) -> Autom
     shown = sorted([*sorted(first), *others][:MOST_STATES])
     places = _places(automaton, shown)
     distances = automaton.distances
-    moves = [move for move in automaton.transitions if move.source in places and move.target in places]
-    moves.sort(key=lambda move: move.source not in first)
+    ends = [(each, to) for each in shown for to in automaton.successors[each] if to in places]
+    ends.sort(key=lambda move: move[0] not in first)
+    moves = [move for each in ends[:MOST_MOVES] if (move := automaton.transition(*each)) is not None]
     return AutomatonDrawing(
         size_words(automaton),
         tuple(
@@ -85,8 +82,7 @@ def draw_automaton(automaton: Automaton, visited: Collection[int] = ()) -> Autom
             for state in shown
         ),
         tuple(
-            DrawnMove(move.source, move.target, _cut(automaton.guard_words(move)))
-            for move in moves[:_MOST_MOVES]
+            DrawnMove(move.source, move.target, automaton.guard_words(move, LONGEST_GUARD)) for move in moves
         ),
         len(automaton.states) - len(shown),
     )
@@ -145,7 +141,3 @@ def _middle(row: Mapping[int, float], successors: Mapping[int, Sequence[int]], s
     """Return the mean row of the states that lead to one, or its own."""
     found = [row[each] for each, targets in successors.items() if each != state and state in targets]
     return sum(found) / len(found) if found else row[state]
-
-
-def _cut(text: str) -> str:
-    return text if len(text) <= _LONGEST_GUARD else f"{text[: _LONGEST_GUARD - 1].rstrip()}…"

@@ -1,16 +1,16 @@
 """The moves of an automaton: which states lead to which others, and under what guards.
 
-A guard is a disjunction of few cubes, computed from the diagram of a state's moves.
+Moves are kept as decision diagrams. A guard is a disjunction of few cubes, which is computed from them when
+it is asked for: an automaton may have far more transitions, and these more cubes, than anyone will look at.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias, overload
 
 from spatial_replay.automata.diagrams import LEAF, NO, YES, Diagrams
-from spatial_replay.automata.minimise import nodes_of
 from spatial_replay.automata.propositions import Proposition
 from spatial_replay.errors import NoAutomatonError
 
@@ -25,7 +25,10 @@ Guard: TypeAlias = tuple[Cube, ...]
 
 
 MAX_CUBES = 100_000
-"""How many cubes all guards of an automaton have together."""
+"""How many cubes a guard has at most."""
+
+FEW_CUBES = 1_000
+"""How many cubes are kept of a guard that has more than `MAX_CUBES`."""
 
 
 class Covers:
@@ -37,22 +40,27 @@ class Covers:
     def __init__(self, diagrams: Diagrams) -> None:
         self._diagrams = diagrams
         self._known: dict[tuple[int, int], tuple[tuple[Cube, ...], int]] = {}
-        self._cubes = 0
 
     def guard(self, node: int) -> Guard:
         """Return the cubes of a function.
 
         Raises:
-            NoAutomatonError: they, and those before, are more than `MAX_CUBES`.
+            NoAutomatonError: they are more than `MAX_CUBES`.
         """
-        cubes = self._between(node, node)[0]
-        self._count(len(cubes))
-        return tuple(sorted(cubes))
+        return tuple(sorted(self._between(node, node)[0]))
 
-    def _count(self, cubes: int) -> None:
-        self._cubes += cubes
-        if self._cubes > MAX_CUBES:
-            raise NoAutomatonError(f"the guards of the automaton take more than {MAX_CUBES} cubes")
+    def some(self, node: int) -> Guard:
+        """Return some cubes of a function, `FEW_CUBES` at most, of which no two hold at once."""
+        found: list[Cube] = []
+        stack: list[tuple[int, Cube]] = [(node, ())]
+        while stack and len(found) < FEW_CUBES:
+            each, cube = stack.pop()
+            variable, low, high = self._diagrams[each]
+            if each == YES:
+                found.append(cube)
+            elif each != NO:
+                stack += ((high, (*cube, (variable, True))), (low, (*cube, (variable, False))))
+        return tuple(found)
 
     def _between(self, lower: int, upper: int) -> tuple[tuple[Cube, ...], int]:
         """Return cubes that hold where `lower` does and at most where `upper` does, and their function."""
@@ -80,22 +88,9 @@ class Covers:
         with_1 = (((variable, True), *cube) for cube in cubes_1)
         all_cubes = (*with_0, *with_1, *cubes)
         if len(all_cubes) > MAX_CUBES:
-            self._count(len(all_cubes))
+            raise NoAutomatonError(f"a guard takes more than {MAX_CUBES} cubes")
         decided = diagrams.decide(variable, covered_0, covered_1)
         return all_cubes, diagrams.either(decided, covered)
-
-
-def guard_words(guard: Guard, propositions: Sequence[Proposition]) -> str:
-    """Return a guard as a sentence of the specification language."""
-    if guard == ((),):
-        return "true"
-    texts = [" and ".join(propositions[number].literal(value) for number, value in cube) for cube in guard]
-    is_bare = [len(guard) == 1 or len(cube) == 1 for cube in guard]
-    return " or ".join(text if bare else f"({text})" for text, bare in zip(texts, is_bare, strict=True))
-
-
-MAX_VISITS = 25_000_000
-"""Decisions visited to find all moves, each once for every state that it may matter to."""
 
 
 @dataclass(frozen=True)
@@ -105,108 +100,122 @@ class Transition:
     Attributes:
         guard: cubes of literals (proposition's number, whether it is true), of which one has to hold; no cube
             and no literal of one can be left out.
+        is_cut: whether the guard takes more than `MAX_CUBES`. Then it has only some of them, each of which
+            leads to the target, and no two of which hold at once.
     """
 
     source: int
     guard: Guard
     target: int
+    is_cut: bool = False
 
 
-class Moves(NamedTuple):
-    """Moves as diagrams with states as leaves.
-
-    Attributes:
-        nodes: for each state.
-    """
-
-    diagrams: Diagrams
-    nodes: tuple[int, ...]
-
-
-def moves_of(entries: Sequence[int], decisions: Sequence[tuple[int, int, int]]) -> Moves:
-    """Return the moves of an automaton with such `entries` and `decisions`."""
-    diagrams = Diagrams()
-    nodes: list[int] = []
-
-    def node(place: int) -> int:
-        return diagrams.leaf(~place) if place < 0 else nodes[place]
-
-    for proposition, low, high in decisions:
-        nodes.append(diagrams.decide(proposition, node(low), node(high)))
-    return Moves(diagrams, tuple(node(place) for place in entries))
-
-
-def successors_of(moves: Moves) -> tuple[tuple[int, ...], ...]:
-    """Return for each state, those that one sample can lead to.
-
-    Raises:
-        NoAutomatonError: finding them takes more than `MAX_VISITS`.
-    """
-    diagrams = moves.diagrams
-    found: dict[int, tuple[int, ...]] = {}
-    visits = 0
-    for node in moves.nodes:
-        if node not in found:
-            below = nodes_of(diagrams, node)
-            visits = _counted(visits, len(below))
-            leaves = [diagrams[each].low for each in below if diagrams[each].variable == LEAF]
-            found[node] = tuple(sorted(leaves))
-    return tuple(found[node] for node in moves.nodes)
-
-
-def transitions_of(moves: Moves, successors: Sequence[Sequence[int]]) -> tuple[Transition, ...]:
-    """Return all transitions, by source and target.
+def guard_words(move: Transition, propositions: Sequence[Proposition], longest: int | None = None) -> str:
+    """Return a guard as a sentence of the specification language; one that is cut ends in "…".
 
     Args:
-        successors: those of the moves.
-
-    Raises:
-        NoAutomatonError: finding them takes more than `MAX_VISITS`, or their guards more than `MAX_CUBES`.
+        longest: characters after which it is cut.
     """
-    count = sum(map(len, successors))
-    if count > MAX_CUBES:
-        raise NoAutomatonError(f"the automaton has {count} transitions, at most {MAX_CUBES} are kept")
-    covers = Covers(moves.diagrams)
-    leading = _Leading(moves.diagrams)
-    return tuple(
-        Transition(source, covers.guard(leading.to(target, node)), target)
-        for source, node in enumerate(moves.nodes)
-        for target in successors[source]
-    )
+    if move.guard == ((),):
+        return "true"
+    parts: list[str] = []
+    length = 0
+    for cube in move.guard:
+        text = " and ".join(propositions[number].literal(value) for number, value in cube)
+        parts.append(text if len(move.guard) == 1 or len(cube) == 1 else f"({text})")
+        length += len(parts[-1])
+        if longest is not None and length > longest:
+            break
+    words = " or ".join([*parts, "…"] if move.is_cut else parts)
+    return words if longest is None or len(words) <= longest else f"{words[: longest - 1].rstrip()}…"
 
 
-class _Leading:
-    """Whether moves lead to a state, as functions of the propositions."""
+class Moves:
+    """The moves of an automaton as decision diagrams; what was asked for is remembered."""
 
-    def __init__(self, diagrams: Diagrams) -> None:
-        self._diagrams = diagrams
-        self._known: dict[int, dict[int, int]] = {}
-        self._visits = 0
+    def __init__(self, entries: Sequence[int], decisions: Sequence[tuple[int, int, int]]) -> None:
+        """Take over `entries` and `decisions` of an automaton."""
+        self._diagrams = Diagrams()
+        self._covers = Covers(self._diagrams)
+        places: list[int] = []
 
-    def to(self, target: int, node: int) -> int:
-        """Return the function that is true where a node leads to a state.
+        def node(place: int) -> int:
+            return self._diagrams.leaf(~place) if place < 0 else places[place]
 
-        Raises:
-            NoAutomatonError: that, and all calls before, take more than `MAX_VISITS`.
-        """
-        known = self._known.setdefault(target, {})
-        before = len(known)
-        result = self._copied(target, node, known)
-        self._visits = _counted(self._visits, len(known) - before)
-        return result
+        for proposition, low, high in decisions:
+            places.append(self._diagrams.decide(proposition, node(low), node(high)))
+        self._nodes = tuple(node(place) for place in entries)
+        self._successors: dict[int, tuple[int, ...]] = {}
+        self._leading: dict[int, dict[int, int]] = {}
+        self._transitions: dict[tuple[int, int], Transition] = {}
 
-    def _copied(self, target: int, node: int, known: dict[int, int]) -> int:
+    def __len__(self) -> int:
+        return len(self._nodes)
+
+    def successors(self, source: int) -> tuple[int, ...]:
+        """Return the states that one sample can lead to from a state, in order."""
+        node = self._nodes[source]
+        if node not in self._successors:
+            self._successors[node] = tuple(sorted(self._leaves(node)))
+        return self._successors[node]
+
+    def transition(self, source: int, target: int) -> Transition:
+        """Return the move from one state to another that one sample can lead to."""
+        key = (source, target)
+        if key not in self._transitions:
+            node = self._to(target, self._nodes[source], self._leading.setdefault(target, {}))
+            try:
+                move = Transition(source, self._covers.guard(node), target)
+            except NoAutomatonError:
+                move = Transition(source, self._covers.some(node), target, is_cut=True)
+            self._transitions[key] = move
+        return self._transitions[key]
+
+    def _leaves(self, node: int) -> set[int]:
+        visited = {node}
+        leaves = set()
+        stack = [node]
+        while stack:
+            variable, low, high = self._diagrams[stack.pop()]
+            if variable == LEAF:
+                leaves.add(low)
+                continue
+            for each in (low, high):
+                if each not in visited:
+                    visited.add(each)
+                    stack.append(each)
+        return leaves
+
+    def _to(self, target: int, node: int, known: dict[int, int]) -> int:
+        """Return the function that is true where a node leads to a state."""
         if node not in known:
             variable, low, high = self._diagrams[node]
             if variable == LEAF:
                 known[node] = YES if low == target else NO
             else:
-                branches = self._copied(target, low, known), self._copied(target, high, known)
+                branches = self._to(target, low, known), self._to(target, high, known)
                 known[node] = self._diagrams.decide(variable, *branches)
         return known[node]
 
 
-def _counted(visits: int, more: int) -> int:
-    if visits + more > MAX_VISITS:
-        raise NoAutomatonError(f"finding the automaton's moves takes more than {MAX_VISITS} steps")
-    return visits + more
+class Successors(Sequence[tuple[int, ...]]):
+    """For each state, those that one sample can lead to; worked out when they are asked for."""
+
+    def __init__(self, moves: Moves) -> None:
+        self._moves = moves
+
+    def __len__(self) -> int:
+        return len(self._moves)
+
+    @overload
+    def __getitem__(self, state: int) -> tuple[int, ...]: ...
+
+    @overload
+    def __getitem__(self, state: slice) -> tuple[tuple[int, ...], ...]: ...
+
+    def __getitem__(self, state: int | slice) -> tuple[int, ...] | tuple[tuple[int, ...], ...]:
+        if isinstance(state, slice):
+            return tuple(self[each] for each in range(len(self))[state])
+        if not -len(self) <= state < len(self):
+            raise IndexError(f"no state {state}; there are 0 to {len(self) - 1}")
+        return self._moves.successors(state % len(self))

@@ -153,6 +153,35 @@ class Skeleton:
         self._node("false"), self._node("true")
         self.root = self._of(formula, True)
 
+    def split(self, number: int) -> tuple[Literal["and", "or"], tuple[int, ...]]:
+        """Return subformulas whose conjunction or disjunction a subformula is; alone, if there are none.
+
+        `G (a and b)` is `(G a) and (G b)`, and so is whatever holds until released; `F` and until distribute
+        over `or`.
+        """
+        kind, first, second = self.nodes[number]
+        match kind:
+            case "and" | "or":
+                return kind, self._operands(kind, number)
+            case "R" | "U":
+                over: Literal["and", "or"] = "and" if kind == "R" else "or"
+                parts = self._operands(over, second)
+                if len(parts) > 1:
+                    return over, tuple(self._node(kind, first, each) for each in parts)
+        return "and", (number,)
+
+    def _operands(self, kind: Kind, number: int) -> tuple[int, ...]:
+        """Return the operands of a conjunction or disjunction, however it is bracketed."""
+        found: dict[int, None] = {}
+        stack = [number]
+        while stack:
+            each = self.nodes[stack.pop()]
+            if each.kind == kind:
+                stack += (each.second, each.first)
+            else:
+                found[self._numbers[each]] = None
+        return tuple(found)
+
     def _of(self, formula: Formula, positive: bool) -> int:
         """Return the number of a formula, or of its negation."""
         proposition = self._propositions.literal(formula)

@@ -1,27 +1,73 @@
-"""Minimisation: automata as compilers produce them, and the smallest one that accepts the same runs."""
+"""Machines as compilers produce them, and minimisation: the smallest one that accepts the same runs."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
-from spatial_replay.automata.diagrams import LEAF, Diagrams, copied
+import numpy as np
+
+from spatial_replay.automata.diagrams import LEAF, Diagrams
+from spatial_replay.geometry.arrays import Flags, Integers
+
+_ROUNDS = 8
+"""How often all states are compared at once, before only those that a split concerns are."""
 
 
 @dataclass(frozen=True, eq=False)
 class Machine:
     """A deterministic automaton with a move from every state for every symbol.
 
+    A *place* is a row of `decisions`, or ~q for state q.
+
     Attributes:
-        moves: for each state, the node of the diagram with the states that its moves lead to.
-        accepting: for each state.
-        start: the node with the states that the first sample of a run leads to.
+        moves: (S,), the place with which the moves of each state begin.
+        decisions: (D, 3), a proposition and the places where it is false, and true. These decide on later
+            propositions and stand in earlier rows.
+        accepting: (S,), whether a run may end in each state.
+        start: the place with which the first sample of a run begins.
     """
 
-    diagrams: Diagrams
-    moves: tuple[int, ...]
-    accepting: tuple[bool, ...]
+    moves: Integers
+    decisions: Integers
+    accepting: Flags
     start: int
+
+    @property
+    def size(self) -> int:
+        """How many states and decisions it has."""
+        return len(self.moves) + len(self.decisions)
+
+
+def machine_of(diagrams: Diagrams, moves: Sequence[int], accepting: Sequence[bool], start: int) -> Machine:
+    """Return the machine whose moves are nodes of diagrams with states as leaves."""
+    places: list[int] = []
+    rows: list[tuple[int, int, int]] = []
+    for node in range(len(diagrams)):
+        variable, low, high = diagrams[node]
+        if variable == LEAF:
+            places.append(~low)
+        else:
+            places.append(len(rows))
+            rows.append((variable, places[low], places[high]))
+    return _machine([places[node] for node in moves], rows, accepting, places[start])
+
+
+def _machine(
+    moves: Sequence[int], rows: Sequence[tuple[int, int, int]], accepting: Sequence[bool], start: int
+) -> Machine:
+    decisions = np.array(rows, np.int64).reshape(-1, 3)
+    return Machine(np.array(moves, np.int64), decisions, np.array(accepting, np.bool_), start)
+
+
+def merged(machine: Machine) -> Machine:
+    """Return a machine that accepts the same runs, without equivalent states and those never reached."""
+    machine = _ordered(machine, _reachable(machine))
+    classes = _classes(machine)
+    places, decisions = _relabelled(machine, classes)
+    firsts = np.unique(classes, return_index=True)[1]
+    moves = places[machine.moves[firsts]]
+    return Machine(moves, decisions, machine.accepting[firsts], int(places[machine.start]))
 
 
 def least(machine: Machine) -> Machine:
@@ -31,49 +77,148 @@ def least(machine: Machine) -> Machine:
     their distance from the first one. No run is empty, so that may be any state with the same moves, and one
     that does not accept if there is a choice.
     """
-    machine = _renumbered(machine, _reachable(machine, machine.start))
-    classes = _classes(machine)
-    diagrams = Diagrams()
-    copy = _relabelled(machine, diagrams, classes)
-    moves = [0] * len(set(classes))
-    accepting = [False] * len(moves)
-    for state, number in enumerate(classes):
-        moves[number] = copy(machine.moves[state])
-        accepting[number] = machine.accepting[state]
-    start = copy(machine.start)
-    first = _first(moves, accepting, start)
-    joined = Machine(diagrams, tuple(moves), tuple(accepting), start)
-    others = [state for state in _reachable(joined, start) if state != first]
-    return _renumbered(joined, [first, *others])
+    machine = merged(machine)
+    same = np.flatnonzero(machine.moves == machine.start)
+    if len(same):
+        first = int(same[np.argmin(machine.accepting[same])])
+    else:
+        first = len(machine.moves)
+        moves, accepting = np.append(machine.moves, machine.start), np.append(machine.accepting, False)
+        machine = Machine(moves, machine.decisions, accepting, machine.start)
+    others = [state for state in _reachable(machine) if state != first]
+    return _ordered(machine, [first, *others])
 
 
-def _classes(machine: Machine) -> list[int]:
-    """Return the class of each state: states of one class accept the same runs, the empty one included.
+def _reachable(machine: Machine) -> list[int]:
+    """Return the states that can be reached: nearer ones first, then false before true."""
+    moves, rows = machine.moves.tolist(), machine.decisions.tolist()
+    order: dict[int, None] = {}
+    waiting: list[int] = []
+    # a decision visited before leads to no new state
+    visited = [False] * len(rows)
+    stack = [machine.start]
+    done = 0
+    while stack:
+        place = stack.pop()
+        if place < 0:
+            if ~place not in order:
+                order[~place] = None
+                waiting.append(~place)
+        elif not visited[place]:
+            visited[place] = True
+            _, low, high = rows[place]
+            stack += (high, low)
+        if not stack and done < len(waiting):
+            stack.append(moves[waiting[done]])
+            done += 1
+    return waiting
 
-    Classes are split until the moves of all members lead to the same ones. The largest part of a class keeps
-    its number, so that few states have to be checked again (Hopcroft, 1971).
+
+def _ordered(machine: Machine, states: Sequence[int]) -> Machine:
+    """Return only some states, in the order given, and decisions in theirs; no move leads to another."""
+    numbers = {state: number for number, state in enumerate(states)}
+    rows = machine.decisions.tolist()
+    places: dict[int, int] = {}
+    decisions: list[tuple[int, int, int]] = []
+
+    def place(before: int) -> int:
+        if before < 0:
+            return ~numbers[~before]
+        after = places.get(before)
+        if after is None:
+            variable, low, high = rows[before]
+            row = (variable, place(low), place(high))
+            after = places[before] = len(decisions)
+            decisions.append(row)
+        return after
+
+    moves = [place(before) for before in machine.moves[np.array(states, np.int64)].tolist()]
+    start = place(machine.start)
+    return _machine(moves, decisions, machine.accepting[np.array(states, np.int64)].tolist(), start)
+
+
+def _relabelled(machine: Machine, numbers: Integers) -> tuple[Integers, Integers]:
+    """Give the states other numbers, and merge decisions that have become equal.
+
+    Returns:
+        For each place its new place, (D + S,), to be indexed by place: ~q is index D + S - 1 - q. And the new
+        decisions.
     """
-    classes = [int(accepts) for accepts in machine.accepting]
-    # the members of each class, by where their moves lead to
-    parts: list[dict[int, set[int]]] = [{}, {}]
+    decisions = machine.decisions
+    places = np.concatenate([np.empty(len(decisions), np.int64), ~numbers[::-1]])
+    span = len(places) + 1
+    found: list[Integers] = []
+    count = 0
+    for rows in _levels(decisions):
+        variable = decisions[rows[0], 0]
+        low, high = places[decisions[rows, 1]], places[decisions[rows, 2]]
+        places[rows] = low
+        differ = low != high
+        keys = (low[differ] + span) * (2 * span) + high[differ] + span
+        kinds, firsts, inverse = np.unique(keys, return_index=True, return_inverse=True)
+        places[rows[differ]] = count + inverse.ravel()
+        level = np.empty((len(kinds), 3), np.int64)
+        level[:, 0], level[:, 1], level[:, 2] = variable, low[differ][firsts], high[differ][firsts]
+        found.append(level)
+        count += len(kinds)
+    return places, np.concatenate(found) if found else np.empty((0, 3), np.int64)
+
+
+def _levels(decisions: Integers) -> Iterator[Integers]:
+    """Yield the rows that decide on each proposition, the last proposition first."""
+    if not len(decisions):
+        return
+    order = np.argsort(-decisions[:, 0], kind="stable")
+    bounds = np.flatnonzero(np.diff(decisions[order, 0])) + 1
+    yield from np.split(order, bounds)
+
+
+def _classes(machine: Machine) -> Integers:
+    """Return the class of each state: states of one class accept the same runs, the empty one included."""
+    classes = np.unique(machine.accepting, return_inverse=True)[1].ravel().astype(np.int64)
+    for _ in range(_ROUNDS):
+        places = _relabelled(machine, classes)[0]
+        keys = classes * (2 * len(places) + 2) + places[machine.moves] + len(places)
+        after = np.unique(keys, return_inverse=True)[1].ravel().astype(np.int64)
+        if after.max() == classes.max():
+            return classes
+        classes = after
+    return np.unique(_split_classes(machine, classes.tolist()), return_inverse=True)[1].ravel()
+
+
+def _split_classes(machine: Machine, classes: list[int]) -> list[int]:
+    """Split classes until the moves of all members of one lead to the same ones.
+
+    The largest part of a class keeps its number, so that few states are checked again (Hopcroft, 1971).
+    """
+    moves, rows = machine.moves.tolist(), machine.decisions.tolist()
+    parts: list[dict[int, set[int]]] = [{} for _ in range(max(classes) + 1)]
     leading: dict[int, int] = {}
-    before = _before(machine)
+    above = above_of(moves, rows)
     diagrams = Diagrams()
     pending: Collection[int] = range(len(classes))
     while pending:
-        copy = _relabelled(machine, diagrams, classes)
+        known: dict[int, int] = {}
+
+        def copy(place: int, known: dict[int, int] = known) -> int:
+            if place < 0:
+                return diagrams.leaf(classes[~place])
+            if place not in known:
+                variable, low, high = rows[place]
+                known[place] = diagrams.decide(variable, copy(low), copy(high))
+            return known[place]
+
         for state in pending:
             own = parts[classes[state]]
             if state in leading:
                 own[leading[state]].remove(state)
                 if not own[leading[state]]:
                     del own[leading[state]]
-            leading[state] = copy(machine.moves[state])
+            leading[state] = copy(moves[state])
             own.setdefault(leading[state], set()).add(state)
         moved = _split(parts, classes, dict.fromkeys(classes[state] for state in pending))
-        pending = dict.fromkeys(source for state in moved for source in before[state])
-    numbers: dict[int, int] = {}
-    return [numbers.setdefault(each, len(numbers)) for each in classes]
+        pending = sources_of(above, moved)
+    return classes
 
 
 def _split(parts: list[dict[int, set[int]]], classes: list[int], touched: Iterable[int]) -> list[int]:
@@ -91,72 +236,34 @@ def _split(parts: list[dict[int, set[int]]], classes: list[int], touched: Iterab
     return moved
 
 
-def _before(machine: Machine) -> list[list[int]]:
-    """Return for each state those from which a sample can lead to it."""
-    before: list[list[int]] = [[] for _ in machine.moves]
-    for state, node in enumerate(machine.moves):
-        for target in leaves_of(machine.diagrams, node):
-            before[target].append(state)
-    return before
+def above_of(moves: Sequence[int], rows: Iterable[Sequence[int]]) -> dict[int, list[int]]:
+    """Return for each place the rows that lead to it at once, and ~q if the moves of state q begin there."""
+    above: dict[int, list[int]] = {}
+    for number, (_, low, high) in enumerate(rows):
+        above.setdefault(low, []).append(number)
+        above.setdefault(high, []).append(number)
+    for state, place in enumerate(moves):
+        above.setdefault(place, []).append(~state)
+    return above
 
 
-def _first(moves: list[int], accepting: list[bool], start: int) -> int:
-    """Return a state that moves as a run begins, one more if there is none."""
-    same = [state for state, node in enumerate(moves) if node == start]
-    if not same:
-        moves.append(start)
-        accepting.append(False)
-        return len(moves) - 1
-    return min(same, key=lambda state: accepting[state])
+def sources_of(
+    above: dict[int, list[int]], targets: Iterable[int], visited: set[int] | None = None
+) -> dict[int, None]:
+    """Return the states from which one sample can lead to some states.
 
-
-def _reachable(machine: Machine, start: int) -> list[int]:
-    """Return the states that can be reached from a node: nearer ones first, then false before true."""
-    order = dict.fromkeys(leaves_of(machine.diagrams, start))
-    waiting = list(order)
-    for state in waiting:
-        for target in leaves_of(machine.diagrams, machine.moves[state]):
-            if target not in order:
-                order[target] = None
-                waiting.append(target)
-    return waiting
-
-
-def _renumbered(machine: Machine, states: Sequence[int]) -> Machine:
-    """Return only some states, in the order given; no move leads to another."""
-    numbers = {state: number for number, state in enumerate(states)}
-    diagrams = Diagrams()
-    copy = _relabelled(machine, diagrams, numbers)
-    return Machine(
-        diagrams,
-        tuple(copy(machine.moves[state]) for state in states),
-        tuple(machine.accepting[state] for state in states),
-        copy(machine.start),
-    )
-
-
-def _relabelled(
-    machine: Machine, diagrams: Diagrams, numbers: Mapping[int, int] | Sequence[int]
-) -> Callable[[int], int]:
-    """Return a function that copies nodes into other diagrams, with other numbers for the states."""
-    return copied(machine.diagrams, diagrams, LEAF, lambda node: numbers[machine.diagrams[node].low])
-
-
-def leaves_of(diagrams: Diagrams, node: int) -> list[int]:
-    """Return the leaves below a node, in the order of the decisions, false before true."""
-    return [diagrams[each].low for each in nodes_of(diagrams, node) if diagrams[each].variable == LEAF]
-
-
-def nodes_of(diagrams: Diagrams, node: int) -> list[int]:
-    """Return a node and those below it, in the order of the decisions, false before true."""
-    visited: dict[int, None] = {}
-    stack = [node]
+    Args:
+        above: as from `above_of`.
+        visited: rows that are not followed again; those that are followed are added.
+    """
+    sources: dict[int, None] = {}
+    seen = set() if visited is None else visited
+    stack = [~target for target in targets]
     while stack:
-        each = stack.pop()
-        if each in visited:
-            continue
-        visited[each] = None
-        variable, low, high = diagrams[each]
-        if variable != LEAF:
-            stack += [high, low]
-    return list(visited)
+        for each in above.get(stack.pop(), ()):
+            if each < 0:
+                sources[~each] = None
+            elif each not in seen:
+                seen.add(each)
+                stack.append(each)
+    return sources

@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 from spatial_replay.automata.diagrams import Diagrams
 from spatial_replay.automata.ltlf import Kind, Node, Skeleton
-from spatial_replay.automata.minimise import Machine
+from spatial_replay.automata.minimise import Machine, machine_of
 from spatial_replay.errors import NoAutomatonError
 
 _MAX_DEPTH = 220
@@ -220,7 +220,7 @@ def _machine(printed: str, propositions: int) -> Machine:
     moves = tuple(_node(diagrams, each, 0) for each in cubes)
     first = cubes[0][0].target
     accepts = {int(number) for number in accepting[1].split()}
-    return Machine(diagrams, moves, tuple(state in accepts for state in range(states)), moves[first])
+    return machine_of(diagrams, moves, [state in accepts for state in range(states)], moves[first])
 
 
 def _node(diagrams: Diagrams, cubes: list[_Cube], variable: int) -> int:

@@ -17,7 +17,7 @@ from typing import NamedTuple, TypeAlias
 
 from spatial_replay.automata.diagrams import NO, YES, Diagrams, copied
 from spatial_replay.automata.ltlf import FALSE, TRUE, Skeleton
-from spatial_replay.automata.minimise import Machine
+from spatial_replay.automata.minimise import Machine, machine_of
 from spatial_replay.errors import NoAutomatonError
 
 Obligation: TypeAlias = tuple[int, bool]
@@ -128,14 +128,26 @@ MAX_DECISIONS = 150_000
 """How many nodes the decision diagrams may have."""
 
 
-def progressed(skeleton: Skeleton, propositions: int) -> Machine:
-    """Return the automaton of a skeleton over so many propositions.
+def progressed(
+    skeleton: Skeleton,
+    propositions: int,
+    number: int | None = None,
+    *,
+    states: int = MAX_STATES,
+    decisions: int = MAX_DECISIONS,
+) -> Machine:
+    """Return an automaton of a skeleton over so many propositions.
+
+    Args:
+        number: the subformula that it is of; without it, the whole formula.
+        states, decisions: how many it takes at most.
 
     Raises:
-        NoAutomatonError: it would take more than `MAX_STATES` or `MAX_DECISIONS`.
+        NoAutomatonError: it would take more.
     """
+    root = skeleton.root if number is None else number
     try:
-        return _Progression(skeleton, propositions).machine()
+        return _Progression(skeleton, propositions, states, decisions).machine(root)
     except RecursionError:
         raise NoAutomatonError("the automaton takes decisions that are nested too deeply") from None
 
@@ -143,32 +155,33 @@ def progressed(skeleton: Skeleton, propositions: int) -> Machine:
 class _Progression:
     """The states of a skeleton, explored from the first one."""
 
-    def __init__(self, skeleton: Skeleton, propositions: int) -> None:
+    def __init__(self, skeleton: Skeleton, propositions: int, states: int, decisions: int) -> None:
         self._skeleton = skeleton
         self._propositions = propositions
-        self._diagrams = Diagrams(MAX_DECISIONS)
+        self._most = states
+        self._diagrams = Diagrams(decisions)
         self._obligations = Obligations(self._diagrams, propositions, skeleton.chains)
         self._now: dict[int, int] = {FALSE: NO, TRUE: YES}
         self._next: dict[int, int] = {NO: NO, YES: YES}
 
-    def machine(self) -> Machine:
+    def machine(self, root: int) -> Machine:
         states: dict[int, int] = {}
         waiting: list[int] = []
 
         def number(node: int) -> int:
             if node not in states:
-                if len(waiting) == MAX_STATES:
-                    raise NoAutomatonError(f"the automaton takes more than {MAX_STATES} states")
+                if len(waiting) == self._most:
+                    raise NoAutomatonError(f"the automaton takes more than {self._most} states")
                 states[node] = len(waiting)
                 waiting.append(node)
             return states[node]
 
         result = Diagrams()
         copy = copied(self._diagrams, result, self._propositions, number)
-        start = copy(self._read(self._skeleton.root))
+        start = copy(self._read(root))
         # the list grows while it is iterated: moves lead to new states
-        moves = tuple(copy(self._after(node)) for node in waiting)
-        return Machine(result, moves, tuple(map(self._accepts, waiting)), start)
+        moves = [copy(self._after(node)) for node in waiting]
+        return machine_of(result, moves, [self._accepts(node) for node in waiting], start)
 
     def _read(self, number: int) -> int:
         """Return what a subformula requires of this sample and, as obligations, of the next."""

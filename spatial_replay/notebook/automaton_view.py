@@ -76,8 +76,9 @@ def automaton_svg(automaton: Automaton) -> str | None:
 
 def _is_large(automaton: Automaton) -> bool:
     # the transitions of an automaton with very many states take long to find
-    too_many = len(automaton.states) > _MOST_STATES
-    return too_many or sum(len(each.guard) for each in automaton.transitions) > _MOST_CUBES
+    if len(automaton.states) > _MOST_STATES or not automaton.is_listable:
+        return True
+    return sum(len(each.guard) for each in automaton.transitions) > _MOST_CUBES
 
 
 @plot.register(Automaton)

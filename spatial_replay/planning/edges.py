@@ -11,8 +11,8 @@ from itertools import pairwise, takewhile
 from typing import Any, Final, NamedTuple, TypeAlias
 
 from spatial_replay.automata.automaton import Automaton
-from spatial_replay.automata.guards import Transition
-from spatial_replay.errors import UsageError
+from spatial_replay.automata.guards import MAX_CUBES, Transition
+from spatial_replay.errors import NoAutomatonError, UsageError
 from spatial_replay.monitor.atoms.live import SampleLeaves
 from spatial_replay.planning.decisions import Consideration, Edge, Guards, Reason
 from spatial_replay.spec.formula import Formula, Outline, Specification
@@ -131,12 +131,21 @@ def equivalent_edges(
 def _other_edges(
     automaton: Automaton, edge: Edge, pruned: Collection[Edge], symbol: Symbol
 ) -> Iterator[Transition]:
-    """Iterate over the transitions that must not be taken on the way to an edge."""
+    """Iterate over the transitions that must not be taken on the way to an edge.
+
+    Raises:
+        NoAutomatonError: a guard that is cut, since what it leaves out would not be avoided.
+    """
     source = edge[0]
     allowed = {*edge, *(automaton.step_set({source}, symbol) & automaton.can_accept)}
     for target in automaton.successors[source]:
         transition = automaton.transition(source, target)
         if transition is not None and target not in allowed and (source, target) not in pruned:
+            if transition.is_cut:
+                reason = f"the guard of {source} -> {target} takes more than {MAX_CUBES} cubes"
+                raise NoAutomatonError(
+                    f"{reason}, too many to plan around; write simpler propositions", reason
+                )
             yield transition
 
 

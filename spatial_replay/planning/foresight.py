@@ -322,7 +322,7 @@ class Foresight:
     @cached_property
     def _hopeless(self) -> frozenset[Edge]:
         """The edges that need what no arrangement of the objects can bring about."""
-        if self._first is None:
+        if self._first is None or not self._automaton.is_listable:
             return frozenset()
         symbol = self._expected.symbol(self._first)
         literals = {

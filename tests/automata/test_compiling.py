@@ -9,6 +9,7 @@ import pytest
 import spatial_replay as sr
 from automata.golden import FILE, FORMULAS, as_values
 from spatial_replay import Automaton, NoAutomatonError, UsageError, automaton, parse_specification
+from spatial_replay.automata import dot_text, hoa_text, words_text
 from spatial_replay.simulation.worlds import default_specification
 
 GOLDEN = json.loads(FILE.read_text())
@@ -175,10 +176,51 @@ def test_too_many_propositions_are_reported() -> None:
         machine_of(text)
 
 
-def test_guards_with_too_many_cubes_are_reported() -> None:
-    text = " xor ".join(f"(X p{number} >= 0)" for number in range(24))
-    with pytest.raises(NoAutomatonError, match="guards"):
-        automaton(parse_specification(text), compiler="own")
+def responses(count: int) -> Automaton:
+    return machine_of(" and ".join(f"(G ((a{n} >= 0) -> F b{n} >= 0))" for n in range(count)))
+
+
+def test_twelve_responses_take_a_state_for_each_set_of_open_requests() -> None:
+    machine = responses(12)
+    assert (len(machine.states), len(machine.distances)) == (2**12, 2**12)
+    # from any set of open requests, one sample may leave any other
+    assert machine.successors[100] == tuple(machine.states)
+    assert [each.target for each in next(machine.paths(100))] == [0]
+    requests = [True, False] * 12
+    assert not machine.accepts([requests]) and machine.accepts([requests, [False, True] * 12])
+
+
+def test_of_an_automaton_with_too_many_transitions_the_states_nearest_to_the_start_are_shown() -> None:
+    machine = responses(8)
+    assert not machine.is_listable
+    with pytest.raises(NoAutomatonError, match="more than 100000 cubes in the guards of its transitions"):
+        _ = machine.transitions
+    words = words_text(machine)
+    assert words.splitlines()[-1].strip() == (
+        "… 196 more states, more transitions and the rest of long guards are left out: there are too many"
+    )
+    assert "state 59:" in words and "state 60:" not in words
+    assert "196 more states" in dot_text(machine)
+    with pytest.raises(UsageError, match=r"Hanoi format has every transition .*256 states"):
+        hoa_text(machine)
+
+
+def test_a_guard_of_too_many_cubes_is_cut_and_says_so() -> None:
+    machine = machine_of(" xor ".join(f"(X p{number} >= 0)" for number in range(24)))
+    assert (len(machine.states), len(machine.decisions)) == (4, 47)
+    move = machine.transition(1, 3)
+    assert move is not None and move.is_cut
+    assert machine.guard_words(move).endswith(" or …")
+    for cube in move.guard[:20]:
+        assert machine.step(1, [dict(cube)[number] for number in range(24)]) == 3
+
+
+def test_operands_are_compiled_by_themselves_where_that_is_smaller() -> None:
+    # six deadlines: 2**6 sets of what is done, for each of 100 samples
+    machine = machine_of(" and ".join(f"(F[0, 100] p{n} >= 0)" for n in range(6)))
+    assert len(machine.states) == 100 * (2**6 - 1) + 3
+    nested = machine_of("G (" + " and ".join(f"((a{n} >= 0) -> F b{n} >= 0)" for n in range(10)) + ")")
+    assert nested.accepting == responses(10).accepting and nested.decisions == responses(10).decisions
 
 
 def test_an_ambiguous_choice_of_spec_is_a_usage_error() -> None:
