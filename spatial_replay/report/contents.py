@@ -98,8 +98,8 @@ class ReportedResult:
 
     @property
     def robustness_text(self) -> str:
-        """The root's robustness, or between which numbers it lies."""
-        return final_text(self.result.robustness, self.result.lower, self.result.upper)
+        """The root's robustness with its unit, or between which numbers it lies."""
+        return final_text(self.result.robustness, self.result.lower, self.result.upper, self.unit)
 
     @property
     def formula(self) -> Formula:

@@ -24,7 +24,8 @@ from spatial_replay.report.compact import json_text, sentence_parts
 from spatial_replay.report.contents import MANY, ReportedResult, RunReport, worst_first
 from spatial_replay.report.data import page_data
 from spatial_replay.report.tree_panel import final_text
-from spatial_replay.spec.units import is_mixed
+from spatial_replay.spec.formula import iter_nodes
+from spatial_replay.spec.units import declared_unit, is_mixed
 from spatial_replay.text import Instant, Sentence, counted, printable
 
 _CALENDAR_NS: Final = 500_000_000 * 10**9
@@ -167,8 +168,7 @@ def _counts(report: RunReport) -> str:
 def _summary(each: ReportedResult, first_ns: int) -> Html:
     """Return the line of a result: its verdict, requirement and number, and since when it is certain."""
     result = each.result
-    unit = f" {each.unit}" if each.unit and each.robustness_text else ""
-    numbers = [f"robustness {each.robustness_text or 'not determined'}{unit}"]
+    numbers = [f"robustness {each.robustness_text or 'not determined'}"]
     if result.violated_at_ns is not None:
         numbers.append(f"violated since {Instant(result.violated_at_ns, first_ns)}")
     elif result.satisfied_at_ns is not None:
@@ -198,12 +198,13 @@ def _requirement(identifier: str | None, name: str, title: str | None) -> Iterat
 
 def _specs(each: ReportedResult, first_ns: int) -> Html:
     """Return one row for each named spec within a result, and the units that its number is the least of."""
-    rows = []
+    rows, formulas = [], {identifier: node for identifier, _, node in iter_nodes(each.result.formula)}
     for node in each.specs:
         settled_ns = settled_time(each.result.settled_ns, node.id)
         spec = each.named.get(node.name or "")
         about = (None, None) if spec is None else (spec.id, spec.title)
-        numbers = f"robustness {final_text(node.robustness, node.final_lower, node.final_upper)}"
+        unit = declared_unit(formulas[node.id], each.result.evidence.units)
+        numbers = f"robustness {final_text(node.robustness, node.final_lower, node.final_upper, unit)}"
         if settled_ns is not None:
             numbers += f", violated since {Instant(settled_ns, first_ns)}"
         line = element("span", text(numbers), **{"class": "numbers"})

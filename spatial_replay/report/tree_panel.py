@@ -17,7 +17,7 @@ from spatial_replay.monitor.verdict import final_verdict
 from spatial_replay.report.compact import Packing
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Boolean, Formula, Temporal, iter_nodes, operands_of, operator_of
-from spatial_replay.text import json_number, number_text
+from spatial_replay.text import json_number, with_unit
 
 MOST_NODES: Final = 400
 """Nodes of a tree that a page shows, at most."""
@@ -116,13 +116,13 @@ def requirement_values(
     ]
 
 
-def final_text(robustness: float, lower: float, upper: float) -> str:
-    """Return a node's final robustness, or the ends of its interval."""
+def final_text(robustness: float, lower: float, upper: float, unit: str = "") -> str:
+    """Return a node's final robustness with its unit, or the ends of its interval."""
     if math.isnan(robustness) or not (lower == upper == robustness):
         if math.isnan(lower):
-            return "" if math.isnan(robustness) else number_text(robustness)
-        return f"{number_text(lower)} … {number_text(upper)}"
-    return number_text(robustness)
+            return "" if math.isnan(robustness) else with_unit(robustness, unit)
+        return f"{with_unit(lower, unit)} … {with_unit(upper, unit)}"
+    return with_unit(robustness, unit)
 
 
 def named_nodes(formula: Formula) -> tuple[int, ...]:

@@ -233,12 +233,14 @@ def test_a_unit_that_is_declared_is_shown(tmp_path: Path, data_folder: Path) -> 
         "  /turtle1/pose: {shape: {disc: 0.5}, signals: {speed: {field: linear_velocity, unit: m/s}}}\n"
     )
     source = open_source(data_folder / "bags/two_turtles.bag", mapping=tmp_path / "turtles.yaml")
-    specs = [sr.parse_specification("spec slow = G (speed <= 9)")]
+    specs = [sr.parse_specification("spec slow = G (speed <= 9)\nspec never_fast = slow")]
     run_replay(source, specs, output=tmp_path / "annotated.mcap")
     again = open_source(tmp_path / "annotated.mcap")
     for log, page in ((source, "run.html"), (again, "again.html")):
         write_report(log, specs, tmp_path / page)
         assert page_of(tmp_path / page).facts["results"][0]["nodes"][0]["unit"] == "m/s"
+        numbers = re.findall(r'class="numbers">robustness ([^<,]*)', (tmp_path / page).read_text("utf-8"))
+        assert [each.split()[-1] for each in numbers] == ["m/s", "m/s"]
 
 
 def test_a_damaged_log_is_said_to_be_so_first(tmp_path: Path) -> None:

@@ -397,11 +397,6 @@ function failureWords(part) {
   return [...partWords({...part, node}), ` ${how} by ${numberText(Math.abs(number))}${spaced(declaredUnit(node))} now`];
 }
 
-// The unit that the log declares for the number of an atom, or "".
-function declaredUnit({unit, divisor}) {
-  return divisor !== 1 || unit === "1" || unit === "mixed" || unit.startsWith("units of") ? "" : unit;
-}
-
 function spaced(unit) {
   return unit && ` ${unit}`;
 }

@@ -4,8 +4,7 @@ function makeTree(clock) {
   const place = body("tree");
   const title = element("p", {class: "which"});
   const head = element("div", {class: "row head", "aria-hidden": "true"},
-    element("span", {class: "what"}, "node"), element("span", {class: "number"}, "so far"),
-    element("span", {class: "number"}, "now"));
+    element("span", {class: "what"}, "node"));
   const list = element("ul", {class: "tree", "aria-label": "Nodes of the formula"});
   place.append(title, head, list);
   let rows = [];
@@ -17,6 +16,9 @@ function makeTree(clock) {
       list.replaceChildren(element("li", {}, "Nothing was evaluated."));
       return;
     }
+    const unit = commonUnit(result.nodes);
+    head.replaceChildren(head.firstChild,
+      ...["so far", "now"].map((words) => element("span", {class: "number"}, words + unit)));
     list.replaceChildren(branch(result.nodes[0], rows));
     lightPath(list, rows, result);
   });
@@ -28,6 +30,17 @@ function makeTree(clock) {
     title.textContent = `${result.title} at ${secondsText(clock.shownTime)}${isLast ? ", the last sample" : ""}`;
     for (const row of rows) showRow(row, clock.run, result, sample, isLast);
   });
+}
+
+// The unit that a log declares for the number of a node, or "".
+function declaredUnit({unit, divisor}) {
+  return divisor !== 1 || unit === "1" || unit === "mixed" || unit.startsWith("units of") ? "" : unit;
+}
+
+// The unit in which all nodes are, for a heading; none where it is not declared, or too long.
+function commonUnit(nodes) {
+  const [unit, ...others] = new Set(nodes.map(declaredUnit));
+  return unit && !others.length && unit.length <= 4 ? ` [${unit}]` : "";
 }
 
 // Marks the way to the node that decided the verdict, and scrolls to it.
