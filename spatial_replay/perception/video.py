@@ -336,7 +336,8 @@ def has_key(data: bytes) -> bool:
 def _lacks_index(path: Path) -> bool:
     """Return whether a file is an .mp4 or .mov without the box that says where its frames are."""
     with path.open("rb") as file:
-        size, at, kinds = path.stat().st_size, 0, []
+        kinds: list[bytes] = []
+        size, at = path.stat().st_size, 0
         while at + 8 <= size and len(kinds) < _MOST_BOXES:
             file.seek(at)
             head = file.read(16)
