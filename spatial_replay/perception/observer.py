@@ -208,9 +208,9 @@ class TagObserver:
                 since_ns, last = self._last[each.name]
                 if time_ns - since_ns <= self.hold_ns:
                     grown = last.uncertainty + each.fastest * (time_ns - since_ns) / 1e9
-                    held[each.name] = TrackedObject(
-                        last.footprint, last.class_name, last.yaw, last.height, grown
-                    )
+                    # a yaw has no uncertainty: of what may have turned, it is unknown
+                    yaw = None if each.fastest else last.yaw
+                    held[each.name] = TrackedObject(last.footprint, last.class_name, yaw, last.height, grown)
                 else:
                     self._hidden[each.name] = each.class_name
         return held

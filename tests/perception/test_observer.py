@@ -162,6 +162,8 @@ def test_a_hidden_object_is_unknown_and_a_held_one_ever_less_certain() -> None:
     stated = [each.objects["red"].uncertainty for each in held[1:4]]
     grown = 0.5 * PERIOD_NS / 1e9
     assert np.diff(stated) == pytest.approx([grown, grown])
+    # it may have turned, so that `oriented` is unknown
+    assert [each.objects["red"].yaw is None for each in held[:4]] == [False, False, True, True]
     # the tags file may say so as well; who asks for another time gets that
     own = parse_tags(TABLE + "fastest: 0.5\nhold: 40ms\n")
     for hold_ns, frames in ((None, 3), (0, 2), (2 * PERIOD_NS, 4)):
