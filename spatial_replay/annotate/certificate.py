@@ -186,6 +186,18 @@ def specification_sha256(files: Sequence[Specification]) -> str:
     return total.hexdigest()
 
 
+PLAN_SHA256 = "plan_sha256"
+"""The entry of a certificate for the settings of a planned run."""
+
+
+def plan_sha256(plan: Mapping[str, str]) -> str:
+    """Return the SHA-256 of the metadata of a planned run: names and values, in the order of names."""
+    total = hashlib.sha256()
+    for name, value in sorted(plan.items()):
+        total.update(_text(name) + _text(value))
+    return total.hexdigest()
+
+
 def specifications_json(files: Sequence[Specification]) -> str:
     """Return specifications as metadata lists them, in JSON: name and SHA-256 of the canonical text."""
     texts = [format_specification(file).encode("utf-8", "surrogatepass") for file in files]
@@ -218,13 +230,20 @@ class EvaluationHashes:
         for index, block in enumerate(results):
             self._results.add(index, block.series)
 
-    def certificate(self, files: Sequence[Specification]) -> Mapping[str, str]:
-        """Return the certificate of the evaluation, once it is finished."""
+    def certificate(
+        self, files: Sequence[Specification], plan: Mapping[str, str] | None = None
+    ) -> Mapping[str, str]:
+        """Return the certificate of the evaluation, once it is finished.
+
+        Args:
+            plan: the metadata of a planned run.
+        """
         return {
             "samples_sha256": self._samples.hexdigest(),
             "messages_sha256": self._messages.hexdigest(),
             "specification_sha256": specification_sha256(files),
             "results_sha256": self._results.hexdigest(),
+            **({} if plan is None else {PLAN_SHA256: plan_sha256(plan)}),
             "spatial_replay_version": __version__,
         }
 

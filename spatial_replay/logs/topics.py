@@ -60,6 +60,9 @@ TRIGGER = "spatial_replay_trigger"
 CERTIFICATE = "spatial_replay_certificate"
 """The metadata record that comes last: hashes of inputs and results."""
 
+PLAN_METADATA = "spatial_replay_plan"
+"""The metadata record with the settings and the specification that a planner's decisions depend on."""
+
 RECOVERY = "spatial_replay_recovery"
 """The metadata record of a log that was recovered from a damaged one: what is missing in it."""
 

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 from spatial_replay.lazy import loaded_when_used
 
 if TYPE_CHECKING:
-    from spatial_replay.planning.decision_log import PLAN_METADATA, BlackBox, plan_metadata
+    from spatial_replay.logs.topics import PLAN_METADATA
+    from spatial_replay.planning.decision_log import BlackBox, plan_metadata
     from spatial_replay.planning.decisions import Candidate, Executor, Outcome, Reason, Step, Target
     from spatial_replay.planning.map_layers import MapLayers, map_layers
     from spatial_replay.planning.map_messages import map_fields
@@ -66,14 +67,14 @@ __all__ = [
 __getattr__, __dir__ = loaded_when_used(
     globals(),
     {
-        "decision_log": ("PLAN_METADATA", "BlackBox", "plan_metadata"),
+        "decision_log": ("BlackBox", "plan_metadata"),
         "decisions": ("Candidate", "Executor", "Outcome", "Reason", "Step", "Target"),
         "map_layers": ("MapLayers", "map_layers"),
         "map_messages": ("map_fields",),
         "maps": ("FREE", "GradientMap", "centre_of", "gradient_map", "moved_object", "proposition_maps"),
         "paths": ("shortest_path",),
         "planner": ("MOST_MOTIONS", "Planner"),
-        "read": ("LoggedStep", "planner_of", "read_decisions", "read_steps"),
+        "read": ("PLAN_METADATA", "LoggedStep", "planner_of", "read_decisions", "read_steps"),
         "recompute": ("recompute_decisions",),
         "settings": ("Settings", "settings_from_text", "text_from_settings"),
         "workspace": ("Grid", "Workspace"),

@@ -29,7 +29,12 @@ from spatial_replay.logs.schemas.PlanDecision_pb2 import (
     PlanTarget,
     PrunedEdge,
 )
-from spatial_replay.logs.topics import GRADIENT_MAP, PLAN_DECISION, PLAN_PATH, protobuf_channel
+from spatial_replay.logs.topics import (
+    GRADIENT_MAP,
+    PLAN_DECISION,
+    PLAN_PATH,
+    protobuf_channel,
+)
 from spatial_replay.palette import NEUTRAL, POSITIVE
 from spatial_replay.planning.decisions import (
     Candidate,
@@ -47,9 +52,6 @@ from spatial_replay.planning.maps import centre_of, moved_object
 from spatial_replay.planning.planner import Planner
 from spatial_replay.planning.settings import Settings, text_from_settings
 from spatial_replay.trace.sample import Sample
-
-PLAN_METADATA: Final = "spatial_replay_plan"
-"""Name of the metadata record with the settings and the specification that decisions depend on."""
 
 PLAN_VERSION: Final = 2
 """What decisions and maps say: 1, the maps as they are; 2, also what they are made of, and how acceptance was

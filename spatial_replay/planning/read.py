@@ -13,9 +13,14 @@ from spatial_replay.logs.mcap.reader import McapSource
 from spatial_replay.logs.messages import Block, Messages
 from spatial_replay.logs.schemas.PlanDecision_pb2 import PlanDecision
 from spatial_replay.logs.source import Source, read_blocks
-from spatial_replay.logs.topics import GRADIENT_MAP, PLAN_DECISION, PLAN_PATH, RECORDED_PREFIX
-from spatial_replay.planning.decision_log import (
+from spatial_replay.logs.topics import (
+    GRADIENT_MAP,
+    PLAN_DECISION,
     PLAN_METADATA,
+    PLAN_PATH,
+    RECORDED_PREFIX,
+)
+from spatial_replay.planning.decision_log import (
     PLAN_VERSION,
     BlackBox,
     decision_from_payload,

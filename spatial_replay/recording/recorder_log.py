@@ -121,7 +121,7 @@ class FileLog:
     def add(self, samples: Sequence[Sample], trace: Trace, messages: Messages) -> None:
         """See `RecorderLog`."""
         while self._metadata:
-            self._writer.add_metadata(*self._metadata.popleft())
+            self._recording.add_metadata(*self._metadata.popleft())
         if len(trace) or len(messages):
             self._recording.add_samples(trace, messages)
         if len(trace):

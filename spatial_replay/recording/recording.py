@@ -19,6 +19,7 @@ from spatial_replay.logs.topics import (
     AUTOMATA,
     CERTIFICATE,
     ENDING,
+    PLAN_METADATA,
     METADATA,
     OBJECTS,
     RECORDED_PREFIX,
@@ -82,6 +83,7 @@ class Recording:
         )
         self._samples = self._messages = self._end_ns = 0
         self._topics: set[str] = set()
+        self._plan: Mapping[str, str] | None = None
         self._images: set[str] = set()
         self._hashes = EvaluationHashes([(tree.name, tree.object) for tree in self._evaluation.trees])
         sink.add_metadata(METADATA, _metadata(files, about or {}))
@@ -173,6 +175,12 @@ class Recording:
         self._hashes.add_samples(trace, own)
         return own
 
+    def add_metadata(self, name: str, data: Mapping[str, str]) -> None:
+        """Write a metadata record; the certificate covers that of a plan."""
+        self._sink.add_metadata(name, data)
+        if name == PLAN_METADATA:
+            self._plan = dict(data)
+
     def end(self, *, interrupted: bool = False, dropped: int = 0, messages_dropped: int = 0) -> None:
         """Write what follows the last sample; the certificate is that of a replay of the log.
 
@@ -197,7 +205,7 @@ class Recording:
             }
             self._sink.add_metadata(VERDICTS, texts)
         self._sink.add_metadata(ENDING, ending)
-        self._sink.add_metadata(CERTIFICATE, self._hashes.certificate(self._files))
+        self._sink.add_metadata(CERTIFICATE, self._hashes.certificate(self._files, self._plan))
 
     def break_off(self, *, dropped: int = 0, messages_dropped: int = 0) -> None:
         """Write the end of a log whose last samples could not be written: it has no certificate."""

@@ -17,7 +17,7 @@ from spatial_replay.annotate.specification import (
 )
 from spatial_replay.logs.messages import Attachment, Messages, merge
 from spatial_replay.logs.source import Source, axes_of, units_of
-from spatial_replay.logs.topics import REPLAYED_PREFIX, image_topics
+from spatial_replay.logs.topics import PLAN_METADATA, REPLAYED_PREFIX, image_topics
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.stream import SeriesBlock, join_blocks
@@ -246,7 +246,11 @@ class Replay:
                 has_leaves=self._keep_leaves,
             ),
             vacuous=idle_templates(self.files, self.trees),
-            certificate={} if self._hashes is None else self._hashes.certificate(self._written_files),
+            certificate={}
+            if self._hashes is None
+            else self._hashes.certificate(
+                self._written_files, dict(self._source.metadata()).get(PLAN_METADATA)
+            ),
             semantics=options.semantics,
         )
 

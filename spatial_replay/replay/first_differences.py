@@ -15,6 +15,7 @@ from spatial_replay.logs.remote import LogFile
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.schemas.Robustness_pb2 import Robustness
 from spatial_replay.logs.schemas.Specification_pb2 import Specification
+from spatial_replay.annotate.certificate import PLAN_SHA256
 from spatial_replay.logs.topics import DERIVED, OBJECTS, ROBUSTNESS, SPECIFICATION
 from spatial_replay.text import Instant, Sentence, printable
 
@@ -94,6 +95,11 @@ def explain_differences(
             lines.append(Sentence(f"{name:<14} differ from those certified; the log does not show where"))
         else:
             lines.append(Sentence(f"{name:<14} differ first ", where))
+    if PLAN_SHA256 in recorded:
+        is_same = recorded[PLAN_SHA256] == computed.get(PLAN_SHA256)
+        lines.append(
+            Sentence(f"{'plan settings':<14} {'the same' if is_same else 'differ from those certified'}")
+        )
     version = recorded.get("spatial_replay_version", "unknown")
     is_same = version == __version__
     lines.append(

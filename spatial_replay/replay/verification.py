@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any
 
+from spatial_replay.annotate.certificate import PLAN_SHA256, plan_sha256
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.logs.mcap.reader import McapSource
 from spatial_replay.logs.source import Source
-from spatial_replay.logs.topics import CERTIFICATE, METADATA
+from spatial_replay.logs.topics import CERTIFICATE, METADATA, PLAN_METADATA
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.replay.annotated import load_files, run_replay
 from spatial_replay.replay.clipped_source import CLIP_METADATA, clipped_source
@@ -28,9 +29,12 @@ _HASHES: Mapping[str, str] = MappingProxyType(
         "messages_sha256": "other messages",
         "specification_sha256": "another specification",
         "results_sha256": "other results",
+        PLAN_SHA256: "other plan settings",
     }
 )
 """The meaning of a difference, for each hash of a certificate."""
+
+_NO_PLAN = "no plan settings: the log was planned, and its decisions cannot be recomputed without"
 
 _READING = ("on_time_jump", "late", "rate", "lost", "y_down", "concave")
 _WINDOW = ("start_ns", "end_ns", "every")
@@ -46,23 +50,29 @@ class Verified:
         faults: what could not be read.
         explanation: for each part of the certificate whether it is the same, and where it differs first;
             empty unless it was asked for.
+        lacks_plan: whether the log says that it was planned, and neither has settings nor was certified with
+            any.
     """
 
     recorded: Mapping[str, str]
     computed: Mapping[str, str]
     faults: tuple[str, ...] = ()
     explanation: tuple[str, ...] = ()
+    lacks_plan: bool = False
 
     @property
     def differences(self) -> tuple[str, ...]:
         """The differences in words; none if everything is equal."""
         if not self.recorded:
             return ("the log has no certificate: it was not written to its end",)
-        return tuple(
+        found = [
             f"{what}: {self.computed.get(key, 'nothing')} now, {self.recorded.get(key, 'nothing')} recorded"
             for key, what in _HASHES.items()
             if self.recorded.get(key) != self.computed.get(key)
-        )
+            # certificates of before have no hash of the settings
+            and not (key == PLAN_SHA256 and key not in self.recorded)
+        ]
+        return (*found, *([_NO_PLAN] if self.lacks_plan else []))
 
 
 def verify_certificate(
@@ -105,7 +115,16 @@ def verify_certificate(
         arrow=str(options.get("arrow", "")),
     )
     replayed = run_replay(evaluated, _files(log), chosen, advance=advance)
-    verified = Verified(dict(recorded), dict(replayed.certificate), replayed.faults)
+    computed = dict(replayed.certificate)
+    plan = metadata.get(PLAN_METADATA)
+    if not options.get("layer") and recorded.get(PLAN_SHA256) == computed.get(PLAN_SHA256):
+        # its source has those that were certified; the log's own copy of them counts, too
+        computed |= {} if plan is None else {PLAN_SHA256: plan_sha256(plan)}
+        if plan is None:
+            computed.pop(PLAN_SHA256, None)
+    lacks_plan = about.get("planned") == "true" and plan is None and PLAN_SHA256 not in recorded
+    lacks_plan = lacks_plan and not options.get("layer")
+    verified = Verified(dict(recorded), computed, replayed.faults, lacks_plan=lacks_plan)
     if not explain:
         return verified
     found: Mapping[str, Sentence] = {}

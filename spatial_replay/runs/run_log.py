@@ -79,7 +79,7 @@ class RunLog:
         """
         with uninterrupted():
             self._write_waiting()
-            self._writer.add_metadata(name, data)
+            self._recording.add_metadata(name, data)
 
     def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
         """Attach a file to the log.

@@ -15,8 +15,9 @@ import spatial_replay as sr
 from planning.kinematics import BLOCKS, block
 from planning.plans import PUSH, record_plan_of
 from spatial_replay import LogError, Settings, UsageError, load_specification
+from spatial_replay.logs.mcap.writer import LogWriter
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
-from spatial_replay.logs.topics import GRADIENT_MAP, PLAN_PATH
+from spatial_replay.logs.topics import GRADIENT_MAP, PLAN_METADATA, PLAN_PATH
 from spatial_replay.planning import (
     Grid,
     Reason,
@@ -134,8 +135,47 @@ def test_a_replay_keeps_decisions(tmp_path):
 def test_certificates_cover_decisions(tmp_path):
     record_plan_of(tmp_path / "run.mcap")
     verified = verify_certificate(open_source(tmp_path / "run.mcap"))
-    assert verified.recorded
+    assert "plan_sha256" in verified.recorded
     assert verified.differences == ()
+
+
+def test_verify_notices_edited_and_removed_plan_settings(tmp_path):
+    log = tmp_path / "annotated.mcap"
+    run_replay(open_source(RECORDED), load_files([], open_source(RECORDED)), output=log)
+    assert sr.verify(log).differences == sr.verify(log, RECORDED).differences == ()
+    settings = dict(open_source(log).metadata())[PLAN_METADATA]
+    edited = settings | {"settings": settings["settings"].replace('"margin":', '"margin": 1')}
+    assert edited != settings
+    for name, plan, now in (("edited", edited, ""), ("removed", None, "nothing now")):
+        with_plan(log, tmp_path / f"{name}.mcap", plan)
+        for source in (None, RECORDED):
+            verified = sr.verify(tmp_path / f"{name}.mcap", source, explain=True)
+            (difference,) = verified.differences
+            assert difference.startswith(f"other plan settings: {now}")
+        assert "plan settings  differ from those certified" in verified.explanation
+
+
+def test_verify_notices_that_a_log_without_a_hash_of_its_plan_settings_has_none(tmp_path):
+    # it was recorded before certificates had one
+    assert sr.verify(RECORDED).differences == ()
+    with_plan(RECORDED, tmp_path / "removed.mcap", None)
+    (difference,) = sr.verify(tmp_path / "removed.mcap").differences
+    assert difference.startswith("no plan settings: ")
+
+
+def with_plan(log, output, plan):
+    """Copy a log with other plan settings, or without any."""
+    source = open_source(log)
+    with output.open("wb") as stream, LogWriter(stream) as writer:
+        for block in source.iter_blocks():
+            writer.write_messages(block.messages)
+        for attachment in source.attachments():
+            writer.add_attachment(attachment.name, attachment.media_type, attachment.data)
+        for name, data in source.metadata():
+            if name != PLAN_METADATA:
+                writer.add_metadata(name, data)
+            elif plan is not None:
+                writer.add_metadata(name, plan)
 
 
 TURNING = Settings(
