@@ -72,6 +72,8 @@ if TYPE_CHECKING:
     from spatial_replay.recording.trigger import Trigger
     from spatial_replay.replay.engine import Replayed
     from spatial_replay.replay.verification import Verified
+    from spatial_replay.sanity.examine import Examination, Finding, SpecExamination, doctor
+    from spatial_replay.sanity.examples import Example
     from spatial_replay.sources.open_log import read_trace
     from spatial_replay.sources.overview import ObjectOverview, Overview
     from spatial_replay.spec.diagnostics import Diagnostic
@@ -101,6 +103,9 @@ __all__ = [
     "EditOutcome",
     "Ending",
     "Evaluation",
+    "Examination",
+    "Example",
+    "Finding",
     "FirstDifference",
     "Footprint",
     "Gap",
@@ -135,6 +140,7 @@ __all__ = [
     "Settings",
     "SpatialReplayError",
     "SpecDiff",
+    "SpecExamination",
     "SpecResult",
     "SpecUpdate",
     "Specification",
@@ -164,6 +170,7 @@ __all__ = [
     "clip_log",
     "diff_logs",
     "diff_specifications",
+    "doctor",
     "evaluate",
     "evaluate_logs",
     "info",
@@ -231,6 +238,8 @@ __getattr__, __dir__ = loaded_when_used(
         "recording.recorder": ("Recorder",),
         "replay.engine": ("Replayed",),
         "replay.verification": ("Verified",),
+        "sanity.examine": ("Examination", "Finding", "SpecExamination", "doctor"),
+        "sanity.examples": ("Example",),
         "sources.open_log": ("read_trace",),
         "sources.overview": ("ObjectOverview", "Overview"),
         "spec.diagnostics": ("Diagnostic",),

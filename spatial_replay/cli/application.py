@@ -41,6 +41,7 @@ COMMANDS: dict[str, str] = {
     "clip": "Cut the smallest part of a log that shows a verdict.",
     "completion": "Print a shell completion script.",
     "diff": "Compare two specifications over a log, or two logs.",
+    "doctor": "Find what is wrong with a specification before any run.",
     "explain": "Explain a verdict.",
     "export": "Export the robustness of every node as a table.",
     "info": "Show what a log contains.",

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from spatial_replay.cli.findings import Form, show_findings
+from spatial_replay.cli.findings import Form, finding_format_option, findings_of, show_findings
 from spatial_replay.cli.options import (
     JsonCommand,
     LogPath,
@@ -52,14 +51,7 @@ _AUTOMATON_FILES = (".dot", ".hoa", ".svg")
 @profile_option
 @reading_options
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of text.")
-@click.option(
-    "--format",
-    "form",
-    type=click.Choice(["text", "github", "sarif"]),
-    default="text",
-    help="Print errors and warnings for GitHub's annotations, or for code scanning, and no tree."
-    "  [default: text]",
-)
+@finding_format_option
 @click.option(
     "--dfa",
     metavar="FILE|-",
@@ -100,13 +92,13 @@ def check(
     if log is None:
         _refuse_log_options(reading, strict_names)
     shown = str(specification)
-    with _findings_of(shown, form):
+    with findings_of(shown, form):
         (parsed,) = load_spec_options([specification], profile, constants)
     inputs = local_files([specification] if log is None else [specification, log])
     if dfa is not None:
         _check_automaton_options(parsed, of, dfa, inputs)
     compared = _compare_with_log(parsed, log, reading, strict_names) if log is not None else _Compared()
-    diagnostics = [*parsed.warnings, *compared.diagnostics]
+    diagnostics = [*parsed.warnings, *compared.diagnostics, *_examined(parsed)]
     show_diagnostics(diagnostics)
     show_findings(form, shown, diagnostics)
     if any(each.severity == "error" for each in diagnostics):
@@ -117,16 +109,6 @@ def check(
         show(*_lines(parsed, compared))
     if dfa is not None:
         _write_automata(parsed, of, dfa, inputs, quiet=as_json)
-
-
-@contextmanager
-def _findings_of(specification: str, form: Form) -> Iterator[None]:
-    """Print the errors of a specification that cannot be parsed in the form that was asked for, too."""
-    try:
-        yield
-    except SpecificationError as error:
-        show_findings(form, specification, error.diagnoses)
-        raise
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,6 +126,14 @@ class _Compared:
     windows: Sequence[str] = ()
     ranges: Sequence[ThresholdRange] = ()
     summary: str = ""
+
+
+def _examined(specification: Specification) -> list[Diagnostic]:
+    """Return what `doctor` finds."""
+    # only needed once the text is parsed: automata load the numerical libraries
+    from spatial_replay.sanity import doctor
+
+    return [each.diagnostic for each in doctor(specification, examples=False).findings]
 
 
 def _refuse_log_options(reading: ReadArguments, strict_names: bool) -> None:

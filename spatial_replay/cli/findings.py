@@ -2,15 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, Literal, TypeAlias
 from urllib.parse import quote
 
+import click
+
 from spatial_replay import __version__
 from spatial_replay.cli.terminal import PROGRAM, show, show_json
-from spatial_replay.errors import Diagnosis
+from spatial_replay.errors import Diagnosis, SpecificationError
 
 Form: TypeAlias = Literal["text", "github", "sarif"]
+
+finding_format_option = click.option(
+    "--format",
+    "form",
+    type=click.Choice(["text", "github", "sarif"]),
+    default="text",
+    help="Print only errors and warnings, for GitHub's annotations or for code scanning.  [default: text]",
+)
+
+
+@contextmanager
+def findings_of(specification: str, form: Form) -> Iterator[None]:
+    """Print the errors of a specification that cannot be parsed in the form that was asked for, too."""
+    try:
+        yield
+    except SpecificationError as error:
+        show_findings(form, specification, error.diagnoses)
+        raise
 
 
 def show_findings(form: Form, path: str, diagnoses: Sequence[Diagnosis]) -> None:

@@ -30,6 +30,7 @@ from spatial_replay.recording.plan_loop import run_plan
 from spatial_replay.runs.filmed import open_film
 from spatial_replay.runs.run_log import RunLog, run_log
 from spatial_replay.runs.scripted import about_run, refuse_unknown_names
+from spatial_replay.sanity import refuse_unsatisfiable
 from spatial_replay.simulation.injection import Injection
 from spatial_replay.simulation.world import World
 from spatial_replay.simulation.worlds import default_specification, make_world
@@ -214,13 +215,15 @@ def record_plan(
 
     Raises:
         NoAutomatonError: a specification without an automaton.
-        SpecificationError: names that the world does not have.
+        SpecificationError: no run satisfies the result, or names that the world does not have.
         UsageError: no such scenario, no simulator, no such result, several to choose from, a result that
             cannot be planned for.
         OutputError: the output cannot be written.
     """
     (kept,) = logged_specifications([default_specification(scenario) if file is None else file])
     _refuse_missing(kept, name)
+    for planned in [name] if name else [spec.name for spec in kept.results if len(kept.results) == 1]:
+        refuse_unsatisfiable(kept, planned)
     made = about_run(scenario, seed=seed, noise_m=noise_m, injections=injections)
     about = {**made, "planned": "true"}
     # an error in the world or the planner leaves the output untouched

@@ -11,7 +11,7 @@ from spatial_replay.cli import run
 from spatial_replay.planning import read_decisions
 
 SATISFIED = "spec calm = F (green leftof red)\n"
-IMPOSSIBLE = "spec torn = F (red leftof blue and red rightof blue)\n"
+IMPOSSIBLE = "spec torn = F (red dist blue >= 100)\n"
 
 
 @pytest.fixture(autouse=True)
@@ -68,6 +68,16 @@ def test_one_of_several_results_has_to_be_chosen(tmp_path: Path, capsys: pytest.
         ("spec calm = G O (green leftof red)\n", [], "past operators"),
         ("spec calm = F (pink leftof red)\n", [], "the world never has the object 'pink'"),
         ("spec calm = F (\n", [], "task.spatial:1"),
+        (
+            "spec calm = F (red leftof blue and not (red leftof blue))\n",
+            [],
+            "no run satisfies calm: by logic alone",
+        ),
+        (
+            "spec calm = F (red leftof blue and red ovlp blue)\n",
+            [],
+            "no run satisfies calm: `red leftof blue` and `red ovlp blue` exclude each other",
+        ),
         (SATISFIED, ["--inject", "drop@1s"], "drop"),
     ],
 )

@@ -47,7 +47,7 @@ def test_recomputed_decisions_and_certificate_are_equal(pushed: tuple[Path, Plan
 
 def test_an_impossible_task_ends_with_a_reason(tmp_path: Path) -> None:
     pytest.importorskip("pybullet", reason="PyBullet is not installed; it has wheels for Python 3.11")
-    impossible = sr.parse_specification("F (red leftof blue and red rightof blue)")
+    impossible = sr.parse_specification("F (red dist blue >= 100)")
     planned = record_plan("push", tmp_path / "run.mcap", impossible)
     assert planned.ended == "no path"
     assert planned.reason.startswith("no path left")

@@ -1,0 +1,14 @@
+"""Sanity of specifications: which runs satisfy them at all, by automata and laws of geometry."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from spatial_replay.lazy import loaded_when_used
+
+if TYPE_CHECKING:
+    from spatial_replay.sanity.examine import doctor, refuse_unsatisfiable
+
+__all__ = ["doctor", "refuse_unsatisfiable"]
+
+__getattr__, __dir__ = loaded_when_used(globals(), {"examine": ("doctor", "refuse_unsatisfiable")})

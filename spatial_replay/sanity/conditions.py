@@ -1,0 +1,428 @@
+"""Propositions as conditions: Boolean functions of linear inequalities between measured quantities.
+
+A relation's robustness is built of measurements by sums, minima and maxima, so "at least 0" is a Boolean
+function of inequalities between sums. Two relations about one quantity share it, whatever their names:
+`a closeto[0.1] b` and `a dist b >= 0.2` are inequalities about one distance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from fractions import Fraction
+from itertools import product
+from math import isfinite
+from typing import Final, Literal, NamedTuple, TypeAlias
+
+from spatial_replay.automata.diagrams import NO, YES, Diagrams
+from spatial_replay.sanity.linear import Inequality
+from spatial_replay.spec.format import format_formula, format_number, format_term
+from spatial_replay.spec.formula import (
+    ANY_CLASS,
+    Atom,
+    Boolean,
+    CentroidProjection,
+    Earlier,
+    Enlarged,
+    Expression,
+    Formula,
+    Group,
+    Maximum,
+    Measurement,
+    Minimum,
+    Misalignment,
+    Negative,
+    Number,
+    Outline,
+    Projection,
+    Protrusion,
+    Quantified,
+    RegionName,
+    Scaled,
+    Signal,
+    SignedDistance,
+    Sum,
+    Term,
+    TrackedName,
+    Truth,
+    Variable,
+    expand,
+)
+from spatial_replay.spec.walks import base_of, iter_formulas, measured_terms
+
+MAX_INEQUALITIES: Final = 64
+"""How many inequalities one relation is written as at most; one of more is not looked into."""
+
+MAX_DECISIONS: Final = 200_000
+"""How many nodes the diagrams of conditions may have."""
+
+Quantity: TypeAlias = Measurement | Signal
+Weights: TypeAlias = tuple[tuple[Quantity, Fraction], ...]
+
+
+class Linear(NamedTuple):
+    """A weighted sum of quantities, plus a constant."""
+
+    weights: Weights
+    constant: Fraction = Fraction(0)
+
+
+class Choice(NamedTuple):
+    """The least or the greatest of some numbers."""
+
+    kind: Literal["min", "max"]
+    options: tuple[Linear | Choice, ...]
+
+
+Tree: TypeAlias = Linear | Choice
+
+
+class Fact(NamedTuple):
+    """What a diagram decides on: an inequality between quantities, or something that is not looked into.
+
+    Attributes:
+        weights: of a sum of quantities, the first 1; none for what is not looked into.
+        threshold: what the sum is compared with.
+        side: ">" is false where the sum is less, and leaves open where it is equal, as relations between
+            footprints are marginal there. ">=" and "<=" are meant to the letter, for sums that some relation
+            compares with "==".
+        texts: sentences of the language where it is true, and where it is false.
+        alone: of a quantifier over a class, its value where no object is of that class; otherwise None.
+    """
+
+    weights: Weights
+    threshold: Fraction
+    side: Literal[">", ">=", "<="]
+    texts: tuple[str, str]
+    alone: bool | None = None
+
+    def inequality(self, value: bool, label: int) -> Inequality:
+        """Return what holds where the fact is true, or false."""
+        rises = (self.side != "<=") == value
+        is_strict = self.side == ">" or not value
+        if rises:
+            weights = tuple((quantity, -weight) for quantity, weight in self.weights)
+            return Inequality(weights, -self.threshold, is_strict, label)
+        return Inequality(self.weights, self.threshold, is_strict, label)
+
+
+class Conditions:
+    """The facts that some formulas are about, and the diagrams of propositions over them.
+
+    Attributes:
+        diagrams: of all conditions; variables are the numbers of facts.
+        facts: by number.
+    """
+
+    def __init__(self, formulas: Iterable[Formula], regions: Mapping[str, Outline]) -> None:
+        self.diagrams = Diagrams(MAX_DECISIONS)
+        self.facts: list[Fact] = []
+        self.regions = regions
+        self._numbers: dict[object, int] = {}
+        self._trees: dict[Expression, Tree | None] = {}
+        self._known: dict[int, tuple[Formula, int]] = {}
+        # quantities that are compared with "==": modes and counts as a rule
+        self._compared: set[Weights] = set()
+        atoms = [each for one in formulas for each in iter_formulas(one) if isinstance(each, Atom)]
+        for each in atoms:
+            self._tree_of(each.expression)
+        # what is measured comes first: a run that only it decides can be placed
+        for each in atoms:
+            self.of(each)
+
+    def of(self, formula: Formula) -> int:
+        """Return the diagram of a formula about one sample."""
+        known = self._known.get(id(formula))
+        if known is None:
+            # the formula is kept, so that its id stays its own
+            known = self._known[id(formula)] = formula, self._diagram(expand(formula))
+        return known[1]
+
+    def _diagram(self, formula: Formula) -> int:
+        diagrams = self.diagrams
+        match formula:
+            case Truth():
+                return YES if formula.value else NO
+            case Atom():
+                tree = self._tree_of(formula.expression)
+                return self._opaque(formula) if tree is None else self._condition(tree, formula)
+            case Boolean(operator="not"):
+                return diagrams.complement(self.of(formula.operands[0]))
+            case Boolean():
+                result = self.of(formula.operands[0])
+                join = diagrams.both if formula.operator == "and" else diagrams.either
+                for each in formula.operands[1:]:
+                    result = join(result, self.of(each))
+                return result
+            case _:
+                return self._opaque(formula)
+
+    def _tree_of(self, expression: Expression) -> Tree | None:
+        if expression not in self._trees:
+            tree = self._trees[expression] = _tree(expression, self.regions)
+            if tree is not None:
+                self._compared |= set(_equated(tree))
+        return self._trees[expression]
+
+    def _condition(self, tree: Tree, atom: Atom) -> int:
+        """Return where a number is at least 0."""
+        if isinstance(tree, Choice):
+            parts = [self._condition(each, atom) for each in tree.options]
+            join = self.diagrams.both if tree.kind == "min" else self.diagrams.either
+            result = parts[0]
+            for each in parts[1:]:
+                result = join(result, each)
+            return result
+        if not tree.weights:
+            return YES if tree.constant >= 0 else NO
+        weights, threshold, is_least = _compared(tree)
+        is_whole = isinstance(self._trees[atom.expression], Linear)
+        texts = _texts(atom, is_whole, is_least, weights, threshold)
+        if weights in self._compared:
+            return self._fact(Fact(weights, threshold, ">=" if is_least else "<=", texts))
+        node = self._fact(Fact(weights, threshold, ">", texts if is_least else texts[::-1]))
+        return node if is_least else self.diagrams.complement(node)
+
+    def _opaque(self, formula: Formula) -> int:
+        text = format_formula(formula)
+        alone = None
+        if isinstance(formula, Quantified) and isinstance(formula.group, Group):
+            alone = formula.quantifier == "forall" if formula.group.class_name != ANY_CLASS else None
+        return self._fact(Fact((), Fraction(0), ">", (text, f"not ({text})"), alone))
+
+    def _fact(self, fact: Fact) -> int:
+        key = (fact[:3]) if fact.weights else fact.texts
+        if key not in self._numbers:
+            self._numbers[key] = len(self.facts)
+            self.facts.append(fact)
+        return self.diagrams.variable(self._numbers[key])
+
+
+def _compared(linear: Linear) -> tuple[Weights, Fraction, bool]:
+    """Return a sum that is at least 0 as a sum, its threshold, and whether that is the least value."""
+    factor = linear.weights[0][1]
+    weights = tuple((quantity, weight / factor) for quantity, weight in linear.weights)
+    return weights, -linear.constant / factor, factor > 0
+
+
+def _equated(tree: Tree) -> Iterable[Weights]:
+    """Yield the sums that have to be equal to a threshold."""
+    if isinstance(tree, Linear):
+        return
+    sums = [_compared(each) for each in tree.options if isinstance(each, Linear) and each.weights]
+    if tree.kind == "min":
+        yield from (one[0] for one in sums if one[2] and (*one[:2], False) in sums)
+    for option in tree.options:
+        yield from _equated(option)
+
+
+def _texts(
+    atom: Atom, is_whole: bool, is_least: bool, weights: Weights, threshold: Fraction
+) -> tuple[str, str]:
+    """Return the sentences of a fact of an atom: where it holds, and where it fails."""
+    if is_whole:
+        return atom.text, f"not ({atom.text})"
+    (quantity, _), *others = weights
+    limit = format_number(float(threshold))
+    signs = (">=", "<=") if is_least else ("<=", ">=")
+    if not others and isinstance(quantity, SignedDistance):
+        pair = f"{format_term(quantity.first)} dist {format_term(quantity.second)}"
+        return f"{pair} {signs[0]} {limit}", f"{pair} {signs[1]} {limit}"
+    if not others and isinstance(quantity, Signal):
+        return f"{quantity.name} {signs[0]} {limit}", f"{quantity.name} {signs[1]} {limit}"
+    text = _relation_text(weights) if not threshold else None
+    if text is None:
+        return f"a part of {atom.text}", f"not a part of {atom.text}"
+    # the relation says that a sum is at least 0, or at most
+    relation, holds_above = text
+    texts = relation, f"not ({relation})"
+    return texts if holds_above == is_least else texts[::-1]
+
+
+def _relation_text(weights: Weights) -> tuple[str, bool] | None:
+    """Return the relation between two terms that compares a sum with 0, and whether it holds above 0."""
+    match weights:
+        case ((Protrusion() as quantity, _),):
+            return f"{format_term(quantity.inner)} enclosedin {format_term(quantity.outer)}", False
+        case ((Projection() as one, _), (Projection() as other, weight)) if weight == -1:
+            ends = {one.side: one, other.side: other}
+            if one.axis == other.axis and len(ends) == 2:
+                first, second = format_term(ends["max"].term), format_term(ends["min"].term)
+                return f"{first} prec[{one.axis}] {second}", one.side == "min"
+    return None
+
+
+# ------------------------------------------------------------------------------------ sums and choices
+
+
+def _tree(expression: Expression, regions: Mapping[str, Outline]) -> Tree | None:
+    """Return an expression as sums below minima and maxima; None for one with too many sums."""
+    try:
+        tree = _built(expression, regions)
+    except (_TooManyError, OverflowError):
+        return None
+    return tree
+
+
+class _TooManyError(Exception):
+    """An expression of more than `MAX_INEQUALITIES` sums."""
+
+
+def _built(expression: Expression, regions: Mapping[str, Outline]) -> Tree:
+    match expression:
+        case Number():
+            return Linear((), exact(expression.value))
+        case Signal():
+            return Linear(((expression, Fraction(1)),))
+        case Sum():
+            return _added(_built(expression.first, regions), _built(expression.second, regions))
+        case Negative():
+            return _times(_built(expression.operand, regions), Fraction(-1))
+        case Scaled():
+            return _times(_built(expression.operand, regions), 1 / exact(expression.divisor))
+        case Minimum() | Maximum():
+            options = tuple(_built(each, regions) for each in expression.operands)
+            return _chosen("min" if isinstance(expression, Minimum) else "max", options)
+        case _:
+            return _measured(expression, regions)
+
+
+def exact(value: float) -> Fraction:
+    """Return the decimal fraction that a number is written as.
+
+    Raises:
+        OverflowError: it is not finite.
+    """
+    if not isfinite(value):
+        raise OverflowError("not finite")
+    return Fraction(repr(float(value)))
+
+
+def _added(one: Tree, other: Tree) -> Tree:
+    if isinstance(one, Choice):
+        return _chosen(one.kind, tuple(_added(each, other) for each in one.options))
+    if isinstance(other, Choice):
+        return _added(other, one)
+    total = dict(one.weights)
+    for quantity, weight in other.weights:
+        total[quantity] = total.get(quantity, Fraction(0)) + weight
+    weights = sorted(((key, value) for key, value in total.items() if value), key=lambda each: repr(each[0]))
+    return Linear(tuple(weights), one.constant + other.constant)
+
+
+def _times(tree: Tree, factor: Fraction) -> Tree:
+    if isinstance(tree, Choice):
+        kind = tree.kind if factor > 0 else "max" if tree.kind == "min" else "min"
+        return Choice(kind, tuple(_times(each, factor) for each in tree.options))
+    weights = tuple((quantity, weight * factor) for quantity, weight in tree.weights)
+    return Linear(weights, tree.constant * factor)
+
+
+def _chosen(kind: Literal["min", "max"], options: tuple[Tree, ...]) -> Tree:
+    if sum(map(_size, options)) > MAX_INEQUALITIES:
+        raise _TooManyError
+    return options[0] if len(options) == 1 else Choice(kind, options)
+
+
+def _size(tree: Tree) -> int:
+    return 1 if isinstance(tree, Linear) else sum(map(_size, tree.options))
+
+
+def _measured(measurement: Measurement, regions: Mapping[str, Outline]) -> Tree:
+    """Return a measurement of unions as the least or greatest of measurements of their members."""
+    kind: Literal["min", "max"]
+    each: list[Measurement]
+    match measurement:
+        case SignedDistance() | Misalignment():
+            kind, of = "min", type(measurement)
+            pairs = product(members(measurement.first), members(measurement.second))
+            each = [of(*sorted(pair, key=repr)) for pair in pairs]
+        case Protrusion():
+            # of a union as the outer one nothing is known: a part of it may hold each part of the inner one
+            kind, outer = "max", plain(measurement.outer)
+            each = [Protrusion(inner, outer) for inner in members(measurement.inner)]
+        case Projection():
+            kind, axis = measurement.side, measurement.axis
+            each = [Projection(term, axis, kind) for term in members(measurement.term)]
+        case CentroidProjection():
+            kind, axis = measurement.side, measurement.axis
+            terms = map(without_radius, members(measurement.term))
+            each = [CentroidProjection(term, axis, kind) for term in terms]
+    return _chosen(kind, tuple(_shifted(one, regions) for one in each))
+
+
+def _shifted(measurement: Measurement, regions: Mapping[str, Outline]) -> Linear:
+    """Return a measurement of enlarged terms by that of the terms, where that is exact."""
+    one = Fraction(1)
+    match measurement:
+        case Projection() if measurement.axis != "z":
+            radius = radius_of(measurement.term)
+            bare = Projection(without_radius(measurement.term), measurement.axis, measurement.side)
+            return Linear(((bare, one),), radius if measurement.side == "max" else -radius)
+        case SignedDistance() if is_flat(measurement.first, regions) or is_flat(measurement.second, regions):
+            terms = measurement.first, measurement.second
+            bare_pair = SignedDistance(*sorted(map(without_radius, terms), key=repr))
+            return Linear(((bare_pair, one),), -sum(map(radius_of, terms), Fraction(0)))
+        case Protrusion() if is_flat(measurement.inner, regions) or is_flat(measurement.outer, regions):
+            bare_in = Protrusion(without_radius(measurement.inner), without_radius(measurement.outer))
+            return Linear(((bare_in, one),), radius_of(measurement.inner) - radius_of(measurement.outer))
+    return Linear(((measurement, one),))
+
+
+# -------------------------------------------------------------------------------------------- terms
+
+
+def members(term: Term) -> tuple[Term, ...]:
+    """Return the terms whose union a term is: the members of a named group, otherwise itself."""
+    term = plain(term)
+    if isinstance(term, Enlarged):
+        return tuple(Enlarged(each, term.radius) for each in members(term.term))
+    group = term.term if isinstance(term, Earlier) else term
+    if not isinstance(group, Group) or group.members is None:
+        return (term,)
+    if any(isinstance(each, Variable) for each in group.excluded):
+        return (term,)
+    left_out = {each.name for each in group.excluded}
+    names = [TrackedName(name) for name in group.members if name not in left_out]
+    if not names:
+        return (term,)
+    if isinstance(term, Earlier):
+        return tuple(Earlier(name, term.samples, term.duration_ns) for name in names)
+    return tuple(names)
+
+
+def plain(term: Term) -> Term:
+    """Return a term with its enlargements as one, and a region as it always is."""
+    if isinstance(term, Enlarged):
+        inner = plain(term.term)
+        radius = term.radius + (inner.radius if isinstance(inner, Enlarged) else 0.0)
+        return Enlarged(without_radius(inner), radius) if radius else inner
+    if isinstance(term, Earlier) and isinstance(term.term, RegionName):
+        return term.term
+    return term
+
+
+def without_radius(term: Term) -> Term:
+    """Return a term before it is enlarged."""
+    return term.term if isinstance(term, Enlarged) else term
+
+
+def radius_of(term: Term) -> Fraction:
+    """Return by how much a term is enlarged."""
+    return exact(term.radius) if isinstance(term, Enlarged) else Fraction(0)
+
+
+def is_flat(term: Term, regions: Mapping[str, Outline]) -> bool:
+    """Return whether a term certainly has no height: distances to it are those in the plane."""
+    base = without_radius(term)
+    return isinstance(base, RegionName) and base.name in regions and regions[base.name].height is None
+
+
+def is_solid(term: Term) -> bool:
+    """Return whether a term covers something in every sample in which it is known."""
+    return not isinstance(base_of(term), Group)
+
+
+def terms_in(quantities: Iterable[Quantity]) -> list[Term]:
+    """Return the terms that quantities measure, each once, without enlargements."""
+    found = (term for each in quantities if not isinstance(each, Signal) for term in measured_terms(each))
+    return list(dict.fromkeys(without_radius(term) for term in found))

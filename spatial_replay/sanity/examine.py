@@ -1,0 +1,375 @@
+"""What is wrong with a specification before any run: it cannot be satisfied, or checks nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import combinations
+from typing import Final, Literal, TypeAlias
+
+from spatial_replay.errors import NoAutomatonError, SpecificationError
+from spatial_replay.lazy import Displayed
+from spatial_replay.sanity.conditions import Conditions, is_solid, members
+from spatial_replay.sanity.examples import Example, shortest_example
+from spatial_replay.sanity.readings import Reading, automaton_of, loosened, reading_of
+from spatial_replay.sanity.search import Found, Search, Side, UndecidedError
+from spatial_replay.spec.diagnostics import Diagnostic, SourceText
+from spatial_replay.spec.format import format_formula
+from spatial_replay.spec.formula import (
+    Atom,
+    Boolean,
+    Formula,
+    NamedSpec,
+    Quantified,
+    Span,
+    Specification,
+    Temporal,
+    iter_nodes,
+)
+from spatial_replay.spec.load import require_specification
+from spatial_replay.spec.walks import is_spatial, iter_formulas, looks_back, other_names, terms_of
+from spatial_replay.text import shortened_formula
+
+MAX_PAIRS: Final = 300
+"""How many pairs of specs are compared at most."""
+
+MAX_ANTECEDENTS: Final = 40
+"""How many antecedents of one spec are looked at."""
+
+_SHOWN: Final = 3
+"""How many exclusions a sentence names."""
+
+Kind: TypeAlias = Literal["unsatisfiable", "always true", "idle antecedent", "implied", "contradiction"]
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that is wrong with a specification.
+
+    Attributes:
+        kind: what it is.
+        specs: the names of the specs that it is about; of an implied one, that and the one that implies it.
+        reason: why: "by its logic alone", or what geometry excludes.
+        exclusions: relations that exclude each other in one sample, on which the finding rests.
+        diagnostic: the finding as a warning with its place in the text.
+    """
+
+    kind: Kind
+    specs: tuple[str, ...]
+    reason: str
+    exclusions: tuple[tuple[str, ...], ...]
+    diagnostic: Diagnostic
+
+
+@dataclass(frozen=True, slots=True)
+class SpecExamination:
+    """What could be decided about one result of a specification.
+
+    Attributes:
+        name: of the spec.
+        reason: why it has no automaton, so that only a looser reading of it was examined; "" if it has one.
+        undecided: questions that were given up, as sentences.
+        unrelated: what was taken to hold or fail whatever else holds: quantifiers over open groups, relations
+            to earlier samples.
+        satisfied, violated: the shortest runs that satisfy it, and violate it; None where there is none, or
+            none was found.
+    """
+
+    name: str
+    reason: str
+    undecided: tuple[str, ...]
+    unrelated: tuple[str, ...]
+    satisfied: Example | None = None
+    violated: Example | None = None
+
+
+@dataclass(frozen=True)
+class Examination(Displayed):
+    """What is wrong with a specification, and what its specs mean by example.
+
+    Attributes:
+        findings: in the order of the text.
+        specs: one for each result.
+        notes: what was left out, as sentences.
+    """
+
+    findings: tuple[Finding, ...]
+    specs: tuple[SpecExamination, ...]
+    notes: tuple[str, ...] = ()
+
+
+def doctor(specification: Specification, *, examples: bool = True) -> Examination:
+    """Find what is wrong with a specification before any run is evaluated.
+
+    It finds specs that no run satisfies with a margin (a robustness above 0), or that none violates with one;
+    specs that follow from another one, or contradict it; and implications whose antecedent never holds.
+    Automata decide, together with laws of geometry: a run is only considered if footprints could be so.
+
+    Args:
+        examples: look for the shortest runs that satisfy and violate each spec, too.
+
+    Raises:
+        UsageError: not a specification.
+    """
+    require_specification(specification)
+    return _Examiner(specification).examination(examples)
+
+
+def refuse_unsatisfiable(specification: Specification, name: str) -> None:
+    """Refuse a spec that no run satisfies with a margin.
+
+    Raises:
+        SpecificationError: it is one.
+    """
+    spec = next(spec for spec in specification.specs if spec.name == name)
+    finding = _Examiner(specification).why_empty(_Part(spec.name, spec.formula, spec.span))
+    if finding is not None:
+        raise SpecificationError([replace(finding.diagnostic, severity="error")])
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A spec that is a result, or a conjunct of one under its own name."""
+
+    name: str
+    formula: Formula
+    span: Span
+
+    @cached_property
+    def names(self) -> frozenset[str]:
+        """What it is about."""
+        atoms = [each for each in iter_formulas(self.formula) if isinstance(each, Atom)]
+        signals = {str(each.parameters[0]) for each in atoms if each.relation == "signal"}
+        named = {each.name for each in iter_formulas(self.formula) if each.name is not None}
+        return (other_names(self.formula) - named) | signals
+
+
+def _parts(spec: NamedSpec, specs: dict[str, NamedSpec]) -> Iterator[_Part]:
+    """Yield the named conjuncts of a spec; the spec itself, if it has others."""
+    waiting = [_Part(spec.name, spec.formula, spec.span)]
+    while waiting:
+        part = waiting.pop()
+        formula = part.formula
+        operands = (
+            formula.operands if isinstance(formula, Boolean) and formula.operator in ("and", "spec") else ()
+        )
+        below = [specs.get(each.name or "") for each in operands]
+        if operands and all(below):
+            waiting += [_Part(each.name, each.formula, each.span) for each in reversed(below) if each]
+        else:
+            yield part
+
+
+class _Examiner:
+    """One examination: what geometry excludes is found once for all questions."""
+
+    def __init__(self, specification: Specification) -> None:
+        self._specification = specification
+        self._source = SourceText.of(specification.source, specification.filename)
+        formulas = [spec.formula for spec in specification.specs]
+        self._search = Search(Conditions(formulas, specification.regions))
+        self._readings: dict[str, Reading] = {}
+        self._answers: dict[tuple[str, bool], Found | None] = {}
+        self._findings: list[Finding] = []
+        self._undecided: dict[str, list[str]] = {}
+        self._notes: list[str] = []
+
+    def examination(self, examples: bool) -> Examination:
+        specs = {spec.name: spec for spec in self._specification.specs}
+        results = self._specification.results
+        parts = {part.name: part for spec in results for part in _parts(spec, specs)}
+        for spec in results:
+            whole = _Part(spec.name, spec.formula, spec.span)
+            self._examine(whole)
+            if not self._is_empty(whole, True):
+                self._antecedents(whole)
+        for part in parts.values():
+            if part.name not in {spec.name for spec in results}:
+                self._examine(part)
+        self._pairs(tuple(parts.values()), results)
+        described = tuple(self._described(spec, examples) for spec in results)
+        places = sorted(self._findings, key=lambda each: (each.diagnostic.line, each.diagnostic.column))
+        return Examination(tuple(places), described, tuple(self._notes))
+
+    def why_empty(self, part: _Part) -> Finding | None:
+        """Return the finding that no run satisfies a part; None if one may."""
+        if self._is_empty(part, True):
+            self._examine(part)
+        return self._findings[0] if self._findings else None
+
+    def _reading(self, part: _Part) -> Reading:
+        if part.name not in self._readings:
+            self._readings[part.name] = reading_of(self._specification, part.name, part.formula)
+        return self._readings[part.name]
+
+    def _answer(self, part: _Part, satisfied: bool) -> Found | None:
+        """Return the shortest run that satisfies, or violates, a part; None if that is not decided."""
+        key = part.name, satisfied
+        if key not in self._answers:
+            reading = self._reading(part)
+            side = reading.satisfying if satisfied else reading.violating
+            what = "whether a run satisfies it" if satisfied else "whether a run violates it"
+            self._answers[key] = self._asked(part.name, what, *([] if side is None else [side]))
+        return self._answers[key]
+
+    def _asked(self, name: str, what: str, *sides: Side) -> Found | None:
+        try:
+            if sides:
+                return self._search.shortest(*sides)
+        except UndecidedError:
+            pass
+        self._undecided.setdefault(name, []).append(what)
+        return None
+
+    def _is_empty(self, part: _Part, satisfied: bool) -> bool:
+        answer = self._answer(part, satisfied)
+        return answer is not None and answer.word is None
+
+    def _examine(self, part: _Part) -> None:
+        if self._is_empty(part, True):
+            message = f"no run satisfies {part.name}"
+            self._add(
+                "unsatisfiable", (part.name,), part.span, self._answer(part, True), message, _UNSATISFIABLE
+            )
+        elif self._is_empty(part, False):
+            message = f"every run satisfies {part.name}"
+            self._add("always true", (part.name,), part.span, self._answer(part, False), message, _ALWAYS)
+
+    def _antecedents(self, part: _Part) -> None:
+        satisfying = self._reading(part).satisfying
+        nodes = (node for _, _, node in iter_nodes(part.formula))
+        implications = {
+            node.span: node for node in nodes if isinstance(node, Boolean) and node.operator == "->"
+        }
+        for node in list(implications.values())[:MAX_ANTECEDENTS]:
+            antecedent = node.operands[0]
+            wanted = loosened(Temporal("F", (antecedent,)))
+            text = shortened_formula(format_formula(antecedent))
+            try:
+                ever = Side(automaton_of(self._specification, part.name, wanted))
+            except NoAutomatonError:
+                continue
+            alone = self._asked(part.name, f"whether `{text}` ever holds", ever)
+            if alone is None:
+                continue
+            found, where = alone, ""
+            if found.word is not None and satisfying is not None:
+                within = self._asked(
+                    part.name, f"whether `{text}` holds in a run that satisfies it", satisfying, ever
+                )
+                found, where = within or found, f" in a run that satisfies {part.name}"
+            if found.word is None:
+                message = f"`{text}` never holds{where}, so this implication checks nothing"
+                self._add("idle antecedent", (part.name,), node.span, found, message, _IDLE)
+
+    def _pairs(self, parts: Sequence[_Part], results: Sequence[NamedSpec]) -> None:
+        """Compare specs that are about the same things, and are no trouble on their own."""
+        sound = [part for part in parts if not (self._is_empty(part, True) or self._is_empty(part, False))]
+        pairs = [(one, other) for one, other in combinations(sound, 2) if one.names & other.names]
+        if len(pairs) > MAX_PAIRS:
+            self._notes.append(f"of {len(pairs)} pairs of specs, {MAX_PAIRS} were compared")
+        for one, other in pairs[:MAX_PAIRS]:
+            satisfying = [self._reading(each).satisfying for each in (one, other)]
+            violating = [self._reading(each).violating for each in (one, other)]
+            both = self._compared(one, "contradicts", other, *satisfying)
+            if both is not None and both.word is None:
+                message = f"no run satisfies both {one.name} and {other.name}"
+                self._add("contradiction", (one.name, other.name), other.span, both, message, _CONTRADICTION)
+                continue
+            after = self._compared(one, "implies", other, satisfying[0], violating[1])
+            before = self._compared(other, "implies", one, satisfying[1], violating[0])
+            follows = after is not None and after.word is None
+            leads = before is not None and before.word is None
+            if follows and leads:
+                message = f"{other.name} says the same as {one.name}"
+                self._add(
+                    "implied", (other.name, one.name), other.span, _joint(after, before), message, _SAME
+                )
+            elif follows:
+                message = f"{other.name} follows from {one.name}"
+                self._add("implied", (other.name, one.name), other.span, after, message, _IMPLIED)
+            elif leads:
+                message = f"{one.name} follows from {other.name}"
+                self._add("implied", (one.name, other.name), one.span, before, message, _IMPLIED)
+
+    def _compared(self, one: _Part, verb: str, other: _Part, *sides: Side | None) -> Found | None:
+        given = [side for side in sides if side is not None]
+        if len(given) < len(sides):
+            return None
+        return self._asked(one.name, f"whether it {verb} {other.name}", *given)
+
+    def _add(
+        self, kind: Kind, specs: tuple[str, ...], span: Span, found: Found | None, message: str, hint: str
+    ) -> None:
+        if found is None:
+            return
+        reason = _reason(found)
+        loose = [name for name in specs if name in self._readings and self._readings[name].reason]
+        if loose:
+            reason += ", however its bounds and past operators are read"
+        diagnostic = self._source.diagnostic("warning", span, f"{message}: {reason}", hint)
+        self._findings.append(Finding(kind, specs, reason, found.exclusions, diagnostic))
+
+    def _described(self, spec: NamedSpec, examples: bool) -> SpecExamination:
+        part = _Part(spec.name, spec.formula, spec.span)
+        runs: list[Example | None] = []
+        for satisfied in (True, False):
+            answer = self._answer(part, satisfied)
+            word = None if answer is None else answer.word
+            if word is None or not examples:
+                runs.append(None)
+            else:
+                is_exact = not self._reading(part).reason
+                runs.append(
+                    shortest_example(
+                        self._specification, spec, self._search, word, satisfied, is_exact=is_exact
+                    )
+                )
+        undecided = tuple(self._undecided.get(spec.name, ()))
+        return SpecExamination(
+            spec.name, self._reading(part).reason, undecided, tuple(_unrelated(spec.formula)), *runs
+        )
+
+
+_UNSATISFIABLE: Final = "look for a relation that is the wrong way round, or a threshold that is too strict"
+_ALWAYS: Final = "it checks nothing; look at its brackets and operators"
+_IDLE: Final = "look for a relation that is the wrong way round, or for missing brackets"
+_CONTRADICTION: Final = "one of them is violated in every log"
+_IMPLIED: Final = "it adds nothing; leave it out, or make it stricter"
+_SAME: Final = "leave one of them out"
+
+
+def _joint(one: Found | None, other: Found | None) -> Found:
+    found = [each for each in (one, other) if each is not None]
+    exclusions = dict.fromkeys(exclusion for each in found for exclusion in each.exclusions)
+    return Found(None, all(each.by_logic for each in found), tuple(exclusions))
+
+
+def _reason(found: Found) -> str:
+    """Return why there is no such run."""
+    if found.by_logic or not found.exclusions:
+        return "by logic alone, whatever is measured"
+    texts = [_exclusion_text(each) for each in found.exclusions[:_SHOWN]]
+    more = len(found.exclusions) - len(texts)
+    return "; ".join(texts) + (f"; and {more} more" if more else "")
+
+
+def _exclusion_text(texts: Sequence[str]) -> str:
+    if len(texts) == 1:
+        return f"`{texts[0]}` never holds"
+    *most, last = (f"`{text}`" for text in texts)
+    return f"{', '.join(most)} and {last} exclude each other"
+
+
+def _unrelated(formula: Formula) -> Iterator[str]:
+    """Yield what geometry says nothing about: open quantifiers, and relations to earlier samples."""
+    texts: dict[str, None] = {}
+    for each in iter_formulas(formula):
+        if isinstance(each, Quantified):
+            texts[format_formula(each)] = None
+        elif isinstance(each, Atom) and is_spatial(each):
+            terms = [member for term in terms_of(each.expression) for member in members(term)]
+            if any(looks_back(term) or not is_solid(term) for term in terms):
+                texts[each.text] = None
+    yield from texts

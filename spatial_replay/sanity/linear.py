@@ -1,0 +1,226 @@
+"""Whether linear inequalities can hold together, exactly: a solution, or which of them exclude each other.
+
+The method is the simplex of solvers for satisfiability (Dutertre and de Moura, 2006). A strict inequality
+keeps an infinitesimal distance: numbers are pairs (a, b) that stand for a + b times a positive infinitesimal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping, Sequence
+from fractions import Fraction
+from typing import Final, NamedTuple, TypeAlias
+
+Real: TypeAlias = Fraction | float
+"""Fractions give exact answers, floats fast ones."""
+
+Coefficients: TypeAlias = tuple[tuple[Hashable, Real], ...]
+"""Pairs of a quantity and its factor; no quantity twice."""
+
+_Pair: TypeAlias = tuple[Real, Real]
+
+MAX_PIVOTS: Final = 4000
+"""Steps after which an answer is no longer waited for."""
+
+_TOLERANCE: Final = 1e-9
+"""By how much floats may miss a bound."""
+
+
+class Inequality(NamedTuple):
+    """A weighted sum of quantities that is at most a bound.
+
+    Attributes:
+        is_strict: it must be less than the bound.
+        label: what a conflict names it by; None for a law, which no conflict names.
+    """
+
+    coefficients: Coefficients
+    bound: Real
+    is_strict: bool = False
+    label: int | None = None
+
+
+class Solution(NamedTuple):
+    """An answer; neither part is given if the search was not finished.
+
+    Attributes:
+        values: of all quantities, that keep every inequality; of strict ones only the limit.
+        conflict: labels of inequalities that exclude each other.
+    """
+
+    values: Mapping[Hashable, Real] | None
+    conflict: frozenset[int] | None
+
+
+def solve(
+    inequalities: Sequence[Inequality], *, exact: bool = True, start: Mapping[Hashable, Real] | None = None
+) -> Solution:
+    """Return values that keep all inequalities, or labels of some that exclude each other.
+
+    Args:
+        exact: compute with fractions; else with floats, up to a tolerance.
+        start: values that quantities keep unless an inequality moves them; 0 without it.
+    """
+    tableau = _Tableau(0.0 if exact else _TOLERANCE, start or {})
+    for index, each in enumerate(inequalities):
+        if not tableau.add(each, index):
+            break
+    found = tableau.conflict if tableau.conflict is not None else tableau.search()
+    if found is None:
+        return Solution(tableau.values(), None)
+    if not found:
+        return Solution(None, None)
+    labels = (inequalities[index].label for index in found)
+    return Solution(None, frozenset(label for label in labels if label is not None))
+
+
+class _Tableau:
+    """Variables with bounds, some of which are sums of others; `conflict` once two bounds cross."""
+
+    def __init__(self, tolerance: float, start: Mapping[Hashable, Real]) -> None:
+        self.conflict: set[int] | None = None
+        self._start = start
+        self._tolerance = tolerance
+        self._numbers: dict[Hashable, int] = {}
+        self._quantities: dict[Hashable, int] = {}
+        # of each variable that is a sum: the factors of the others
+        self._rows: dict[int, dict[int, Real]] = {}
+        self._value: list[_Pair] = []
+        self._lower: list[tuple[_Pair, int] | None] = []
+        self._upper: list[tuple[_Pair, int] | None] = []
+
+    def add(self, inequality: Inequality, index: int) -> bool:
+        """Add a bound; return whether it does not contradict the opposite bound."""
+        coefficients, bound, is_strict, _ = inequality
+        if not coefficients:
+            if bound < -self._tolerance or (is_strict and bound <= 0):
+                self.conflict = {index}
+            return self.conflict is None
+        factor = coefficients[0][1]
+        normal = tuple((key, value / factor) for key, value in coefficients)
+        variable = self._variable(normal)
+        limit = (bound / factor, (-1 if factor > 0 else 1) if is_strict else 0)
+        if factor > 0:
+            before = self._upper[variable]
+            if before is None or limit < before[0]:
+                self._upper[variable] = limit, index
+        else:
+            before = self._lower[variable]
+            if before is None or limit > before[0]:
+                self._lower[variable] = limit, index
+        lower, upper = self._lower[variable], self._upper[variable]
+        if lower is not None and upper is not None and self._below(upper[0], lower[0]):
+            self.conflict = {lower[1], upper[1]}
+        return self.conflict is None
+
+    def search(self) -> set[int] | None:
+        """Move variables into their bounds; return what conflicts, or nothing if it takes too long."""
+        for variable in range(len(self._value)):
+            if variable not in self._rows:
+                self._enter(variable)
+        for variable, row in self._rows.items():
+            self._value[variable] = self._sum(row)
+        for _ in range(MAX_PIVOTS):
+            violated = self._violated()
+            if violated is None:
+                return None
+            variable, rises = violated
+            own = self._lower[variable] if rises else self._upper[variable]
+            if own is None:
+                return set()
+            row = self._rows[variable]
+            entering = next((each for each in sorted(row) if self._can_move(each, row[each], rises)), None)
+            if entering is None:
+                bounds = [
+                    self._upper[each] if (factor > 0) == rises else self._lower[each]
+                    for each, factor in row.items()
+                ]
+                return {own[1], *(bound[1] for bound in bounds if bound is not None)}
+            self._pivot(variable, entering, own[0])
+        return set()
+
+    def values(self) -> dict[Hashable, Real]:
+        """Return the values of the quantities, without infinitesimals."""
+        return {key: self._value[number][0] for key, number in self._quantities.items()}
+
+    def _variable(self, normal: Coefficients) -> int:
+        """Return the variable of a sum whose first factor is 1."""
+        if len(normal) == 1:
+            return self._quantity(normal[0][0])
+        number = self._numbers.get(normal)
+        if number is None:
+            # quantities are numbered before the sums of them
+            row = {self._quantity(key): factor for key, factor in normal}
+            number = self._numbers[normal] = self._new()
+            self._rows[number] = row
+        return number
+
+    def _quantity(self, key: Hashable) -> int:
+        if key not in self._quantities:
+            self._quantities[key] = self._new(self._start.get(key, 0))
+        return self._quantities[key]
+
+    def _new(self, value: Real = 0) -> int:
+        self._value.append((value, 0))
+        self._lower.append(None)
+        self._upper.append(None)
+        return len(self._value) - 1
+
+    def _enter(self, variable: int) -> None:
+        """Move a variable that is no sum into its bounds."""
+        lower, upper = self._lower[variable], self._upper[variable]
+        if lower is not None and self._value[variable] < lower[0]:
+            self._value[variable] = lower[0]
+        elif upper is not None and self._value[variable] > upper[0]:
+            self._value[variable] = upper[0]
+
+    def _sum(self, row: Mapping[int, Real]) -> _Pair:
+        whole: Real = 0
+        small: Real = 0
+        for variable, factor in row.items():
+            value = self._value[variable]
+            whole += factor * value[0]
+            small += factor * value[1]
+        return whole, small
+
+    def _below(self, one: _Pair, other: _Pair) -> bool:
+        return one[0] < other[0] - self._tolerance if self._tolerance else one < other
+
+    def _violated(self) -> tuple[int, bool] | None:
+        """Return the first sum outside of its bounds, and whether it has to rise (Bland's rule)."""
+        for variable in sorted(self._rows):
+            value, lower, upper = self._value[variable], self._lower[variable], self._upper[variable]
+            if lower is not None and self._below(value, lower[0]):
+                return variable, True
+            if upper is not None and self._below(upper[0], value):
+                return variable, False
+        return None
+
+    def _can_move(self, variable: int, factor: Real, rises: bool) -> bool:
+        """Return whether a variable can change so that a sum with it rises, or falls."""
+        up = (factor > 0) == rises
+        bound = self._upper[variable] if up else self._lower[variable]
+        value = self._value[variable]
+        return bound is None or (self._below(value, bound[0]) if up else self._below(bound[0], value))
+
+    def _pivot(self, leaving: int, entering: int, goal: _Pair) -> None:
+        """Set a sum to a bound by changing one of its variables, which becomes a sum in its place."""
+        row = self._rows.pop(leaving)
+        factor = row.pop(entering)
+        step = tuple((to - at) / factor for to, at in zip(goal, self._value[leaving], strict=True))
+        self._value[leaving] = goal
+        here = self._value[entering]
+        self._value[entering] = (here[0] + step[0], here[1] + step[1])
+        solved = {variable: -value / factor for variable, value in row.items()}
+        solved[leaving] = 1 / factor
+        for other, content in self._rows.items():
+            weight = content.pop(entering, 0)
+            if weight:
+                was = self._value[other]
+                self._value[other] = (was[0] + weight * step[0], was[1] + weight * step[1])
+                for variable, value in solved.items():
+                    total = content.get(variable, 0) + weight * value
+                    if total > self._tolerance or total < -self._tolerance:
+                        content[variable] = total
+                    else:
+                        content.pop(variable, None)
+        self._rows[entering] = solved

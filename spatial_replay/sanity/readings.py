@@ -1,0 +1,117 @@
+"""A spec as automata: its own, or those of looser readings that still decide a part of the questions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from spatial_replay.automata.automaton import Automaton
+from spatial_replay.automata.compile import automaton
+from spatial_replay.errors import NoAutomatonError
+from spatial_replay.sanity.search import Side
+from spatial_replay.spec.formula import (
+    PAST_OPERATORS,
+    Boolean,
+    Formula,
+    NamedSpec,
+    Specification,
+    Temporal,
+    Truth,
+    expand,
+)
+from spatial_replay.spec.walks import iter_formulas
+
+
+@dataclass(frozen=True)
+class Reading:
+    """The runs that satisfy a formula, and those that violate it, or more runs where it has no automaton.
+
+    Attributes:
+        satisfying, violating: None where not even a looser reading has an automaton.
+        reason: why the formula itself has none; "" if it has one.
+    """
+
+    satisfying: Side | None
+    violating: Side | None
+    reason: str = ""
+
+    @property
+    def sides(self) -> tuple[Side, ...]:
+        """The automata that there are."""
+        return tuple(side for side in (self.satisfying, self.violating) if side is not None)
+
+
+def reading_of(specification: Specification, name: str, formula: Formula) -> Reading:
+    """Return the automata that decide on a formula.
+
+    What an automaton cannot follow is read loosely: a bounded `F` as one without a bound, a past operator as
+    one that may hold or not. Runs are only ever added, so that what the looser reading excludes is excluded.
+    """
+    try:
+        own = automaton_of(specification, name, formula)
+    except NoAutomatonError as error:
+        reason = error.reason
+    else:
+        return Reading(Side(own), Side(own, False))
+    return Reading(
+        _loosely(specification, name, formula, positive=True),
+        _loosely(specification, name, formula, positive=False),
+        reason,
+    )
+
+
+def automaton_of(specification: Specification, name: str, formula: Formula) -> Automaton:
+    """Return the automaton of a formula in the words of a specification.
+
+    Raises:
+        NoAutomatonError: as `automaton`.
+    """
+    alone = replace(specification, specs=(NamedSpec(name, formula),), source="")
+    return automaton(alone, name, compiler="own")
+
+
+def _loosely(specification: Specification, name: str, formula: Formula, *, positive: bool) -> Side | None:
+    wanted = formula if positive else Boolean("not", (formula,))
+    for bounds in ("seconds", "all"):
+        try:
+            return Side(automaton_of(specification, name, loosened(wanted, bounds)))
+        except NoAutomatonError:
+            continue
+    return None
+
+
+def loosened(
+    formula: Formula, bounds: Literal["seconds", "all"] = "seconds", *, loose: bool = True
+) -> Formula:
+    """Return a formula without past operators and bounds that holds wherever the formula does.
+
+    Args:
+        bounds: drop those in seconds, or all.
+        loose: otherwise, return one that holds at most where the formula does.
+    """
+    if not any(_is_obstacle(each, bounds) for each in iter_formulas(formula)):
+        return formula
+    formula = expand(formula)
+    match formula:
+        case Boolean(operator="not"):
+            return replace(formula, operands=(loosened(formula.operands[0], bounds, loose=not loose),))
+        case Boolean() | Temporal():
+            if formula.operator in PAST_OPERATORS:
+                return Truth(loose)
+            operands = tuple(loosened(each, bounds, loose=loose) for each in formula.operands)
+            if isinstance(formula, Boolean) or not _is_obstacle(formula, bounds):
+                return replace(formula, operands=operands)
+            # every window from here on holds this sample; others may be empty
+            is_now = formula.bound is not None and formula.bound.lower == 0
+            if (formula.operator == "G") == loose:
+                return operands[-1] if is_now else Truth(loose)
+            return replace(formula, operands=operands, bound=None)
+    return formula
+
+
+def _is_obstacle(formula: Formula, bounds: Literal["seconds", "all"]) -> bool:
+    if not isinstance(formula, Temporal):
+        return False
+    bound = formula.bound
+    is_bounded = bound is not None and (bounds == "all" or bound.unit == "ns")
+    return formula.operator in PAST_OPERATORS or is_bounded

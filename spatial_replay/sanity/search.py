@@ -1,0 +1,298 @@
+"""The shortest run that automata accept or reject together, among the runs that geometry allows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple, TypeAlias
+
+from spatial_replay.automata.automaton import Automaton
+from spatial_replay.automata.diagrams import LEAF, NO, YES
+from spatial_replay.automata.minimise import leaves_of
+from spatial_replay.errors import NoAutomatonError
+from spatial_replay.sanity.conditions import Conditions, Fact
+from spatial_replay.sanity.laws import laws
+from spatial_replay.sanity.linear import solve
+from spatial_replay.spec.formula import Protrusion, Signal
+
+Cube: TypeAlias = dict[int, bool]
+"""Facts by number that have to be true, or false, in one sample."""
+
+Word: TypeAlias = tuple[Cube, ...]
+"""What has to hold in each sample of a run; whatever it leaves open, the end is the same."""
+
+MAX_STATES: Final = 2000
+"""How many combinations of states one search visits."""
+
+MAX_CONFLICTS: Final = 2000
+"""How many combinations of facts geometry excludes at most before an answer is given up."""
+
+
+class Side(NamedTuple):
+    """An automaton, and whether it has to accept the run or to reject it."""
+
+    automaton: Automaton
+    accepts: bool = True
+
+
+class UndecidedError(Exception):
+    """A question that takes too many steps."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """The answer to one question.
+
+    Attributes:
+        word: of the shortest run; None if there is none.
+        by_logic: whether there is none whatever the facts are about.
+        exclusions: facts that exclude each other, without which there would be one.
+    """
+
+    word: Word | None
+    by_logic: bool = False
+    exclusions: tuple[tuple[str, ...], ...] = ()
+
+
+class Search:
+    """Answers questions about automata over the same conditions; what geometry excludes is kept."""
+
+    def __init__(self, conditions: Conditions) -> None:
+        self._conditions = conditions
+        self._diagrams = conditions.diagrams
+        self._moves: dict[tuple[int, int], int] = {}
+        self._automata: dict[int, Automaton] = {}
+        self._numbers: dict[tuple[int, ...], int] = {}
+        self._tuples: list[tuple[int, ...]] = []
+        self._exclusions: list[frozenset[tuple[int, bool]]] = []
+        self._allowed = YES
+
+    def shortest(self, *sides: Side) -> Found:
+        """Return the shortest run that all sides agree with.
+
+        Raises:
+            UndecidedError: it takes too many steps.
+        """
+        try:
+            word = self._search(sides, geometry=True)
+            if word is not None:
+                return Found(word)
+            if self._search(sides, geometry=False) is None:
+                return Found(None, by_logic=True)
+        except (NoAutomatonError, RecursionError) as error:
+            raise UndecidedError from error
+        return Found(None, exclusions=tuple(self._texts_of(each) for each in self._about(sides)))
+
+    def is_possible(self, condition: int) -> bool:
+        """Return whether a condition holds in some sample.
+
+        Raises:
+            UndecidedError: it takes too many steps.
+        """
+        return self._cube(condition) is not None
+
+    def excluded(self, cube: Cube) -> bool:
+        """Return whether geometry excludes that facts have such values in one sample."""
+        return self._conflict(cube) is not None
+
+    def _search(self, sides: Sequence[Side], *, geometry: bool) -> Word | None:
+        start = tuple(side.automaton.initial for side in sides)
+        before: dict[tuple[int, ...], tuple[tuple[int, ...] | None, Cube]] = {}
+        waiting = [start]
+        for number, states in enumerate(waiting):
+            if len(waiting) > MAX_STATES:
+                raise UndecidedError
+            moves = self._joined(sides, states)
+            for leaf in leaves_of(self._diagrams, moves):
+                after = self._tuples[leaf]
+                if after in before or not all(map(_may_agree, sides, after)):
+                    continue
+                cube = self._cube(self._leading(moves, leaf)) if geometry else {}
+                if cube is None:
+                    continue
+                # samples may lead back to the state before the first one
+                before[after] = (states if number else None), cube
+                if all(map(_agrees, sides, after)):
+                    return tuple(reversed(list(_back(after, before))))
+                waiting.append(after)
+        return None
+
+    def _joined(self, sides: Sequence[Side], states: Sequence[int]) -> int:
+        """Return where one sample leads to, as a diagram over facts with combinations of states as leaves."""
+        nodes = [self._composed(side.automaton, state) for side, state in zip(sides, states, strict=True)]
+        known: dict[tuple[int, ...], int] = {}
+
+        def join(key: tuple[int, ...]) -> int:
+            if key not in known:
+                decisions = [self._diagrams[node] for node in key]
+                variable = min(each.variable for each in decisions)
+                if variable == LEAF:
+                    known[key] = self._diagrams.leaf(self._number(tuple(each.low for each in decisions)))
+                else:
+                    branches = [self._diagrams.branches(node, variable) for node in key]
+                    low, high = (join(each) for each in zip(*branches, strict=True))
+                    known[key] = self._diagrams.decide(variable, low, high)
+            return known[key]
+
+        return join(tuple(nodes))
+
+    def _number(self, states: tuple[int, ...]) -> int:
+        if states not in self._numbers:
+            self._numbers[states] = len(self._tuples)
+            self._tuples.append(states)
+        return self._numbers[states]
+
+    def _composed(self, automaton: Automaton, state: int) -> int:
+        """Return the moves from a state as a diagram over facts, with states as leaves."""
+        self._automata[id(automaton)] = automaton
+        conditions = [self._conditions.of(each.formula) for each in automaton.propositions]
+
+        def node(place: int) -> int:
+            if place < 0:
+                return self._diagrams.leaf(~place)
+            key = (id(automaton), place)
+            if key not in self._moves:
+                proposition, low, high = automaton.decisions[place]
+                self._moves[key] = self._diagrams.choose(conditions[proposition], node(high), node(low))
+            return self._moves[key]
+
+        return node(automaton.entries[state])
+
+    def _leading(self, node: int, leaf: int) -> int:
+        """Return where a diagram leads to a leaf."""
+        known: dict[int, int] = {}
+
+        def to(each: int) -> int:
+            if each not in known:
+                variable, low, high = self._diagrams[each]
+                if variable == LEAF:
+                    known[each] = YES if low == leaf else NO
+                else:
+                    known[each] = self._diagrams.decide(variable, to(low), to(high))
+            return known[each]
+
+        return to(node)
+
+    def _cube(self, condition: int) -> Cube | None:
+        """Return facts that make a condition true, and that geometry allows together; None without any."""
+        for _ in range(MAX_CONFLICTS):
+            open_ = self._diagrams.both(condition, self._allowed)
+            if open_ == NO:
+                return None
+            cube = self._first(open_)
+            # facts on the way that do not matter are left out
+            for fact in sorted(cube, reverse=True):
+                less = {each: value for each, value in cube.items() if each != fact}
+                if self._is_certain(condition, less):
+                    cube = less
+            conflict = self._conflict(cube)
+            if conflict is None:
+                return cube
+            self._exclusions.append(frozenset(conflict.items()))
+            self._allowed = self._diagrams.both(self._allowed, self._clause(conflict))
+        raise UndecidedError
+
+    def _first(self, node: int) -> Cube:
+        """Return decisions that lead to true."""
+        cube: Cube = {}
+        while node != YES:
+            variable, low, high = self._diagrams[node]
+            cube[variable] = low == NO
+            node = high if low == NO else low
+        return cube
+
+    def _is_certain(self, node: int, cube: Cube) -> bool:
+        """Return whether a function is true wherever some facts have their values."""
+        waiting, visited = [node], {node}
+        while waiting:
+            each = waiting.pop()
+            if each == NO:
+                return False
+            if each == YES:
+                continue
+            variable, low, high = self._diagrams[each]
+            value = cube.get(variable)
+            for after in (low, high) if value is None else (high,) if value else (low,):
+                if after not in visited:
+                    visited.add(after)
+                    waiting.append(after)
+        return True
+
+    def _clause(self, cube: Cube) -> int:
+        """Return where facts do not all have their values."""
+        node = NO
+        for fact in sorted(cube, reverse=True):
+            node = self._diagrams.decide(fact, *((YES, node) if cube[fact] else (node, YES)))
+        return node
+
+    def _conflict(self, cube: Cube) -> Cube | None:
+        """Return the fewest of some facts that geometry excludes together; None if it allows them all."""
+        numbers = self._impossible(cube)
+        if numbers is None:
+            return None
+        core = {number: cube[number] for number in sorted(numbers)}
+        for number in tuple(core):
+            less = {each: value for each, value in core.items() if each != number}
+            if less and self._impossible(less) is not None:
+                core = less
+        return core
+
+    def _impossible(self, cube: Cube) -> frozenset[int] | None:
+        facts = self._conditions.facts
+        own = [
+            facts[number].inequality(value, number) for number, value in cube.items() if facts[number].weights
+        ]
+        inside = {
+            quantity
+            for each in own
+            if len(each.coefficients) == 1 and each.bound <= 0
+            for quantity, weight in each.coefficients
+            if isinstance(quantity, Protrusion) and weight > 0
+        }
+        weights = [facts[number].weights for number in cube]
+        quantities = dict.fromkeys(quantity for each in weights for quantity, _ in each)
+        geometry = [each for each in quantities if not isinstance(each, Signal)]
+        known = laws(geometry, inside, self._conditions.regions) if geometry else []
+        return solve([*own, *known]).conflict
+
+    def _about(self, sides: Sequence[Side]) -> Iterator[frozenset[tuple[int, bool]]]:
+        """Yield the exclusions between facts that automata read."""
+        facts: set[int] = set()
+        waiting = [
+            self._conditions.of(each.formula) for side in sides for each in side.automaton.propositions
+        ]
+        visited = set(waiting)
+        while waiting:
+            variable, low, high = self._diagrams[waiting.pop()]
+            if variable != LEAF:
+                facts.add(variable)
+                waiting += {low, high} - visited
+                visited |= {low, high}
+        for each in self._exclusions:
+            if facts.issuperset(fact for fact, _ in each):
+                yield each
+
+    def _texts_of(self, exclusion: frozenset[tuple[int, bool]]) -> tuple[str, ...]:
+        return tuple(self.fact(number).texts[0 if value else 1] for number, value in sorted(exclusion))
+
+    def fact(self, number: int) -> Fact:
+        """Return a fact by its number."""
+        return self._conditions.facts[number]
+
+
+def _agrees(side: Side, state: int) -> bool:
+    return (state in side.automaton.accepting) == side.accepts
+
+
+def _may_agree(side: Side, state: int) -> bool:
+    return state in (side.automaton.can_accept if side.accepts else side.automaton.can_reject)
+
+
+def _back(
+    states: tuple[int, ...], before: dict[tuple[int, ...], tuple[tuple[int, ...] | None, Cube]]
+) -> Iterator[Cube]:
+    """Yield the cubes of a run from its last sample back to its first."""
+    at: tuple[int, ...] | None = states
+    while at is not None:
+        at, cube = before[at]
+        yield cube
