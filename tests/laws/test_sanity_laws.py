@@ -1,0 +1,200 @@
+"""Laws of the doctor: what it excludes happens in no run, and its shortest runs are runs, and shortest."""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import spatial_replay as sr
+from laws.reference import Interval, Prefix
+
+NAMES = "abc"
+
+
+@st.composite
+def relations(draw: st.DrawFn) -> str:
+    """A relation between a few objects and regions, with few thresholds, so that some exclude others."""
+    first, second, third = draw(st.permutations(NAMES))
+    term = draw(st.sampled_from([second, second, "left_bin", "right_bin", f"enlarge({second}, 0.5)"]))
+    limit = draw(st.sampled_from(["-0.5", "0", "0.5", "1"]))
+    return draw(
+        st.sampled_from(
+            [
+                f"{first} leftof {term}",
+                f"{first} rightof {term}",
+                f"{first} below {second}",
+                f"{first} partleftof {second}",
+                f"{first} prec[z] {second}",
+                f"{first} dist {term} <= {limit}",
+                f"{first} dist {term} >= {limit}",
+                f"{first} ovlp {term}",
+                f"{first} partovlp {second}",
+                f"{first} enclosedin {term}",
+                f"{first} moved[{limit.removeprefix('-')}] {second}",
+                f"{first} closer {second} than {third}",
+                f"{first} between[x] ({second}, {third})",
+                f"{first} oriented[{limit}] {second}",
+                f"both leftof {first}",
+                f"{first} enclosedin tall",
+            ]
+        )
+    )
+
+
+@st.composite
+def spatial_formulas(draw: st.DrawFn) -> str:
+    """Some relations that have to hold, or not, in one sample or all, now or later."""
+    literals = [
+        draw(st.sampled_from(["{}", "{}", "(not {})"])).format(f"({each})")
+        for each in draw(st.lists(relations(), min_size=2, max_size=4))
+    ]
+    body = draw(st.sampled_from([" and ", " and ", " or "])).join(literals)
+    return draw(st.sampled_from(["F ({})", "G ({})", "F[0s, 2s] ({})", "G (O ({}))"])).format(body)
+
+
+REGIONS = """
+region left_bin = box(0, 0, 1, 1)
+region right_bin = circle((3, 0.5), 0.5)
+region tall = box(0, 0, 2, 2) height (0, 1)
+group both = b, c
+"""
+
+
+def crowded_trace(seed: int, samples: int = 60) -> sr.Trace:
+    """Boxes, discs and unions on a coarse grid, so that many touch, overlap and lie in one another."""
+    random = np.random.default_rng(seed)
+
+    def footprint() -> sr.Footprint:
+        x, y = random.integers(-1, 7, 2) / 2.0
+        width, height = random.choice([0.0, 0.25, 0.5, 1.0, 3.0], 2)
+        kind = random.integers(4)
+        if kind == 0:
+            return sr.Footprint.disc(x, y, width / 2.0)
+        box = sr.Footprint.box(x, y, x + width, y + height)
+        if kind == 1:
+            return sr.Footprint.union([box, sr.Footprint.disc(x, y, 0.25)])
+        if kind == 2:
+            return sr.Footprint.polygon([(x, y), (x + 1, y), (x, y + 1)])
+        return box
+
+    def tracked() -> sr.TrackedObject:
+        bottom = float(random.choice([-0.5, 0.0, 0.5]))
+        turn = float(random.choice([0.0, 1.0, np.pi]))
+        return sr.TrackedObject(
+            footprint(), yaw=turn, height=(bottom, bottom + float(random.choice([0.25, 1.0])))
+        )
+
+    return sr.Trace.from_samples(
+        [sr.Sample(time_ns * 10**9, {name: tracked() for name in NAMES}) for time_ns in range(samples)]
+    )
+
+
+ROUNDING = 1e-9
+
+
+@settings(max_examples=60)
+@given(spatial_formulas(), spatial_formulas(), st.integers(0, 2**32))
+def test_what_the_doctor_excludes_happens_in_no_run(one: str, other: str, seed: int) -> None:
+    specification = sr.parse_specification(f"{REGIONS}spec one = {one}\nspec other = {other}\n")
+    examined = sr.doctor(specification, examples=False)
+    if not examined.findings:
+        return
+    # single samples in turn, so that each of them has to be excluded, and all of them together
+    trace = crowded_trace(seed)
+    windows = [trace, *(crowded_trace(seed + number, 1) for number in range(8))]
+    for window in windows:
+        rho = {result.name: result.robustness for result in sr.evaluate(specification, window).results}
+        for finding in examined.findings:
+            values = [rho[name] for name in finding.specs]
+            if finding.kind == "unsatisfiable":
+                assert values[0] <= ROUNDING
+            elif finding.kind == "always true":
+                assert values[0] >= -ROUNDING
+            elif finding.kind == "contradiction":
+                assert min(values) <= ROUNDING
+            elif finding.kind == "implied":
+                assert max(values[0], -values[1]) >= -ROUNDING
+
+
+@settings(max_examples=60)
+@given(spatial_formulas())
+def test_a_placed_run_is_evaluated_to_the_verdict_that_it_shows(text: str) -> None:
+    specification = sr.parse_specification(f"{REGIONS}spec one = {text}\n")
+    (spec,) = sr.doctor(specification).specs
+    for example in (spec.satisfied, spec.violated):
+        if example is not None and example.samples is not None:
+            result = sr.evaluate(specification, sr.Trace.from_samples(example.samples))
+            assert result.verdict == example.verdict
+            assert result.results[0].robustness == example.robustness
+            assert len(example.samples) == len(example.sentences)
+        elif example is not None:
+            assert example.note
+
+
+def _formulas(depth: int) -> st.SearchStrategy[str]:
+    leaves = st.sampled_from(["(p >= 1)", "(q >= 1)", "(q < 1)", "true"])
+    if depth == 0:
+        return leaves
+    inner = _formulas(depth - 1)
+    unary = st.sampled_from(
+        ["not {}", "(F {})", "(G {})", "(X {})", "(WX {})", "(F[1, 2] {})", "(G[0, 1] {})"]
+    )
+    binary = st.sampled_from(
+        ["({} and {})", "({} or {})", "({} -> {})", "({} U {})", "({} R {})", "({} W {})"]
+    )
+    return st.one_of(
+        leaves,
+        st.builds(lambda shape, one: shape.format(one), unary, inner),
+        st.builds(lambda shape, one, other: shape.format(one, other), binary, inner, inner),
+        st.builds(lambda shape, one, other: shape.format(one, other), binary, inner, inner),
+    )
+
+
+LONGEST = 3
+SYMBOLS = list(product([False, True], repeat=2))
+
+
+def satisfying_lengths(formula: object) -> dict[bool, set[int]]:
+    """The lengths of short runs that satisfy a formula about p and q, and violate it, by trying all."""
+    lengths: dict[bool, set[int]] = {True: set(), False: set()}
+    for length in range(1, LONGEST + 1):
+        for word in product(SYMBOLS, repeat=length):
+
+            def leaf(atom: sr.NamedSpec, t: int, word: tuple[tuple[bool, bool], ...] = word) -> Interval:
+                name, operator, _ = atom.parameters
+                holds = word[t]["pq".index(name)] == (operator == ">=")
+                return Interval(1.0, 1.0) if holds else Interval(-1.0, -1.0)
+
+            rho = Prefix([10**9 * t for t in range(length)], leaf, goes_on=False).rho(formula, 0).low
+            lengths[rho > 0].add(length)
+    return lengths
+
+
+@settings(max_examples=80)
+@given(_formulas(3))
+def test_shortest_runs_are_found_exactly_where_there_are_runs(text: str) -> None:
+    specification = sr.parse_specification(f"spec one = {text}\n")
+    examined = sr.doctor(specification)
+    (spec,) = examined.specs
+    assert not spec.reason
+    assert not spec.undecided
+    lengths = satisfying_lengths(specification.specs[0].formula)
+    kinds = {finding.kind for finding in examined.findings}
+    for example, satisfied, empty in (
+        (spec.satisfied, True, "unsatisfiable"),
+        (spec.violated, False, "always true"),
+    ):
+        assert (example is None) == (empty in kinds)
+        if example is None:
+            assert not lengths[satisfied]
+            continue
+        assert example.samples is not None
+        if len(example.samples) <= LONGEST:
+            assert len(example.samples) == min(lengths[satisfied])
+        else:
+            assert not lengths[satisfied]
+        verdict = sr.evaluate(specification, sr.Trace.from_samples(example.samples)).verdict
+        assert verdict == ("satisfied" if satisfied else "violated")

@@ -1,0 +1,195 @@
+"""The doctor finds what is wrong with specifications, and says how far it could look."""
+
+from __future__ import annotations
+
+import pytest
+
+import spatial_replay as sr
+
+REGIONS = """
+region left_bin = box(0, 0, 1, 1)
+region right_bin = circle((3, 0.5), 0.5)
+group cups = cup, mug
+"""
+
+
+def findings(text: str) -> list[tuple[str, tuple[str, ...]]]:
+    specification = sr.parse_specification(REGIONS + text)
+    return [(each.kind, each.specs) for each in sr.doctor(specification, examples=False).findings]
+
+
+def exclusions(formula: str, profile: str = "paper") -> tuple[tuple[str, ...], ...]:
+    """What excludes that a formula ever holds."""
+    specification = sr.parse_specification(f"{REGIONS}spec s = F ({formula})\n", profile=profile)
+    (finding,) = sr.doctor(specification, examples=False).findings
+    assert finding.kind == "unsatisfiable"
+    return finding.exclusions
+
+
+@pytest.mark.parametrize(
+    ("formula", "excluded"),
+    [
+        ("a leftof b and b leftof a", ("a leftof b", "b leftof a")),
+        ("a leftof b and b leftof c and c leftof a", ("a leftof b", "b leftof c", "c leftof a")),
+        ("a leftof b and a ovlp b", ("a leftof b", "a ovlp b")),
+        ("a prec[z] b and a ovlp b", ("a prec[z] b", "a ovlp b")),
+        ("a enclosedin b and not (a ovlp b)", ("a enclosedin b", "not (a ovlp b)")),
+        (
+            "a enclosedin b and b enclosedin c and not (a enclosedin c)",
+            ("a enclosedin b", "b enclosedin c", "not (a enclosedin c)"),
+        ),
+        ("a enclosedin b and b leftof c and c ovlp a", ("a enclosedin b", "b leftof c", "c ovlp a")),
+        ("a dist b <= 0.1 and b farfrom[0.2] a", ("a dist b <= 0.1", "b farfrom[0.2] a")),
+        ("a moved[0.2] b and not (a moved[0.1] b)", ("a moved[0.2] b", "not (a moved[0.1] b)")),
+        (
+            "a closer b than c and a ovlp c and a dist b > 0",
+            ("a closer b than c", "a ovlp c", "a dist b > 0"),
+        ),
+        ("a oriented[-0.1] b", ("a oriented[-0.1] b",)),
+        (
+            "cup enclosedin left_bin and cup enclosedin right_bin",
+            ("cup enclosedin left_bin", "cup enclosedin right_bin"),
+        ),
+        (
+            "cup enclosedin left_bin and pen enclosedin right_bin and pen leftof cup",
+            ("cup enclosedin left_bin", "pen enclosedin right_bin", "pen leftof cup"),
+        ),
+        ("cups leftof b and b leftof mug", ("mug prec[x] b", "b leftof mug")),
+        ("mode == 2 and mode >= 3", ("mode <= 2", "mode >= 3")),
+    ],
+)
+def test_what_geometry_excludes_is_named(formula: str, excluded: tuple[str, ...]) -> None:
+    assert exclusions(formula) == (excluded,)
+
+
+def test_the_published_profile_compares_centroids() -> None:
+    assert exclusions("a leftof b and b leftof a", "spatial_spec") == (("a leftof b", "b leftof a"),)
+    # by their centroids, overlapping objects may be left of each other
+    specification = sr.parse_specification("F (a leftof b and a ovlp b)", profile="spatial_spec")
+    assert sr.doctor(specification, examples=False).findings == ()
+
+
+def test_what_can_hold_is_not_excluded() -> None:
+    assert (
+        findings("spec s = F (a leftof b and a rightof c and a dist b <= 0.1 and c enclosedin left_bin)\n")
+        == []
+    )
+    # marginal by its nature, and meant
+    assert findings("spec s = F (mode == 2 and mode >= 2)\nspec t = F (a touch[0] b)\n") == []
+
+
+def test_contradictions_of_logic_alone_are_said_to_be() -> None:
+    specification = sr.parse_specification("F (p >= 1 and not (p >= 1))")
+    (finding,) = sr.doctor(specification).findings
+    assert finding.reason == "by logic alone, whatever is measured"
+    assert "no run satisfies spec: by logic alone" in finding.diagnostic.message
+    assert exclusions("a leftof b and a rightof b") == ()
+
+
+def test_specs_are_compared_with_each_other() -> None:
+    found = findings(
+        "spec far = G (cup dist mug >= 0.2)\n"
+        "spec apart = G (cup dist mug >= 0.1)\n"
+        "spec near = F (cup dist mug <= 0.15)\n"
+        "spec other = G (pen dist mug >= 0.1)\n"
+    )
+    assert found == [("implied", ("apart", "far")), ("contradiction", ("far", "near"))]
+
+
+def test_specs_that_say_the_same_are_one_finding() -> None:
+    assert findings("spec one = G (a ovlp b)\nspec two = not F (a dist b > 0)\n") == [
+        ("implied", ("two", "one"))
+    ]
+
+
+def test_the_conjuncts_of_a_result_are_compared_too() -> None:
+    assert findings(
+        "spec never = G not (cup ovlp left_bin)\n"
+        "spec put = F (cup enclosedin left_bin)\n"
+        "spec whole = never and put\n"
+    ) == [("contradiction", ("never", "put")), ("unsatisfiable", ("whole",))]
+
+
+def test_an_antecedent_that_never_holds_is_found() -> None:
+    (finding,) = sr.doctor(
+        sr.parse_specification(
+            "spec s = G (a dist b >= 0.2) and G (a dist b <= 0.1 -> F (a leftof b))", filename="s.spatial"
+        )
+    ).findings
+    assert finding.kind == "idle antecedent"
+    assert finding.diagnostic.message == (
+        "`a dist b <= 0.1` never holds in a run that satisfies s, so this implication checks nothing: "
+        "`a dist b >= 0.2` and `a dist b <= 0.1` exclude each other"
+    )
+    assert (finding.diagnostic.line, finding.diagnostic.column) == (1, 36)
+
+
+def test_without_an_automaton_looser_readings_decide_what_they_can() -> None:
+    specification = sr.parse_specification(
+        "spec never = F[0s, 2s] (a leftof b and b leftof a)\n"
+        "spec once = G (a leftof c -> O (a ovlp c))\n"
+        "spec bound = F[0s, 2s] (a leftof d)\n"
+        "spec wrong = G (a rightof d)\n"
+    )
+    examined = sr.doctor(specification)
+    assert [(each.kind, each.specs) for each in examined.findings] == [
+        ("unsatisfiable", ("never",)),
+        ("contradiction", ("bound", "wrong")),
+    ]
+    assert "however its bounds and past operators are read" in examined.findings[0].reason
+    never, once, bound, wrong = examined.specs
+    assert never.reason == "`F[0s, 2s]` counts seconds, an automaton counts samples"
+    assert "looks back" in once.reason
+    assert not wrong.reason
+    # guesses that an evaluation confirmed
+    assert bound.satisfied is not None
+    assert bound.satisfied.robustness is not None
+    assert bound.satisfied.robustness > 0
+
+
+def test_too_large_an_automaton_is_read_without_its_bounds() -> None:
+    specification = sr.parse_specification(
+        "spec s = G (a leftof b -> F[400, 20000] b leftof a) and F (a ovlp b and a leftof b)"
+    )
+    examined = sr.doctor(specification)
+    assert [each.kind for each in examined.findings] == ["unsatisfiable"]
+    assert "more than 10000 subformulas" in examined.specs[0].reason
+
+
+def test_what_is_decided_propositionally_only_is_listed() -> None:
+    specification = sr.parse_specification(
+        'group people = class "person"\n'
+        "spec s = F (exists p in people: p dist a <= 1) and G not (a moved[0.1] a[-1])\n"
+    )
+    (spec,) = sr.doctor(specification).specs
+    assert spec.unrelated == ("exists p in people: (p dist a <= 1)", "a moved[0.1] a[-1]")
+    assert spec.satisfied is not None
+    assert spec.satisfied.samples is None
+    assert spec.satisfied.note
+
+
+def test_shortest_runs_show_what_has_to_hold_in_each_sample() -> None:
+    specification = sr.parse_specification("spec s = (a leftof b) U[2, 4] (a ovlp b) and G (battery >= 0.2)")
+    (spec,) = sr.doctor(specification).specs
+    assert spec.satisfied is not None
+    assert spec.violated is not None
+    assert spec.satisfied.sentences == (
+        "a leftof b and battery >= 0.2",
+        "a leftof b and battery >= 0.2",
+        "a ovlp b and battery >= 0.2",
+    )
+    assert spec.violated.sentences == ("not (battery >= 0.2)",)
+    assert len(spec.satisfied.rows) == 3
+
+
+def test_a_template_is_examined_about_any_object() -> None:
+    specification = sr.parse_specification("spec s(e) = G (e dist cup >= 0.3) and F (e dist cup <= 0.2)")
+    examined = sr.doctor(specification)
+    assert [each.kind for each in examined.findings] == ["unsatisfiable"]
+    assert examined.specs[0].violated is not None
+    assert examined.specs[0].violated.note == "a template is about the objects of a log"
+
+
+def test_only_specifications_are_examined() -> None:
+    with pytest.raises(sr.UsageError, match="give a Specification"):
+        sr.doctor("F (a leftof b)")  # type: ignore[arg-type]
