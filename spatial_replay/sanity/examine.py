@@ -9,11 +9,11 @@ from itertools import combinations
 from typing import Final, Literal, TypeAlias
 
 from spatial_replay.errors import NoAutomatonError, SpecificationError
-from spatial_replay.lazy import Displayed
-from spatial_replay.sanity.conditions import Conditions, is_solid, members
+from spatial_replay.sanity.conditions import FactDiagrams
 from spatial_replay.sanity.examples import Example, shortest_example
-from spatial_replay.sanity.readings import Reading, automaton_of, loosened, reading_of
-from spatial_replay.sanity.search import Found, Search, Side, UndecidedError
+from spatial_replay.sanity.readings import SpecReading, automaton_of, loosened, reading_of
+from spatial_replay.sanity.shortest_words import Answer, Side, UndecidedError, WordSearch
+from spatial_replay.sanity.sums import is_solid, members
 from spatial_replay.spec.diagnostics import Diagnostic, SourceText
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import (
@@ -85,7 +85,7 @@ class SpecExamination:
 
 
 @dataclass(frozen=True)
-class Examination(Displayed):
+class Examination:
     """What is wrong with a specification, and what its specs mean by example.
 
     Attributes:
@@ -168,9 +168,9 @@ class _Examiner:
         self._specification = specification
         self._source = SourceText.of(specification.source, specification.filename)
         formulas = [spec.formula for spec in specification.specs]
-        self._search = Search(Conditions(formulas, specification.regions))
-        self._readings: dict[str, Reading] = {}
-        self._answers: dict[tuple[str, bool], Found | None] = {}
+        self._search = WordSearch(FactDiagrams(formulas, specification.regions))
+        self._readings: dict[str, SpecReading] = {}
+        self._answers: dict[tuple[str, bool], Answer | None] = {}
         self._findings: list[Finding] = []
         self._undecided: dict[str, list[str]] = {}
         self._notes: list[str] = []
@@ -198,12 +198,12 @@ class _Examiner:
             self._examine(part)
         return self._findings[0] if self._findings else None
 
-    def _reading(self, part: _Part) -> Reading:
+    def _reading(self, part: _Part) -> SpecReading:
         if part.name not in self._readings:
             self._readings[part.name] = reading_of(self._specification, part.name, part.formula)
         return self._readings[part.name]
 
-    def _answer(self, part: _Part, satisfied: bool) -> Found | None:
+    def _answer(self, part: _Part, satisfied: bool) -> Answer | None:
         """Return the shortest run that satisfies, or violates, a part; None if that is not decided."""
         key = part.name, satisfied
         if key not in self._answers:
@@ -213,7 +213,7 @@ class _Examiner:
             self._answers[key] = self._asked(part.name, what, *([] if side is None else [side]))
         return self._answers[key]
 
-    def _asked(self, name: str, what: str, *sides: Side) -> Found | None:
+    def _asked(self, name: str, what: str, *sides: Side) -> Answer | None:
         try:
             if sides:
                 return self._search.shortest(*sides)
@@ -293,14 +293,14 @@ class _Examiner:
                 message = f"{one.name} follows from {other.name}"
                 self._add("implied", (one.name, other.name), one.span, before, message, _IMPLIED)
 
-    def _compared(self, one: _Part, verb: str, other: _Part, *sides: Side | None) -> Found | None:
+    def _compared(self, one: _Part, verb: str, other: _Part, *sides: Side | None) -> Answer | None:
         given = [side for side in sides if side is not None]
         if len(given) < len(sides):
             return None
         return self._asked(one.name, f"whether it {verb} {other.name}", *given)
 
     def _add(
-        self, kind: Kind, specs: tuple[str, ...], span: Span, found: Found | None, message: str, hint: str
+        self, kind: Kind, specs: tuple[str, ...], span: Span, found: Answer | None, message: str, hint: str
     ) -> None:
         if found is None:
             return
@@ -340,13 +340,13 @@ _IMPLIED: Final = "it adds nothing; leave it out, or make it stricter"
 _SAME: Final = "leave one of them out"
 
 
-def _joint(one: Found | None, other: Found | None) -> Found:
+def _joint(one: Answer | None, other: Answer | None) -> Answer:
     found = [each for each in (one, other) if each is not None]
     exclusions = dict.fromkeys(exclusion for each in found for exclusion in each.exclusions)
-    return Found(None, all(each.by_logic for each in found), tuple(exclusions))
+    return Answer(None, all(each.by_logic for each in found), tuple(exclusions))
 
 
-def _reason(found: Found) -> str:
+def _reason(found: Answer) -> str:
     """Return why there is no such run."""
     if found.by_logic or not found.exclusions:
         return "by logic alone, whatever is measured"

@@ -11,8 +11,8 @@ from spatial_replay.errors import SpatialReplayError
 from spatial_replay.geometry.footprint import TrackedObject
 from spatial_replay.monitor.evaluate import evaluate
 from spatial_replay.sanity.conditions import Fact
-from spatial_replay.sanity.placement import CannotPlaceError, Scene, place
-from spatial_replay.sanity.search import Search, Word
+from spatial_replay.sanity.placement import CannotPlaceError, Setting, place
+from spatial_replay.sanity.shortest_words import Word, WordSearch
 from spatial_replay.spec.checks import object_names, signal_names
 from spatial_replay.spec.formula import (
     Atom,
@@ -66,7 +66,7 @@ class Example:
 def shortest_example(
     specification: Specification,
     spec: NamedSpec,
-    search: Search,
+    search: WordSearch,
     word: Word,
     satisfied: bool,
     *,
@@ -105,9 +105,9 @@ def _placed(
     if len(facts) > MAX_SAMPLES:
         raise CannotPlaceError(f"it takes {len(facts)} samples")
     alone = replace(specification, specs=(replace(spec, is_result=True),))
-    scene = _scene(alone, spec)
+    setting = _setting(alone, spec)
     for period_ns in (_SECOND_NS,) if is_exact else (_SECOND_NS, _TENTH_NS):
-        for samples in place(scene, facts, period_ns):
+        for samples in place(setting, facts, period_ns):
             try:
                 result = evaluate(alone, Trace.from_samples(samples)).results[0]
             except SpatialReplayError:
@@ -117,7 +117,7 @@ def _placed(
     return None
 
 
-def _scene(alone: Specification, spec: NamedSpec) -> Scene:
+def _setting(alone: Specification, spec: NamedSpec) -> Setting:
     """Return what a spec is about."""
     atoms = [each for each in iter_formulas(spec.formula) if isinstance(each, Atom)]
     measured = [part for atom in atoms for part in iter_expressions(atom.expression)]
@@ -132,7 +132,7 @@ def _scene(alone: Specification, spec: NamedSpec) -> Scene:
     bases = [base_of(term) for atom in atoms for term in terms_of(atom.expression)]
     regions = [base.name for base in bases if isinstance(base, RegionName)]
     named = {name: alone.regions[name] for name in dict.fromkeys(regions)}
-    return Scene(object_names(alone), signal_names(alone), named, upright, tuple(dict.fromkeys(turned)))
+    return Setting(object_names(alone), signal_names(alone), named, upright, tuple(dict.fromkeys(turned)))
 
 
 def _row(sample: Sample) -> dict[str, Any]:

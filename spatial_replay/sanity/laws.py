@@ -10,7 +10,8 @@ from fractions import Fraction
 from itertools import combinations, permutations
 from typing import Final
 
-from spatial_replay.sanity.conditions import (
+from spatial_replay.sanity.linear import Inequality
+from spatial_replay.sanity.sums import (
     Quantity,
     exact,
     is_flat,
@@ -19,7 +20,6 @@ from spatial_replay.sanity.conditions import (
     terms_in,
     without_radius,
 )
-from spatial_replay.sanity.linear import Inequality
 from spatial_replay.spec.formula import (
     Axis,
     CentroidProjection,

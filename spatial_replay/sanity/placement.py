@@ -12,11 +12,11 @@ from dataclasses import dataclass, field
 from itertools import product
 from typing import Any, Final, NamedTuple, TypeAlias
 
-import numpy as np
-
-from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
-from spatial_replay.sanity.conditions import Fact, Quantity, plain, radius_of, without_radius
+from spatial_replay.geometry.footprint import Footprint, TrackedObject
+from spatial_replay.sanity.conditions import Fact
 from spatial_replay.sanity.linear import Inequality, solve
+from spatial_replay.sanity.region_boxes import around, centroid, footprint_of, inside
+from spatial_replay.sanity.sums import Quantity, plain, radius_of, without_radius
 from spatial_replay.spec.formula import (
     Axis,
     CentroidProjection,
@@ -75,7 +75,7 @@ class _Amount(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Scene:
+class Setting:
     """What there is to place.
 
     Attributes:
@@ -103,23 +103,23 @@ class Scene:
         key = (name, outer)
         if key not in self._boxes:
             outline = self.regions[name]
-            limits = _around(outline) if outer else _inside(footprint_of(outline))
+            limits = around(outline) if outer else inside(footprint_of(outline))
             self._boxes[key] = limits if outline.height is None else (*limits, outline.height)
         return self._boxes[key]
 
 
 def place(
-    scene: Scene, facts: Sequence[Sequence[tuple[Fact, bool]]], period_ns: int
+    setting: Setting, facts: Sequence[Sequence[tuple[Fact, bool]]], period_ns: int
 ) -> Iterator[tuple[Sample, ...]]:
     """Yield placements in which facts have some values, sample by sample; the roomiest first.
 
     Raises:
         CannotPlaceError: a fact is about something that is not placed.
     """
-    unit = _unit(scene, facts)
-    turns = [_turns(scene, each) for each in facts]
+    unit = _unit(setting, facts)
+    turns = [_turns(setting, each) for each in facts]
     for margin, spread in ((0.2, 2.0), (0.04, 4.0), (0.04, 20.0), (0.005, 50.0)):
-        attempt = _Attempt(scene, unit, margin * unit, spread)
+        attempt = _Attempt(setting, unit, margin * unit, spread)
         required: list[Inequality] = list(attempt.sizes())
         choices: list[Ways] = []
         for index, sample in enumerate(facts):
@@ -134,9 +134,11 @@ def place(
             yield tuple(attempt.sample(found, index, turns[index], period_ns) for index in range(len(facts)))
 
 
-def _unit(scene: Scene, facts: Sequence[Sequence[tuple[Fact, bool]]]) -> float:
+def _unit(setting: Setting, facts: Sequence[Sequence[tuple[Fact, bool]]]) -> float:
     """Return a length that fits what the facts are about."""
-    lengths = [high - low for name in scene.regions for low, high in scene.region_box(name, outer=False)[:2]]
+    lengths = [
+        high - low for name in setting.regions for low, high in setting.region_box(name, outer=False)[:2]
+    ]
     if lengths:
         return min(lengths) / 4.0 or 1.0
     thresholds = [
@@ -151,8 +153,8 @@ def _unit(scene: Scene, facts: Sequence[Sequence[tuple[Fact, bool]]]) -> float:
 class _Attempt:
     """One placement in the making: unknowns are the least sides of boxes in each sample, and their sizes."""
 
-    def __init__(self, scene: Scene, unit: float, margin: float, spread: float) -> None:
-        self._scene = scene
+    def __init__(self, setting: Setting, unit: float, margin: float, spread: float) -> None:
+        self._setting = setting
         self._unit = unit
         self._margin = margin
         self._spread = spread
@@ -160,7 +162,7 @@ class _Attempt:
 
     def sizes(self) -> Iterator[Inequality]:
         """Yield that no box is too small or too large to be looked at."""
-        for name, axis in product(self._scene.objects, self._scene.axes):
+        for name, axis in product(self._setting.objects, self._setting.axes):
             size = _Amount({("size", name, axis): 1.0})
             yield size.at_least(self._unit / self._spread)
             yield size.at_most(self._unit * self._spread)
@@ -224,9 +226,9 @@ class _Attempt:
     ) -> Sample:
         """Return a sample of a solution."""
         objects: dict[str, TrackedObject | Footprint] = {}
-        for name in self._scene.objects:
+        for name in self._setting.objects:
             limits = []
-            for axis in self._scene.axes:
+            for axis in self._setting.axes:
                 low = values["at", name, axis, index]
                 limits.append((_rounded(low), _rounded(low + values["size", name, axis])))
             (xmin, xmax), (ymin, ymax), *height = limits
@@ -235,22 +237,22 @@ class _Attempt:
                 yaw=turns.get(name),
                 height=height[0] if height else None,
             )
-        signals = {name: _rounded(values["signal", name, index]) for name in self._scene.signals}
+        signals = {name: _rounded(values["signal", name, index]) for name in self._setting.signals}
         return Sample(index * period_ns, objects, signals)
 
     def _start(self, samples: int) -> dict[Any, float]:
         """Return where objects stay unless a fact moves them: in a row below all regions."""
-        boxes = [self._scene.region_box(name, outer=True) for name in self._scene.regions]
+        boxes = [self._setting.region_box(name, outer=True) for name in self._setting.regions]
         left = min((box[0][0] for box in boxes), default=0.0)
         bottom = min((box[1][0] for box in boxes), default=0.0) - 2.0 * self._unit
         start: dict[Any, float] = {}
-        for number, name in enumerate(self._scene.objects):
+        for number, name in enumerate(self._setting.objects):
             place = {"x": left + 2.0 * number * self._unit, "y": bottom, "z": 0.0}
-            for axis in self._scene.axes:
+            for axis in self._setting.axes:
                 start["size", name, axis] = self._unit
                 start.update({("at", name, axis, index): place[axis] for index in range(samples)})
         start.update(
-            {("signal", name, index): 0.0 for name in self._scene.signals for index in range(samples)}
+            {("signal", name, index): 0.0 for name in self._setting.signals for index in range(samples)}
         )
         return start
 
@@ -283,11 +285,11 @@ class _Attempt:
         """Return the least and the greatest coordinates of a term along its axes."""
         term = without_radius(term)
         if isinstance(term, RegionName):
-            limits = self._scene.region_box(term.name, outer=outer)
+            limits = self._setting.region_box(term.name, outer=outer)
             return [(_Amount({}, low), _Amount({}, high)) for low, high in limits]
         name, at = _object(term, index)
         sides = []
-        for axis in self._scene.axes:
+        for axis in self._setting.axes:
             low = _Amount({("at", name, axis, at): 1.0})
             sides.append((low, low.plus(_Amount({("size", name, axis): 1.0}))))
         return sides
@@ -298,8 +300,8 @@ class _Attempt:
         assert isinstance(quantity, (Projection, CentroidProjection))
         axis = "xyz".index(quantity.axis)
         if isinstance(quantity, CentroidProjection) and isinstance(quantity.term, RegionName):
-            footprint = footprint_of(self._scene.regions[quantity.term.name])
-            centres = [_centroid(part)[axis] for part in footprint.parts]
+            footprint = footprint_of(self._setting.regions[quantity.term.name])
+            centres = [centroid(part)[axis] for part in footprint.parts]
             return _Amount({}, min(centres) if quantity.side == "min" else max(centres))
         sides = self._sides(quantity.term, index, outer=True)
         if axis >= len(sides):
@@ -321,7 +323,7 @@ def _object(term: Term, index: int) -> tuple[str, int]:
     raise CannotPlaceError("a group of a class, or of all objects, is not placed")
 
 
-def _turns(scene: Scene, facts: Sequence[tuple[Fact, bool]]) -> dict[str, float]:
+def _turns(setting: Setting, facts: Sequence[tuple[Fact, bool]]) -> dict[str, float]:
     """Return orientations, by quarters, for which facts about orientations have their values.
 
     Raises:
@@ -332,10 +334,10 @@ def _turns(scene: Scene, facts: Sequence[tuple[Fact, bool]]) -> dict[str, float]
         for fact, value in facts
         if fact.weights and isinstance(fact.weights[0][0], Misalignment)
     ]
-    if len(scene.turned) > MAX_TURNED:
+    if len(setting.turned) > MAX_TURNED:
         raise CannotPlaceError(f"more than {MAX_TURNED} objects have orientations")
-    for quarters in product(range(4), repeat=len(scene.turned)):
-        turns = {name: math.pi / 2.0 * each for name, each in zip(scene.turned, quarters, strict=True)}
+    for quarters in product(range(4), repeat=len(setting.turned)):
+        turns = {name: math.pi / 2.0 * each for name, each in zip(setting.turned, quarters, strict=True)}
         if all(_is_turned(fact, value, turns) for fact, value in asked):
             return turns
     raise CannotPlaceError("no turns by quarters fit")
@@ -361,56 +363,3 @@ def _holds(inequality: Inequality, values: Mapping[Any, Any]) -> bool:
 
 def _rounded(value: float) -> float:
     return float(f"{value:.{_DIGITS}g}")
-
-
-# ------------------------------------------------------------------------------------------ regions
-
-
-def footprint_of(outline: Outline) -> Footprint:
-    """Return the area of a region."""
-    if outline.is_disc:
-        (x, y), *_ = outline.vertices
-        return Footprint.disc(x, y, outline.radius)
-    return Footprint.polygon(np.array(outline.vertices, np.float64))
-
-
-def _around(outline: Outline) -> tuple[tuple[float, float], ...]:
-    vertices, radius = np.array(outline.vertices, np.float64), outline.radius
-    limits = zip(vertices.min(axis=0) - radius, vertices.max(axis=0) + radius, strict=True)
-    return tuple((float(low), float(high)) for low, high in limits)
-
-
-def _inside(footprint: Footprint) -> tuple[tuple[float, float], ...]:
-    """Return the largest box, among some, that a footprint encloses."""
-    boxes = [_box_in(part) for part in footprint.parts]
-    return max(boxes, key=lambda box: math.prod(high - low for low, high in box))
-
-
-def _box_in(part: ConvexPart) -> tuple[tuple[float, float], ...]:
-    """Return a box around a part's centroid, of the proportions of the box around the part."""
-    x, y = _centroid(part)
-    if len(part.vertices) < 3:
-        half = part.radius / math.sqrt(2.0)
-        return (x - half, x + half), (y - half, y + half)
-    width, height = np.ptp(part.vertices, axis=0).tolist()
-    after = np.roll(part.vertices, -1, axis=0)
-    # corners are counter-clockwise: normals point outwards
-    normals = np.column_stack([after[:, 1] - part.vertices[:, 1], part.vertices[:, 0] - after[:, 0]])
-    room = (normals * (part.vertices - (x, y))).sum(axis=1)
-    share = float((room / (np.abs(normals) @ (width / 2.0, height / 2.0))).min())
-    return (x - share * width / 2.0, x + share * width / 2.0), (
-        y - share * height / 2.0,
-        y + share * height / 2.0,
-    )
-
-
-def _centroid(part: ConvexPart) -> tuple[float, float]:
-    """Return the centroid of a part's polygon; of a point or segment, the mean."""
-    vertices = part.vertices - part.vertices[0]
-    after = np.roll(vertices, -1, axis=0)
-    cross = vertices[:, 0] * after[:, 1] - after[:, 0] * vertices[:, 1]
-    if len(vertices) < 3:
-        x, y = vertices.mean(axis=0).tolist()
-    else:
-        x, y = (((vertices + after) * cross[:, None]).sum(axis=0) / (3.0 * cross.sum())).tolist()
-    return x + float(part.vertices[0, 0]), y + float(part.vertices[0, 1])

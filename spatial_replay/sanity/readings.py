@@ -8,7 +8,7 @@ from typing import Literal
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.compile import automaton
 from spatial_replay.errors import NoAutomatonError
-from spatial_replay.sanity.search import Side
+from spatial_replay.sanity.shortest_words import Side
 from spatial_replay.spec.formula import (
     PAST_OPERATORS,
     Boolean,
@@ -23,7 +23,7 @@ from spatial_replay.spec.walks import iter_formulas
 
 
 @dataclass(frozen=True)
-class Reading:
+class SpecReading:
     """The runs that satisfy a formula, and those that violate it, or more runs where it has no automaton.
 
     Attributes:
@@ -41,7 +41,7 @@ class Reading:
         return tuple(side for side in (self.satisfying, self.violating) if side is not None)
 
 
-def reading_of(specification: Specification, name: str, formula: Formula) -> Reading:
+def reading_of(specification: Specification, name: str, formula: Formula) -> SpecReading:
     """Return the automata that decide on a formula.
 
     What an automaton cannot follow is read loosely: a bounded `F` as one without a bound, a past operator as
@@ -52,8 +52,8 @@ def reading_of(specification: Specification, name: str, formula: Formula) -> Rea
     except NoAutomatonError as error:
         reason = error.reason
     else:
-        return Reading(Side(own), Side(own, False))
-    return Reading(
+        return SpecReading(Side(own), Side(own, False))
+    return SpecReading(
         _loosely(specification, name, formula, positive=True),
         _loosely(specification, name, formula, positive=False),
         reason,

@@ -8,9 +8,8 @@ from typing import Final, NamedTuple, TypeAlias
 
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.diagrams import LEAF, NO, YES
-from spatial_replay.automata.minimise import leaves_of
 from spatial_replay.errors import NoAutomatonError
-from spatial_replay.sanity.conditions import Conditions, Fact
+from spatial_replay.sanity.conditions import Fact, FactDiagrams
 from spatial_replay.sanity.laws import laws
 from spatial_replay.sanity.linear import solve
 from spatial_replay.spec.formula import Protrusion, Signal
@@ -40,7 +39,7 @@ class UndecidedError(Exception):
 
 
 @dataclass(frozen=True)
-class Found:
+class Answer:
     """The answer to one question.
 
     Attributes:
@@ -54,10 +53,10 @@ class Found:
     exclusions: tuple[tuple[str, ...], ...] = ()
 
 
-class Search:
+class WordSearch:
     """Answers questions about automata over the same conditions; what geometry excludes is kept."""
 
-    def __init__(self, conditions: Conditions) -> None:
+    def __init__(self, conditions: FactDiagrams) -> None:
         self._conditions = conditions
         self._diagrams = conditions.diagrams
         self._moves: dict[tuple[int, int], int] = {}
@@ -67,7 +66,7 @@ class Search:
         self._exclusions: list[frozenset[tuple[int, bool]]] = []
         self._allowed = YES
 
-    def shortest(self, *sides: Side) -> Found:
+    def shortest(self, *sides: Side) -> Answer:
         """Return the shortest run that all sides agree with.
 
         Raises:
@@ -76,12 +75,12 @@ class Search:
         try:
             word = self._search(sides, geometry=True)
             if word is not None:
-                return Found(word)
+                return Answer(word)
             if self._search(sides, geometry=False) is None:
-                return Found(None, by_logic=True)
+                return Answer(None, by_logic=True)
         except (NoAutomatonError, RecursionError) as error:
             raise UndecidedError from error
-        return Found(None, exclusions=tuple(self._texts_of(each) for each in self._about(sides)))
+        return Answer(None, exclusions=tuple(self._texts_of(each) for each in self._about(sides)))
 
     def is_possible(self, condition: int) -> bool:
         """Return whether a condition holds in some sample.
@@ -102,8 +101,8 @@ class Search:
         for number, states in enumerate(waiting):
             if len(waiting) > MAX_STATES:
                 raise UndecidedError
-            moves = self._joined(sides, states)
-            for leaf in leaves_of(self._diagrams, moves):
+            moves, leaves = self._joined(sides, states)
+            for leaf in leaves:
                 after = self._tuples[leaf]
                 if after in before or not all(map(_may_agree, sides, after)):
                     continue
@@ -117,8 +116,8 @@ class Search:
                 waiting.append(after)
         return None
 
-    def _joined(self, sides: Sequence[Side], states: Sequence[int]) -> int:
-        """Return where one sample leads to, as a diagram over facts with combinations of states as leaves."""
+    def _joined(self, sides: Sequence[Side], states: Sequence[int]) -> tuple[int, list[int]]:
+        """Return where one sample leads to, as a diagram over facts, and its leaves: tuples of states."""
         nodes = [self._composed(side.automaton, state) for side, state in zip(sides, states, strict=True)]
         known: dict[tuple[int, ...], int] = {}
 
@@ -134,7 +133,9 @@ class Search:
                     known[key] = self._diagrams.decide(variable, low, high)
             return known[key]
 
-        return join(tuple(nodes))
+        whole = join(tuple(nodes))
+        decisions = [self._diagrams[node] for node in known.values()]
+        return whole, list(dict.fromkeys(each.low for each in decisions if each.variable == LEAF))
 
     def _number(self, states: tuple[int, ...]) -> int:
         if states not in self._numbers:
