@@ -141,6 +141,14 @@ def test_numbers_that_fit_recorded_runs_are_found_and_written(capsys: pytest.Cap
     assert "const clearance = 0.8 in [0, 2]    # metres, a first guess" in Path("pass.spatial").read_text()
 
 
+@pytest.mark.usefixtures("desk")
+def test_what_is_wrong_with_a_specification_is_found_and_its_shortest_runs_are_looked_at(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    follow("doctor.md", {}, capsys)
+    assert Path("served.html").stat().st_size > 10_000
+
+
 @pytest.fixture
 def gate(desk: Path, monkeypatch: pytest.MonkeyPatch) -> list[Block]:
     """The blocks of the page about CI, with its files and logs made, in a folder of its own."""

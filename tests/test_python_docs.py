@@ -43,4 +43,5 @@ def test_the_examples_run_and_print_what_the_text_says(
     assert [line.split()[0] for line in printed[8]] == ["cup", "hold"]
     assert printed[9][1:3] == ["False True True", "frozenset({0, 2})"]
     assert printed[9][3].startswith("0 2 ")
-    assert [line.split()[0] for line in printed[10]] == ["1", "2"]
+    assert printed[10] == ["unsatisfiable (('cup leftof plate', 'plate leftof cup'),)", "satisfied"]
+    assert [line.split()[0] for line in printed[11]] == ["1", "2"]
