@@ -7,18 +7,22 @@ a free path leads to.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
 from spatial_replay.errors import TraceError
+from spatial_replay.geometry.arrays import Floats
 from spatial_replay.geometry.footprint import TrackedObject
 from spatial_replay.planning.decisions import Candidate, Consideration, Guards, Reason, Target
-from spatial_replay.planning.map_layers import near
+from spatial_replay.planning.demands import Pose, with_moved
+from spatial_replay.planning.map_layers import distance_to, near
 from spatial_replay.planning.maps import (
     CONSTRAINED,
     FREE,
+    OCCUPIED,
     OUT_OF_REACH,
     REASONS,
     Cubes,
@@ -32,6 +36,7 @@ from spatial_replay.planning.maps import (
     proposition_maps,
 )
 from spatial_replay.planning.paths import Path, shortest_path
+from spatial_replay.planning.refining import refined
 from spatial_replay.planning.settings import Settings
 from spatial_replay.planning.workspace import Grid, Workspace
 from spatial_replay.spec.formula import Formula, Outline
@@ -42,6 +47,7 @@ def find_target(
     gradient: GradientMap,
     tracked: TrackedObject,
     settings: Settings,
+    room: Floats,
     failed: Collection[tuple[float, float]] = (),
 ) -> Target | str:
     """Return the target for an object, or why there is none.
@@ -49,14 +55,19 @@ def find_target(
     Args:
         gradient: the map of the progress set.
         tracked: the object before the motion.
+        room: (A, rows, columns), the distance to what room is kept from.
         failed: places (x, y) where earlier attempts failed.
     """
     holds = (gradient.blocked == FREE) & (gradient.robustness >= settings.margin)
     good = holds & ~near(failed, gradient.grid)
+    if settings.rules > 1 and not good.any() and holds.any():
+        # a motion may fail by chance: then places come again, those farther from the failures first
+        away = distance_to(failed, gradient.grid)
+        good = holds & (away >= away[holds.any(axis=0)].max() / 2.0)
     if not good.any():
         return _why_nowhere(gradient, settings, bool(failed))
     if settings.skill == "place":
-        return _best_cell(gradient, good, tracked, settings)
+        return _best_cell(gradient, good & (room >= settings.room), good, tracked)
     return _nearest_cell(gradient, good, tracked, settings)
 
 
@@ -74,8 +85,30 @@ def target_in(
     return _nearest_cell(gradient, only, tracked, settings)
 
 
-def _best_cell(gradient: GradientMap, good: np.ndarray, tracked: TrackedObject, settings: Settings) -> Target:
-    roomy = good & (gradient.clearance >= settings.room)
+def nearest_target(
+    gradient: GradientMap, good: np.ndarray, tracked: TrackedObject, settings: Settings
+) -> Target | str:
+    """Return the target in the nearest of some cells (A, rows, columns), or why there is none."""
+    if not good.any():
+        return "there is no place for it"
+    if settings.skill == "push":
+        return _nearest_cell(gradient, good, tracked, settings)
+    here = centre_of(tracked.footprint)
+    away = np.hypot(*(gradient.grid.centres() - np.array(here)).T).reshape(gradient.grid.shape)
+    values = np.where(good, -away, -np.inf)
+    turn, row, column = (int(index) for index in np.unravel_index(int(np.argmax(values)), values.shape))
+    return _target(gradient, tracked, (turn, row, column), (here, gradient.grid.centre(row, column)))
+
+
+def points_along(waypoints: Sequence[tuple[float, float]], step: float) -> Iterator[tuple[float, float]]:
+    """Yield points on a way, no farther apart than a step."""
+    yield waypoints[0]
+    for (u, v), (x, y) in pairwise(waypoints):
+        count = max(1, math.ceil(math.dist((u, v), (x, y)) / step))
+        yield from ((u + k / count * (x - u), v + k / count * (y - v)) for k in range(1, count + 1))
+
+
+def _best_cell(gradient: GradientMap, roomy: np.ndarray, good: np.ndarray, tracked: TrackedObject) -> Target:
     values = np.where(roomy if roomy.any() else good, gradient.robustness, -np.inf)
     turn, row, column = (int(index) for index in np.unravel_index(int(np.argmax(values)), values.shape))
     here, there = centre_of(tracked.footprint), gradient.grid.centre(row, column)
@@ -187,32 +220,75 @@ class Movables:
         ]
 
     def candidate(
-        self, name: str, consideration: Consideration, failed: Collection[tuple[float, float]] = ()
+        self,
+        name: str,
+        consideration: Consideration,
+        failed: Collection[tuple[float, float]] = (),
+        later: Collection[str] = (),
+        *,
+        refine: bool = False,
     ) -> Candidate:
         """Return an object with its map for an edge, and its target or why it has none.
 
         Args:
             failed: places (x, y) where earlier attempts failed.
+            later: objects that may still have to be moved after this motion.
+            refine: refine the target, if the settings want that.
 
         Raises:
             TraceError: the sample has no footprint for the object.
         """
-        tracked = self._sample.objects[name]
-        if not isinstance(tracked, TrackedObject):
-            raise TraceError(f"object {name!r} is {tracked!r}; give a TrackedObject")
-        gradient = gradient_map(
-            self.maps_of(name),
-            consideration.progress.cubes,
-            consideration.constraints.cubes,
-            self._settings.workspace,
-            self._settings.constraint_margin,
-        )
-        target = find_target(gradient, tracked, self._settings, failed)
+        tracked = self._tracked(name)
+        settings, maps = self._settings, self.maps_of(name)
+        cubes = consideration.progress.cubes, consideration.constraints.cubes
+        gradient = gradient_map(maps, *cubes, settings.workspace, settings.constraint_margin)
+        room_from = None if settings.room_from == "all" or name in later else later
+        target = find_target(gradient, tracked, settings, maps.room(room_from), failed)
+        if isinstance(target, Target) and refine:
+            target = self.refined(target, consideration, room_from)
         if isinstance(target, Target):
             target = self.with_way(target, consideration.constraints.cubes)
         if isinstance(target, str):
             return Candidate(name, gradient, None, target, failed=tuple(failed))
         return Candidate(name, gradient, target, failed=tuple(failed))
+
+    def refined(
+        self,
+        target: Target,
+        consideration: Consideration,
+        room_from: Collection[str] | None,
+        then: Mapping[str, Pose] | None = None,
+    ) -> Target:
+        """Return a target of a placed object with more robustness nearby, if the settings want that.
+
+        Args:
+            room_from: the objects to keep room from; None for everything.
+            then: where other objects are moved to later, for the robustness, and as obstacles.
+        """
+        settings, name = self._settings, target.name
+        if settings.skill == "push" or not settings.refine:
+            return target
+        progress, constraints = consideration.progress.cubes, consideration.constraints.cubes
+        later = self._sample if then is None else with_moved(self._sample, then)
+
+        def measured(grid: Grid, yaws: tuple[float, ...]) -> tuple[GradientMap, Floats]:
+            workspace = replace(settings.workspace, yaws=yaws)
+            about = self._propositions, self._regions
+            now = proposition_maps(*about, self._sample, name, workspace, grid)
+            after = now if then is None else proposition_maps(*about, later, name, workspace, grid)
+            gradient = gradient_map(
+                now, progress, constraints, settings.workspace, settings.constraint_margin, after
+            )
+            gradient.blocked[after.clearance <= settings.workspace.clearance] = OCCUPIED
+            return gradient, np.minimum(now.room(room_from), after.room(room_from))
+
+        return refined(target, self._tracked(name), settings, measured)
+
+    def _tracked(self, name: str) -> TrackedObject:
+        tracked = self._sample.objects[name]
+        if not isinstance(tracked, TrackedObject):
+            raise TraceError(f"object {name!r} is {tracked!r}; give a TrackedObject")
+        return tracked
 
     def with_way(self, target: Target, constraints: Cubes) -> Target | str:
         """Return the target of a carried object with a way that keeps the constraints, or why there is none.
@@ -244,9 +320,7 @@ class Movables:
         self, target: Target, constraints: Cubes, about: Sequence[int]
     ) -> tuple[np.ndarray, Grid]:
         """Return (rows, columns): the constraints' robustness with the object carried there; and the grid."""
-        settings, tracked = self._settings, self._sample.objects[target.name]
-        if not isinstance(tracked, TrackedObject):
-            raise TraceError(f"object {target.name!r} is {tracked!r}; give a TrackedObject")
+        settings, tracked = self._settings, self._tracked(target.name)
         if tracked.height is not None and settings.lift:
             low, high = tracked.height
             tracked = replace(tracked, height=(low + settings.lift, high + settings.lift))
@@ -271,9 +345,7 @@ class Movables:
         Raises:
             TraceError: the sample has no footprint for the object.
         """
-        tracked = self._sample.objects[name]
-        if not isinstance(tracked, TrackedObject):
-            raise TraceError(f"object {name!r} is {tracked!r}; give a TrackedObject")
+        tracked = self._tracked(name)
         if name not in self._maps:
             workspace = self._settings.workspace
             pushes = self._settings.skill == "push"

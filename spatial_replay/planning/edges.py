@@ -15,6 +15,7 @@ from spatial_replay.automata.guards import MAX_CUBES, Transition
 from spatial_replay.errors import NoAutomatonError, UsageError
 from spatial_replay.monitor.atoms.live import SampleLeaves
 from spatial_replay.planning.decisions import Consideration, Edge, Guards, Reason
+from spatial_replay.planning.maps import concerns
 from spatial_replay.spec.formula import Formula, Outline, Specification
 from spatial_replay.trace.sample import Sample
 
@@ -177,6 +178,15 @@ def loss_text(automaton: Automaton, states: Collection[int], before: Symbol, sym
     # what has just changed says more than what was so before
     changed = [each for each in cube if before and before[each[0]] is not symbol[each[0]]]
     return " and ".join(automaton.propositions[number].literal(value) for number, value in changed or cube)
+
+
+def moved_later(
+    path: Sequence[Transition], symbol: Symbol, formulas: Sequence[Formula], names: Iterable[str]
+) -> frozenset[str]:
+    """Return the objects that the rest of a path, without its first edge, may ask to be moved."""
+    literals = (literal for each in path[1:] for cube in each.guard for literal in cube)
+    unmet = {number for number, wanted in literals if symbol[number] is not wanted}
+    return frozenset(name for name in names if any(concerns(formulas[number], name) for number in unmet))
 
 
 def worst_state(automaton: Automaton, states: Iterable[int]) -> int | None:

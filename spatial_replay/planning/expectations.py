@@ -20,7 +20,7 @@ class Foreseen(NamedTuple):
     """A sample that is expected after motions.
 
     Attributes:
-        moved: the poses of the objects moved, by name and in order.
+        moved: the poses of the objects moved, by name and in order, each with all its turns.
     """
 
     sample: Sample
@@ -29,7 +29,9 @@ class Foreseen(NamedTuple):
     def after(self, target: Target) -> Foreseen:
         """Return the scene after a motion."""
         pose = target.x, target.y, target.turn
-        moved = {**dict(self.moved), target.name: pose}
+        moved = dict(self.moved)
+        *_, turned = moved.get(target.name, (0.0, 0.0, 0.0))
+        moved[target.name] = target.x, target.y, turned + target.turn
         return Foreseen(with_moved(self.sample, {target.name: pose}), tuple(sorted(moved.items())))
 
 

@@ -32,6 +32,7 @@ from spatial_replay.planning.edges import (
     consideration_of,
     equivalent_edges,
     idle_transitions,
+    moved_later,
 )
 from spatial_replay.planning.expectations import Expectations, Foreseen
 from spatial_replay.planning.map_layers import AVOIDED_CELLS
@@ -157,10 +158,11 @@ class Foresight:
         """Yield motions that take the first edge of a path, and where they lead."""
         movables = self._expected.movables(scene)
         candidates: list[Candidate] = []
+        later = moved_later(path, self._expected.symbol(scene), self._formulas, movables.names)
         for name in movables.names_for(consideration.progress):
             if not self._expected.budget.spend():
                 return
-            candidates.append(movables.candidate(name, consideration, self._failed(name)))
+            candidates.append(movables.candidate(name, consideration, self._failed(name), later))
         for number in by_cost(candidates, self._settings):
             target = candidates[number].target
             if target is not None:
@@ -204,8 +206,14 @@ class Foresight:
                 about = Arranger(scene.sample, self._regions, self._settings, demands, self._expected.budget)
                 if self._expected.budget.left <= 0 or about.why_hopeless():
                     continue
-                arrangements = about.arrangements(self._settings.motions)
-                for cells in islice(arrangements, _MOST_ORDERED):
+                near_failures = []
+                for cells in islice(about.arrangements(self._settings.motions), _MOST_ORDERED):
+                    if self._is_near_failure(about, cells):
+                        near_failures.append(cells)
+                    else:
+                        yield from self._ordered_from(scene, aims, consideration, about, cells)
+                # a motion may fail by chance: places where one did come again, after all others
+                for cells in near_failures if self._settings.rules > 1 else ():
                     yield from self._ordered_from(scene, aims, consideration, about, cells)
 
     def _demands_of(self, scene: Foreseen, aims: Sequence[Transition]) -> Iterator[tuple[Demand, ...]]:
@@ -267,6 +275,14 @@ class Foresight:
                     open_sets += (done | frozenset(each) for each in combinations(left, size))
         return False
 
+    def _is_near_failure(self, about: Arranger, cells: Mapping[str, Cell]) -> bool:
+        """Return whether an arrangement brings an object near a place where that failed."""
+        near = AVOIDED_CELLS * self._settings.workspace.grid.cell_size
+        poses = ((name, about.pose(name, cell)) for name, cell in cells.items())
+        return any(
+            (x - u) ** 2 + (y - v) ** 2 <= near**2 for name, (x, y, _) in poses for u, v in self._failed(name)
+        )
+
     def _ordered_from(
         self,
         scene: Foreseen,
@@ -277,10 +293,6 @@ class Foresight:
     ) -> Iterator[tuple[tuple[Target, ...], tuple[Foreseen, int]]]:
         """Yield the motions to an arrangement, in an order in which each is possible."""
         poses = {name: about.pose(name, cell) for name, cell in cells.items()}
-        near = AVOIDED_CELLS * self._settings.workspace.grid.cell_size
-        for name, (x, y, _) in poses.items():
-            if any((x - u) ** 2 + (y - v) ** 2 <= near**2 for u, v in self._failed(name)):
-                return
         robustness = self._expected.robustness(about.sample_with(cells), aims[0].guard)
         order = MotionOrder(self._expected, scene, aims, consideration, poses, robustness)
         if (found := order.found()) is not None:
@@ -295,7 +307,8 @@ class Foresight:
     ) -> Consideration:
         """Return an edge with the first of several motions as its chosen candidate."""
         first = motions[0]
-        poses = {each.name: (each.x, each.y, each.turn) for each in motions[1:]}
+        # what is parked first goes to its own place later
+        poses = {each.name: (each.x, each.y, each.turn) for each in motions[1:] if each.name != first.name}
         sample = movables.sample
         settings, now = self._settings, movables.maps_of(first.name)
         then = proposition_maps(
@@ -310,12 +323,42 @@ class Foresight:
         gradient = gradient_map(now, *cubes, settings.workspace, settings.constraint_margin, then)
         place = gradient.cell_of(first.x, first.y, first.turn)
         target = replace(first, robustness=float(gradient.robustness[place]))
+        if all(each.name != first.name for each in motions[1:]):
+            target = self._refined(target, consideration, movables, poses, (*motions[1:], *rest))
         candidate = Candidate(first.name, gradient, target, is_chosen=True)
         others = tuple(replace(each, is_chosen=False) for each in consideration.candidates)
         planned = (target, *motions[1:], *rest)
         return replace(
             consideration, candidates=(*others, candidate), pruned=None, motions=planned, is_joint=True
         )
+
+    def _refined(
+        self,
+        target: Target,
+        consideration: Consideration,
+        movables: Movables,
+        poses: Mapping[str, Pose],
+        rest: tuple[Target, ...],
+    ) -> Target:
+        """Return the first of several motions with a refined target, if the others lead on as before."""
+        here, *_, there = target.waypoints
+        found = movables.refined(replace(target, waypoints=(here, there)), consideration, None, poses)
+        ways = movables.with_way(found, consideration.constraints.cubes)
+        if isinstance(ways, str) or found.robustness <= target.robustness:
+            return target
+        state = consideration.edge[0]
+        before, after = (self._states_along((each, *rest), state) for each in (target, ways))
+        return ways if before == after else target
+
+    def _states_along(self, motions: Sequence[Target], state: int) -> list[frozenset[int]]:
+        """Return the states after each of some motions, from the newest sample on."""
+        scene, states, visited = self._first, frozenset({state}), []
+        for each in motions:
+            scene = scene.after(each) if scene is not None else None
+            if scene is not None:
+                states = self._automaton.step_set(states, self._expected.symbol(scene))
+                visited.append(states)
+        return visited
 
     # --------------------------------------------------------------------------------------- what is seen
 

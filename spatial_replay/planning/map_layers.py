@@ -193,7 +193,7 @@ def _causes(
     for reason, kind in _KIND_OF.items():
         codes[blocked == reason] = kind * _NUMBERS
     stands = blocked == OCCUPIED
-    codes[stands] += maps.nearest[stands]
+    codes[stands] += maps.distances.argmin(axis=0)[stands]
     held, texts = blocked == CONSTRAINED, ()
     if held.any():
         texts, which = _most_dangerous(gradient.made_of, blocked.shape)
@@ -250,12 +250,16 @@ def _options(part: _Part) -> Iterator[_Part]:
 
 def near(failed: Collection[tuple[float, float]], grid: Grid) -> Booleans:
     """Return (rows, columns): whether each cell is near a place where an attempt failed."""
-    found = np.zeros(grid.shape, np.bool_)
+    return distance_to(failed, grid) <= AVOIDED_CELLS * grid.cell_size
+
+
+def distance_to(places: Collection[tuple[float, float]], grid: Grid) -> Floats:
+    """Return (rows, columns): the distance from each cell to the nearest of some places."""
+    away = np.full(grid.shape, np.inf)
     centres = grid.centres()
-    for place in failed:
-        away = np.hypot(*(centres - np.array(place)).T)
-        found |= (away <= AVOIDED_CELLS * grid.cell_size).reshape(grid.shape)
-    return found
+    for place in places:
+        np.minimum(away, np.hypot(*(centres - np.array(place)).T).reshape(grid.shape), out=away)
+    return away
 
 
 def room_cost(candidate: Candidate, target: Target, settings: Settings) -> RoomCost | None:

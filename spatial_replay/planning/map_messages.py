@@ -59,8 +59,9 @@ def maps_of(step: Step) -> list[TurnedMap]:
 
 
 def _is_aim(candidate: Candidate, turn: int) -> bool:
-    """Return whether the target has this orientation."""
-    return candidate.target is not None and candidate.target.turn == candidate.map.turns[turn]
+    """Return whether this is the orientation nearest to that of the target, which may be turned from it."""
+    target = candidate.target
+    return target is not None and candidate.map.cell_of(target.x, target.y, target.turn)[0] == turn
 
 
 def map_digest(gradient: GradientMap) -> bytes:

@@ -7,7 +7,7 @@ evaluate a log evaluate a map, all relations in one call, and a cell has the num
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final, NamedTuple, TypeAlias
 
@@ -160,7 +160,7 @@ class PropositionMaps:
         grid: the cells.
         lower, upper: (P, A, rows, columns), bounds of the robustness; -inf and +inf if it is unknown.
         clearance: (A, rows, columns), signed distance to the nearest obstacle; +inf without obstacles.
-        nearest: (A, rows, columns), that obstacle by its number in `obstacles`.
+        distances: (O, A, rows, columns), that to each of `obstacles`.
         turns: (A,) angles in radians by which the object is turned.
         obstacles: names of what may be in the way; the last one, "", stands for those of the workspace.
         about: what was measured.
@@ -171,10 +171,15 @@ class PropositionMaps:
     lower: Floats
     upper: Floats
     clearance: Floats
-    nearest: NDArray[np.int64]
+    distances: Floats
     turns: Floats
     obstacles: tuple[str, ...]
     about: MapSubject = field(repr=False)
+
+    def room(self, others: Collection[str] | None) -> Floats:
+        """Return (A, rows, columns): the distance to the nearest of some objects; of all for None."""
+        kept = [others is None or name in others for name in self.obstacles]
+        return np.asarray(self.distances[kept].min(axis=0, initial=np.inf))
 
 
 class MapSubject(NamedTuple):
@@ -237,11 +242,10 @@ def proposition_maps(
     if workspace.obstacles:
         static = _to_static(everywhere, name, workspace)
     clearances = np.vstack((over_cells[0][len(concerned) :], static))
-    nearest = clearances.argmin(axis=0)
     clearance = clearances.min(axis=0).reshape(shape)
     lower, upper = ends
     about = MapSubject(tuple(propositions), regions, sample)
-    ways = nearest.reshape(shape), turns, (*obstacles, "")
+    ways = clearances.reshape(-1, *shape), turns, (*obstacles, "")
     return PropositionMaps(name, cells, lower, upper, clearance, *ways, about)
 
 

@@ -31,6 +31,7 @@ from spatial_replay.planning.edges import (
     equivalent_edges,
     idle_transitions,
     loss_text,
+    moved_later,
     refuse_template,
     why_no_path,
     worst_state,
@@ -294,8 +295,11 @@ class Planner:
         exhausted = self._attempts.why_exhausted(consideration.edge, self.settings.attempts)
         if exhausted is not None:
             return replace(consideration, pruned=exhausted)
+        later = moved_later(path, self._symbol, self._formulas, movables.names)
         candidates = [
-            movables.candidate(name, consideration, self._attempts.failed_places(consideration, name))
+            movables.candidate(
+                name, consideration, self._attempts.failed_places(consideration, name), later, refine=True
+            )
             for name in movables.names_for(consideration.progress)
         ]
         alone = with_choice(consideration, candidates, self.settings)

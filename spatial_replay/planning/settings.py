@@ -23,8 +23,24 @@ from spatial_replay.planning.workspace import (
 Skill: TypeAlias = Literal["push", "place"]
 """What the robot does with an object: push it along a path in the plane, or pick and place it."""
 
+RoomFrom: TypeAlias = Literal["later", "all"]
+"""From what a placed object keeps the preferred room: from what may still be moved, or from everything."""
+
 _SKILLS = ("push", "place")
-_PLAIN = ("skill", "movable", "margin", "constraint_margin", "room", "attempts", "motions", "lift")
+_ROOM_FROM = ("later", "all")
+_PLAIN = (
+    "skill",
+    "movable",
+    "margin",
+    "constraint_margin",
+    "room",
+    "room_from",
+    "attempts",
+    "motions",
+    "lift",
+    "refine",
+    "rules",
+)
 """Settings that stand in the text as they are."""
 
 
@@ -40,12 +56,19 @@ class Settings:
         constraint_margin: how far constraints have to stay from holding, in the same unit, at least 0.
         room: preferred clearance of a placed object, in footprint units, so that it and its neighbours can be
             grasped later; at least 0. Targets with less are used if there is no other.
+        room_from: "later" keeps room only from objects that may still have to be moved on the way to
+            acceptance, and from everything if the object itself may: where room is not needed, robustness
+            counts. "all" always keeps it from everything, whatever robustness that costs.
         attempts: how many failed motions prune an edge, at least 1.
         motions: how many objects are moved for one edge at most, at least 1. With 1, the planner takes one
             edge by one motion and looks no further, as in the paper.
         lift: how high above where it stood an object is carried, in footprint units, at least 0. Its way then
             keeps what must not hold at a distance, over other things where heights allow. None leaves the way
             to the robot.
+        refine: whether targets of placed objects are refined within their cell, and, between several
+            orientations, to turns in between; without it, they are middles of cells.
+        rules: 2, or 1 for the rules of earlier versions, so that their logs can be recomputed: no motions
+            that only make room, and an object is never brought near a place where that failed before.
 
     Raises:
         UsageError: invalid values, all of them reported.
@@ -57,9 +80,12 @@ class Settings:
     margin: float = 0.0
     constraint_margin: float = 0.0
     room: float = 0.0
-    attempts: int = 3
+    room_from: RoomFrom = "later"
+    attempts: int = 6
     motions: int = 6
     lift: float | None = 0.0
+    refine: bool = True
+    rules: int = 2
 
     def __post_init__(self) -> None:
         refuse_faults(self._faults())
@@ -78,6 +104,11 @@ class Settings:
             distances["lift"] = self.lift
         yield from number_faults(distances, 0)
         yield from count_faults({"attempts": self.attempts, "motions": self.motions})
+        if self.room_from not in _ROOM_FROM:
+            yield f"room_from is {self.room_from!r}; give {' or '.join(_ROOM_FROM)}"
+        yield from kind_faults("refine", self.refine, bool, "True or False")
+        if self.rules not in (1, 2):
+            yield f"rules is {self.rules!r}; give 2, or 1 for the rules of earlier versions"
 
 
 def text_from_settings(settings: Settings) -> str:
@@ -138,4 +169,8 @@ def _settings(read: dict[str, Any]) -> Settings:
         # logs of planners that did not look ahead do not have it
         motions=int(read.get("motions", 1)),
         lift=None if read.get("lift") is None else float(read["lift"]),
+        # logs of earlier planners state none of these
+        room_from=read.get("room_from", "all"),
+        refine=read.get("refine", False),
+        rules=read.get("rules", 1),
     )

@@ -85,11 +85,14 @@ class _Owner(NamedTuple):
 
     @property
     def target(self) -> PlanTarget | None:
-        """The candidate's target, if it was found on this map."""
+        """The candidate's target, if it was found on this map: that of the nearest orientation."""
         candidate = self.candidate
-        return (
-            candidate.target if candidate.HasField("target") and candidate.target.turn == self.turn else None
+        if not candidate.HasField("target"):
+            return None
+        nearest = min(
+            (each.turn for each in candidate.maps), key=lambda turn: abs(turn - candidate.target.turn)
         )
+        return candidate.target if nearest == self.turn else None
 
 
 class _Drawn(NamedTuple):

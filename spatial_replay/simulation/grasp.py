@@ -90,7 +90,7 @@ def surface(scene: Scene, name: str, goal: Point) -> float:
 def _angles(scene: Scene, name: str) -> list[tuple[float, float]]:
     """Return (thickness, yaw of the tool) of possible grasps: across flat sides if there are any."""
     pose, covered = scene.pose(name), scene.footprint(name)
-    if isinstance(scene.bodies[name].shape, Box) and pose.stands:
+    if isinstance(scene.bodies[name].shape, Box) and pose.is_level:
         turns = [pose.yaw, pose.yaw + math.pi / 2]
     else:
         turns = [k * math.pi / _ANGLES for k in range(_ANGLES)]
@@ -111,7 +111,7 @@ def _turns(
     is_round = not isinstance(scene.bodies[name].shape, Box) and pose.stands
     for picked in (angle, angle + math.pi):
         grasp_yaw = turn_towards(picked, *start, 2 * math.pi)
-        further = 0.0 if yaw is None or not pose.stands else yaw - pose.yaw
+        further = 0.0 if yaw is None or not pose.is_level else yaw - pose.yaw
         if is_round:
             further = math.atan2(goal[1], goal[0]) - math.atan2(start[1], start[0])
         turn = turn_towards(grasp_yaw + further, *goal, 2 * math.pi)

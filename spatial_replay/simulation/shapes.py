@@ -14,6 +14,9 @@ from spatial_replay.geometry.footprint import Footprint
 UPRIGHT = 1e-2
 """The lean, in radians, below which a body counts as upright."""
 
+_LEVEL = 0.1
+"""The lean, in radians, up to which a body has a yaw: a knife with its handle on a mat does."""
+
 _RIM = 16
 """Corners of the polygon around the rim of a leaning cylinder."""
 
@@ -68,6 +71,11 @@ class Pose:
     def stands(self) -> bool:
         """Whether the body's axis z is vertical, upwards or downwards."""
         return min(self.lean, math.pi - self.lean) < UPRIGHT
+
+    @property
+    def is_level(self) -> bool:
+        """Whether the body's axis z is nearly vertical, so that its yaw means something."""
+        return min(self.lean, math.pi - self.lean) < _LEVEL
 
 
 def footprint(shape: Shape, pose: Pose) -> Footprint:

@@ -246,7 +246,7 @@ class Tabletop:
 
     def _tracked(self, body: Body, pose: Pose, error: tuple[float, float]) -> TrackedObject:
         detected = Pose(pose.position + np.array([*error, 0.0]), pose.rotation)
-        yaw = pose.yaw if isinstance(body.shape, Box) and pose.stands else None
+        yaw = pose.yaw if isinstance(body.shape, Box) and pose.is_level else None
         return TrackedObject(
             footprint(body.shape, detected),
             class_name=body.class_name,

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 import spatial_replay as sr
-from spatial_replay.planning import read_decisions, recompute_decisions
+from spatial_replay.planning import centre_of, read_decisions, recompute_decisions
 from spatial_replay.replay import load_files, run_replay, verify_certificate
-from spatial_replay.runs.planned import PlannedRun, record_plan
+from spatial_replay.runs.planned import PlannedRun, record_plan, settings_for
+from spatial_replay.simulation.worlds import make_world
 from spatial_replay.sources import open_source
 
 
@@ -73,6 +76,31 @@ def test_a_bun_is_placed_on_a_plate(tmp_path: Path) -> None:
     planned = record_plan("pick-place", tmp_path / "run.mcap", bun)
     assert planned.satisfied
     assert planned.steps == 1
+
+
+def test_a_push_stops_before_the_sample_that_would_violate() -> None:
+    pytest.importorskip("pybullet", reason="PyBullet is not installed; it has wheels for Python 3.11")
+    text = "spec apart = G (red dist green >= 0.03)\nspec s = (F (red dist blue <= 0.08)) and apart"
+    file = sr.parse_specification(text)
+    with closing(make_world("push", seed=3)) as world:
+        planner = sr.Planner(file, replace(settings_for(world), movable=("red",)), name="s")
+        seen: list[sr.Sample] = []
+
+        def observe(sample: sr.Sample) -> str:
+            seen.append(sample)
+            planner.observe(sample)
+            return planner.stop_reason
+
+        world.attach(observe)
+        world.step()
+        assert planner.next_step().target is not None
+        # the robot strays: straight towards green, instead of along the way that was planned
+        done = world.push("red", [centre_of(seen[0].objects["green"].footprint)])
+        assert not done.succeeded
+        assert done.reason.startswith("stopped: with the next sample, not (red dist green >= 0.03)")
+        planner.conclude(sr.Outcome(done.succeeded, done.reason))
+        assert planner.next_step().kind == "execute"
+    assert sr.evaluate(file, sr.Trace.from_samples(seen)).node("apart").verdict == "satisfied"
 
 
 def test_a_knife_is_turned_to_its_place(tmp_path: Path) -> None:

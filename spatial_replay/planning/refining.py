@@ -1,0 +1,84 @@
+"""Refined targets: from the middle of a cell to a better place and turn nearby, on finer and finer grids."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+
+from spatial_replay.geometry.arrays import Booleans, Floats
+from spatial_replay.geometry.footprint import TrackedObject
+from spatial_replay.planning.decisions import Target
+from spatial_replay.planning.maps import FREE, GradientMap
+from spatial_replay.planning.settings import Settings
+from spatial_replay.planning.workspace import Grid
+
+_COARSEST: Final = 0.5
+"""The first distance between places, in cells."""
+_HALVED: Final = 4
+"""How often that distance is halved."""
+_MOST_GRIDS: Final = 12
+"""The most grids that are measured for one target."""
+_FARTHEST: Final = 2.0
+"""How far a target moves from the middle of its cell at most, in cells, along x and along y."""
+_BETTER: Final = 1e-9
+"""How much robustness a move has to gain."""
+
+Measured = Callable[[Grid, tuple[float, ...]], tuple[GradientMap, Floats]]
+"""Gives the map of an object over a grid in some orientations (yaws), and its room there."""
+
+
+def refined(target: Target, tracked: TrackedObject, settings: Settings, measured: Measured) -> Target:
+    """Return the target with the most robustness near a target, or the same one.
+
+    A compass search: the best of 5 x 5 places around the newest one, in up to three turns, and closer ones
+    once none is better. Places are free, as that of the target is, and have the preferred room if that has.
+
+    Args:
+        tracked: the object before the motion.
+        measured: measures maps around the target.
+    """
+    size = settings.workspace.grid.cell_size
+    spacing, turning, halved = _COARSEST * size, _widest_turn(settings, tracked) / 2.0, 0
+    pose, best, least = (target.x, target.y, target.turn), target.robustness, -math.inf
+    for number in range(_MOST_GRIDS):
+        x, y, turn = pose
+        low = x - 2.5 * spacing, y - 2.5 * spacing
+        turns = [0.0] if turning == 0.0 else [-turning, 0.0, turning]
+        yaws = tuple((tracked.yaw or 0.0) + turn + each for each in turns) if settings.workspace.yaws else ()
+        gradient, room = measured(Grid(*low, spacing, 5, 5), yaws)
+        if number == 0:
+            middle = len(gradient.turns) // 2, 2, 2
+            least = settings.room if room[middle] >= settings.room else -math.inf
+        good = (gradient.blocked == FREE) & (room >= least) & _near(gradient, target, tracked, settings)
+        values = np.where(good, gradient.robustness, -np.inf)
+        place = tuple(map(int, np.unravel_index(int(np.argmax(values)), values.shape)))
+        if values[place] > best + _BETTER:
+            best = float(values[place])
+            pose = (*gradient.grid.centre(*place[1:]), float(gradient.turns[place[0]]))
+        elif halved == _HALVED:
+            break
+        else:
+            spacing, turning, halved = spacing / 2.0, turning / 2.0, halved + 1
+    x, y, turn = pose
+    yaw = None if tracked.yaw is None else tracked.yaw + turn
+    return Target(target.name, x, y, turn, yaw, (*target.waypoints[:-1], (x, y)), best)
+
+
+def _near(gradient: GradientMap, target: Target, tracked: TrackedObject, settings: Settings) -> Booleans:
+    """Return (A, rows, columns): whether poses are as near to a target as they may be."""
+    offsets = np.abs(gradient.grid.centres() - np.array([target.x, target.y])).max(axis=1)
+    near = offsets <= _FARTHEST * settings.workspace.grid.cell_size * (1.0 + 1e-9)
+    turned = np.abs(gradient.turns - target.turn) <= _widest_turn(settings, tracked) * (1.0 + 1e-9)
+    return np.asarray(turned[:, None, None] & near.reshape(gradient.grid.shape))
+
+
+def _widest_turn(settings: Settings, tracked: TrackedObject) -> float:
+    """Return how far an object may be turned from an orientation: half the way to the next one; or 0."""
+    yaws = sorted(settings.workspace.yaws)
+    if len(yaws) < 2 or tracked.yaw is None:
+        return 0.0
+    return min(after - before for before, after in pairwise(yaws)) / 2.0
