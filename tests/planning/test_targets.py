@@ -59,7 +59,7 @@ def test_a_refined_target_is_at_least_as_robust_and_free(x, y, side, yaw):
 
 
 def test_refined_targets_are_better_than_cells_and_turns():
-    diamond = "region goal = polygon((5.13, 3.9), (6.33, 5.1), (5.13, 6.3), (3.93, 5.1))\n"
+    diamond = "region goal = polygon((5.2, 4.0), (6.4, 5.2), (5.2, 6.4), (4.0, 5.2))\n"
     diamond += "spec s = F (a enclosedin goal)"
     turning = replace(TABLE, workspace=replace(TABLE.workspace, yaws=(0.0, math.pi / 2)))
     things = {"a": block(1, 1, size=1)}
