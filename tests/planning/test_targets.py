@@ -42,7 +42,7 @@ def polygon_of(tracked):
     return Polygon(part.vertices)
 
 
-@settings(max_examples=25)
+@settings(max_examples=10)
 @given(st.floats(3.0, 7.0), st.floats(3.0, 7.0), st.floats(1.2, 2.5), st.floats(0.0, 1.5))
 def test_a_refined_target_is_at_least_as_robust_and_free(x, y, side, yaw):
     goal = affinity.rotate(box(x - side, y - side, x + side, y + side), yaw, use_radians=True)
@@ -72,7 +72,7 @@ def test_refined_targets_are_better_than_cells_and_turns():
     )
     # a square of side 1.697 around one of side 1
     assert turned.robustness == pytest.approx((1.2 * math.sqrt(2) - 1.0) / 2.0, abs=0.01)
-    assert turned.yaw == pytest.approx(math.pi / 4, abs=0.02)
+    assert abs(turned.yaw) == pytest.approx(math.pi / 4, abs=0.02)
 
 
 BESIDE = "region goal = box(3, 3, 7, 7)\n"

@@ -68,6 +68,37 @@ def bench_gradient_map(bench: Any) -> None:
         bench.measure(f"moving {name}", run, unit="object", runs=21, limit_s=0.010, reference_s=2.1)
 
 
+def bench_decision(bench: Any) -> None:
+    """A decision on six objects that all go into one region: the first of six motions, planned to the end."""
+    names = [f"o{number}" for number in range(6)]
+    shape = sr.TrackedObject(sr.Footprint.box(-0.04, -0.04, 0.04, 0.04), yaw=0.0)
+    places = [(0.1 + 0.16 * (number % 3), 0.15 + 0.3 * (number // 3)) for number in range(6)]
+    objects = {name: moved_object(shape, *place) for name, place in zip(names, places, strict=True)}
+    text = f"group things = {', '.join(names)}\nregion goal = box(0.6, 0.1, 0.95, 0.5)\n"
+    specification = sr.parse_specification(f"{text}spec s = F (forall o in things: o enclosedin goal)")
+    workspace = Workspace(Grid.over(0.0, 0.0, 1.0, 1.0, 0.02), clearance=0.01)
+    sample, formulas = sr.Sample(0, objects), [each.formula for each in automaton(specification).propositions]
+
+    def planner(_: object = None) -> sr.Planner:
+        made = sr.Planner(specification, sr.Settings(workspace, margin=0.005))
+        made.observe(sample)
+        return made
+
+    def one_map(_: object) -> object:
+        return proposition_maps(formulas, specification.regions, sample, "o0", workspace)
+
+    one = bench.measure("a map of one object", one_map, unit="map", runs=21)
+    decided = bench.measure(
+        "six objects together",
+        lambda made: made.next_step(),
+        prepare=planner,
+        unit="decision",
+        runs=5,
+        limit_s=1.0,
+    )
+    bench.ratio("a decision, in maps", decided.median_s / one.median_s, 150.0)
+
+
 def bench_path(bench: Any) -> None:
     """Jump-point search over 90 x 90 cells, a fifth of them blocked."""
     free = np.random.default_rng(1).random((90, 90)) >= 0.2
