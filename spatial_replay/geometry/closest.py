@@ -40,7 +40,7 @@ def closest_pairs(batch: FootprintBatch, rows: Integers, uncertainty: Floats, en
         np.ascontiguousarray(rows),
         uncertainty,
         float(enlargement),
-        np.empty((len(batch.vertices), 3)),
+        np.empty((len(batch.vertices), 4)),
         result,
     )
     return result
@@ -85,7 +85,7 @@ def closest_rows(
     edges: Floats,
     result: Floats,
 ) -> None:
-    """Fill `result` (T, 3); see `closest_pairs`. `edges` (V, 3) is room to work in."""
+    """Fill `result` (T, 3); see `closest_pairs`. `edges` (V, 4) is room to work in."""
     rows = Rows(part_start, vertex_start, vertices, edges, radius, bottom, top)
     is_filled = np.zeros(len(part_start), dtype=np.bool_)
     width = members.shape[1]

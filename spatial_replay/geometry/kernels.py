@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from spatial_replay.compiled import elementwise, inlined, long_kernel
 from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.geometry.calipers import are_many, walked_distance, walked_protrusion
 
 SIGNED_DISTANCE, PROTRUSION = 0, 1
 MIN_X, MAX_X, MIN_Y, MAX_Y, MIN_Z, MAX_Z = 2, 3, 4, 5, 6, 7
@@ -24,7 +25,10 @@ CENTROID_MIN_X, CENTROID_MAX_X, CENTROID_MIN_Y, CENTROID_MAX_Y = 8, 9, 10, 11
 
 
 class Rows(NamedTuple):
-    """The arrays of a `FootprintBatch`, with the `edges` (V, 3) of its parts: normal and length of each."""
+    """The arrays of a `FootprintBatch`, with the `edges` (V, 4) of its parts: normal and length of each.
+
+    The fourth number of a part's first edge is how far other vertices are from its first one at most.
+    """
 
     part_start: Integers
     vertex_start: Integers
@@ -54,7 +58,25 @@ def _fill_edges(vertices: Floats, edges: Floats, start: int, stop: int) -> None:
 def fill_row(rows: Rows, row: int) -> None:
     """Compute the edges of a row, which `rows_distance` reads."""
     for p in range(rows.part_start[row], rows.part_start[row + 1]):
-        _fill_edges(rows.vertices, rows.edges, rows.vertex_start[p], rows.vertex_start[p + 1])
+        start, stop = rows.vertex_start[p], rows.vertex_start[p + 1]
+        _fill_edges(rows.vertices, rows.edges, start, stop)
+        squared = 0.0
+        for i in range(start + 1, stop):
+            dx, dy = (
+                rows.vertices[i, 0] - rows.vertices[start, 0],
+                rows.vertices[i, 1] - rows.vertices[start, 1],
+            )
+            squared = max(squared, dx * dx + dy * dy)
+        rows.edges[start, 3] = math.sqrt(squared)
+
+
+@inlined
+def _is_farther(rows: Rows, p: int, q: int, reach: float) -> bool:
+    """Return whether the distance of two parts, without their radii, is surely more than `reach`."""
+    a, b = rows.vertex_start[p], rows.vertex_start[q]
+    reach += rows.edges[a, 3] + rows.edges[b, 3]
+    dx, dy = rows.vertices[a, 0] - rows.vertices[b, 0], rows.vertices[a, 1] - rows.vertices[b, 1]
+    return reach < 0.0 or dx * dx + dy * dy > (1.0 + 1e-9) * reach * reach
 
 
 @inlined
@@ -118,6 +140,8 @@ def _convex_distance(
     Some edge normal attains the penetration depth. The distance of disjoint polygons is attained at a
     vertex and a point inside an edge, whose normal then separates by just that much, or at two vertices.
     """
+    if are_many(a_stop - a_start, b_stop - b_start):
+        return walked_distance(vertices, edges, a_start, a_stop, b_start, b_stop)
     a_separation, a_nearest = _separate(vertices, edges, a_start, a_stop, b_start, b_stop)
     b_separation, b_nearest = _separate(vertices, edges, b_start, b_stop, a_start, a_stop)
     separation = max(a_separation, b_separation)
@@ -140,6 +164,8 @@ def _convex_protrusion(
 ) -> float:
     """Return the greatest signed distance from a vertex of A to the polygon B (without their radii)."""
     greatest = -np.inf
+    if are_many(a_stop - a_start, b_stop - b_start):
+        return walked_protrusion(vertices, edges, a_start, a_stop, b_start, b_stop)
     for i in range(a_start, a_stop):
         greatest = max(greatest, _convex_distance(vertices, edges, i, i + 1, b_start, b_stop))
     return greatest
@@ -173,11 +199,14 @@ def rows_distance(rows: Rows, a: int, b: int, enlargement: float) -> float:
     least = np.inf
     for p in range(rows.part_start[a], rows.part_start[a + 1]):
         for q in range(rows.part_start[b], rows.part_start[b + 1]):
+            # grouped so that swapping p and q cannot change a bit
+            grown = (rows.radius[p] + rows.radius[q]) + enlargement
+            if _is_farther(rows, p, q, least + grown):
+                continue
             distance = _convex_distance(
                 rows.vertices, rows.edges, start[p], start[p + 1], start[q], start[q + 1]
             )
-            # grouped so that swapping p and q cannot change a bit
-            least = min(least, distance - ((rows.radius[p] + rows.radius[q]) + enlargement))
+            least = min(least, distance - grown)
     if math.isnan(rows.bottom[a]) or math.isnan(rows.bottom[b]):
         return least
     gap = max(rows.bottom[a] - rows.top[b], rows.bottom[b] - rows.top[a])
@@ -192,6 +221,9 @@ def _part_protrusion(rows: Rows, a: int, p: int, b: int, enlargement: float) -> 
     start, radius = rows.vertex_start, rows.radius
     least = np.inf
     for q in range(rows.part_start[b], rows.part_start[b + 1]):
+        # some vertex of p sticks out as far as p is from q
+        if _is_farther(rows, p, q, least - (radius[p] - radius[q]) - enlargement):
+            continue
         planar = _convex_protrusion(rows.vertices, rows.edges, start[p], start[p + 1], start[q], start[q + 1])
         least = min(least, planar + (radius[p] - radius[q]) + enlargement)
     if math.isnan(rows.bottom[a]) or math.isnan(rows.bottom[b]):
@@ -291,7 +323,7 @@ def measure_rows(
     """Fill `values` (K, T) with K quantities in T samples; see `measure`.
 
     In sample t, operand o has the `width[o]` rows from `members[member_start[o] + t * width[o]]` on;
-    `member_start` (O + 1,) ends with the total. `edges` (V, 3), one for each vertex, is room to work in.
+    `member_start` (O + 1,) ends with the total. `edges` (V, 4), one for each vertex, is room to work in.
     """
     # edges only of rows that distances need: a log has many more that are projected or unused
     is_filled = np.zeros(len(part_start), dtype=np.bool_)

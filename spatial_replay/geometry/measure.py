@@ -96,7 +96,7 @@ def measure(batch: FootprintBatch, operands: Sequence[Operand], requests: Sequen
         np.array([QUANTITY_CODES[request.quantity] for request in requests], dtype=np.int64),
         np.array([request.first for request in requests], dtype=np.int64),
         np.array([request.second for request in requests], dtype=np.int64),
-        np.empty((len(batch.vertices), 3)),
+        np.empty((len(batch.vertices), 4)),
         values,
     )
     return values

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 import shapely
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from laws.strategies_geometry import (
@@ -87,6 +87,35 @@ def test_signed_distance_is_that_of_the_set_of_differences_less_the_radii(first,
 def test_signed_distance_of_sharp_parts_apart_is_their_distance(first, second):
     expected = outline_of(first.vertices).distance(outline_of(second.vertices))
     assert max(0.0, signed_distance(sharp(first), sharp(second))) == pytest.approx(expected, abs=TOLERANCE)
+
+
+@st.composite
+def round_parts(draw):
+    """Ellipses of so many corners that those of two make thousands of pairs; evenly spaced or not."""
+    count, flat = draw(st.integers(66, 90)), draw(st.sampled_from([1.0, 0.4, 0.02]))
+    steps = np.random.default_rng(draw(st.integers(0, 99))).uniform(0.5, 1.5, count)
+    turns = np.cumsum(steps if draw(st.booleans()) else np.ones(count))
+    around = 2.0 * math.pi * turns / turns[-1]
+    outline = draw(st.integers(1, 8)) / 4 * np.column_stack((np.cos(around), flat * np.sin(around)))
+    (part,) = moved(Footprint.polygon(outline), draw(angles), *draw(st.tuples(near, near))).parts
+    return part
+
+
+near = st.integers(-48, 48).map(lambda value: value / 16)
+
+
+@settings(max_examples=60)
+@given(round_parts(), round_parts())
+def test_outlines_of_many_corners_are_measured_like_others(first, second):
+    measured, expected = (
+        signed_distance(sharp(first), sharp(second)),
+        signed_distance_by_differences(first, second),
+    )
+    assert measured == pytest.approx(expected, abs=TOLERANCE)
+    assert measured == signed_distance(sharp(second), sharp(first))
+    # the corners one by one, each with few pairs
+    corners = [signed_distance(Footprint.polygon([corner]), sharp(second)) for corner in first.vertices]
+    assert protrusion(sharp(first), sharp(second)) == pytest.approx(max(corners), abs=TOLERANCE)
 
 
 @given(footprints, footprints, radii)

@@ -54,6 +54,36 @@ def bench_blocks(measure: Any) -> None:
     )
 
 
+CORNERS = 1000
+
+
+def bench_corners(bench: Any) -> None:
+    """Objects with outlines of 1,000 corners, each with each: the signed distance, the protrusion."""
+    at, turns = np.random.default_rng(1), np.linspace(0, 2 * np.pi, CORNERS, endpoint=False)
+    shapes = {
+        "convex": np.column_stack((np.cos(turns), np.sin(turns))),
+        "concave": np.column_stack((np.cos(turns), np.sin(turns))) * (1 + 0.3 * np.sin(9 * turns))[:, None],
+    }
+    for shape, outline in shapes.items():
+        objects = {
+            f"o{number}": sr.TrackedObject(sr.Footprint.polygon(outline + place))
+            for number, place in enumerate(at.uniform(-9, 9, (12, 2)))
+        }
+        trace = sr.Trace.from_samples([sr.Sample(0, objects)])
+        pairs = [(a, b) for a in objects for b in objects if a < b]
+        for relation in ("dist", "enclosedin"):
+            atoms = [f"{a} dist {b} >= 0" if relation == "dist" else f"{a} enclosedin {b}" for a, b in pairs]
+            specification = sr.parse_specification(" or ".join(atoms))
+            bench.measure(
+                f"{shape}, {relation}",
+                lambda fresh, specification=specification: sr.evaluate(specification, fresh),
+                prepare=lambda trace=trace: replace(trace),
+                per=len(pairs),
+                unit="pair",
+                runs=11,
+            )
+
+
 CROWD = """
 group people = class "person"
 spec apart = G (forall p, q in people: p dist q >= 0.5)

@@ -257,7 +257,7 @@ def _measure(plan: PlanArrays, rows: SampleRows, values: Floats, spreads: Floats
         plan.quantity,
         plan.first,
         plan.second,
-        np.empty((len(rows.vertices), 3)),
+        np.empty((len(rows.vertices), 4)),
         measured,
     )
     of_operands = _spreads(plan.operand_start, members, places, here)
@@ -302,7 +302,7 @@ def _closest(plan: PlanArrays, rows: SampleRows, closest: Floats) -> None:
             members,
             uncertainty,
             plan.closest_enlargement[k],
-            np.empty((len(rows.vertices), 3)),
+            np.empty((len(rows.vertices), 4)),
             found,
         )
         closest[k, 0, 0] = closest[k, 1, 0] = found[0, 0]
