@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING
 import click
 
 from spatial_replay.cli.application import ExitCode
+from spatial_replay.cli.decisions import decision_lines, decision_rows
 from spatial_replay.cli.options import JsonCommand, LogPath, ReadArguments, reading_options
-from spatial_replay.cli.output import MANY, WORST_FIRST, counts_text, decision_lines, decision_rows
+from spatial_replay.cli.output import MANY, WORST_FIRST, counts_text
 from spatial_replay.cli.progress import progress
 from spatial_replay.cli.terminal import show, show_bytes, show_file, show_json, warn
 from spatial_replay.errors import UsageError

@@ -52,7 +52,7 @@ class _OutputFile(click.Path):
         return super().convert(value, param, ctx)
 
 
-class _LogOutput(_OutputFile):
+class LogOutput(_OutputFile):
     """A path to write a log to; the name of a file of another kind is refused."""
 
     def convert(
@@ -85,7 +85,7 @@ def output_option(text: str, *, required: bool = False) -> Callable[[_Command], 
 
 def log_output_option(text: str) -> Callable[[_Command], _Command]:
     """Return the required option `-o FILE` of a command that writes a log, with its help."""
-    return click.option("-o", "--output", type=_LogOutput(path_type=Path), required=True, help=text)
+    return click.option("-o", "--output", type=LogOutput(path_type=Path), required=True, help=text)
 
 
 durability_option = click.option(

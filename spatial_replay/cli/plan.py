@@ -5,12 +5,13 @@ from __future__ import annotations
 import shlex
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from spatial_replay.cli.application import exit_code_from_verdicts
 from spatial_replay.cli.options import (
+    LogOutput,
     LogPath,
     constants_option,
     durability_option,
@@ -27,7 +28,9 @@ from spatial_replay.cli.record import (
     show_film,
     simulation_options,
 )
+from spatial_replay.cli.setting_options import setting_options
 from spatial_replay.cli.terminal import show
+from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import LogFile, local_files
 from spatial_replay.text import counted
 
@@ -35,14 +38,58 @@ if TYPE_CHECKING:
     from spatial_replay.logs.output_file import Durability
 
 
-@click.group()
-def plan() -> None:
+@click.group(invoke_without_command=True)
+@click.option(
+    "--redo",
+    "log",
+    metavar="LOG",
+    type=LogPath(),
+    help="Decide again on the samples of a planned run, with what the options below change.",
+)
+@click.option(
+    "-o", "--output", type=LogOutput(path_type=Path), help="Log to write with both decisions (MCAP)."
+)
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of text.")
+@click.option("--spec", metavar="SPEC", type=LogPath(), help="Specification to plan for instead.")
+@click.option("--of", metavar="NAME", help="Result to plan for, if SPEC has several.")
+@constants_option
+@profile_option
+@setting_options
+@click.pass_context
+def plan(
+    context: click.Context,
+    log: LogFile | None,
+    changes: Mapping[str, Any],
+    **options: Any,
+) -> int | None:
     """Plan a run in a simulated world, and record it with every decision.
 
+    With --redo, show what the planner of a log would have decided, on the recorded samples, with another
+    specification or other settings: which decisions are the same, and the first one that differs, with both
+    maps. Exits with 0 if every decision does the same, otherwise with 1.
+
     \b
-    Example:
+    Examples:
       spatial-replay plan push -o push.mcap --seed 3
+      spatial-replay plan push -o push.mcap --settings careful.yaml --attempts 5
+      spatial-replay plan --redo push.mcap
+      spatial-replay plan --redo table.mcap --room 0.02
+      spatial-replay plan --redo push.mcap --spec edited.spatial -o both.mcap
     """
+    if log is not None and context.invoked_subcommand is None:
+        # imported here so that --help stays fast
+        from spatial_replay.cli.redo import redo
+
+        return redo(log, changes=changes, **options)
+    if log is not None:
+        raise UsageError(f"--redo takes no scenario; leave out {context.invoked_subcommand}")
+    if changes or any(options.values()):
+        if context.invoked_subcommand is not None:
+            raise UsageError(f"options of a run come after its scenario: plan {context.invoked_subcommand} …")
+        raise UsageError("there is nothing to plan; give a scenario, or --redo LOG")
+    if context.invoked_subcommand is None:
+        context.fail(f"Missing a scenario ({', '.join(SCENARIOS)}), or --redo LOG.")
+    return None
 
 
 def planning_command(scenario: str) -> click.Command:
@@ -58,7 +105,7 @@ def planning_command(scenario: str) -> click.Command:
     Examples:
       spatial-replay plan {scenario} -o run.mcap --seed 3
       spatial-replay plan {scenario} -o run.mcap --spec edited.spatial
-      spatial-replay plan {scenario} -o run.mcap --spec several.spatial --of one
+      spatial-replay plan {scenario} -o run.mcap --settings careful.yaml --attempts 5
       spatial-replay info run.mcap --decisions
     """
 
@@ -75,6 +122,7 @@ def planning_command(scenario: str) -> click.Command:
     @constants_option
     @profile_option
     @simulation_options
+    @setting_options
     def command(
         output: Path,
         durability: Durability,
@@ -83,6 +131,7 @@ def planning_command(scenario: str) -> click.Command:
         constants: Mapping[str, float | str],
         profile: str | None,
         simulation: SimulationArguments,
+        changes: Mapping[str, Any],
     ) -> int:
         # imported here so that --help stays fast
         from spatial_replay.runs.planned import record_plan
@@ -107,6 +156,7 @@ def planning_command(scenario: str) -> click.Command:
                 inputs=local_files(named),
                 advance=advance,
                 durability=durability,
+                changes=changes,
             )
         show(
             f"wrote {output}: {counted(planned.samples, 'sample')} over {planned.seconds:.3f} s; "

@@ -27,7 +27,15 @@ if TYPE_CHECKING:
     from spatial_replay.planning.planner import MOST_MOTIONS, Planner
     from spatial_replay.planning.read import LoggedStep, planner_of, read_decisions, read_steps
     from spatial_replay.planning.recompute import recompute_decisions
-    from spatial_replay.planning.settings import Settings, settings_from_text, text_from_settings
+    from spatial_replay.planning.redo import Redone, redo_decisions
+    from spatial_replay.planning.settings import (
+        Settings,
+        changed_settings,
+        load_settings,
+        parse_settings,
+        settings_from_text,
+        text_from_settings,
+    )
     from spatial_replay.planning.workspace import Grid, Workspace
 
 __all__ = [
@@ -44,21 +52,26 @@ __all__ = [
     "Outcome",
     "Planner",
     "Reason",
+    "Redone",
     "Settings",
     "Step",
     "Target",
     "Workspace",
     "centre_of",
+    "changed_settings",
     "gradient_map",
+    "load_settings",
     "map_fields",
     "map_layers",
     "moved_object",
+    "parse_settings",
     "plan_metadata",
     "planner_of",
     "proposition_maps",
     "read_decisions",
     "read_steps",
     "recompute_decisions",
+    "redo_decisions",
     "settings_from_text",
     "shortest_path",
     "text_from_settings",
@@ -76,7 +89,15 @@ __getattr__, __dir__ = loaded_when_used(
         "planner": ("MOST_MOTIONS", "Planner"),
         "read": ("PLAN_METADATA", "LoggedStep", "planner_of", "read_decisions", "read_steps"),
         "recompute": ("recompute_decisions",),
-        "settings": ("Settings", "settings_from_text", "text_from_settings"),
+        "redo": ("Redone", "redo_decisions"),
+        "settings": (
+            "Settings",
+            "changed_settings",
+            "load_settings",
+            "parse_settings",
+            "settings_from_text",
+            "text_from_settings",
+        ),
         "workspace": ("Grid", "Workspace"),
     },
 )

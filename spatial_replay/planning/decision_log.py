@@ -50,7 +50,7 @@ from spatial_replay.planning.map_layers import MapLayers, map_layers
 from spatial_replay.planning.map_messages import TurnedMap, explain, map_digest, map_message, maps_of
 from spatial_replay.planning.maps import centre_of, moved_object
 from spatial_replay.planning.planner import Planner
-from spatial_replay.planning.settings import Settings, text_from_settings
+from spatial_replay.planning.settings import text_from_settings
 from spatial_replay.trace.sample import Sample
 
 PLAN_VERSION: Final = 2
@@ -81,6 +81,10 @@ class BlackBox:
 
     Samples, decisions and outcomes have to go through it in the order in which they happen. Equal ones give
     equal bytes, so that a log can be verified by recomputing it.
+
+    Attributes:
+        planner: the planner.
+        version: of what messages say, see `PLAN_VERSION`.
     """
 
     def __init__(self, planner: Planner, *, version: int = PLAN_VERSION) -> None:
@@ -90,7 +94,7 @@ class BlackBox:
             version: of what messages say, see `PLAN_VERSION`.
         """
         self.planner = planner
-        self._version = version
+        self.version = version
         self._written = dict.fromkeys(_CHANNELS, 0)
         self._sample: Sample | None = None
         self._step: Step | None = None
@@ -125,15 +129,9 @@ class BlackBox:
         self._step = step
         self._tracked = self._object_moved()
         self._travelled = [] if self._tracked is None else [centre_of(self._tracked.footprint)]
-        layers: dict[Candidate, MapLayers] = {}
-        if self._version > 1:
-            found = (each for edge in step.considered for each in edge.candidates)
-            layers = {each: map_layers(each.map, each.failed) for each in found}
-        about = self.planner.automaton.name, self.planner.settings
-        self._decision = decision_message(step, *about, self._written[_MAPS], layers)
-        if self._version > 1 and step.lost is not None:
-            self._decision.lost.CopyFrom(PlanLoss(time_ns=step.lost.time_ns, text=step.lost.text))
-        maps = [map_message(each, step.time_ns, layers.get(each.candidate)) for each in maps_of(step)]
+        layers = _layers_of(step) if self.version > 1 else None
+        self._decision = decision_message(step, self.planner, self._written[_MAPS], layers)
+        maps = [map_message(each, step.time_ns, (layers or {}).get(each.candidate)) for each in maps_of(step)]
         path = path_message(step.target, self._tracked, step.time_ns)
         return step, self._messages(step.time_ns, [*ended, self._decision], maps, [path])
 
@@ -223,25 +221,32 @@ def latest_decisions(decisions: Iterable[PlanDecision]) -> tuple[PlanDecision, .
     return tuple(by_number[number] for number in sorted(by_number))
 
 
+def _layers_of(step: Step) -> dict[Candidate, MapLayers]:
+    found = (each for edge in step.considered for each in edge.candidates)
+    return {each: map_layers(each.map, each.failed) for each in found}
+
+
+def explained_decision(step: Step, planner: Planner, first_map: int = 0) -> PlanDecision:
+    """Return a decision of a planner as the newest version of a message, without an outcome."""
+    return decision_message(step, planner, first_map, _layers_of(step))
+
+
 def decision_message(
-    step: Step,
-    specification: str,
-    settings: Settings,
-    first_map: int,
-    layers: Mapping[Candidate, MapLayers],
+    step: Step, planner: Planner, first_map: int, layers: Mapping[Candidate, MapLayers] | None
 ) -> PlanDecision:
     """Return a decision as a message, without an outcome.
 
     Args:
+        planner: that made it.
         first_map: the number of the step's first map in the log.
-        layers: the maps taken apart; empty for messages as older logs have them.
+        layers: the maps taken apart; None for messages as older logs have them.
     """
     numbers = {turned: number for number, turned in enumerate(maps_of(step), first_map)}
     pruned = (PrunedEdge(source=edge[0], target=edge[1], reason=str(reason)) for edge, reason in step.pruned)
     message = PlanDecision(
         time_ns=step.time_ns,
         number=step.number,
-        specification=specification,
+        specification=planner.automaton.name,
         kind=_KINDS[step.kind],
         states=step.states,
         considered=[_edge(each, numbers) for each in step.considered],
@@ -249,10 +254,13 @@ def decision_message(
         pruned=pruned,
         reason=step.reason,
     )
+    if layers is None:
+        return message
+    if step.lost is not None:
+        message.lost.CopyFrom(PlanLoss(time_ns=step.lost.time_ns, text=step.lost.text))
     for edge, of_edge in zip(step.considered, message.considered, strict=True):
         for each, of_candidate in zip(edge.candidates, of_edge.candidates, strict=True):
-            if each in layers:
-                explain(of_candidate, each, layers[each], settings)
+            explain(of_candidate, each, layers[each], planner.settings)
     return message
 
 

@@ -167,7 +167,7 @@ def read_steps(log: str | PathLike[str]) -> tuple[LoggedStep, ...]:
             if decision.HasField("outcome"):
                 steps[decision.number] = _ended(steps[decision.number], decision)
             elif rerun.last is not None:
-                _refuse_other(source, rerun.last, decision)
+                refuse_other(source, rerun.last, decision)
                 steps[decision.number] = LoggedStep(rerun.last, sample, None, None, ())
     if not steps:
         raise _without_decisions(source)
@@ -180,7 +180,12 @@ def _ended(logged: LoggedStep, decision: PlanDecision) -> LoggedStep:
     return replace(logged, outcome=_outcome(decision), end_ns=outcome.end_ns, travelled=travelled)
 
 
-def _refuse_other(source: Source, step: Step, decision: PlanDecision) -> None:
+def refuse_other(source: Source, step: Step, decision: PlanDecision) -> None:
+    """Check that a recomputed step is the recorded decision.
+
+    Raises:
+        LogError: it is another one.
+    """
     if (step.number, step.reason) != (decision.number, decision.reason):
         raise LogError(
             f"decision {decision.number} in {source.name} is {decision.reason!r}; recomputed, it is "

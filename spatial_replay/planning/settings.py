@@ -1,15 +1,21 @@
-"""Settings of a planner, and their text in a log, from which decisions can be recomputed."""
+"""Settings of a planner: their text in a log, and the files and options in which people write them."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any, Literal, TypeAlias
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from importlib.resources import files
+from os import PathLike
+from types import MappingProxyType
+from typing import Any, Final, Literal, TypeAlias
 
 from spatial_replay.errors import GeometryError, LogError, UsageError
 from spatial_replay.geometry.footprint import ConvexPart, Footprint
+from spatial_replay.logs.remote import log_file
+from spatial_replay.mapping.yaml_document import checked_document, read_yaml_text
 from spatial_replay.planning.workspace import (
     Grid,
     Workspace,
@@ -27,6 +33,7 @@ RoomFrom: TypeAlias = Literal["later", "all"]
 """From what a placed object keeps the preferred room: from what may still be moved, or from everything."""
 
 _SKILLS = ("push", "place")
+SCHEMA_FILE: Final = "settings.schema.json"
 _ROOM_FROM = ("later", "all")
 _PLAIN = (
     "skill",
@@ -174,3 +181,138 @@ def _settings(read: dict[str, Any]) -> Settings:
         refine=read.get("refine", False),
         rules=read.get("rules", 1),
     )
+
+
+# ------------------------------------------------------------------------------------- files and options
+
+
+@cache
+def settings_schema() -> Mapping[str, Any]:
+    """Return the JSON Schema of settings files; its properties are all settings, each with a description."""
+    text = files("spatial_replay.planning").joinpath(SCHEMA_FILE).read_text(encoding="utf-8")
+    schema: Mapping[str, Any] = json.loads(text)
+    return schema
+
+
+def load_settings(path: str | PathLike[str], base: Settings | None = None) -> Settings:
+    """Load a settings file (YAML), which changes some settings of others.
+
+    Args:
+        path: of the file, or its address.
+        base: the settings to change; without them, the file has to give `area` and `cell_size`.
+
+    Raises:
+        MissingFileError: there is no such file.
+        UsageError: the file is not valid; all errors are listed.
+    """
+    return changed_settings(base, parse_settings(read_yaml_text(path), log_file(path).name))
+
+
+def parse_settings(text: str, name: str = "settings") -> Mapping[str, Any]:
+    """Parse the text of a settings file, and return what it changes, by setting.
+
+    Args:
+        name: of the file, for errors.
+
+    Raises:
+        UsageError: the text is not valid; all errors are listed.
+    """
+    document = checked_document(text, name, settings_schema(), lambda document: [], "a settings file")
+    value: Any = document.value
+    return dict(value)
+
+
+def parse_setting(key: str, text: str) -> Mapping[str, Any]:
+    """Parse one setting as YAML, as an option gives it; a list needs no brackets.
+
+    Raises:
+        UsageError: the value is not valid.
+    """
+    kind = settings_schema()["properties"][key]
+    is_list = kind.get("type") == "array" or any("names" in each.get("$ref", "") for each in _options(kind))
+    if is_list and text.strip() != "null" and not text.strip().startswith("["):
+        text = f"[{text}]"
+    option = f"--{key.replace('_', '-')}"
+    try:
+        return parse_settings(f"{key}: {text}", option)
+    except UsageError as error:
+        # there is one line, and the option names the key
+        message = str(error).replace(f"{option}:1: {key}", option, 1).replace(f"{option}:1", option)
+        raise UsageError(message) from None
+
+
+def _options(kind: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    return [kind, *kind.get("anyOf", ())]
+
+
+def changed_settings(base: Settings | None, changes: Mapping[str, Any]) -> Settings:
+    """Return settings with some changed, by the keys and values of a settings file.
+
+    Raises:
+        UsageError: values that do not go together, or no grid.
+    """
+    grid = _changed_grid(None if base is None else base.workspace.grid, changes)
+    workspace = Workspace(grid) if base is None else replace(base.workspace, grid=grid)
+    of_workspace = {key: read(changes[key]) for key, read in _OF_WORKSPACE.items() if key in changes}
+    plain = {key: _plain(key, changes[key]) for key in _PLAIN if key in changes}
+    workspace = replace(workspace, **of_workspace)
+    return Settings(workspace, **plain) if base is None else replace(base, workspace=workspace, **plain)
+
+
+def _changed_grid(grid: Grid | None, changes: Mapping[str, Any]) -> Grid:
+    if grid is None and not {"area", "cell_size"} <= changes.keys():
+        raise UsageError("where to plan is not known; give area: [xmin, ymin, xmax, ymax], and cell_size")
+    if grid is not None and not {"area", "cell_size"} & changes.keys():
+        return grid
+    cell_size = float(changes["cell_size"]) if grid is None or "cell_size" in changes else grid.cell_size
+    if grid is None or "area" in changes:
+        box = tuple(map(float, changes["area"]))
+    else:
+        xmax, ymax = grid.xmin + grid.columns * grid.cell_size, grid.ymin + grid.rows * grid.cell_size
+        box = (grid.xmin, grid.ymin, xmax, ymax)
+    xmin, ymin, xmax, ymax = box
+    return Grid.over(xmin, ymin, xmax, ymax, cell_size)
+
+
+def _plain(key: str, value: Any) -> Any:
+    if key in _LENGTHS and value is not None:
+        return float(value)
+    return tuple(value) if isinstance(value, list) else value
+
+
+_LENGTHS = ("margin", "constraint_margin", "room", "lift")
+
+
+def _angle(value: float | str) -> float:
+    return math.radians(float(value.removesuffix("deg"))) if isinstance(value, str) else float(value)
+
+
+def _obstacle(value: Mapping[str, Any]) -> Footprint:
+    ((shape, numbers),) = value.items()
+    if shape == "polygon":
+        return Footprint.polygon(numbers)
+    return Footprint.box(*numbers) if shape == "box" else Footprint.disc(*numbers)
+
+
+_OF_WORKSPACE: Final[Mapping[str, Callable[[Any], Any]]] = MappingProxyType(
+    {
+        "yaws": lambda each: tuple(map(_angle, each)),
+        "base": lambda each: (float(each[0]), float(each[1])),
+        "nearest": float,
+        "farthest": lambda each: math.inf if each is None else float(each),
+        "obstacles": lambda each: tuple(map(_obstacle, each)),
+        "supports": frozenset,
+        "clearance": float,
+    }
+)
+
+
+def changes_text(before: Settings, after: Settings) -> tuple[str, ...]:
+    """Return what differs between two settings, such as "room 0.09 -> 0.02"."""
+    old, new = (json.loads(text_from_settings(each)) for each in (before, after))
+    return tuple(f"{key} {_brief(old[key])} -> {_brief(new[key])}" for key in old if old[key] != new[key])
+
+
+def _brief(value: Any) -> str:
+    text = json.dumps(value).replace('"', "")
+    return text if len(text) <= 60 else f"{text[:59]}…"

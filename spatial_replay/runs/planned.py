@@ -6,11 +6,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 from spatial_replay.annotate.automaton_state import SpecAutomaton
 from spatial_replay.annotate.specification import logged_specifications
@@ -24,7 +25,7 @@ from spatial_replay.logs.topics import PLAN_METADATA
 from spatial_replay.planning.decision_log import BlackBox, plan_metadata
 from spatial_replay.planning.decisions import Kind, Outcome, Step
 from spatial_replay.planning.planner import Planner
-from spatial_replay.planning.settings import Settings, Skill
+from spatial_replay.planning.settings import Settings, Skill, changed_settings
 from spatial_replay.planning.workspace import Grid, Workspace
 from spatial_replay.recording.plan_loop import run_plan
 from spatial_replay.runs.filmed import open_film
@@ -88,6 +89,13 @@ def settings_for(world: World) -> Settings:
         room=preset.room,
         lift=preset.lift,
     )
+
+
+def _settings(world: World, changes: Mapping[str, Any]) -> Settings:
+    settings = changed_settings(settings_for(world), changes)
+    if settings.skill != world.skill:
+        raise UsageError(f"the robot of {world.name} can only {world.skill} objects; leave `skill` out")
+    return settings
 
 
 class WorldExecutor:
@@ -202,6 +210,7 @@ def record_plan(
     inputs: Sequence[Path] = (),
     advance: Callable[[int], None] = lambda samples: None,
     durability: Durability = "process",
+    changes: Mapping[str, Any] = MappingProxyType({}),
 ) -> PlannedRun:
     """Let a planner satisfy a specification in a scenario's world; equal arguments give equal bytes.
 
@@ -212,6 +221,7 @@ def record_plan(
         inputs: files that the output must not be.
         advance: called with the number of new samples.
         durability: "disk" for a log of which the disk has each chunk as soon as it is written.
+        changes: to the planner's settings for the world, by the keys of settings files.
 
     Raises:
         NoAutomatonError: a specification without an automaton.
@@ -229,7 +239,7 @@ def record_plan(
     # an error in the world or the planner leaves the output untouched
     with closing(make_world(scenario, seed=seed, noise_m=noise_m, injections=injections, gui=gui)) as world:
         refuse_unknown_names([kept], world.sample())
-        planner = Planner(kept, settings_for(world), name=name)
+        planner = Planner(kept, _settings(world, changes), name=name)
         warm_up_planner()
         known = _known(kept, planner.automaton)
         with (
