@@ -18,7 +18,7 @@ from spatial_replay.geometry.arrays import Floats
 from spatial_replay.geometry.footprint import TrackedObject
 from spatial_replay.planning.decisions import Candidate, Consideration, Guards, Reason, Target
 from spatial_replay.planning.demands import Pose, with_moved
-from spatial_replay.planning.map_layers import distance_to, near
+from spatial_replay.planning.map_layers import avoided_cells
 from spatial_replay.planning.maps import (
     CONSTRAINED,
     FREE,
@@ -59,11 +59,7 @@ def find_target(
         failed: places (x, y) where earlier attempts failed.
     """
     holds = (gradient.blocked == FREE) & (gradient.robustness >= settings.margin)
-    good = holds & ~near(failed, gradient.grid)
-    if settings.rules > 1 and not good.any() and holds.any():
-        # a motion may fail by chance: then places come again, those farther from the failures first
-        away = distance_to(failed, gradient.grid)
-        good = holds & (away >= away[holds.any(axis=0)].max() / 2.0)
+    good = holds & ~avoided_cells(gradient, settings, failed)
     if not good.any():
         return _why_nowhere(gradient, settings, bool(failed))
     if settings.skill == "place":
@@ -248,9 +244,9 @@ class Movables:
             target = self.refined(target, consideration, room_from)
         if isinstance(target, Target):
             target = self.with_way(target, consideration.constraints.cubes)
-        if isinstance(target, str):
-            return Candidate(name, gradient, None, target, failed=tuple(failed))
-        return Candidate(name, gradient, target, failed=tuple(failed))
+        kept_from = None if room_from is None else tuple(room_from)
+        found, why = (None, target) if isinstance(target, str) else (target, "")
+        return Candidate(name, gradient, found, why, failed=tuple(failed), room_from=kept_from)
 
     def refined(
         self,

@@ -129,7 +129,7 @@ class BlackBox:
         self._step = step
         self._tracked = self._object_moved()
         self._travelled = [] if self._tracked is None else [centre_of(self._tracked.footprint)]
-        layers = _layers_of(step) if self.version > 1 else None
+        layers = _layers_of(step, self.planner) if self.version > 1 else None
         self._decision = decision_message(step, self.planner, self._written[_MAPS], layers)
         maps = [map_message(each, step.time_ns, (layers or {}).get(each.candidate)) for each in maps_of(step)]
         path = path_message(step.target, self._tracked, step.time_ns)
@@ -221,14 +221,14 @@ def latest_decisions(decisions: Iterable[PlanDecision]) -> tuple[PlanDecision, .
     return tuple(by_number[number] for number in sorted(by_number))
 
 
-def _layers_of(step: Step) -> dict[Candidate, MapLayers]:
+def _layers_of(step: Step, planner: Planner) -> dict[Candidate, MapLayers]:
     found = (each for edge in step.considered for each in edge.candidates)
-    return {each: map_layers(each.map, each.failed) for each in found}
+    return {each: map_layers(each.map, planner.settings, each.failed) for each in found}
 
 
 def explained_decision(step: Step, planner: Planner, first_map: int = 0) -> PlanDecision:
     """Return a decision of a planner as the newest version of a message, without an outcome."""
-    return decision_message(step, planner, first_map, _layers_of(step))
+    return decision_message(step, planner, first_map, _layers_of(step, planner))
 
 
 def decision_message(

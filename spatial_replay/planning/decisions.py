@@ -97,6 +97,7 @@ class Candidate:
         rejected: why it was rejected; empty if it was not.
         is_chosen: whether this is the object to move.
         failed: places (x, y) where earlier motions failed, from which a target stays away.
+        room_from: the objects from which its target keeps room; None for everything.
     """
 
     name: str
@@ -105,6 +106,7 @@ class Candidate:
     rejected: str = ""
     is_chosen: bool = False
     failed: tuple[tuple[float, float], ...] = ()
+    room_from: tuple[str, ...] | None = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -61,10 +61,10 @@ class BlockedBy(NamedTuple):
 
 
 class RoomCost(NamedTuple):
-    """What the room around a target costs: the robustness possible with less, and the clearance there."""
+    """What the room around a target costs: the robustness possible with less, and the room there."""
 
     robustness: float
-    clearance: float
+    room: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,10 +87,13 @@ class MapLayers:
     blocked_by: NDArray[np.int64]
 
 
-def map_layers(gradient: GradientMap, failed: Collection[tuple[float, float]] = ()) -> MapLayers:
+def map_layers(
+    gradient: GradientMap, settings: Settings, failed: Collection[tuple[float, float]] = ()
+) -> MapLayers:
     """Take a gradient map apart.
 
     Args:
+        settings: of the planner.
         failed: places (x, y) where motions of the object failed, from which it stays away.
     """
     parts, shape = gradient.made_of, gradient.blocked.shape
@@ -103,7 +106,7 @@ def map_layers(gradient: GradientMap, failed: Collection[tuple[float, float]] = 
         layers[place] = lower[place] if leaf.wanted else -upper[place]
     places = {leaf: place for place, leaf in enumerate(leaves)}
     _, limiting = _limit(progress, layers, places)
-    causes, blocked_by = _causes(gradient, failed)
+    causes, blocked_by = _causes(gradient, avoided_cells(gradient, settings, failed))
     texts = tuple(each.text for each in leaves)
     return MapLayers(texts, layers, np.broadcast_to(limiting, shape), causes, blocked_by)
 
@@ -184,9 +187,7 @@ def _measured(maps: PropositionMaps, formulas: Sequence[Formula]) -> tuple[Float
     return found.lower, found.upper
 
 
-def _causes(
-    gradient: GradientMap, failed: Collection[tuple[float, float]]
-) -> tuple[tuple[BlockedBy, ...], NDArray[np.int64]]:
+def _causes(gradient: GradientMap, avoided: Booleans) -> tuple[tuple[BlockedBy, ...], NDArray[np.int64]]:
     """Return what blocks cells, and the number of its cause for each."""
     maps, blocked = gradient.made_of.now, gradient.blocked
     codes = np.full(blocked.shape, -1, np.int64)
@@ -198,7 +199,7 @@ def _causes(
     if held.any():
         texts, which = _most_dangerous(gradient.made_of, blocked.shape)
         codes[held] += which[held]
-    codes[(blocked == FREE) & near(failed, gradient.grid)] = _FAILED * _NUMBERS
+    codes[(blocked == FREE) & avoided] = _FAILED * _NUMBERS
     found, counts = np.unique(codes[codes >= 0], return_counts=True)
     order = np.argsort(-counts, kind="stable")
     causes = []
@@ -262,14 +263,28 @@ def distance_to(places: Collection[tuple[float, float]], grid: Grid) -> Floats:
     return away
 
 
+def avoided_cells(
+    gradient: GradientMap, settings: Settings, failed: Collection[tuple[float, float]]
+) -> Booleans:
+    """Return (rows, columns): the cells that a target avoids after failed motions."""
+    avoided = near(failed, gradient.grid)
+    holds = (gradient.blocked == FREE) & (gradient.robustness >= settings.margin)
+    if settings.rules > 1 and holds.any() and not (holds & ~avoided).any():
+        # a motion may fail by chance: then places come again, those farther from the failures first
+        away = distance_to(failed, gradient.grid)
+        return np.asarray(away < away[holds.any(axis=0)].max() / 2.0)
+    return avoided
+
+
 def room_cost(candidate: Candidate, target: Target, settings: Settings) -> RoomCost | None:
-    """Return what the room around a target costs; None if no more robustness was possible without it."""
+    """Return what the room around a target costs; None if no more robustness was possible with less."""
     gradient = candidate.map
     if settings.skill != "place" or settings.room <= 0.0:
         return None
-    good = (gradient.blocked == FREE) & ~near(candidate.failed, gradient.grid)
-    tight = good & (gradient.clearance < settings.room) & (gradient.robustness > target.robustness)
+    good = (gradient.blocked == FREE) & ~avoided_cells(gradient, settings, candidate.failed)
+    room = gradient.made_of.now.room(candidate.room_from)
+    tight = good & (room < settings.room) & (gradient.robustness > target.robustness)
     if not tight.any():
         return None
     place = np.unravel_index(int(np.argmax(np.where(tight, gradient.robustness, -np.inf))), tight.shape)
-    return RoomCost(float(gradient.robustness[place]), float(gradient.clearance[place]))
+    return RoomCost(float(gradient.robustness[place]), float(room[place]))

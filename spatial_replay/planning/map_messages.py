@@ -77,7 +77,7 @@ def map_message(turned: TurnedMap, time_ns: int, layers: MapLayers | None = None
     """
     gradient = turned.candidate.map
     grid, values = gradient.grid, gradient.values[turned.turn]
-    added = {} if layers is None else dict(_fields(gradient, turned.turn, layers))
+    added = {} if layers is None else dict(_fields(turned, layers))
     kinds = [(name, values.dtype.str) for name, values in added.items()]
     cells = np.empty(values.shape, np.dtype([*_CELL.descr, *kinds]))
     cells["robustness"] = values
@@ -108,18 +108,24 @@ def map_message(turned: TurnedMap, time_ns: int, layers: MapLayers | None = None
     return message
 
 
-def _fields(gradient: GradientMap, turn: int, layers: MapLayers) -> Iterator[tuple[str, np.ndarray]]:
+def _fields(turned: TurnedMap, layers: MapLayers) -> Iterator[tuple[str, np.ndarray]]:
     """Yield what a map is made of, for one orientation, (rows, columns) each, with names."""
+    turn, gradient, room_from = turned.turn, turned.candidate.map, turned.candidate.room_from
     yield "limited_by", (layers.limiting[turn] + 1).astype("<u2")
     yield "blocked_by", (layers.blocked_by[turn] + 1).astype("<u2")
-    yield "clearance", gradient.clearance[turn].astype("<f4")
+    yield "clearance", _singles(gradient.clearance[turn])
+    yield "room", _singles(gradient.made_of.now.room(room_from)[turn])
     varying = [bool((layer != layer.flat[0]).any()) for layer in layers.robustness]
     chosen = sorted(range(len(varying)), key=lambda place: not varying[place])[:MOST_LAYERS]
     for place in sorted(chosen):
-        values = layers.robustness[place, turn]
         # a number in front, so that no conjunct is named like another field
         name = f"{place + 1}: {layers.conjuncts[place]}"
-        yield name, np.where(np.isfinite(values), values, np.nan).astype("<f4")
+        yield name, _singles(layers.robustness[place, turn])
+
+
+def _singles(values: np.ndarray) -> np.ndarray:
+    """Return numbers as a viewer draws them, NaN where they are not finite."""
+    return np.where(np.isfinite(values), values, np.nan).astype("<f4")
 
 
 def map_fields(message: GridMessage) -> dict[str, np.ndarray]:
@@ -152,5 +158,5 @@ def explain(message: PlanCandidate, candidate: Candidate, layers: MapLayers, set
     for cause in layers.causes:
         message.causes.append(PlanCause(kind=_CAUSES[cause.kind], text=cause.name, cells=cause.cells))
     if target is not None and (cost := room_cost(candidate, target, settings)) is not None:
-        room = PlanRoom(wanted=settings.room, possible=cost.robustness, clearance=cost.clearance)
+        room = PlanRoom(wanted=settings.room, possible=cost.robustness, clearance=cost.room)
         message.room.CopyFrom(room)

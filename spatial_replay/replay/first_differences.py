@@ -8,6 +8,7 @@ from itertools import zip_longest
 import numpy as np
 
 from spatial_replay import __version__
+from spatial_replay.annotate.certificate import PLAN_SHA256
 from spatial_replay.bags.columns import Message
 from spatial_replay.bags.mcap_log import McapLog
 from spatial_replay.logs.messages import Messages
@@ -15,7 +16,6 @@ from spatial_replay.logs.remote import LogFile
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.schemas.Robustness_pb2 import Robustness
 from spatial_replay.logs.schemas.Specification_pb2 import Specification
-from spatial_replay.annotate.certificate import PLAN_SHA256
 from spatial_replay.logs.topics import DERIVED, OBJECTS, ROBUSTNESS, SPECIFICATION
 from spatial_replay.text import Instant, Sentence, printable
 

@@ -29,6 +29,8 @@ TIDYING = Settings(
     margin=0.05,
     constraint_margin=0.1,
     room=0.4,
+    room_from="all",
+    refine=False,
     lift=None,
 )
 SHAPES = {
@@ -120,7 +122,7 @@ def test_the_choice_and_what_its_room_costs_follow_from_the_logged_maps(logged):
         is_roomy: max(
             float(np.where((each["blocked_by"] == 0) & roomy, each["robustness"], -np.inf).max())
             for each in fields.values()
-            for roomy in [(each["clearance"] >= 0.4) | (not is_roomy)]
+            for roomy in [(each["room"] >= 0.4) | (not is_roomy)]
         )
         for is_roomy in (True, False)
     }
