@@ -122,6 +122,11 @@ def planning_command(scenario: str) -> click.Command:
     @constants_option
     @profile_option
     @simulation_options
+    @click.option(
+        "--timings",
+        is_flag=True,
+        help="Log how long each decision took, on /spatial/log; logs of equal options then differ.",
+    )
     @setting_options
     def command(
         output: Path,
@@ -131,6 +136,7 @@ def planning_command(scenario: str) -> click.Command:
         constants: Mapping[str, float | str],
         profile: str | None,
         simulation: SimulationArguments,
+        timings: bool,
         changes: Mapping[str, Any],
     ) -> int:
         # imported here so that --help stays fast
@@ -157,6 +163,7 @@ def planning_command(scenario: str) -> click.Command:
                 advance=advance,
                 durability=durability,
                 changes=changes,
+                timings=timings,
             )
         show(
             f"wrote {output}: {counted(planned.samples, 'sample')} over {planned.seconds:.3f} s; "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Final
@@ -9,6 +10,7 @@ from typing import Final
 import numpy as np
 from foxglove_schemas_protobuf.Grid_pb2 import Grid as GridMessage
 from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
+from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.message import DecodeError, Message
@@ -60,7 +62,8 @@ lost. Logs without a version have 1."""
 _DECISIONS: Final = protobuf_channel(PLAN_DECISION, PlanDecision)
 _MAPS: Final = protobuf_channel(GRADIENT_MAP, GridMessage)
 _PATHS: Final = protobuf_channel(PLAN_PATH, SceneUpdate)
-_CHANNELS: Final = (_DECISIONS, _MAPS, _PATHS)
+_TIMINGS: Final = protobuf_channel(EVENT_LOG, Log)
+_CHANNELS: Final = (_DECISIONS, _MAPS, _PATHS, _TIMINGS)
 
 _KINDS: MappingProxyType[Kind, PlanDecision.Kind.ValueType] = MappingProxyType(
     {
@@ -87,13 +90,15 @@ class BlackBox:
         version: of what messages say, see `PLAN_VERSION`.
     """
 
-    def __init__(self, planner: Planner, *, version: int = PLAN_VERSION) -> None:
+    def __init__(self, planner: Planner, *, version: int = PLAN_VERSION, timings: bool = False) -> None:
         """Begin before the first sample.
 
         Args:
             version: of what messages say, see `PLAN_VERSION`.
+            timings: also log how long each decision took, so that equal runs do not give equal logs.
         """
         self.planner = planner
+        self._times = timings
         self.version = version
         self._written = dict.fromkeys(_CHANNELS, 0)
         self._sample: Sample | None = None
@@ -122,7 +127,9 @@ class BlackBox:
         Raises:
             UsageError: nothing was observed yet, or the last step was not concluded.
         """
+        began = time.perf_counter()
         step = self.planner.next_step()
+        took_s = time.perf_counter() - began
         if step is self._step:
             return step, self._messages(step.time_ns, [], [], [])
         ended = self._ended_wait(step.time_ns)
@@ -133,7 +140,8 @@ class BlackBox:
         self._decision = decision_message(step, self.planner, self._written[_MAPS], layers)
         maps = [map_message(each, step.time_ns, (layers or {}).get(each.candidate)) for each in maps_of(step)]
         path = path_message(step.target, self._tracked, step.time_ns)
-        return step, self._messages(step.time_ns, [*ended, self._decision], maps, [path])
+        timings = [_timing(step, took_s)] if self._times else []
+        return step, self._messages(step.time_ns, [*ended, self._decision], maps, [path], timings)
 
     def conclude(self, outcome: Outcome) -> Messages:
         """Take the outcome of the last step, and return its messages.
@@ -177,13 +185,22 @@ class BlackBox:
     def _messages(self, time_ns: int, *of_channels: Sequence[Message]) -> Messages:
         """Return messages of each channel, numbered on from those before."""
         streams = []
-        for channel, messages in zip(_CHANNELS, of_channels, strict=True):
+        # only a decision may have a timing
+        for channel, messages in zip(_CHANNELS, of_channels, strict=False):
             first = self._written[channel]
             self._written[channel] += len(messages)
             payloads = [message.SerializeToString(deterministic=True) for message in messages]
             times_ns = np.full(len(payloads), time_ns, np.int64)
             streams.append(messages_of(channel, times_ns, payloads, first))
         return merge(streams)
+
+
+def _timing(step: Step, took_s: float) -> Log:
+    """Return how long a decision took, for the log of sentences, which no certificate covers."""
+    text = f"decision {step.number} took {took_s * 1e3:.1f} ms"
+    message = Log(level=Log.INFO, message=text, name="planner")
+    message.timestamp.FromNanoseconds(step.time_ns)
+    return message
 
 
 def plan_metadata(planner: Planner, filename: str) -> dict[str, str]:

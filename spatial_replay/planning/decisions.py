@@ -8,6 +8,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Literal, Protocol, TypeAlias
 
 from spatial_replay.lazy import Displayed
+from spatial_replay.text import time_text
 
 if TYPE_CHECKING:
     # a report reads reasons without loading the kernels behind maps
@@ -221,6 +222,14 @@ def wait_outcome(step: Step, states: tuple[int, ...]) -> Outcome:
     if states == step.ahead[-1:]:
         return Outcome(succeeded=True, reason="the time has passed")
     return Outcome(succeeded=False, reason="what is seen has changed")
+
+
+def sentence_of(step: Step) -> str:
+    """Return the reason of a step, with when and by what acceptance was lost."""
+    if step.lost is None:
+        return step.reason
+    why = f", when this held: {step.lost.text}" if step.lost.text else ""
+    return f"{step.reason}; that was lost at {time_text(step.lost.time_ns)}{why}"
 
 
 class Executor(Protocol):

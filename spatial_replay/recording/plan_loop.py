@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
+from spatial_replay.errors import UsageError
 from spatial_replay.planning.decisions import Executor, Outcome, Step
 from spatial_replay.planning.planner import Planner
 
@@ -45,7 +46,7 @@ class LoopEnd(NamedTuple):
     motions: int
 
 
-def plan(planner: Planner, robot: Robot, recorder: Recorder) -> Step:
+def plan(planner: Planner, robot: Robot, recorder: Recorder, *, timings: bool = False) -> Step:
     """Let a planner decide and a robot act until there is nothing more to do, and record all of it.
 
     The log has the samples, every decision with its maps and outcome, and the settings, so that
@@ -56,6 +57,7 @@ def plan(planner: Planner, robot: Robot, recorder: Recorder) -> Step:
         planner: that has observed nothing yet.
         robot: moves things, and writes samples with `recorder.write`.
         recorder: that records the planner's specification, or was opened with `planner=`.
+        timings: also record how long each decision took; the recorder must have no planner yet.
 
     Returns:
         The last decision: "hold" if the specification is satisfied, as far as the planner can see.
@@ -65,7 +67,11 @@ def plan(planner: Planner, robot: Robot, recorder: Recorder) -> Step:
         OutputError: the log cannot be written.
     """
     if recorder.planner is not planner:
-        recorder.attach(planner)
+        recorder.attach(planner, timings=timings)
+    elif timings:
+        raise UsageError(
+            "a recorder with a planner was given its timings when that was attached; leave them out"
+        )
     return run_plan(recorder, robot.execute, robot.look).last
 
 

@@ -366,8 +366,11 @@ class Recorder(SampleWriter):
         """The planner whose decisions are recorded."""
         return None if self._box is None else self._box.planner
 
-    def attach(self, planner: Planner) -> None:
+    def attach(self, planner: Planner, *, timings: bool = False) -> None:
         """Let a planner observe every sample that is written from now on, and record its decisions.
+
+        Args:
+            timings: also record how long each decision took, as a sentence on /spatial/log.
 
         Raises:
             UsageError: a second planner, one whose specification is not recorded, one that has observed
@@ -376,7 +379,7 @@ class Recorder(SampleWriter):
         from spatial_replay.planning.decision_log import BlackBox
 
         self._refuse_planner(planner)
-        self._box = BlackBox(planner)
+        self._box = BlackBox(planner, timings=timings)
         self._drains = True
 
     def _refuse_planner(self, planner: Planner) -> None:

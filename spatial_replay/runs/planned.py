@@ -13,17 +13,21 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
+
 from spatial_replay.annotate.automaton_state import SpecAutomaton
 from spatial_replay.annotate.specification import logged_specifications
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.compiled import compile_ahead
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
+from spatial_replay.logs.messages import messages_of
 from spatial_replay.logs.output_file import Durability
-from spatial_replay.logs.topics import PLAN_METADATA
+from spatial_replay.logs.schemas.BehaviourTree_pb2 import BehaviourTree
+from spatial_replay.logs.topics import BEHAVIOUR_TREE, PLAN_METADATA, protobuf_channel
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.planning.decision_log import BlackBox, plan_metadata
-from spatial_replay.planning.decisions import Kind, Outcome, Step
+from spatial_replay.planning.decisions import Kind, Outcome, Step, sentence_of
 from spatial_replay.planning.planner import Planner
 from spatial_replay.planning.settings import Settings, Skill, changed_settings
 from spatial_replay.planning.workspace import Grid, Workspace
@@ -33,11 +37,13 @@ from spatial_replay.runs.run_log import RunLog, run_log
 from spatial_replay.runs.scripted import about_run, refuse_unknown_names
 from spatial_replay.sanity import refuse_unsatisfiable
 from spatial_replay.simulation.injection import Injection
-from spatial_replay.simulation.world import World
+from spatial_replay.simulation.world import TreeTick, World
 from spatial_replay.simulation.worlds import default_specification, make_world
 from spatial_replay.spec import parse_specification
 from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.sample import Sample
+
+_TREES = protobuf_channel(BEHAVIOUR_TREE, BehaviourTree)
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,6 +138,7 @@ class PlanLoop:
         """Begin before the first sample."""
         self._box, self._log = box, log
         self.planning_s = 0.0
+        self._newest_ns = self._ticks = 0
 
     @property
     def planner(self) -> Planner:
@@ -146,6 +153,7 @@ class PlanLoop:
             OutputError: the log cannot be written.
         """
         self._log.write(sample)
+        self._newest_ns = sample.time_ns
         began = time.perf_counter()
         self._box.observe(sample)
         self.planning_s += time.perf_counter() - began
@@ -157,6 +165,17 @@ class PlanLoop:
         self.planning_s += time.perf_counter() - began
         self._log.write_messages(messages)
         return step
+
+    def log_tick(self, tick: TreeTick, time_ns: int) -> None:
+        """Log a tick of the robot's behaviour tree, with the newest sample."""
+        message = BehaviourTree(time_ns=time_ns, tick=tick.number)
+        for node in tick.nodes:
+            status = BehaviourTree.Status.Value(f"STATUS_{node.status}")
+            message.nodes.add(name=node.name, type=node.kind, parent=node.parent, status=status)
+        payload = message.SerializeToString(deterministic=True)
+        times_ns = np.array([self._newest_ns])
+        self._log.write_messages(messages_of(_TREES, times_ns, [payload], self._ticks))
+        self._ticks += 1
 
     def conclude(self, outcome: Outcome) -> None:
         """Take the outcome of the last step, and log it."""
@@ -211,6 +230,7 @@ def record_plan(
     advance: Callable[[int], None] = lambda samples: None,
     durability: Durability = "process",
     changes: Mapping[str, Any] = MappingProxyType({}),
+    timings: bool = False,
 ) -> PlannedRun:
     """Let a planner satisfy a specification in a scenario's world; equal arguments give equal bytes.
 
@@ -222,6 +242,7 @@ def record_plan(
         advance: called with the number of new samples.
         durability: "disk" for a log of which the disk has each chunk as soon as it is written.
         changes: to the planner's settings for the world, by the keys of settings files.
+        timings: also log how long each decision took; logs of equal arguments then differ.
 
     Raises:
         NoAutomatonError: a specification without an automaton.
@@ -247,7 +268,7 @@ def record_plan(
             run_log(output, [kept], about, inputs, known, durability) as log,
         ):
             log.add_metadata(PLAN_METADATA, plan_metadata(planner, kept.filename))
-            loop = PlanLoop(BlackBox(planner), log)
+            loop = PlanLoop(BlackBox(planner, timings=timings), log)
 
             def observe(sample: Sample) -> str:
                 loop.observe(sample)
@@ -256,7 +277,7 @@ def record_plan(
                 advance(1)
                 return planner.stop_reason
 
-            world.attach(observe)
+            world.attach(observe, lambda tick: loop.log_tick(tick, world.time_ns))
             end = run_plan(loop, WorldExecutor(world, world.skill).execute, world.step)
         last = end.last
         return PlannedRun(
@@ -265,7 +286,7 @@ def record_plan(
             ended=last.kind,
             name=planner.automaton.name,
             verdict=log.verdicts[planner.automaton.name],
-            reason=last.reason,
+            reason=sentence_of(last),
             steps=end.motions,
             pruned=len(last.pruned),
             planning_s=loop.planning_s,

@@ -16,7 +16,7 @@ from py_trees.decorators import Retry
 from spatial_replay.simulation.grasp import Grasp, Point, best_grasp
 from spatial_replay.simulation.picking import carry, let_go, missed, pick_up, set_down
 from spatial_replay.simulation.scene import Scene
-from spatial_replay.simulation.world import Execution
+from spatial_replay.simulation.world import Execution, TreeNode, TreeTick
 
 Goal = tuple[Point, float | None]
 """The target position of a body, and its yaw there; None for any yaw."""
@@ -33,15 +33,40 @@ def setting_by_tree(
     blackboard = _Blackboard()
     tasks = [_task(scene, name, goal, blackboard, via) for name, goal in goals.items()]
     tree = Sequence("set", memory=True, children=tasks)
-    tree.tick_once()
+    ticks = _Ticks(scene, tree)
+    ticks.tick()
     while tree.status is Status.RUNNING:
         yield
-        tree.tick_once()
+        ticks.tick()
     succeeded = tree.status is Status.SUCCESS
     done = f"placed {', '.join(goals)}"
     if blackboard.failures:
         done += f", after this went wrong: {'; '.join(blackboard.failures)}"
     return Execution(succeeded, done if succeeded else blackboard.failures[-1])
+
+
+class _Ticks:
+    """The ticks of a tree; those that change the status of a node are reported."""
+
+    def __init__(self, scene: Scene, tree: Behaviour) -> None:
+        self._scene, self._tree, self._count = scene, tree, 0
+        self._reported: tuple[TreeNode, ...] = ()
+
+    def tick(self) -> None:
+        self._tree.tick_once()
+        nodes = tuple(_nodes(self._tree, None, []))
+        if nodes != self._reported:
+            self._scene.report_tick(TreeTick(self._count, nodes))
+        self._reported, self._count = nodes, self._count + 1
+
+
+def _nodes(tree: Behaviour, parent: int | None, found: list[TreeNode]) -> list[TreeNode]:
+    kind = type(tree).__name__ if tree.children else "Action"
+    place = len(found)
+    found.append(TreeNode(tree.name, kind, parent, tree.status.name))
+    for child in tree.children:
+        _nodes(child, place, found)
+    return found
 
 
 class _Blackboard:

@@ -62,18 +62,28 @@ def best_grasp(scene: Scene, name: str, goal: Point, yaw: float | None) -> Grasp
         return f"{name} is too thick for the gripper as it lies"
     bottom, top = scene.height(name)
     above_bottom = max(FINGERTIP + 0.003, top - bottom - _BELOW_TOP)
-    best, best_room, can_pick = None, _ROOM, False
+    best, best_room, can_turn_hand, can_pick, can_place = None, _ROOM, False, False, False
     for thickness, angle in sorted(across):
         opening = min(WIDEST, thickness + _OPENING)
         for grasp_yaw, turn in _turns(scene, name, angle, goal, yaw):
             grasp = Grasp(grasp_yaw, turn, above_bottom, opening)
             here = _room(scene, name, start, grasp.yaw, grasp, bottom)
             there = _room(scene, name, goal, grasp.turn, grasp, surface(scene, name, goal))
-            can_pick = can_pick or here > _ROOM
+            can_turn_hand = True
+            can_pick, can_place = can_pick or here > _ROOM, can_place or there > _ROOM
             room = min(here, there, _AMPLE)
             if room > best_room:
                 best, best_room = grasp, room
-    return best or f"no room for the fingers around {name} where it {'should go' if can_pick else 'lies'}"
+    if best is not None:
+        return best
+    if not can_turn_hand:
+        return f"the hand cannot turn as far as {name} has to be turned"
+    if can_pick and can_place:
+        return f"no grasp of {name} has room for the fingers both where it lies and where it should go"
+    where = (
+        "where it lies" if can_place else "where it should go" if can_pick else "where it lies and should go"
+    )
+    return f"no room for the fingers around {name} {where}"
 
 
 def surface(scene: Scene, name: str, goal: Point) -> float:

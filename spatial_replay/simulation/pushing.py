@@ -91,8 +91,10 @@ def _stroke(scene: Scene, name: str, goal: Point) -> Generator[None, None, str]:
     u, v = math.cos(heading), math.sin(heading)
     back = u * x + v * y - extent(scene.footprint(name), heading)[0] + FINGER_DEPTH / 2
     behind = (x - u * (back + _AWAY), y - v * (back + _AWAY))
-    if not (in_reach(*behind) and in_reach(*goal)):
-        return f"the robot does not reach far enough to push {name} there"
+    if not in_reach(*goal):
+        return f"the robot does not reach ({goal[0]:.2f}, {goal[1]:.2f}), where {name} should go"
+    if not in_reach(*behind):
+        return f"the robot does not reach behind {name} where it lies"
     gap = _gap(scene, name, behind, heading)
     if gap is None:
         return f"no room for the fingers behind {name}"

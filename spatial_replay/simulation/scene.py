@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,16 +15,17 @@ from spatial_replay.geometry.measure import MeasureRequest, Operand, measure
 from spatial_replay.simulation.arm import Arm
 from spatial_replay.simulation.bullet import Engine
 from spatial_replay.simulation.shapes import Pose, footprint, height
-from spatial_replay.simulation.world import Body
+from spatial_replay.simulation.world import Body, TreeTick
 
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """The physics, the arm, and the bodies by name."""
+    """The physics, the arm, the bodies by name, and where ticks of behaviour trees go."""
 
     engine: Engine
     arm: Arm
     bodies: Mapping[str, Body]
+    report_tick: Callable[[TreeTick], None] = lambda tick: None
 
     def pose(self, name: str) -> Pose:
         """Return the pose of a body."""

@@ -20,7 +20,7 @@ from spatial_replay.simulation.pushing import pushing
 from spatial_replay.simulation.scenario import Scenario
 from spatial_replay.simulation.scene import Scene
 from spatial_replay.simulation.shapes import Box, Pose, footprint, height
-from spatial_replay.simulation.world import Body, Execution, ReachableArea, Skill
+from spatial_replay.simulation.world import Body, Execution, ReachableArea, Skill, TreeTick
 from spatial_replay.trace.sample import Sample
 
 SAMPLES_PER_S = 30
@@ -69,6 +69,7 @@ class Tabletop:
         self._noise_m = noise_m
         self._injections = tuple(injections)
         self._listen: Callable[[Sample], str | None] = lambda sample: None
+        self._listen_to_tree: Callable[[TreeTick], None] = lambda tick: None
         self._halt = ""
         self._gui = gui
         self._engine: Engine | None = None
@@ -103,8 +104,12 @@ class Tabletop:
         """The robot and the bodies, for motions."""
         return self._scene
 
-    def attach(self, listen: Callable[[Sample], str | None]) -> None:
-        self._listen = listen
+    def attach(
+        self,
+        listen: Callable[[Sample], str | None],
+        listen_to_tree: Callable[[TreeTick], None] = lambda tick: None,
+    ) -> None:
+        self._listen, self._listen_to_tree = listen, listen_to_tree
 
     def reset(self, seed: int) -> None:
         if seed < 0:
@@ -121,7 +126,7 @@ class Tabletop:
             place, yaw = (x, y, each.bottom + tall / 2 + 5e-4), each.yaw + turn * scenario.scatter_rad
             engine.add(each.body.name, each.body.shape, each.mass_kg, place, yaw, each.colour)
         bodies = {each.body.name: each.body for each in scenario.placements}
-        self._scene = Scene(engine, Arm(engine), MappingProxyType(bodies))
+        self._scene = Scene(engine, Arm(engine), MappingProxyType(bodies), self._report_tick)
         self._scene.arm.drive()
         for _ in range(_SETTLING_STEPS):
             engine.step()
@@ -236,6 +241,9 @@ class Tabletop:
         if self._ticks % _TICKS_PER_SAMPLE == 0 and self._ticks != self._last_sampled:
             self._last_sampled = self._ticks
             self._halt = self._listen(self.sample()) or ""
+
+    def _report_tick(self, tick: TreeTick) -> None:
+        self._listen_to_tree(tick)
 
     def _inject(self) -> None:
         if not self._injections:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 from spatial_replay.geometry.footprint import Footprint
 from spatial_replay.simulation.shapes import Shape
@@ -71,6 +71,28 @@ class Execution:
     reason: str
 
 
+class TreeNode(NamedTuple):
+    """A node of a behaviour tree.
+
+    Attributes:
+        kind: such as Sequence, Selector, Retry, or Action for a leaf.
+        parent: place of the node above among the nodes; None for the root.
+        status: INVALID if it was not ticked since the tree began or was reset.
+    """
+
+    name: str
+    kind: str
+    parent: int | None
+    status: Literal["INVALID", "RUNNING", "SUCCESS", "FAILURE"]
+
+
+class TreeTick(NamedTuple):
+    """A behaviour tree after a tick that changed the status of a node: depth first, children in order."""
+
+    number: int
+    nodes: tuple[TreeNode, ...]
+
+
 class World(Protocol):
     """A world that is simulated step by step; lengths are in metres.
 
@@ -103,8 +125,15 @@ class World(Protocol):
     def time_ns(self) -> int:
         """The simulated time, from 0."""
 
-    def attach(self, listen: Callable[[Sample], str | None]) -> None:
-        """Pass samples to `listen` from now on; a reason that it returns stops a motion."""
+    def attach(
+        self,
+        listen: Callable[[Sample], str | None],
+        listen_to_tree: Callable[[TreeTick], None] = lambda tick: None,
+    ) -> None:
+        """Pass samples to `listen` from now on, and ticks of behaviour trees to `listen_to_tree`.
+
+        A reason that `listen` returns stops a motion.
+        """
 
     def reset(self, seed: int) -> None:
         """Restart at time 0; equal seeds give equal worlds."""
