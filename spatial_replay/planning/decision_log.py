@@ -32,6 +32,7 @@ from spatial_replay.logs.schemas.PlanDecision_pb2 import (
     PrunedEdge,
 )
 from spatial_replay.logs.topics import (
+    EVENT_LOG,
     GRADIENT_MAP,
     PLAN_DECISION,
     PLAN_PATH,
