@@ -293,7 +293,7 @@ def test_scenes_of_the_campaign_end_as_they_should(campaign, kind):
         "push",
         "pick and place, in turn",
         "pick and place, at once",
-        "pick and place, for good",
+        "pick and place, to stay",
         "table, at once",
     ],
 )
