@@ -60,10 +60,13 @@ class Fact(NamedTuple):
         """Return what holds where the fact is true, or false."""
         rises = (self.side != "<=") == value
         is_strict = self.side == ">" or not value
-        if rises:
-            weights = tuple((quantity, -weight) for quantity, weight in self.weights)
-            return Inequality(weights, -self.threshold, is_strict, label)
-        return Inequality(self.weights, self.threshold, is_strict, label)
+        sign = -1 if rises else 1
+        weights = tuple((quantity, sign * _whole(weight)) for quantity, weight in self.weights)
+        return Inequality(weights, sign * self.threshold, is_strict, label)
+
+
+def _whole(weight: Fraction) -> Fraction | int:
+    return weight.numerator if weight.denominator == 1 else weight
 
 
 class FactDiagrams:

@@ -5,10 +5,10 @@ Each holds for unions of convex parts, with heights or without; what the plane a
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from fractions import Fraction
-from itertools import combinations, permutations
-from typing import Final
+from itertools import combinations
+from typing import Final, TypeVar
 
 from spatial_replay.sanity.linear import Inequality
 from spatial_replay.sanity.sums import (
@@ -23,7 +23,6 @@ from spatial_replay.sanity.sums import (
 from spatial_replay.spec.formula import (
     Axis,
     CentroidProjection,
-    Enlarged,
     Misalignment,
     Outline,
     Projection,
@@ -33,7 +32,7 @@ from spatial_replay.spec.formula import (
     Term,
 )
 
-MAX_TERMS: Final = 12
+MAX_TERMS: Final = 16
 """How many terms laws are written out for; between more of them only those of one measurement are."""
 
 
@@ -51,24 +50,27 @@ def laws(
     if len(terms) > MAX_TERMS:
         return found
     extents = _Extents(used, terms, regions)
-    distances = {each for each in used if isinstance(each, SignedDistance)}
-    protrusions = {each for each in used if isinstance(each, Protrusion)}
+    distances = [each for each in used if isinstance(each, SignedDistance)]
+    protrusions = [each for each in used if isinstance(each, Protrusion)]
     found += _enlarged(distances, protrusions)
-    distances = {_distance(*map(without_radius, (each.first, each.second))) for each in distances}
-    protrusions = {Protrusion(without_radius(each.inner), without_radius(each.outer)) for each in protrusions}
-    within = {each for each in inside if not isinstance(each.inner, Enlarged)}
-    found += _transitive(protrusions, within, regions)
-    found += _nested(distances, protrusions, within, regions)
+    # in the order of the text, so that equal questions are answered by equal steps
+    bare = dict.fromkeys(
+        _distance(without_radius(each.first), without_radius(each.second)) for each in distances
+    )
+    outside = dict.fromkeys(_bare(each) for each in protrusions)
+    within = dict.fromkeys(each for each in inside if each in outside)
+    found += _transitive(outside, within, regions)
+    found += _nested(bare, within, regions)
     if extents.matter:
-        found += extents.laws(distances, protrusions)
+        found += extents.laws(bare, outside)
     return found
 
 
 def _law(*weights: tuple[Quantity, int], bound: Fraction = Fraction(0)) -> Inequality:
     """Return the law that a weighted sum is at most a bound."""
-    total: dict[Quantity, Fraction] = {}
+    total: dict[Quantity, int] = {}
     for quantity, weight in weights:
-        total[quantity] = total.get(quantity, Fraction(0)) + weight
+        total[quantity] = total.get(quantity, 0) + weight
     return Inequality(tuple((key, value) for key, value in total.items() if value), bound)
 
 
@@ -90,23 +92,36 @@ def _single(used: Iterable[Quantity]) -> Iterator[Inequality]:
                 yield _law((each, 1))
 
 
-def _enlarged(distances: Iterable[SignedDistance], protrusions: Iterable[Protrusion]) -> Iterator[Inequality]:
+def _enlarged(distances: list[SignedDistance], protrusions: list[Protrusion]) -> Iterator[Inequality]:
     """Yield by how much enlarging changes a measurement at most: less where heights decide it."""
-    for each in sorted(distances, key=repr):
-        bare = _distance(without_radius(each.first), without_radius(each.second))
-        for other in sorted({*distances, bare} - {each}, key=repr):
-            if _distance(without_radius(other.first), without_radius(other.second)) == bare:
-                radius = _reach(each) - _reach(other)
-                if radius >= 0:
-                    yield _law((each, 1), (other, -1))
-                    yield _law((other, 1), (each, -1), bound=radius)
-    for one in sorted(protrusions, key=repr):
-        within = Protrusion(without_radius(one.inner), without_radius(one.outer))
-        for alike in sorted({*protrusions, within} - {one}, key=repr):
-            if (without_radius(alike.inner), without_radius(alike.outer)) == (within.inner, within.outer):
-                change = _growth(one) - _growth(alike)
-                yield _law((one, 1), (alike, -1), bound=max(change, Fraction(0)))
-                yield _law((alike, 1), (one, -1), bound=max(-change, Fraction(0)))
+    for one, other in _variants(
+        distances, lambda each: _distance(*map(without_radius, (each.first, each.second)))
+    ):
+        change = _reach(one) - _reach(other)
+        yield _law((one, 1), (other, -1), bound=max(-change, Fraction(0)))
+        yield _law((other, 1), (one, -1), bound=max(change, Fraction(0)))
+    for inner, outer in _variants(protrusions, _bare):
+        change = _growth(inner) - _growth(outer)
+        yield _law((inner, 1), (outer, -1), bound=max(change, Fraction(0)))
+        yield _law((outer, 1), (inner, -1), bound=max(-change, Fraction(0)))
+
+
+_Measured = TypeVar("_Measured", SignedDistance, Protrusion)
+
+
+def _variants(
+    measured: list[_Measured], bare_of: Callable[[_Measured], _Measured]
+) -> Iterator[tuple[_Measured, _Measured]]:
+    """Yield pairs of measurements of the same terms, enlarged by different radii."""
+    alike: dict[_Measured, dict[_Measured, None]] = {}
+    for each in measured:
+        alike.setdefault(bare_of(each), {})[each] = None
+    for bare, variants in alike.items():
+        yield from combinations({**variants, bare: None}, 2)
+
+
+def _bare(protrusion: Protrusion) -> Protrusion:
+    return Protrusion(without_radius(protrusion.inner), without_radius(protrusion.outer))
 
 
 def _reach(distance: SignedDistance) -> Fraction:
@@ -118,54 +133,46 @@ def _growth(protrusion: Protrusion) -> Fraction:
 
 
 def _transitive(
-    protrusions: set[Protrusion], within: set[Protrusion], regions: Mapping[str, Outline]
+    protrusions: dict[Protrusion, None], within: dict[Protrusion, None], regions: Mapping[str, Outline]
 ) -> Iterator[Inequality]:
     """Yield that a sticks out of c at most as far as a out of b and b out of c together."""
-    terms = [term for term in terms_in(protrusions) if is_solid(term)]
-    for _ in terms:
-        more = set()
-        for first, second in permutations(sorted(protrusions, key=repr), 2):
+    given = [each for each in protrusions if is_solid(each.inner) and is_solid(each.outer)]
+    waiting = list(given)
+    for first in waiting:
+        for second in given:
             a, b, c = first.inner, first.outer, second.outer
-            if b != second.inner or a == c or not all(map(is_solid, (a, b, c))):
-                continue
             # heights count between a and c, but not on the way over a region without any
-            if is_flat(b, regions) and not is_flat(a, regions) and not is_flat(c, regions):
+            is_gap = is_flat(b, regions) and not is_flat(a, regions) and not is_flat(c, regions)
+            if b != second.inner or a == c or is_gap:
                 continue
             whole = Protrusion(a, c)
             yield _law((whole, 1), (first, -1), (second, -1))
-            if {first, second} <= within:
-                within.add(whole)
-            more.add(whole)
-        if more <= protrusions:
-            break
-        protrusions |= more
+            if first in within and second in within:
+                within[whole] = None
+            if whole not in protrusions:
+                protrusions[whole] = None
+                waiting.append(whole)
 
 
 def _nested(
-    distances: set[SignedDistance],
-    protrusions: set[Protrusion],
-    within: set[Protrusion],
-    regions: Mapping[str, Outline],
+    distances: dict[SignedDistance, None], within: dict[Protrusion, None], regions: Mapping[str, Outline]
 ) -> Iterator[Inequality]:
     """Yield that what is inside overlaps, and is as far from others as its outside or farther."""
-    for each in sorted(within & protrusions, key=repr):
-        if is_solid(each.inner) and is_solid(each.outer):
-            distances.add(_distance(each.inner, each.outer))
-            yield _law((_distance(each.inner, each.outer), 1), (each, -1))
-    for _ in within:
-        more = set()
-        for each in sorted(within, key=repr):
+    inside = [each for each in within if is_solid(each.inner) and is_solid(each.outer)]
+    waiting = list(distances)
+    for pair in waiting:
+        for each in inside:
             a, b = each.inner, each.outer
-            if not (is_solid(a) and is_solid(b)) or (is_flat(a, regions) and not is_flat(b, regions)):
-                continue
-            for pair in sorted(distances, key=repr):
+            if pair == _distance(a, b):
+                yield _law((pair, 1), (each, -1))
+            elif not (is_flat(a, regions) and not is_flat(b, regions)):
                 for c, other in ((pair.first, pair.second), (pair.second, pair.first)):
-                    if other in (a, b) and c not in (a, b):
-                        yield _law((_distance(b, c), 1), (_distance(a, c), -1), (each, -1))
-                        more |= {_distance(b, c), _distance(a, c)}
-        if more <= distances:
-            break
-        distances |= more
+                    if other in (a, b):
+                        near, far = _distance(b, c), _distance(a, c)
+                        yield _law((near, 1), (far, -1), (each, -1))
+                        more = [one for one in (near, far) if one not in distances]
+                        distances.update(dict.fromkeys(more))
+                        waiting += more
 
 
 class _Extents:
@@ -195,14 +202,14 @@ class _Extents:
             if (one.term, one.axis) == (other.term, other.axis):
                 low, high = (one, other) if one.side == "min" else (other, one)
                 yield _law((low, 1), (high, -1))
-        for pair in sorted(distances, key=repr):
+        for pair in distances:
             if not (is_solid(pair.first) and is_solid(pair.second)) or pair.first == pair.second:
                 continue
             for a, b in ((pair.first, pair.second), (pair.second, pair.first)):
                 for axis in self._axes(a, b):
                     gap = (Projection(b, axis, "min"), 1), (Projection(a, axis, "max"), -1)
                     yield _law(*gap, (pair, -1))
-        for inside in sorted(protrusions, key=repr):
+        for inside in protrusions:
             a, b = inside.inner, inside.outer
             if not (is_solid(a) and is_solid(b)) or a == b:
                 continue

@@ -11,7 +11,7 @@ from fractions import Fraction
 from typing import Final, NamedTuple, TypeAlias
 
 Real: TypeAlias = Fraction | float
-"""Fractions give exact answers, floats fast ones."""
+"""Fractions and whole numbers give exact answers, floats fast ones."""
 
 Coefficients: TypeAlias = tuple[tuple[Hashable, Real], ...]
 """Pairs of a quantity and its factor; no quantity twice."""
@@ -73,6 +73,15 @@ def solve(
     return Solution(None, frozenset(label for label in labels if label is not None))
 
 
+def _ratio(value: Real, factor: Real) -> Real:
+    """Return an exact quotient of exact numbers; whole ones stay whole, which is several times as fast."""
+    if factor in (1, -1):
+        return value * factor
+    if isinstance(value, float) or isinstance(factor, float):
+        return value / factor
+    return Fraction(value) / factor
+
+
 class _Tableau:
     """Variables with bounds, some of which are sums of others; `conflict` once two bounds cross."""
 
@@ -96,9 +105,9 @@ class _Tableau:
                 self.conflict = {index}
             return self.conflict is None
         factor = coefficients[0][1]
-        normal = tuple((key, value / factor) for key, value in coefficients)
+        normal = tuple((key, _ratio(value, factor)) for key, value in coefficients)
         variable = self._variable(normal)
-        limit = (bound / factor, (-1 if factor > 0 else 1) if is_strict else 0)
+        limit = (_ratio(bound, factor), (-1 if factor > 0 else 1) if is_strict else 0)
         if factor > 0:
             before = self._upper[variable]
             if before is None or limit < before[0]:
@@ -206,12 +215,12 @@ class _Tableau:
         """Set a sum to a bound by changing one of its variables, which becomes a sum in its place."""
         row = self._rows.pop(leaving)
         factor = row.pop(entering)
-        step = tuple((to - at) / factor for to, at in zip(goal, self._value[leaving], strict=True))
+        step = tuple(_ratio(to - at, factor) for to, at in zip(goal, self._value[leaving], strict=True))
         self._value[leaving] = goal
         here = self._value[entering]
         self._value[entering] = (here[0] + step[0], here[1] + step[1])
-        solved = {variable: -value / factor for variable, value in row.items()}
-        solved[leaving] = 1 / factor
+        solved = {variable: _ratio(-value, factor) for variable, value in row.items()}
+        solved[leaving] = _ratio(1, factor)
         for other, content in self._rows.items():
             weight = content.pop(entering, 0)
             if weight:

@@ -73,8 +73,12 @@ def automaton_of(specification: Specification, name: str, formula: Formula) -> A
 def _loosely(specification: Specification, name: str, formula: Formula, *, positive: bool) -> Side | None:
     wanted = formula if positive else Boolean("not", (formula,))
     for bounds in ("seconds", "all"):
+        looser = loosened(wanted, bounds)
+        if looser is wanted:
+            # it has no automaton as it is
+            continue
         try:
-            return Side(automaton_of(specification, name, loosened(wanted, bounds)))
+            return Side(automaton_of(specification, name, looser))
         except NoAutomatonError:
             continue
     return None

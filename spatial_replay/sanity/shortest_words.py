@@ -20,8 +20,14 @@ Cube: TypeAlias = dict[int, bool]
 Word: TypeAlias = tuple[Cube, ...]
 """What has to hold in each sample of a run; whatever it leaves open, the end is the same."""
 
-MAX_STATES: Final = 2000
-"""How many combinations of states one search visits."""
+MAX_STEPS: Final = 200_000
+"""How many steps one question takes, each a decision of a diagram that is visited."""
+
+MAX_ALL_STEPS: Final = 800_000
+"""How many steps all questions about one specification take together."""
+
+_STEPS_OF_GEOMETRY: Final = 50
+"""How many steps asking geometry counts as."""
 
 MAX_CONFLICTS: Final = 2000
 """How many combinations of facts geometry excludes at most before an answer is given up."""
@@ -65,6 +71,8 @@ class WordSearch:
         self._tuples: list[tuple[int, ...]] = []
         self._exclusions: list[frozenset[tuple[int, bool]]] = []
         self._allowed = YES
+        self._possible: dict[frozenset[tuple[int, bool]], frozenset[int] | None] = {}
+        self._steps = self._all_steps = 0
 
     def shortest(self, *sides: Side) -> Answer:
         """Return the shortest run that all sides agree with.
@@ -72,6 +80,7 @@ class WordSearch:
         Raises:
             UndecidedError: it takes too many steps.
         """
+        self._steps = 0
         try:
             word = self._search(sides, geometry=True)
             if word is not None:
@@ -99,12 +108,12 @@ class WordSearch:
         before: dict[tuple[int, ...], tuple[tuple[int, ...] | None, Cube]] = {}
         waiting = [start]
         for number, states in enumerate(waiting):
-            if len(waiting) > MAX_STATES:
-                raise UndecidedError
             moves, leaves = self._joined(sides, states)
-            for leaf in leaves:
+            ahead = [leaf for leaf in leaves if all(map(_may_agree, sides, self._tuples[leaf]))]
+            # ends come first: a run is found without a look at all that its last sample might do instead
+            for leaf in sorted(ahead, key=lambda leaf: not all(map(_agrees, sides, self._tuples[leaf]))):
                 after = self._tuples[leaf]
-                if after in before or not all(map(_may_agree, sides, after)):
+                if after in before:
                     continue
                 cube = self._cube(self._leading(moves, leaf)) if geometry else {}
                 if cube is None:
@@ -115,6 +124,12 @@ class WordSearch:
                     return tuple(reversed(list(_back(after, before))))
                 waiting.append(after)
         return None
+
+    def _spend(self, steps: int) -> None:
+        self._steps += steps
+        self._all_steps += steps
+        if self._steps > MAX_STEPS or self._all_steps > MAX_ALL_STEPS:
+            raise UndecidedError
 
     def _joined(self, sides: Sequence[Side], states: Sequence[int]) -> tuple[int, list[int]]:
         """Return where one sample leads to, as a diagram over facts, and its leaves: tuples of states."""
@@ -134,6 +149,7 @@ class WordSearch:
             return known[key]
 
         whole = join(tuple(nodes))
+        self._spend(len(known))
         decisions = [self._diagrams[node] for node in known.values()]
         return whole, list(dict.fromkeys(each.low for each in decisions if each.variable == LEAF))
 
@@ -172,11 +188,14 @@ class WordSearch:
                     known[each] = self._diagrams.decide(variable, to(low), to(high))
             return known[each]
 
-        return to(node)
+        result = to(node)
+        self._spend(len(known))
+        return result
 
     def _cube(self, condition: int) -> Cube | None:
         """Return facts that make a condition true, and that geometry allows together; None without any."""
         for _ in range(MAX_CONFLICTS):
+            self._spend(_STEPS_OF_GEOMETRY)
             open_ = self._diagrams.both(condition, self._allowed)
             if open_ == NO:
                 return None
@@ -239,6 +258,13 @@ class WordSearch:
         return core
 
     def _impossible(self, cube: Cube) -> frozenset[int] | None:
+        """Return facts of a cube that geometry excludes together; None if it allows them all."""
+        key = frozenset(cube.items())
+        if key not in self._possible:
+            self._possible[key] = self._asked(cube)
+        return self._possible[key]
+
+    def _asked(self, cube: Cube) -> frozenset[int] | None:
         facts = self._conditions.facts
         own = [
             facts[number].inequality(value, number) for number, value in cube.items() if facts[number].weights
