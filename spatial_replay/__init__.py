@@ -49,6 +49,8 @@ if TYPE_CHECKING:
     from spatial_replay.compare.runs import LogDiff
     from spatial_replay.compare.spec_diff import FirstDifference, SpecDiff
     from spatial_replay.compare.specifications import SpecificationDiff
+    from spatial_replay.falsification.failure_search import falsify
+    from spatial_replay.falsification.failures import Coverage, Failure, Falsification, SearchedRun
     from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
     from spatial_replay.monitor.causes import Cause, LeastPart
     from spatial_replay.monitor.evaluate import Evaluation, evaluate
@@ -96,6 +98,7 @@ __all__ = [
     "ClusterError",
     "Consideration",
     "ConvexPart",
+    "Coverage",
     "DecidingAtom",
     "DecisionDiff",
     "Diagnostic",
@@ -105,6 +108,8 @@ __all__ = [
     "Evaluation",
     "Examination",
     "Example",
+    "Failure",
+    "Falsification",
     "Finding",
     "FirstDifference",
     "Footprint",
@@ -136,6 +141,7 @@ __all__ = [
     "Replayed",
     "RunSpecDiff",
     "Sample",
+    "SearchedRun",
     "Sentence",
     "Settings",
     "SpatialReplayError",
@@ -173,6 +179,7 @@ __all__ = [
     "doctor",
     "evaluate",
     "evaluate_logs",
+    "falsify",
     "info",
     "load_specification",
     "parse_specification",
@@ -215,6 +222,8 @@ __getattr__, __dir__ = loaded_when_used(
         "compare.spec_diff": ("FirstDifference", "SpecDiff"),
         "compare.specifications": ("SpecificationDiff",),
         "compare.edits": ("Edit",),
+        "falsification.failure_search": ("falsify",),
+        "falsification.failures": ("Coverage", "Failure", "Falsification", "SearchedRun"),
         "geometry.footprint": ("ConvexPart", "Footprint", "TrackedObject"),
         "monitor.causes": ("Cause", "LeastPart"),
         "monitor.evaluate": ("Evaluation", "evaluate"),

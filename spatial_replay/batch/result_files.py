@@ -97,17 +97,17 @@ class LocalFolder:
 
     @contextmanager
     def locked(self, name: str) -> Iterator[None]:
-        """Keep other batches from writing here, by a lock on a file, and remove what killed ones have left.
+        """Keep other commands from writing here, by a lock on a file, and remove what killed ones have left.
 
         Raises:
-            UsageError: another batch is running.
+            UsageError: another command is writing here.
         """
         with (self.path / name).open("rb") as stream:
             try:
                 fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
                 raise UsageError(
-                    f"another batch is writing to {self.path}; wait for it, or give another folder"
+                    f"another command is writing to {self.path}; wait for it, or give another folder"
                 ) from None
             for partial in self.path.rglob(f".*{_PARTIAL}"):
                 partial.unlink(missing_ok=True)

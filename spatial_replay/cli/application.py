@@ -44,6 +44,7 @@ COMMANDS: dict[str, str] = {
     "doctor": "Find what is wrong with a specification before any run.",
     "explain": "Explain a verdict.",
     "export": "Export the robustness of every node as a table.",
+    "falsify": "Search for simulated runs that violate a specification.",
     "info": "Show what a log contains.",
     "monitor": "Monitor a running robot.",
     "plan": "Plan a run in a simulated world.",

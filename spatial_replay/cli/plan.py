@@ -25,6 +25,7 @@ from spatial_replay.cli.record import (
     SCENARIOS,
     SimulationArguments,
     parse_injections,
+    parse_starts,
     show_film,
     simulation_options,
 )
@@ -157,6 +158,7 @@ def planning_command(scenario: str) -> click.Command:
                 seed=simulation["seed"],
                 noise_m=simulation["noise"],
                 injections=parse_injections(simulation["inject"]),
+                starts=parse_starts(simulation["start"]),
                 gui=simulation["gui"],
                 camera=simulation["camera"],
                 inputs=local_files(named),

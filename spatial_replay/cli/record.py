@@ -28,13 +28,14 @@ from spatial_replay.cli.options import (
 from spatial_replay.cli.progress import progress
 from spatial_replay.cli.record_video import video
 from spatial_replay.cli.terminal import show
+from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import LogFile, local_files
 from spatial_replay.text import counted
 from spatial_replay.trace.time_points import duration_ns_from_text
 
 if TYPE_CHECKING:
     from spatial_replay.logs.output_file import Durability
-    from spatial_replay.simulation.injection import Injection
+    from spatial_replay.simulation.injection import Injection, Start
 
 SCENARIOS: Mapping[str, str] = MappingProxyType(
     {
@@ -66,6 +67,13 @@ _SIMULATION = (
         help="Mishap to inject: drop@7s, slip@7s, or slip for the whole run; repeat for several.",
     ),
     click.option(
+        "--start",
+        metavar="NAME=X,Y[,TURN]",
+        multiple=True,
+        help="Where an object is at the beginning, in metres and radians; repeat for several."
+        "  [default: as the seed has it]",
+    ),
+    click.option(
         "--gui",
         is_flag=True,
         help="Show the world in a window, no faster than real time. Needs a display.",
@@ -86,6 +94,7 @@ class SimulationArguments(TypedDict):
     seed: int
     noise: float
     inject: tuple[str, ...]
+    start: tuple[str, ...]
     gui: bool
     camera: Path | None
 
@@ -112,6 +121,22 @@ def parse_injections(texts: Sequence[str]) -> list[Injection]:
     from spatial_replay.simulation.injection import Injection
 
     return [Injection.parse(text) for text in texts]
+
+
+def parse_starts(texts: Sequence[str]) -> list[Start]:
+    """Return the starts of objects given on the command line.
+
+    Raises:
+        UsageError: one that is none, or two of one object.
+    """
+    from spatial_replay.simulation.injection import Start
+
+    starts = [Start.parse(text) for text in texts]
+    names = [start.name for start in starts]
+    for name in names:
+        if names.count(name) > 1:
+            raise UsageError(f"--start: {name!r} is given twice; give one place")
+    return starts
 
 
 def recording_command(scenario: str) -> click.Command:
@@ -164,6 +189,7 @@ def recording_command(scenario: str) -> click.Command:
                 duration_ns=None if duration is None else duration_ns_from_text(duration),
                 noise_m=simulation["noise"],
                 injections=parse_injections(simulation["inject"]),
+                starts=parse_starts(simulation["start"]),
                 gui=simulation["gui"],
                 camera=simulation["camera"],
                 inputs=local_files(specs),

@@ -36,7 +36,7 @@ from spatial_replay.runs.filmed import open_film
 from spatial_replay.runs.run_log import RunLog, run_log
 from spatial_replay.runs.scripted import about_run, refuse_unknown_names
 from spatial_replay.sanity import refuse_unsatisfiable
-from spatial_replay.simulation.injection import Injection
+from spatial_replay.simulation.injection import Injection, Start
 from spatial_replay.simulation.world import TreeTick, World
 from spatial_replay.simulation.worlds import default_specification, make_world
 from spatial_replay.spec import parse_specification
@@ -224,6 +224,7 @@ def record_plan(
     seed: int = 0,
     noise_m: float = 0.0,
     injections: Sequence[Injection] = (),
+    starts: Sequence[Start] = (),
     gui: bool = False,
     camera: Path | None = None,
     inputs: Sequence[Path] = (),
@@ -231,12 +232,15 @@ def record_plan(
     durability: Durability = "process",
     changes: Mapping[str, Any] = MappingProxyType({}),
     timings: bool = False,
+    also: Sequence[Specification] = (),
 ) -> PlannedRun:
     """Let a planner satisfy a specification in a scenario's world; equal arguments give equal bytes.
 
     Args:
         file: the specification to plan for; None takes that of the scenario.
+        also: further specifications to evaluate, of which the planner knows nothing.
         name: the result to plan for, if there are several. All are evaluated.
+        starts: where bodies are at the beginning, in place of where the seed puts them.
         camera: a video to make of the run, beside which its tags file is written.
         inputs: files that the output must not be.
         advance: called with the number of new samples.
@@ -251,21 +255,23 @@ def record_plan(
             cannot be planned for.
         OutputError: the output cannot be written.
     """
-    (kept,) = logged_specifications([default_specification(scenario) if file is None else file])
+    files = [default_specification(scenario) if file is None else file, *also]
+    kept, *others = logged_specifications(files)
     _refuse_missing(kept, name)
     for planned in [name] if name else [spec.name for spec in kept.results if len(kept.results) == 1]:
         refuse_unsatisfiable(kept, planned)
-    made = about_run(scenario, seed=seed, noise_m=noise_m, injections=injections)
+    made = about_run(scenario, seed=seed, noise_m=noise_m, injections=injections, starts=starts)
     about = {**made, "planned": "true"}
     # an error in the world or the planner leaves the output untouched
-    with closing(make_world(scenario, seed=seed, noise_m=noise_m, injections=injections, gui=gui)) as world:
-        refuse_unknown_names([kept], world.sample())
+    opened = make_world(scenario, seed=seed, noise_m=noise_m, injections=injections, starts=starts, gui=gui)
+    with closing(opened) as world:
+        refuse_unknown_names([kept, *others], world.sample())
         planner = Planner(kept, _settings(world, changes), name=name)
         warm_up_planner()
         known = _known(kept, planner.automaton)
         with (
             open_film(world, camera, seed=seed) as film,
-            run_log(output, [kept], about, inputs, known, durability) as log,
+            run_log(output, [kept, *others], about, inputs, known, durability) as log,
         ):
             log.add_metadata(PLAN_METADATA, plan_metadata(planner, kept.filename))
             loop = PlanLoop(BlackBox(planner, timings=timings), log)

@@ -12,7 +12,7 @@ from spatial_replay.errors import SpecificationError, UsageError
 from spatial_replay.logs.output_file import Durability
 from spatial_replay.runs.filmed import Film, open_film
 from spatial_replay.runs.run_log import RunLog, run_log
-from spatial_replay.simulation.injection import Injection
+from spatial_replay.simulation.injection import Injection, Start
 from spatial_replay.simulation.tabletop import Tabletop
 from spatial_replay.simulation.world import Execution
 from spatial_replay.simulation.worlds import default_specification, make_world
@@ -64,6 +64,7 @@ def record_script(
     duration_ns: int | None = None,
     noise_m: float = 0.0,
     injections: Sequence[Injection] = (),
+    starts: Sequence[Start] = (),
     gui: bool = False,
     camera: Path | None = None,
     inputs: Sequence[Path] = (),
@@ -74,6 +75,7 @@ def record_script(
 
     Args:
         files: specifications to evaluate during the run; None takes that of the scenario.
+        starts: where bodies are at the beginning, in place of where the seed puts them.
         camera: a video to make of the run, beside which its tags file is written.
         duration_ns: duration in simulated time; None ends with the script.
         inputs: files that the output must not be.
@@ -88,9 +90,10 @@ def record_script(
     if duration_ns is not None and duration_ns <= 0:
         raise UsageError("a run of 0 s has no sample; give a longer duration")
     files = [default_specification(scenario)] if files is None else list(files)
-    about = about_run(scenario, seed=seed, noise_m=noise_m, injections=injections)
+    about = about_run(scenario, seed=seed, noise_m=noise_m, injections=injections, starts=starts)
     # an error in the world or a missing name leaves the output untouched
-    with closing(make_world(scenario, seed=seed, noise_m=noise_m, injections=injections, gui=gui)) as world:
+    made = make_world(scenario, seed=seed, noise_m=noise_m, injections=injections, starts=starts, gui=gui)
+    with closing(made) as world:
         refuse_unknown_names(files, world.sample())
         with (
             open_film(world, camera, seed=seed) as film,
@@ -101,9 +104,34 @@ def record_script(
         return SimulatedRun(log.samples, log.seconds, tuple(world.scene.bodies), outcome)
 
 
-def about_run(scenario: str, *, seed: int, noise_m: float, injections: Sequence[Injection]) -> dict[str, str]:
+def simulate_script(
+    scenario: str,
+    *,
+    seed: int = 0,
+    noise_m: float = 0.0,
+    injections: Sequence[Injection] = (),
+    starts: Sequence[Start] = (),
+) -> list[Sample]:
+    """Return the samples of a scripted run without a log; those that `record_script` records.
+
+    Raises:
+        UsageError: no such scenario, no simulator.
+    """
+    samples: list[Sample] = []
+    made = make_world(scenario, seed=seed, noise_m=noise_m, injections=injections, starts=starts)
+    with closing(made) as world:
+        world.attach(samples.append)
+        world.follow(world.script(), None)
+    return samples
+
+
+def about_run(
+    scenario: str, *, seed: int, noise_m: float, injections: Sequence[Injection], starts: Sequence[Start]
+) -> dict[str, str]:
     """Return the metadata about how a run was made."""
     options = {"seed": seed, "noise_m": noise_m, "inject": [str(each) for each in injections]}
+    if starts:
+        options["start"] = [str(each) for each in starts]
     # worlds are simulated in metres
     axes = Axes(unit="m").metadata()
     return {"source": scenario, "seed": str(seed), "options": json.dumps(options), **axes}

@@ -1,7 +1,8 @@
-"""Injected failures: what goes wrong in a run, and when."""
+"""What is given in place of what a seed decides, or goes wrong: starts of bodies, and injected failures."""
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass
 from typing import Literal, get_args
@@ -52,3 +53,41 @@ class Injection:
 
     def __str__(self) -> str:
         return self.kind if self.at_ns is None else f"{self.kind}@{self.at_ns / 10**9:g}s"
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """Where a body is at the beginning, in place of where the seed puts it.
+
+    Attributes:
+        x, y: its centre, in metres.
+        turn: its yaw, in radians; None for that of the seed.
+    """
+
+    name: str
+    x: float
+    y: float
+    turn: float | None = None
+
+    @classmethod
+    def parse(cls, text: str) -> Start:
+        """Parse `red=0.47,-0.09` or `red=0.47,-0.09,0.4`.
+
+        Raises:
+            UsageError: anything else.
+        """
+        name, _, place = text.partition("=")
+        try:
+            numbers = [float(number) for number in place.split(",")]
+        except ValueError:
+            numbers = []
+        if not name or not 2 <= len(numbers) <= 3 or not all(map(math.isfinite, numbers)):
+            raise UsageError(
+                f"{text!r} is no start; write NAME=X,Y in metres, or NAME=X,Y,TURN with radians, such as "
+                "red=0.47,-0.09,0.4"
+            )
+        return cls(name.strip(), *numbers)
+
+    def __str__(self) -> str:
+        numbers = [self.x, self.y] + ([] if self.turn is None else [self.turn])
+        return f"{self.name}={','.join(f'{number:.12g}' for number in numbers)}"

@@ -49,14 +49,15 @@ class Scene:
         others = [
             self.footprint(other) for other in self.bodies if other != name and self.height(other)[1] > above
         ]
-        return _distance(covered, others) if others else math.inf
+        return least_distance(covered, others) if others else math.inf
 
     def distance(self, covered: Footprint, name: str) -> float:
         """Return the distance to a body in the plane; below 0 if they overlap."""
-        return _distance(covered, [self.footprint(name)])
+        return least_distance(covered, [self.footprint(name)])
 
 
-def _distance(covered: Footprint, others: Sequence[Footprint]) -> float:
+def least_distance(covered: Footprint, others: Sequence[Footprint]) -> float:
+    """Return the distance, in metres, to the nearest of some footprints; below 0 if it overlaps one."""
     batch = FootprintBatch.from_footprints([covered, *others])
     operands = [Operand(np.array([[0]])), Operand(np.arange(1, len(batch))[None, :])]
     return float(measure(batch, operands, [MeasureRequest("signed_distance", 0, 1)])[0, 0])

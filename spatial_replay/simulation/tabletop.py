@@ -14,13 +14,14 @@ from spatial_replay.errors import UsageError
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
 from spatial_replay.simulation.arm import STEPS_PER_TICK, TICKS_PER_S, Arm
 from spatial_replay.simulation.bullet import Engine
-from spatial_replay.simulation.injection import Injection
+from spatial_replay.simulation.injection import Injection, Start
 from spatial_replay.simulation.picking import put_back
 from spatial_replay.simulation.pushing import pushing
 from spatial_replay.simulation.scenario import Scenario
 from spatial_replay.simulation.scene import Scene
 from spatial_replay.simulation.shapes import Box, Pose, footprint, height
 from spatial_replay.simulation.world import Body, Execution, ReachableArea, Skill, TreeTick
+from spatial_replay.text import nearest_hint
 from spatial_replay.trace.sample import Sample
 
 SAMPLES_PER_S = 30
@@ -39,7 +40,8 @@ class Tabletop:
     """The world of a scenario; `World` documents the methods that all worlds have.
 
     Raises:
-        UsageError: the simulator is not installed, the noise is below 0, or an injection is impossible.
+        UsageError: the simulator is not installed, the noise is below 0, an injection is impossible, or a
+            start is of no body.
     """
 
     def __init__(
@@ -49,6 +51,7 @@ class Tabletop:
         seed: int = 0,
         noise_m: float = 0.0,
         injections: Sequence[Injection] = (),
+        starts: Sequence[Start] = (),
         gui: bool = False,
     ) -> None:
         """Create the world at time 0.
@@ -57,6 +60,7 @@ class Tabletop:
             seed: of the initial poses and of the noise.
             noise_m: the maximum error of detected positions, in metres; samples have it as uncertainty.
             injections: failures, and when they happen.
+            starts: where bodies are at the beginning; the seed decides about the others.
             gui: show a window, and run no faster than real time.
         """
         if noise_m < 0 or not math.isfinite(noise_m):
@@ -65,7 +69,13 @@ class Tabletop:
             if injection.kind == "drop" and scenario.skill == "push":
                 what = f"nothing is held in {scenario.name}"
                 raise UsageError(f"{injection}: {what}; slip can be injected there")
+        names = [each.body.name for each in scenario.placements]
+        for start in starts:
+            if start.name not in names:
+                hint = nearest_hint(start.name, names) or f"there are {', '.join(names)}"
+                raise UsageError(f"{start}: {scenario.name} has no {start.name!r}; {hint}")
         self._scenario = scenario
+        self._starts = {start.name: start for start in starts}
         self._noise_m = noise_m
         self._injections = tuple(injections)
         self._listen: Callable[[Sample], str | None] = lambda sample: None
@@ -123,7 +133,10 @@ class Tabletop:
             dx, dy, turn = (drawn.random(3) * 2 - 1).tolist()
             tall = each.body.shape.height
             x, y = each.x + dx * scenario.scatter_m, each.y + dy * scenario.scatter_m
-            place, yaw = (x, y, each.bottom + tall / 2 + 5e-4), each.yaw + turn * scenario.scatter_rad
+            yaw = each.yaw + turn * scenario.scatter_rad
+            if (start := self._starts.get(each.body.name)) is not None:
+                x, y, yaw = start.x, start.y, yaw if start.turn is None else start.turn
+            place = (x, y, each.bottom + tall / 2 + 5e-4)
             engine.add(each.body.name, each.body.shape, each.mass_kg, place, yaw, each.colour)
         bodies = {each.body.name: each.body for each in scenario.placements}
         self._scene = Scene(engine, Arm(engine), MappingProxyType(bodies), self._report_tick)

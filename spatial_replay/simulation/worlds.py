@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from importlib import import_module, resources
 
 from spatial_replay.errors import UsageError
-from spatial_replay.simulation.injection import Injection
+from spatial_replay.simulation.injection import Injection, Start
 from spatial_replay.simulation.scenario import Scenario
 from spatial_replay.simulation.tabletop import Tabletop
 from spatial_replay.spec import parse_specification
@@ -17,15 +17,21 @@ SCENARIOS: tuple[str, ...] = ("push", "pick-place", "table-setting")
 
 
 def make_world(
-    name: str, *, seed: int = 0, noise_m: float = 0.0, injections: Sequence[Injection] = (), gui: bool = False
+    name: str,
+    *,
+    seed: int = 0,
+    noise_m: float = 0.0,
+    injections: Sequence[Injection] = (),
+    starts: Sequence[Start] = (),
+    gui: bool = False,
 ) -> Tabletop:
     """Create the world of a scenario at time 0; for the arguments see `Tabletop`.
 
     Raises:
         UsageError: there is no such scenario, or an argument of `Tabletop` is invalid.
     """
-    scenario = _scenario(name)
-    return Tabletop(scenario, seed=seed, noise_m=noise_m, injections=injections, gui=gui)
+    scenario = scenario_of(name)
+    return Tabletop(scenario, seed=seed, noise_m=noise_m, injections=injections, starts=starts, gui=gui)
 
 
 def default_specification(name: str) -> Specification:
@@ -34,12 +40,17 @@ def default_specification(name: str) -> Specification:
     Raises:
         UsageError: there is no such scenario.
     """
-    filename = f"{_scenario(name).name.replace('-', '_')}.spatial"
+    filename = f"{scenario_of(name).name.replace('-', '_')}.spatial"
     file = resources.files("spatial_replay.simulation.scenarios") / filename
     return parse_specification(file.read_text(encoding="utf-8"), filename=filename)
 
 
-def _scenario(name: str) -> Scenario:
+def scenario_of(name: str) -> Scenario:
+    """Return the definition of a scenario.
+
+    Raises:
+        UsageError: there is no such scenario, or py_trees, which it needs, is not installed.
+    """
     if name not in SCENARIOS:
         raise UsageError(f"there is no scenario {name!r}; there are {', '.join(SCENARIOS)}")
     try:

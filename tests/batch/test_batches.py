@@ -293,7 +293,7 @@ def test_two_batches_do_not_write_to_one_folder(fleet: Path) -> None:
         fcntl.flock(stream, fcntl.LOCK_EX)
         done = batch("logs", "--spec", "gate.spatial")
     assert done.code == 2
-    assert "another batch is writing to results" in done.err
+    assert "another command is writing to results" in done.err
 
 
 def test_what_is_worse_than_a_baseline_or_gone_fails_in_every_output(

@@ -1,0 +1,383 @@
+"""What is searched: the runs of a scenario, or those of a simulation of one's own, by their cases."""
+
+from __future__ import annotations
+
+import json
+import math
+import pickle
+import shlex
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Final, NamedTuple, Protocol, get_args
+
+from spatial_replay.errors import UsageError
+from spatial_replay.falsification.parameters import (
+    Case,
+    Parameter,
+    number_from,
+    parse_range,
+    refuse_range,
+)
+from spatial_replay.geometry.footprint import Footprint
+from spatial_replay.logs.output_file import replacing
+from spatial_replay.recording.recording import refuse_templates
+from spatial_replay.runs.planned import record_plan
+from spatial_replay.runs.run_log import run_log
+from spatial_replay.runs.scripted import about_run, refuse_unknown_names, simulate_script
+from spatial_replay.simulation.injection import Injection, Kind, Start
+from spatial_replay.simulation.scenario import Placement
+from spatial_replay.simulation.scene import least_distance, rectangle
+from spatial_replay.simulation.shapes import Box
+from spatial_replay.simulation.worlds import default_specification, make_world, scenario_of
+from spatial_replay.sources.open_log import read_trace
+from spatial_replay.spec.formula import Specification
+from spatial_replay.text import nearest_hint
+from spatial_replay.trace.sample import Sample
+from spatial_replay.trace.time_points import duration_ns_from_text
+from spatial_replay.trace.trace import Trace
+
+_KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
+_FORMS: Final = "noise=0:0.01, seed=0:999, start, start=0.02, start.OBJECT=0.02, drop@T, slip@T or slip@2s:9s"
+
+
+class SimulatedCase(NamedTuple):
+    """The run of a case: its samples, what writes it as a log, and the unit of lengths in it, if declared."""
+
+    trace: Trace
+    write: Callable[[Path], None]
+    unit: str = ""
+
+
+class Simulation(Protocol):
+    """Gives the run of each case; equal cases have equal runs.
+
+    Attributes:
+        name: what is simulated.
+        files: what has to hold.
+        identity: what else its runs depend on, for the folder of a search.
+    """
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def files(self) -> tuple[Specification, ...]: ...
+    @property
+    def identity(self) -> Mapping[str, bool]: ...
+
+    def is_possible(self, case: Case) -> bool:
+        """Return whether there is such a run: False where objects would lie in each other."""
+
+    def run(self, case: Case) -> SimulatedCase:
+        """Simulate a case."""
+
+    def command(self, case: Case) -> str | None:
+        """Return the command that repeats the run of a case; None if there is none."""
+
+
+def scenario_simulation(
+    scenario: str,
+    files: Sequence[Specification],
+    vary: str | Sequence[str],
+    options: Sequence[str] = (),
+    *,
+    is_planned: bool = False,
+) -> tuple[Simulation, tuple[Parameter, ...]]:
+    """Return the runs of a scenario, and what is varied in them; by default where objects start.
+
+    Args:
+        vary: as on the command line.
+        options: those of `record` that name the specifications.
+
+    Raises:
+        UsageError: there is no such scenario, no simulator, or what cannot be varied.
+        SpecificationError: names that the world does not have.
+    """
+    runs = ScenarioRuns.of(scenario, files, options, is_planned=is_planned)
+    return runs, runs.parameters([vary] if isinstance(vary, str) else vary or ["start"])
+
+
+def own_simulation(
+    simulate: Callable[[Mapping[str, float]], Iterable[Sample]],
+    files: Sequence[Specification],
+    vary: Mapping[str, tuple[float, float]] | Sequence[str],
+    jobs: int = 1,
+) -> tuple[Simulation, tuple[Parameter, ...]]:
+    """Return the runs of a function, and what is varied in them.
+
+    Args:
+        vary: ranges by name, or as `NAME=LOW:HIGH`.
+
+    Raises:
+        UsageError: no specification or a template, an empty range, or a function that no other process has.
+    """
+    if not files:
+        raise UsageError("a simulation of one's own has no specification yet; give what has to hold")
+    refuse_templates(files)
+    if not isinstance(vary, Mapping):
+        texts = [vary] if isinstance(vary, str) else vary
+        vary = {
+            name: (number_from(low, name), number_from(high, name))
+            for name, low, high in map(parse_range, texts)
+        }
+    name = getattr(simulate, "__name__", type(simulate).__name__)
+    runs = OwnSimulation(simulate, tuple(files), name)
+    if jobs > 1:
+        try:
+            pickle.dumps(runs)
+        except (AttributeError, TypeError, pickle.PicklingError) as error:
+            raise UsageError(
+                f"{name} cannot be sent to other processes ({error}); define it in a module, or take jobs=1"
+            ) from None
+    return runs, tuple(Parameter.of_range(each, *span) for each, span in vary.items())
+
+
+@dataclass(frozen=True, slots=True)
+class OwnSimulation:
+    """A simulation of the caller's: a function from the values of a case to samples."""
+
+    simulate: Callable[[Mapping[str, float]], Iterable[Sample]]
+    files: tuple[Specification, ...]
+    name: str
+
+    @property
+    def identity(self) -> Mapping[str, bool]:
+        """See `Simulation`."""
+        return {}
+
+    def is_possible(self, case: Case) -> bool:
+        """See `Simulation`."""
+        return True
+
+    def run(self, case: Case) -> SimulatedCase:
+        """See `Simulation`.
+
+        Raises:
+            UsageError: the function returns anything but samples.
+        """
+        values = {name: value for name, value in case.items() if value is not None}
+        samples = list(self.simulate(values))
+        if not samples or not all(isinstance(each, Sample) for each in samples):
+            what = f"{type(samples[0]).__name__} objects" if samples else "nothing"
+            raise UsageError(f"{self.name} returns {what}; a simulation returns one Sample or more")
+        about = {"source": self.name, "options": json.dumps(values)}
+        return SimulatedCase(
+            Trace.from_samples(samples), lambda output: _write(output, samples, self.files, about)
+        )
+
+    def command(self, case: Case) -> None:
+        """See `Simulation`."""
+
+
+@dataclass(frozen=True, slots=True)
+class ScenarioRuns:
+    """The runs of a simulated world.
+
+    Attributes:
+        spec_options: those options of `record` that name the specifications.
+        is_planned: whether a planner decides, for the scenario's own specification, in place of the script.
+    """
+
+    name: str
+    files: tuple[Specification, ...]
+    spec_options: tuple[str, ...] = ()
+    is_planned: bool = False
+
+    @property
+    def identity(self) -> Mapping[str, bool]:
+        """See `Simulation`."""
+        return {"planned": self.is_planned}
+
+    @classmethod
+    def of(
+        cls,
+        scenario: str,
+        files: Sequence[Specification],
+        options: Sequence[str] = (),
+        *,
+        is_planned: bool = False,
+    ) -> ScenarioRuns:
+        """Take a scenario, and specifications that fit it: without any, its own.
+
+        Raises:
+            UsageError: there is no such scenario, or no simulator.
+            SpecificationError: names that the world does not have.
+        """
+        chosen = tuple(files) or (default_specification(scenario),)
+        with closing(make_world(scenario)) as world:
+            refuse_unknown_names(chosen, world.sample())
+        refuse_templates(chosen)
+        return cls(scenario, chosen, tuple(options), is_planned)
+
+    def parameters(self, texts: Iterable[str]) -> tuple[Parameter, ...]:
+        """Return what is varied, as it is written on the command line.
+
+        Raises:
+            UsageError: what cannot be varied in this world, or is given twice.
+        """
+        found = [parameter for text in texts for parameter in self._parameters(text)]
+        return tuple(found)
+
+    def is_possible(self, case: Case) -> bool:
+        """See `Simulation`."""
+        starts = {start.name: start for start in _conditions(case).starts}
+        scenario = scenario_of(self.name)
+        outlines = {each: _outline(each, starts, scenario.scatter_m) for each in scenario.placements}
+        return all(
+            least_distance(outlines[one], [outlines[other]]) > 0
+            for one, other in combinations(scenario.placements, 2)
+            if (one.body.name in starts or other.body.name in starts) and _is_beside(one, other)
+        )
+
+    def run(self, case: Case) -> SimulatedCase:
+        """See `Simulation`."""
+        given = _conditions(case)
+        if self.is_planned:
+            return self._plan(given)
+        samples = simulate_script(self.name, **given._asdict())
+        about = about_run(self.name, **given._asdict())
+        return SimulatedCase(
+            Trace.from_samples(samples), lambda output: _write(output, samples, self.files, about), unit="m"
+        )
+
+    def command(self, case: Case) -> str:
+        """See `Simulation`."""
+        given = _conditions(case)
+        options = ["--seed", str(given.seed)]
+        if given.noise_m:
+            options += ["--noise", f"{given.noise_m:.12g}"]
+        for each in given.injections:
+            options += ["--inject", str(each)]
+        for start in given.starts:
+            options += ["--start", str(start)]
+        verb = ["plan", self.name] if self.is_planned else ["record", self.name, *self.spec_options]
+        words = ["spatial-replay", *verb, "-o", "again.mcap", *options]
+        return shlex.join(words)
+
+    def _plan(self, given: _Conditions) -> SimulatedCase:
+        own = default_specification(self.name)
+        with TemporaryDirectory() as folder:
+            log = Path(folder, "run.mcap")
+            record_plan(self.name, log, also=[each for each in self.files if each != own], **given._asdict())
+            trace, data = read_trace(log), log.read_bytes()
+
+        def write(output: Path) -> None:
+            with replacing(output) as stream:
+                stream.write(data)
+
+        return SimulatedCase(trace, write, unit="m")
+
+    def _parameters(self, text: str) -> list[Parameter]:
+        name = text.partition("=")[0].strip()
+        kind, at, when = text.partition("@")
+        if at and kind in _KINDS:
+            return [self._mishap(kind, when.strip())]
+        if name == "start" or name.startswith("start."):
+            return self._starts(text)
+        if name in ("noise", "seed"):
+            _, low, high = parse_range(text)
+            ends = number_from(low, name), number_from(high, name)
+            refuse_range(name, *ends)
+            if ends[0] < 0:
+                raise UsageError(f"--vary {text}: {name} is not below 0; begin at 0")
+            if name == "noise":
+                return [Parameter(name, *ends, digits=6, rest=ends[0], group=name, unit="m")]
+            if not all(end.is_integer() for end in ends):
+                raise UsageError(f"--vary {text}: seeds are whole numbers; write seed=0:999")
+            return [Parameter(name, *ends, digits=0, rest=ends[0], group=name, is_drawn=True)]
+        if kind in _KINDS:
+            raise UsageError(f"--vary {text}: write {kind}@T for any time of the run, or {kind}@2s:9s")
+        hint = nearest_hint(name, ["noise", "seed", "start", *_KINDS])
+        raise UsageError(f"--vary: {name!r} cannot be varied in {self.name}; {hint or f'write {_FORMS}'}")
+
+    def _mishap(self, kind: str, when: str) -> Parameter:
+        begin, colon, end = when.partition(":")
+        try:
+            # the world itself says what cannot happen in it
+            with closing(make_world(self.name, injections=[Injection.parse(f"{kind}@1s")])):
+                pass
+            span = (0.0, math.inf)
+            if when != "T":
+                if not colon:
+                    raise UsageError(f"write {kind}@T for any time of the run, or {kind}@2s:9s")
+                span = duration_ns_from_text(begin) / 1e9, duration_ns_from_text(end) / 1e9
+        except UsageError as error:
+            raise UsageError(f"--vary {kind}@{when}: {error}") from None
+        if colon:
+            refuse_range(kind, *span)
+        return Parameter(kind, *span, digits=3, rest=None, group=kind, unit="s")
+
+    def _starts(self, text: str) -> list[Parameter]:
+        name, equals, metres = (part.strip() for part in text.partition("="))
+        scenario = scenario_of(self.name)
+        bodies = [each.body.name for each in scenario.placements]
+        wanted = name.removeprefix("start").removeprefix(".")
+        if wanted and wanted not in bodies:
+            hint = nearest_hint(wanted, bodies) or f"there are {', '.join(bodies)}"
+            raise UsageError(f"--vary {text}: {self.name} has no {wanted!r}; {hint}")
+        off = number_from(metres, name) if equals else scenario.scatter_m
+        if not (math.isfinite(off) and off > 0):
+            raise UsageError(
+                f"--vary {text}: write how far an object may be from its place, such as {name}=0.02"
+            )
+        found = []
+        for each in scenario.placements:
+            if wanted in ("", each.body.name):
+                group = f"start.{each.body.name}"
+                centres = {"x": (each.x, off), "y": (each.y, off), "turn": (each.yaw, scenario.scatter_rad)}
+                for axis, (centre, wide) in centres.items():
+                    digits, unit = (3, "rad") if axis == "turn" else (4, "m")
+                    ends = round(centre - wide, digits), round(centre + wide, digits)
+                    found.append(Parameter(f"{group}.{axis}", *ends, digits, None, group, unit))
+        return found
+
+
+class _Conditions(NamedTuple):
+    """How a case is simulated."""
+
+    seed: int
+    noise_m: float
+    injections: list[Injection]
+    starts: list[Start]
+
+
+def _conditions(case: Case) -> _Conditions:
+    injections = [Injection(kind, round(at * 1e9)) for kind in _KINDS if (at := case.get(kind)) is not None]
+    starts = []
+    for name in case:
+        if name.startswith("start.") and name.endswith(".x"):
+            group = name.removesuffix(".x")
+            x, y, turn = case[name], case[f"{group}.y"], case[f"{group}.turn"]
+            if x is not None and y is not None:
+                starts.append(Start(group.removeprefix("start."), x, y, turn))
+    return _Conditions(int(case.get("seed") or 0), case.get("noise") or 0.0, injections, starts)
+
+
+def _outline(placement: Placement, starts: Mapping[str, Start], scatter_m: float) -> Footprint:
+    """Return what a body covers at the beginning; with the room that the seed may take."""
+    x, y, turn, room = placement.x, placement.y, placement.yaw, scatter_m
+    if (start := starts.get(placement.body.name)) is not None:
+        x, y, turn, room = start.x, start.y, turn if start.turn is None else start.turn, 0.0
+    shape = placement.body.shape
+    if isinstance(shape, Box):
+        return rectangle(x, y, shape.length + 2 * room, shape.width + 2 * room, turn)
+    return Footprint.disc(x, y, shape.radius + room)
+
+
+def _is_beside(one: Placement, other: Placement) -> bool:
+    """Return whether two bodies are at the same height, so that they must not overlap."""
+    return (
+        one.bottom < other.bottom + other.body.shape.height
+        and other.bottom < one.bottom + one.body.shape.height
+    )
+
+
+def _write(
+    output: Path, samples: Sequence[Sample], files: Sequence[Specification], about: Mapping[str, str]
+) -> None:
+    with run_log(output, files, about) as log:
+        for sample in samples:
+            log.write(sample)

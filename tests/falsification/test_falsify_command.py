@@ -1,0 +1,127 @@
+"""`spatial-replay falsify` in a simulated world: its logs, what it says, and its exit codes."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+import spatial_replay as sr
+from spatial_replay.cli import run
+
+NEAR = "spec near = G (red dist blue <= 0.19)\n"
+VARIED = ("--vary", "start.red=0.03", "--vary", "slip@T", "--seed", "2")
+
+
+@pytest.fixture(autouse=True)
+def _extras() -> None:
+    pytest.importorskip("pybullet", reason="PyBullet is not installed; it has wheels for Python 3.11")
+    pytest.importorskip("cma", reason="the search needs cma")
+
+
+def test_a_failure_is_the_log_that_its_command_records(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("near.spatial").write_text(NEAR)
+    command = ["falsify", "push", "--spec", "near.spatial", "-o", "found", *VARIED, "--budget", "3"]
+    assert run(command) == 1
+    said = capsys.readouterr().out
+    assert said.startswith("run 1, with nothing varied: satisfied, near 0.0")
+    found = json.loads(Path("found/failures.json").read_text())
+    worst = found["failures"][0]
+    # a red block too far away needs no mishap
+    assert worst["smaller"]["slip"] is None
+    assert worst["smaller"]["start.red.x"] == worst["case"]["start.red.x"]
+    assert f"with less: found/{worst['smaller_log']}" in said
+    *_, repeated = said.splitlines()
+    again = repeated.removeprefix("the worst again: spatial-replay ")
+    assert f"--start red={worst['case']['start.red.x']}," in again
+    assert run(shlex.split(again)) == 0
+    assert Path("again.mcap").read_bytes() == Path("found", worst["smaller_log"]).read_bytes()
+    # what is known is not simulated again
+    before = {file: file.read_bytes() for file in Path("found").rglob("*.*")}
+    assert run([*command, "--json"]) == 1
+    *_, printed = capsys.readouterr().out.partition("{")
+    assert json.loads("{" + printed) == found
+    assert {file: file.read_bytes() for file in Path("found").rglob("*.*")} == before
+
+
+def test_what_was_covered_is_said_where_nothing_is_found(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["falsify", "push", "-o", str(tmp_path / "found"), "--vary", "noise=0:0.05", "--budget", "2"]
+    # noise leaves doubt, and the robot's script does not act on what is seen
+    assert run(command) == 4
+    said = capsys.readouterr().out.splitlines()
+    assert said[0].startswith("run 1, with nothing varied: satisfied, push 0.0")
+    assert said[1] == "2 runs of push: none violated, 1 unknown"
+    assert said[2].startswith("  the lowest: run 1, satisfied, push 0.0")
+    assert said[4].split()[:5] == ["noise", "0", "to", "0.05", "m"]
+    assert sorted(said[4].split()[5:]) == ["0"] * 9 + ["1"]
+
+
+def test_a_planner_is_searched_as_a_script_is(tmp_path: Path) -> None:
+    # so much noise that it sees nothing to do
+    vary = ["noise=0.2:0.3"]
+    never = sr.parse_specification("spec low = G (tool_z >= 5)")
+    found = sr.falsify("push", never, output=tmp_path / "found", vary=vary, planned=True)
+    (failure,) = found.failures
+    assert failure.command == "spatial-replay plan push -o again.mcap --seed 0 --noise 0.2"
+    results = {result.name: str(result.verdict) for result in sr.replay_log(failure.log).results}
+    assert results == {"push": "unknown", "low": "violated"}
+    assert not sr.verify(failure.log).differences
+
+
+@pytest.mark.parametrize(
+    ("varied", "message"),
+    [
+        ("noise", "--vary: 'noise' is incomplete; write NAME=LOW:HIGH, such as noise=0:0.01"),
+        ("noise=-1:1", "--vary noise=-1:1: noise is not below 0; begin at 0"),
+        ("drop@T", "--vary drop@T: drop@1s: nothing is held in push; slip can be injected there"),
+        ("slip", "--vary slip: write slip@T for any time of the run, or slip@2s:9s"),
+        ("slip@2:3", "--vary slip@2:3: '2' is not a duration"),
+        ("slip@3s:1s", "--vary slip: 3 to 1 is no range; write the lower end first"),
+        ("start.gren", "--vary start.gren: push has no 'gren'; did you mean 'green'?"),
+        ("start=0", "--vary start=0: write how far an object may be from its place"),
+        ("strat", "--vary: 'strat' cannot be varied in push; did you mean 'start'?"),
+        ("seed=0.5:9", "--vary seed=0.5:9: seeds are whole numbers; write seed=0:999"),
+        ("wind=1:2", "--vary: 'wind' cannot be varied in push; write noise=0:0.01, seed=0:999"),
+    ],
+)
+def test_what_cannot_be_varied_is_refused_before_anything_is_written(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], varied: str, message: str
+) -> None:
+    assert run(["falsify", "push", "-o", str(tmp_path / "found"), "--vary", varied]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "found").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--start", "gren=0.4,0.1"], "push has no 'gren'; did you mean 'green'?"),
+        (["--start", "red"], "'red' is no start; write NAME=X,Y in metres"),
+        (["--start", "red=1,2", "--start", "red=2,1"], "--start: 'red' is given twice; give one place"),
+    ],
+)
+def test_starts_that_there_are_not_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], message: str
+) -> None:
+    assert run(["record", "push", "-o", str(tmp_path / "run.mcap"), *options]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "run.mcap").exists()
+
+
+def test_starts_in_which_objects_would_lie_in_each_other_are_left_out(tmp_path: Path) -> None:
+    never = sr.parse_specification("spec calm = G (tool_z >= -5)")
+    found = sr.falsify("push", never, output=tmp_path / "found", vary=["start=0.15"], budget=2)
+    assert found.impossible > 0
+    (_, other) = found.runs
+    starts = [
+        (other.case[f"start.{name}.x"], other.case[f"start.{name}.y"]) for name in ("red", "green", "blue")
+    ]
+    assert all(abs(a - c) > 0.04 or abs(b - d) > 0.04 for (a, b), (c, d) in pairwise(starts))
