@@ -52,6 +52,7 @@ class Parameter:
         Raises:
             UsageError: the range is empty or not finite.
         """
+        low, high = float(low), float(high)
         refuse_range(name, low, high)
         digits = max(0, _DIGITS - math.floor(math.log10(high - low)))
         return cls(name, low, high, digits, min(max(low, 0.0), high), name)
