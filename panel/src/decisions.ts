@@ -15,6 +15,8 @@ const MAP = "/plan/gradient_map";
 /** Cells of all maps that are kept: 16 MiB. */
 const MOST_CELLS = 1 << 22;
 const MOST_GUARDS = 4;
+/** Conjuncts and causes that are listed of a map. */
+const MOST_LISTED = 3;
 const KINDS = ["", "execute", "hold", "wait", "no path"];
 
 interface Decision {
@@ -211,10 +213,29 @@ function drawnOf({ time, message }: Decision, maps: DrawnMap[]): DrawnDecision {
       candidates: edge.candidates.map((each) => ({
         object: printable(each.object), best: each.best === -Infinity ? "nowhere free" : numberText(each.best ?? NaN),
         status: each.rejected ? "rejected" : each.chosen ? "chosen" : "possible", rejected: printable(each.rejected),
+        why: whyOf(each),
         target: each.target ? drawnTarget(each.target) : null,
       })),
     })),
   };
+}
+
+type Candidate = DecisionMessage["considered"][number]["candidates"][number];
+
+/** What limits, blocks and costs the target of an object; logs of earlier planners do not say. */
+function whyOf({ conjuncts = [], causes = [], room, target }: Candidate): string[] {
+  const cells = (count = 0) => `${count} cell${count === 1 ? "" : "s"}`;
+  const limiting = conjuncts.filter((each) => each.limits).sort((a, b) => (b.limits ?? 0) - (a.limits ?? 0));
+  const words = ["something unknown", "", "", "an obstacle of the workspace", "the robot's reach", "something unknown", "a motion that failed there"];
+  const lines = [
+    ...limiting.slice(0, MOST_LISTED).map((each) => `limited by ${printable(each.text)} in ${cells(each.limits)}`),
+    ...causes.slice(0, MOST_LISTED).map((each) => `blocked by ${printable(each.text) || words[each.kind]} in ${cells(each.cells)}`),
+  ];
+  if (room && target) {
+    lines.push(`room ${numberText(target.robustness ?? NaN)} chosen, ${numberText(room.possible ?? NaN)} possible with less room `
+      + `(${numberText(room.clearance ?? NaN)} of ${numberText(room.wanted ?? NaN)})`);
+  }
+  return lines;
 }
 
 function guards(found: readonly { readonly text: string }[]): string[] {

@@ -115,6 +115,9 @@ export interface DecisionMessage {
       readonly rejected: string;
       readonly chosen: boolean;
       readonly maps: readonly { readonly number?: number; readonly turn?: number }[];
+      readonly conjuncts?: readonly { readonly text: string; readonly limits?: number; readonly at_target?: number }[];
+      readonly causes?: readonly { readonly kind: number; readonly text: string; readonly cells?: number }[];
+      readonly room?: { readonly wanted?: number; readonly possible?: number; readonly clearance?: number } | null;
     }[];
     readonly pruned: string;
   }[];

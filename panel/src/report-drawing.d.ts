@@ -56,11 +56,14 @@ declare module "report-drawing" {
   export interface DrawnMap {
     columns: number; low: [number, number]; high: [number, number]; scale: number; values: Float32Array;
     chosen: boolean; edge: number | null; candidate: number | null; title: string; target: DrawnTarget | null;
+    limited?: Float32Array; blocked?: Float32Array; limits?: string[]; blocks?: string[];
+    layers?: { title: string; values: Float32Array }[];
   }
   export interface DrawnEdge {
     path: number[]; aim: boolean; progress: string[]; constraints: string[]; pruned: string;
     candidates: {
       object: string; best: string; status: string; rejected: string; target: DrawnTarget | null;
+      why?: string[];
     }[];
   }
   export interface DrawnDecision {

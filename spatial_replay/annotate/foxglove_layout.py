@@ -29,7 +29,7 @@ from spatial_replay.annotate.viewer_panels import (
 )
 from spatial_replay.logs.messages import Attachment
 from spatial_replay.logs.schemas.Robustness_pb2 import VIOLATED
-from spatial_replay.logs.topics import EVENT_LOG, LAYOUT, PLAN_DECISION
+from spatial_replay.logs.topics import EVENT_LOG, LAYOUT, PLAN_DECISION, REDONE_MAP
 from spatial_replay.trace.axes import OUR_AXES, Axes
 
 _PER_ROW: Final = 6
@@ -100,9 +100,12 @@ _Weighted = tuple[Panel, float]
 
 def _scene_panels(contents: LayoutContents) -> list[_Weighted]:
     """Return the picture of a camera, the scene and, of a planner, its reasons."""
-    scene = scene_panel(_camera(contents.extent), contents.topics, contents.axes)
+    about = _camera(contents.extent), contents.topics, contents.axes
+    scenes = [(scene_panel(*about), 4.0)]
+    if REDONE_MAP in contents.topics:
+        scenes.append((scene_panel(*about, redone=True), 4.0))
     camera = [(image_panel(contents.images, contents.topics), 4.0)] if contents.images else []
-    return [*camera, (scene, 4.0), *([(decision_reason(), 1.0)] if PLAN_DECISION in contents.topics else [])]
+    return [*camera, *scenes, *([(decision_reason(), 1.0)] if PLAN_DECISION in contents.topics else [])]
 
 
 def _evaluation_panels(contents: LayoutContents) -> list[_Weighted]:

@@ -31,6 +31,8 @@ from spatial_replay.logs.topics import (
     GRADIENT_MAP,
     PLAN_DECISION,
     PLAN_PATH,
+    REDONE_MAP,
+    REDONE_PATH,
     ROBUSTNESS,
     SCENE,
     SPECIFICATION,
@@ -78,9 +80,16 @@ class Panel(NamedTuple):
     config: Config
 
 
-def scene_panel(camera: Mapping[str, Any], topics: Collection[str], axes: Axes = OUR_AXES) -> Panel:
-    """Return the scene from above, with the planner's map below it and its path above."""
-    shown: dict[str, Config] = {SCENE: {}, GRADIENT_MAP: {"colorMode": "rgba-fields"}, PLAN_PATH: {}}
+def scene_panel(
+    camera: Mapping[str, Any], topics: Collection[str], axes: Axes = OUR_AXES, *, redone: bool = False
+) -> Panel:
+    """Return the scene from above, with the planner's map below it and its path above.
+
+    Args:
+        redone: show what the planner would have decided otherwise, instead of what it decided.
+    """
+    grid, path = (REDONE_MAP, REDONE_PATH) if redone else (GRADIENT_MAP, PLAN_PATH)
+    shown: dict[str, Config] = {SCENE: {}, grid: {"colorMode": "rgba-fields"}, path: {}}
     config = {
         "cameraState": camera,
         "followMode": "follow-none",
@@ -90,7 +99,9 @@ def scene_panel(camera: Mapping[str, Any], topics: Collection[str], axes: Axes =
         # its axes are a metre long, whatever the scene's size
         "transforms": {f"frame:{frame}": {"visible": False} for frame in FRAMES},
     }
-    return _titled("3D!scene", "Scene" if axes == OUR_AXES else f"Scene, {axes}", config)
+    title = "Scene, redone" if redone else "Scene"
+    shown_title = title if axes == OUR_AXES else f"{title}, {axes}"
+    return _titled("3D!redone" if redone else "3D!scene", shown_title, config)
 
 
 def indicators(trees: Sequence[ReportedTree], outcomes: Sequence[FinalStanding] = ()) -> list[Panel]:

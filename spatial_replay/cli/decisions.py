@@ -16,14 +16,11 @@ if TYPE_CHECKING:
     from spatial_replay.logs.remote import LogFile
     from spatial_replay.logs.schemas.PlanDecision_pb2 import (
         PlanCandidate,
-        PlanCause,
         PlanDecision,
         PlanEdge,
         PlanTarget,
     )
 
-_MOST_LISTED: Final = 3
-"""Conjuncts and causes that are listed of a map."""
 _LONGEST: Final = 400
 """Characters of alternatives that are printed; JSON has all."""
 
@@ -113,7 +110,7 @@ def choice_text(decision: PlanDecision) -> str:
 
 
 def _edge_lines(edge: PlanEdge, *, is_aim: bool) -> Iterator[str]:
-    from spatial_replay.planning.decisions import Reason
+    from spatial_replay.planning.decisions import Reason, candidate_lines
 
     path = " -> ".join(map(str, edge.path))
     yield f"  {'aimed at' if is_aim else 'looked into'} {edge.source} -> {edge.target} on the path {path}"
@@ -135,36 +132,6 @@ def _candidate(candidate: PlanCandidate) -> str:
         return f"{name}: rejected, {candidate.rejected}"
     mark = "chosen" if candidate.chosen else "possible"
     return f"{name}: {mark}, {candidate.best:.4g} at best; {_target(candidate.target)}"
-
-
-def candidate_lines(candidate: PlanCandidate) -> Iterator[tuple[str, str]]:
-    """Yield what limits, blocks and costs the target of an object: (key, text), the key as a first column."""
-    limiting = sorted((each for each in candidate.conjuncts if each.limits), key=lambda each: -each.limits)
-    for each in limiting[:_MOST_LISTED]:
-        here = f", {each.at_target:.4g} at the target" if each.HasField("at_target") else ""
-        yield "limited by", f"{each.text} in {counted(each.limits, 'cell')}{here}"
-    for cause in candidate.causes[:_MOST_LISTED]:
-        yield "blocked by", f"{_cause(cause)} in {counted(cause.cells, 'cell')}"
-    if candidate.HasField("room"):
-        room = candidate.room
-        yield (
-            "room",
-            f"{candidate.target.robustness:.4g} chosen, {room.possible:.4g} possible with less room "
-            f"({max(room.clearance, 0.0):.3g} of {room.wanted:.3g})",
-        )
-
-
-def _cause(cause: PlanCause) -> str:
-    match cause.kind:
-        case cause.KIND_CONSTRAINT | cause.KIND_OBJECT:
-            return cause.text
-        case cause.KIND_OBSTACLE:
-            return "an obstacle of the workspace"
-        case cause.KIND_REACH:
-            return "the robot's reach"
-        case cause.KIND_FAILED:
-            return "a motion that failed there"
-    return "something unknown"
 
 
 def _maps(candidate: PlanCandidate) -> str:

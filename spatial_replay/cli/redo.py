@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from spatial_replay.cli.application import ExitCode, most_severe
-from spatial_replay.cli.decisions import candidate_lines, choice_text, decision_rows, fitted_lines
+from spatial_replay.cli.decisions import choice_text, decision_rows, fitted_lines
 from spatial_replay.cli.options import load_spec_options, require_choice
 from spatial_replay.cli.progress import progress
 from spatial_replay.cli.terminal import show, show_json, warn
@@ -148,6 +148,8 @@ def _candidates(message: PlanDecision) -> list[PlanCandidate]:
 
 
 def _rows(candidate: PlanCandidate | None) -> dict[str, list[str]]:
+    from spatial_replay.planning.decisions import candidate_lines
+
     if candidate is None:
         return {}
     best = "nowhere free" if math.isinf(candidate.best) else f"{candidate.best:.4g}"

@@ -141,8 +141,8 @@ class BlackBox:
         self._decision = decision_message(step, self.planner, self._written[_MAPS], layers)
         maps = [map_message(each, step.time_ns, (layers or {}).get(each.candidate)) for each in maps_of(step)]
         path = path_message(step.target, self._tracked, step.time_ns)
-        timings = [_timing(step, took_s)] if self._times else []
-        return step, self._messages(step.time_ns, [*ended, self._decision], maps, [path], timings)
+        timings = [[_timing(step, took_s)]] if self._times else []
+        return step, self._messages(step.time_ns, [*ended, self._decision], maps, [path], *timings)
 
     def conclude(self, outcome: Outcome) -> Messages:
         """Take the outcome of the last step, and return its messages.

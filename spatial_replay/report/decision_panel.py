@@ -11,6 +11,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from foxglove_schemas_protobuf.Grid_pb2 import Grid
 from google.protobuf.message import DecodeError
+from numpy.typing import NDArray
 
 from spatial_replay.errors import LogError
 from spatial_replay.geometry.arrays import Floats
@@ -22,7 +23,7 @@ from spatial_replay.logs.schemas.PlanDecision_pb2 import (
     PlanTarget,
 )
 from spatial_replay.planning.decision_log import decision_from_payload, latest_decisions
-from spatial_replay.planning.decisions import Reason
+from spatial_replay.planning.decisions import Reason, candidate_lines, cause_text
 from spatial_replay.planning.map_messages import map_fields
 from spatial_replay.report.compact import Packing, singles
 from spatial_replay.text import number_text
@@ -30,6 +31,8 @@ from spatial_replay.text import number_text
 MOST_CELLS: Final = 1_500_000
 """Cells of all maps of a page together, at most; maps of chosen targets come first."""
 _MOST_GUARDS: Final = 4
+_MOST_LAYERED: Final = 50_000
+"""Cells of a map of which a page says what limits and blocks them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,10 +42,12 @@ class ReportedDecisions:
     Attributes:
         decisions: in order, each with its outcome if it has one.
         maps: by the number by which decisions name them, in the order of the log.
+        redone: what would have been decided otherwise, if the log has that.
     """
 
     decisions: tuple[PlanDecision, ...]
     maps: Mapping[int, Grid]
+    redone: ReportedDecisions | None = None
 
 
 class DecisionCollector:
@@ -51,6 +56,13 @@ class DecisionCollector:
     def __init__(self) -> None:
         self._decisions: list[PlanDecision] = []
         self._maps: dict[int, Grid] = {}
+        self._redone: DecisionCollector | None = None
+
+    @property
+    def redone(self) -> DecisionCollector:
+        """What collects the decisions that would have been made otherwise."""
+        self._redone = self._redone or DecisionCollector()
+        return self._redone
 
     def add_decision(self, payload: bytes) -> None:
         """Take in a decision; one that cannot be decoded is skipped."""
@@ -67,7 +79,8 @@ class DecisionCollector:
     @property
     def decisions(self) -> ReportedDecisions:
         """The decisions and maps so far."""
-        return ReportedDecisions(latest_decisions(self._decisions), dict(self._maps))
+        redone = None if self._redone is None else self._redone.decisions
+        return ReportedDecisions(latest_decisions(self._decisions), dict(self._maps), redone)
 
 
 class _Owner(NamedTuple):
@@ -103,6 +116,7 @@ class _Drawn(NamedTuple):
         low, high: where its corners lie.
         owner: None if the log does not record it.
         is_chosen: whether the decision's target was found on it.
+        fields: what the message has of each cell, (rows, columns) by name.
     """
 
     values: Floats
@@ -110,6 +124,7 @@ class _Drawn(NamedTuple):
     high: tuple[float, float]
     owner: _Owner | None
     is_chosen: bool
+    fields: Mapping[str, NDArray[Any]]
 
 
 def decisions_value(
@@ -118,11 +133,27 @@ def decisions_value(
     """Return the decisions as the page reads them, and how many maps did not fit."""
     drawn = [list(_maps_of(plan, decision)) for decision in plan.decisions]
     kept = _kept([each for maps in drawn for each in maps], most_cells)
+    redone = {} if plan.redone is None else _redone_by_number(plan, plan.redone)
     decisions = []
     for decision, maps in zip(plan.decisions, drawn, strict=True):
         values = [_map_value(each, packing) for each in maps if id(each) in kept]
-        decisions.append(_decision_value(decision, values, first_ns, packing))
+        value = dict(_decision_value(decision, values, first_ns, packing))
+        if plan.redone is not None and (other := redone.get(decision.number)) is not None:
+            chosen = [each for each in _maps_of(plan.redone, other) if each.is_chosen]
+            own = [_map_value(each, packing) for each in chosen]
+            value["redone"] = _decision_value(other, own, first_ns, packing)
+        decisions.append(value)
     return {"decisions": decisions, "maps_left_out": sum(map(len, drawn)) - len(kept)}
+
+
+def _redone_by_number(plan: ReportedDecisions, redone: ReportedDecisions) -> dict[int, PlanDecision]:
+    """Return the decisions that do something else than those of the log, by number."""
+    done = {each.number: (each.kind, each.reason, each.time_ns) for each in plan.decisions}
+    return {
+        each.number: each
+        for each in redone.decisions
+        if (each.kind, each.reason, each.time_ns) != done.get(each.number)
+    }
 
 
 def _kept(maps: Sequence[_Drawn], most_cells: int) -> set[int]:
@@ -180,7 +211,7 @@ def _drawn(grid: Grid, owner: _Owner | None, is_chosen: bool) -> _Drawn | None:
     high = x + columns * grid.cell_size.x, y + rows * grid.cell_size.y
     if not np.isfinite([x, y, *high]).all() or high[0] <= x or high[1] <= y:
         return None
-    return _Drawn(numbers.astype(np.float64), (x, y), high, owner, is_chosen)
+    return _Drawn(numbers.astype(np.float64), (x, y), high, owner, is_chosen, fields)
 
 
 def _map_value(drawn: _Drawn, packing: Packing) -> Mapping[str, Any]:
@@ -202,11 +233,27 @@ def _map_value(drawn: _Drawn, packing: Packing) -> Mapping[str, Any]:
         return value
     candidate = owner.candidate
     turned = f", turned by {math.degrees(owner.turn):.3g}°" if len(candidate.maps) > 1 else ""
+    value |= _layer_values(drawn, candidate, packing)
     return value | {
         "edge": owner.edge,
         "candidate": owner.place,
         "title": f"{candidate.object}{turned}",
         "target": None if owner.target is None else _target_value(owner.target),
+    }
+
+
+def _layer_values(drawn: _Drawn, candidate: PlanCandidate, packing: Packing) -> dict[str, Any]:
+    """Return what limits and what blocks each cell and, of the chosen map, the layer of each conjunct."""
+    if not {"limited_by", "blocked_by"} <= drawn.fields.keys() or drawn.values.size > _MOST_LAYERED:
+        return {}
+    named = {number: f"{number}: {each.text}" for number, each in enumerate(candidate.conjuncts, 1)}
+    shown = [name for name in named.values() if name in drawn.fields] if drawn.is_chosen else []
+    return {
+        "limited": packing.add(drawn.fields["limited_by"], "u2"),
+        "blocked": packing.add(drawn.fields["blocked_by"], "u2"),
+        "limits": [each.text for each in candidate.conjuncts],
+        "blocks": [cause_text(each) for each in candidate.causes],
+        "layers": [{"title": name, "values": packing.add(drawn.fields[name], "f4")} for name in shown],
     }
 
 
@@ -262,6 +309,7 @@ def _candidate_value(candidate: PlanCandidate) -> Mapping[str, Any]:
         "best": "nowhere free" if math.isinf(candidate.best) else number_text(candidate.best),
         "status": "rejected" if candidate.rejected else "chosen" if candidate.chosen else "possible",
         "rejected": candidate.rejected,
+        "why": [f"{key} {text}" for key, text in candidate_lines(candidate)],
         "target": _target_value(candidate.target) if candidate.HasField("target") else None,
     }
 

@@ -62,6 +62,10 @@ class Collector:
                     self.decisions.add_decision(payload)
                 case log_topics.GRADIENT_MAP:
                     self.decisions.add_map(sequence, payload)
+                case log_topics.REDONE_DECISION:
+                    self.decisions.redone.add_decision(payload)
+                case log_topics.REDONE_MAP:
+                    self.decisions.redone.add_map(sequence, payload)
 
     def path(self, name: str, object: str | None) -> StatePath:
         """Return where the automaton of a result was; an empty path if it has none."""

@@ -110,7 +110,8 @@ def test_the_command_line_shows_both_decisions_and_both_maps(tidied, tmp_path):
 
 def test_the_log_and_the_page_of_it_have_both_decisions(tidied, tmp_path):
     both, page = tmp_path / "both.mcap", tmp_path / "both.html"
-    run("plan", "--redo", tidied, "--room", "0", "-o", both)
+    ran = run("plan", "--redo", tidied, "--room", "0", "-o", both)
+    assert ran.exit_code == 1, ran.output
     source = open_source(both)
     topics = {
         topic: sum(len(batch) for batch, _ in source.iter_payloads(topic))
@@ -119,6 +120,8 @@ def test_the_log_and_the_page_of_it_have_both_decisions(tidied, tmp_path):
     assert topics["/plan/redone/decision"] == 1
     assert topics["/plan/redone/gradient_map"] == 2
     assert recompute_decisions(source).differences == ()
+    (layout,) = (each.data for each in source.attachments() if each.name == "layout.json")
+    assert {"3D!scene", "3D!redone"} <= json.loads(layout)["configById"].keys()
     write_report(source, [], page)
     assert "Redone" in page.read_text()
 

@@ -32,9 +32,17 @@ function makeDecision(clock, decision) {
   const heading = element("div", {}, title, element("p", {}, sentence(decision.reason)),
     decision.outcome ? element("p", {}, outcomeWords(decision.outcome)) : null);
   return element("li", {class: "card"},
-    heading, meant ? makeMap(clock, meant, false) : null,
+    heading, meant ? makeMap(clock, meant, false) : null, makeRedone(clock, decision.redone),
     tried.length ? element("details", {}, element("summary", {}, summaryOf(decision)), ...tried,
       element("div", {class: "candidates"}, ...unnamed.map((map) => makeMap(clock, map, false)))) : null);
+}
+
+// What would have been decided otherwise, with its map beside the recorded one.
+function makeRedone(clock, decision) {
+  if (!decision) return null;
+  const meant = chosenMap(decision);
+  return element("section", {class: "redone"}, element("p", {}, element("b", {}, "Redone"), `: ${inShort(decision)}`),
+    element("p", {}, sentence(decision.reason)), meant ? makeMap(clock, meant, false) : null);
 }
 
 // The map that a decision's target was found on, if the page has it.
@@ -83,20 +91,50 @@ function makeCandidate(clock, candidate, own) {
   const status = {chosen: "satisfied", possible: "holding", rejected: "violated"}[candidate.status];
   const why = rejected || `to ${target.words}, robustness ${target.robustness}; at best ${best}`;
   return element("div", {class: "candidate"}, ...own.map((map) => makeMap(clock, map, own.length > 1)),
-    element("p", {}, mark(status), element("b", {}, object), ` ${candidate.status}: ${sentence(why)}`));
+    element("p", {}, mark(status), element("b", {}, object), ` ${candidate.status}: ${sentence(why)}`),
+    candidate.why?.length ? element("ul", {class: "quiet"}, ...candidate.why.map((line) => element("li", {}, line))) : null);
 }
 
 function makeMap(clock, map, isTitled) {
+  let shown = map;
   const {made, redraw} = canvas(`Gradient map of ${map.title || "a candidate"}`, (context, width, height) => {
     const at = projection(map.low, map.high, width, height, 1);
-    drawMap(context, clock.run, map, at);
+    drawMap(context, clock.run, shown, at);
     if (!map.target) return;
     drawWay(context, map.target.way, at, {colour: colour("ink"), width: 1.5, dash: [3, 4]});
     drawTarget(context, map.target.at, at);
   });
   made.style.aspectRatio = String((map.high[0] - map.low[0]) / (map.high[1] - map.low[1]));
   window.addEventListener("themechange", redraw);
-  return element("figure", {}, made, isTitled ? element("figcaption", {}, map.title || "a candidate") : null);
+  if (map.limited) made.addEventListener("mousemove", (event) => { made.title = cellWords(clock.run, map, event, made); });
+  const layers = map.layers?.length ? layerChoice(clock.run, map, (layer) => { shown = layer; redraw(); }) : null;
+  return element("figure", {}, made, layers, isTitled ? element("figcaption", {}, map.title || "a candidate") : null);
+}
+
+// A choice between the map and each relation that it is made of.
+function layerChoice(run, map, show) {
+  const layers = map.layers.map((layer) => {
+    const scale = run.numbers(layer.values).reduce((most, each) => Math.max(most, Math.abs(each) || 0), 0);
+    return {...map, values: layer.values, scale, picture: undefined};
+  });
+  const options = ["all that has to hold", ...map.layers.map((layer) => layer.title)];
+  const choice = element("select", {"aria-label": "Layer of the map", onchange: () => show([map, ...layers][choice.selectedIndex])},
+    ...options.map((title) => element("option", {}, title)));
+  return choice;
+}
+
+// What a cell under the pointer says: what blocks it, or what limits it and its robustness.
+function cellWords(run, map, event, made) {
+  const box = made.getBoundingClientRect();
+  const at = projection(map.low, map.high, box.width, box.height, 1);
+  const rows = run.numbers(map.values).length / map.columns;
+  const column = Math.floor((event.clientX - box.left - at.x(map.low[0])) / at.scale / (map.high[0] - map.low[0]) * map.columns);
+  const row = Math.floor((at.y(map.low[1]) - event.clientY + box.top) / at.scale / (map.high[1] - map.low[1]) * rows);
+  if (row < 0 || row >= rows || column < 0 || column >= map.columns) return "";
+  const cell = row * map.columns + column, cause = run.numbers(map.blocked)[cell];
+  if (cause) return `blocked by ${map.blocks[cause - 1] ?? "something else"}`;
+  const limit = map.limits[run.numbers(map.limited)[cell] - 1];
+  return `${numberText(run.numbers(map.values)[cell])}${limit ? `, limited by ${limit}` : ""}`;
 }
 
 // How far the colour of the slightest robustness is from grey, and how much of a map's colours covers the page.
