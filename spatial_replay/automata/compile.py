@@ -6,12 +6,13 @@ MONA is slow and may not be installed where a log is replayed, so a compiled aut
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from types import MappingProxyType
 from typing import Literal, TypeAlias, get_args
 
 from spatial_replay.automata.automaton import MAX_PROPOSITIONS, MAX_ROWS, Automaton, automaton_of
-from spatial_replay.automata.ltlf import Skeleton, no_automaton
+from spatial_replay.automata.ltlf import Skeleton, counts_seconds, no_automaton
 from spatial_replay.automata.minimise import least
 from spatial_replay.automata.mona import compiled_by_mona
 from spatial_replay.automata.products import composed
@@ -110,6 +111,7 @@ def automaton(
     specification: Specification,
     name: str | None = None,
     *,
+    rate_hz: float | None = None,
     compiler: Compiler | None = None,
     stored: Iterable[bytes] = (),
 ) -> Automaton:
@@ -119,21 +121,30 @@ def automaton(
 
     Args:
         name: which spec of the file; without it, its only result.
+        rate_hz: how many samples a second has. Bounds in seconds become bounds in samples with it, which mean
+            the same only in runs of that rate.
         compiler: "own" or "mona"; both give equal automata. Without it, that of this package, and where that
             reaches its limits, MONA.
-        stored: automata as files; one of this spec is taken rather than asking MONA.
+        stored: automata as files; one of this spec is taken rather than asking MONA, unless it has bounds in
+            seconds.
 
     Raises:
-        NoAutomatonError: past operators, bounds in seconds, or too large.
-        UsageError: no specification, no such spec, several to choose from, no such compiler.
+        NoAutomatonError: past operators, bounds in seconds without a rate, or too large.
+        UsageError: no specification, no such spec, several to choose from, no such compiler, a rate that is
+            not above 0.
     """
     require_specification(specification)
     if compiler is not None and compiler not in get_args(Compiler):
         raise UsageError(f"no compiler {compiler!r}; there are 'own' and 'mona'")
+    if rate_hz is not None and not (isinstance(rate_hz, (int, float)) and 0.0 < rate_hz < math.inf):
+        raise UsageError(f"a rate of {rate_hz!r} Hz; give samples a second, above 0")
     spec = chosen_spec(specification, name)
+    if counts_seconds(spec.formula):
+        # a file does not say at which rate it was compiled
+        stored = ()
     source = SourceText.of(specification.source, specification.filename) if specification.source else None
     propositions = Propositions(spec.formula)
-    skeleton = Skeleton(spec.formula, propositions, source)
+    skeleton = Skeleton(spec.formula, propositions, source, rate_hz)
     compilers = get_args(Compiler) if compiler is None else (compiler,)
     try:
         return _compiled(spec, skeleton, propositions, compilers, _read(stored, specification, spec))

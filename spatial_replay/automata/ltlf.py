@@ -5,6 +5,7 @@ A formula without an automaton is refused here, with the place of the operator t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from functools import reduce
 from typing import Literal, NamedTuple
@@ -26,9 +27,36 @@ from spatial_replay.spec.formula import (
     operator_of,
 )
 
+_ROUNDING = 1e-6
+"""By how many samples a bound in seconds may miss one, since it is a decimal number and so is a rate."""
 
-def refuse_operators(formula: Formula, source: SourceText | None) -> None:
-    """Refuse operators that look back or count seconds.
+
+def in_samples(bound: Bound, rate_hz: float) -> Bound | None:
+    """Return a bound in samples, at so many a second; None if no sample is in the window."""
+    if bound.unit == "samples":
+        return bound
+    lower = math.ceil(bound.lower * rate_hz / 1e9 - _ROUNDING)
+    upper = None if bound.upper is None else math.floor(bound.upper * rate_hz / 1e9 + _ROUNDING)
+    return None if upper is not None and upper < lower else Bound(lower, upper, "samples")
+
+
+def bounds_in_samples(formula: Formula, rate_hz: float) -> str:
+    """Return what bounds in seconds become: "at 30 Hz, `F[0s, 3s]` is `F[0, 90]`"; "" without any."""
+    found = {}
+    for node in _temporal(formula):
+        if node.bound is not None and _counts_seconds(node.bound):
+            bound = in_samples(node.bound, rate_hz)
+            found[f"`{written(node)}` is `{operator_of(node)}{format_bound(bound)}`"] = None
+    return f"at {rate_hz:g} Hz, {', '.join(found)}" if found else ""
+
+
+def counts_seconds(formula: Formula) -> bool:
+    """Return whether a formula has bounds in seconds."""
+    return any(node.bound is not None and _counts_seconds(node.bound) for node in _temporal(formula))
+
+
+def refuse_operators(formula: Formula, source: SourceText | None, rate_hz: float | None = None) -> None:
+    """Refuse operators that look back, or count seconds of which it is not known how many samples they have.
 
     Raises:
         NoAutomatonError: with every operator that does.
@@ -39,8 +67,15 @@ def refuse_operators(formula: Formula, source: SourceText | None) -> None:
             message = f"`{node.operator}` looks back: there is no automaton for past operators"
             faults.append(obstacle(source, node, message))
         elif node.bound is not None and _counts_seconds(node.bound):
-            message = f"`{written(node)}` counts seconds, an automaton counts samples"
-            faults.append(obstacle(source, node, message, "for an automaton, bound it in samples"))
+            if rate_hz is None:
+                message = f"`{written(node)}` counts seconds, an automaton counts samples"
+                remedy = (
+                    "for an automaton, bound it in samples, or state the samples a second (--hz, rate_hz)"
+                )
+                faults.append(obstacle(source, node, message, remedy))
+            elif in_samples(node.bound, rate_hz) is None:
+                message = f"no sample is in the window of `{written(node)}` at {rate_hz:g} Hz"
+                faults.append(obstacle(source, node, message, "for an automaton, widen it"))
     if faults:
         messages = dict.fromkeys(map(str, faults))
         reasons = dict.fromkeys(fault.reason for fault in faults)
@@ -129,17 +164,24 @@ class Skeleton:
     """
 
     def __init__(
-        self, formula: Formula, propositions: Propositions, source: SourceText | None = None
+        self,
+        formula: Formula,
+        propositions: Propositions,
+        source: SourceText | None = None,
+        rate_hz: float | None = None,
     ) -> None:
         """Unroll a formula.
 
         Args:
             source: where it stands, for messages.
+            rate_hz: how many samples a second has, for bounds in seconds.
 
         Raises:
-            NoAutomatonError: past operators, bounds in seconds, more than `MAX_NODES` subformulas.
+            NoAutomatonError: past operators, bounds in seconds without a rate, more than `MAX_NODES`
+                subformulas.
         """
-        refuse_operators(formula, source)
+        refuse_operators(formula, source, rate_hz)
+        self._rate_hz = rate_hz
         self.nodes: list[Node] = []
         self._numbers: dict[Node, int] = {}
         self._propositions = propositions
@@ -219,7 +261,10 @@ class Skeleton:
         if formula.operator == "X":
             return self._next(operands[0], strong)
         left = operands[0] if formula.operator == "U" else TRUE if strong else FALSE
-        return self._within(left, operands[-1], formula.bound, strong)
+        bound = formula.bound
+        if bound is not None and _counts_seconds(bound) and self._rate_hz is not None:
+            bound = in_samples(bound, self._rate_hz)
+        return self._within(left, operands[-1], bound, strong)
 
     def _within(self, left: int, right: int, bound: Bound | None, strong: bool) -> int:
         """Unroll an until, or a release where not `strong`, over a window."""

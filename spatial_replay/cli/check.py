@@ -58,6 +58,7 @@ _AUTOMATON_FILES = (".dot", ".hoa", ".svg")
     help="Automaton to write, as .dot, .hoa or .svg; - prints it as text.",
 )
 @click.option("--of", metavar="NAME", help="With --dfa: which result, if SPEC has several.")
+@click.option("--hz", metavar="N", type=float, help="With --dfa: samples per second, for bounds in seconds.")
 def check(
     specification: LogFile,
     log: LogFile | None,
@@ -68,6 +69,7 @@ def check(
     form: Form,
     dfa: str | None,
     of: str | None,
+    hz: float | None,
     reading: ReadArguments,
 ) -> None:
     """Check a specification and print its tree.
@@ -83,6 +85,8 @@ def check(
     """
     if of is not None and dfa is None:
         raise UsageError("--of chooses an automaton; add --dfa FILE")
+    if hz is not None and dfa is None:
+        raise UsageError("--hz is for an automaton; add --dfa FILE")
     if as_json and dfa == "-":
         raise UsageError("--json and --dfa - both write to standard output; give --dfa a file")
     if form != "text" and (as_json or dfa == "-"):
@@ -108,7 +112,7 @@ def check(
     elif form == "text":
         show(*_lines(parsed, compared))
     if dfa is not None:
-        _write_automata(parsed, of, dfa, inputs, quiet=as_json)
+        _write_automata(parsed, of, dfa, inputs, hz, quiet=as_json)
 
 
 @dataclass(frozen=True, slots=True)
@@ -289,7 +293,13 @@ def _check_automaton_options(
 
 
 def _write_automata(
-    specification: Specification, name: str | None, file: str, inputs: Sequence[Path], *, quiet: bool
+    specification: Specification,
+    name: str | None,
+    file: str,
+    inputs: Sequence[Path],
+    hz: float | None,
+    *,
+    quiet: bool,
 ) -> None:
     """Write the automaton of one spec to a file, or print those of all results.
 
@@ -301,29 +311,37 @@ def _write_automata(
         UsageError: Graphviz is not installed.
         OutputError: the file cannot be written.
     """
-    from spatial_replay.automata.compile import automaton
+    from spatial_replay.automata.compile import automaton, chosen_spec
     from spatial_replay.automata.dot_hoa import dot_text, hoa_text, size_words, svg_text
+    from spatial_replay.automata.ltlf import bounds_in_samples
     from spatial_replay.logs.output_file import replacing
 
     if file == _STANDARD_OUTPUT:
-        _print_automata(specification, [name] if name else [spec.name for spec in specification.results])
+        names = [name] if name else [spec.name for spec in specification.results]
+        _print_automata(specification, names, hz)
         return
     path = Path(file)
-    chosen = automaton(specification, name)
+    chosen = automaton(specification, name, rate_hz=hz)
     text = dict(zip(_AUTOMATON_FILES, (dot_text, hoa_text, svg_text), strict=True))[path.suffix](chosen)
     with replacing(path, inputs) as stream:
         stream.write(text.encode())
     show(f"wrote {path}: {size_words(chosen)}", err=quiet)
+    bounds = "" if hz is None else bounds_in_samples(chosen_spec(specification, name).formula, hz)
+    if bounds:
+        show(bounds, err=quiet)
 
 
-def _print_automata(specification: Specification, names: Sequence[str]) -> None:
-    from spatial_replay.automata.compile import automaton
+def _print_automata(specification: Specification, names: Sequence[str], hz: float | None) -> None:
+    from spatial_replay.automata.compile import automaton, chosen_spec
     from spatial_replay.automata.dot_hoa import words_text
+    from spatial_replay.automata.ltlf import bounds_in_samples
 
     faults = []
     for name in names:
         try:
-            show("", *words_text(automaton(specification, name)).split("\n"))
+            text = words_text(automaton(specification, name, rate_hz=hz))
+            bounds = "" if hz is None else bounds_in_samples(chosen_spec(specification, name).formula, hz)
+            show("", *text.split("\n"), *([bounds] if bounds else []))
         except NoAutomatonError as error:
             faults.append(str(error))
     if faults:

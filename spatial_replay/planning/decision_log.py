@@ -215,6 +215,7 @@ def plan_metadata(planner: Planner, filename: str) -> dict[str, str]:
         "file": filename,
         "specification": planner.automaton.name,
         "version": str(PLAN_VERSION),
+        **({} if planner.rate_hz is None else {"rate_hz": repr(planner.rate_hz)}),
     }
 
 

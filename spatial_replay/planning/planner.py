@@ -10,7 +10,9 @@ from typing import Final
 
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.compile import automaton as automaton_of
+from spatial_replay.automata.compile import chosen_spec
 from spatial_replay.automata.guards import Transition
+from spatial_replay.automata.ltlf import bounds_in_samples, counts_seconds
 from spatial_replay.errors import TraceError, UsageError
 from spatial_replay.geometry.footprint import TrackedObject
 from spatial_replay.planning.candidates import Movables, with_choice
@@ -68,10 +70,18 @@ class Planner:
     Attributes:
         specification: what is planned for.
         automaton: of the specification.
+        rate_hz: how many samples a second has, by which bounds in seconds count samples; None if there are
+            no such bounds.
+        bounds: what these bounds have become, in words; empty without any.
     """
 
     def __init__(
-        self, specification: Specification, settings: Settings | None = None, *, name: str | None = None
+        self,
+        specification: Specification,
+        settings: Settings | None = None,
+        *,
+        name: str | None = None,
+        rate_hz: float | None = None,
     ) -> None:
         """Begin before the first sample.
 
@@ -79,15 +89,19 @@ class Planner:
             settings: where and how to plan; without them, every object can be picked up, and placed around
                 the objects of the first sample.
             name: the spec of the file to plan for; without it, its only result.
+            rate_hz: how many samples come a second, for bounds in seconds.
 
         Raises:
-            NoAutomatonError: past operators, bounds in seconds, or too large a formula.
+            NoAutomatonError: past operators, bounds in seconds without a rate, or too large a formula.
             UsageError: no such spec, several to choose from, a template, propositions about earlier samples,
                 or a wrong type of settings.
         """
         if settings is not None:
             refuse_faults(kind_faults("settings", settings, Settings, "Settings(workspace), or None"))
-        self.automaton: Automaton = automaton_of(specification, name)
+        self.automaton: Automaton = automaton_of(specification, name, rate_hz=rate_hz)
+        formula = chosen_spec(specification, name).formula
+        self.rate_hz = rate_hz if counts_seconds(formula) else None
+        self.bounds = "" if rate_hz is None else bounds_in_samples(formula, rate_hz)
         refuse_template(specification, self.automaton.name)
         self._settings = settings
         self.specification = specification

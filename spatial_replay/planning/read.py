@@ -87,8 +87,19 @@ def planner_of(source: Source) -> Planner:
         texts[name].decode("utf-8", "replace"), filename=about.get("file", "<text>")
     )
     return Planner(
-        specification, settings_from_text(about.get("settings", "")), name=about.get("specification")
+        specification,
+        settings_from_text(about.get("settings", "")),
+        name=about.get("specification"),
+        rate_hz=_rate_of(about),
     )
+
+
+def _rate_of(about: Mapping[str, str]) -> float | None:
+    text = about.get("rate_hz")
+    try:
+        return None if text is None else float(text)
+    except ValueError:
+        raise LogError(f"the plan's rate_hz is {text!r:.40}, which is no number") from None
 
 
 def _plan_of(source: Source) -> Mapping[str, str]:

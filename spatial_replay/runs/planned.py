@@ -37,6 +37,7 @@ from spatial_replay.runs.run_log import RunLog, run_log
 from spatial_replay.runs.scripted import about_run, refuse_unknown_names
 from spatial_replay.sanity import refuse_unsatisfiable
 from spatial_replay.simulation.injection import Injection, Start
+from spatial_replay.simulation.tabletop import SAMPLES_PER_S
 from spatial_replay.simulation.world import TreeTick, World
 from spatial_replay.simulation.worlds import default_specification, make_world
 from spatial_replay.spec import parse_specification
@@ -132,6 +133,7 @@ class PlanLoop:
 
     Attributes:
         planning_s: time spent planning, in seconds of real time.
+        bounds: how many samples the bounds in seconds are, in words; empty without any.
     """
 
     def __init__(self, box: BlackBox, log: RunLog) -> None:
@@ -208,6 +210,7 @@ class PlannedRun:
     steps: int
     pruned: int
     planning_s: float
+    bounds: str = ""
 
     @property
     def satisfied(self) -> bool:
@@ -266,9 +269,10 @@ def record_plan(
     opened = make_world(scenario, seed=seed, noise_m=noise_m, injections=injections, starts=starts, gui=gui)
     with closing(opened) as world:
         refuse_unknown_names([kept, *others], world.sample())
-        planner = Planner(kept, _settings(world, changes), name=name)
+        planner = Planner(kept, _settings(world, changes), name=name, rate_hz=SAMPLES_PER_S)
         warm_up_planner()
-        known = _known(kept, planner.automaton)
+        # a replay does not know the rate, and has no automaton for bounds in seconds: neither has the log
+        known = _known(kept, planner.automaton) if planner.rate_hz is None else []
         with (
             open_film(world, camera, seed=seed) as film,
             run_log(output, [kept, *others], about, inputs, known, durability) as log,
@@ -296,6 +300,7 @@ def record_plan(
             steps=end.motions,
             pruned=len(last.pruned),
             planning_s=loop.planning_s,
+            bounds=planner.bounds,
         )
 
 

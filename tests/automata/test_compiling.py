@@ -9,7 +9,7 @@ import pytest
 import spatial_replay as sr
 from automata.golden import FILE, FORMULAS, as_values
 from spatial_replay import Automaton, NoAutomatonError, UsageError, automaton, parse_specification
-from spatial_replay.automata import dot_text, hoa_text, words_text
+from spatial_replay.automata import dot_text, hoa_text, stored_text, words_text
 from spatial_replay.simulation.worlds import default_specification
 
 GOLDEN = json.loads(FILE.read_text())
@@ -232,3 +232,36 @@ def test_an_ambiguous_choice_of_spec_is_a_usage_error() -> None:
     with pytest.raises(UsageError, match="'own' and 'mona'"):
         automaton(specification, "reach", compiler="spot")  # type: ignore[arg-type]
     assert automaton(specification, "stay").name == "stay"
+
+
+# ------------------------------------------------------------------------------------ bounds in seconds
+
+
+def test_bounds_in_seconds_count_samples_at_a_stated_rate() -> None:
+    text = "(F[0s, 0.3s] p >= 0) and G ((p >= 0) -> (q >= 0) U[100ms, 0.2s] (r >= 0))"
+    specification = parse_specification(text)
+    samples = machine_of("(F[0, 3] p >= 0) and G ((p >= 0) -> (q >= 0) U[1, 2] (r >= 0))")
+    assert automaton(specification, rate_hz=10) == samples
+    # between two samples, a window has those that are in it
+    assert automaton(parse_specification("F[0.05s, 0.39s] p >= 0"), rate_hz=10) == machine_of(
+        "F[1, 3] p >= 0"
+    )
+    assert automaton(parse_specification("F[2s, inf] p >= 0"), rate_hz=1.5) == machine_of("F[3, inf] p >= 0")
+
+
+def test_bounds_in_seconds_without_a_sample_or_a_rate_are_reported() -> None:
+    specification = parse_specification("F[1ms, 2ms] a ovlp b", filename="task.spatial")
+    with pytest.raises(NoAutomatonError, match=r"task.spatial:1:1: error: no sample is in the window of `F"):
+        automaton(specification, rate_hz=30)
+    with pytest.raises(NoAutomatonError, match=r"state the samples a second \(--hz, rate_hz\)"):
+        automaton(specification)
+    for rate in (0, -30.0, float("inf"), float("nan"), "30"):
+        with pytest.raises(UsageError, match="give samples a second, above 0"):
+            automaton(specification, rate_hz=rate)  # type: ignore[arg-type]
+
+
+def test_an_automaton_of_a_log_is_not_taken_for_one_of_another_rate() -> None:
+    specification = parse_specification("F[0s, 1s] p >= 0")
+    made = automaton(specification, rate_hz=2)
+    stored = [stored_text(made, specification, specification.specs[0]).encode()]
+    assert automaton(specification, rate_hz=3, stored=stored) == machine_of("F[0, 3] p >= 0")

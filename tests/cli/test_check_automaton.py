@@ -83,3 +83,18 @@ def test_one_of_several_results_has_to_be_chosen(tmp_path: Path, capsys: pytest.
     captured = capsys.readouterr()
     assert "automaton of reach" in captured.out
     assert "two.spatial:2:17: error: `O` looks back" in captured.err
+
+
+def test_bounds_in_seconds_are_counted_in_samples_at_a_stated_rate(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, output = tmp_path / "soon.spatial", tmp_path / "soon.dot"
+    path.write_text("spec soon = F[0s, 3s] p >= 0\n")
+    assert run(["check", str(path), "--dfa", "-"]) == 2
+    assert "state the samples a second (--hz, rate_hz)" in capsys.readouterr().err
+    for file in ("-", str(output)):
+        assert run(["check", str(path), "--dfa", file, "--hz", "30"]) == 0
+        assert capsys.readouterr().out.splitlines()[-1] == "at 30 Hz, `F[0s, 3s]` is `F[0, 90]`"
+    assert run(["check", str(path), "--dfa", "-", "--hz", "0"]) == 2
+    assert run(["check", str(path), "--hz", "30"]) == 2
+    assert "--hz is for an automaton; add --dfa FILE" in capsys.readouterr().err

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import shutil
+from functools import reduce
 from itertools import product
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from laws.reference import Prefix
@@ -15,6 +16,13 @@ from laws.strategies_automaton import compiled, formulas_and_symbols, formulas_w
 from laws.strategies_monitor import leaf_runs
 from spatial_replay import Automaton, NamedSpec, Specification, automaton
 from spatial_replay.automata import TransitionTable, automaton_from, stored_text
+from spatial_replay.automata.automaton import automaton_of
+from spatial_replay.automata.ltlf import Skeleton
+from spatial_replay.automata.minimise import least, merged
+from spatial_replay.automata.products import joined
+from spatial_replay.automata.progression import progressed
+from spatial_replay.automata.propositions import Propositions
+from spatial_replay.spec.formula import Boolean
 
 known = st.booleans()
 perhaps_unknown = st.sampled_from([False, True, None])
@@ -161,3 +169,15 @@ def test_reading_an_automaton_gives_back_what_was_stored(formula):
     machine = automaton(specification)
     text = stored_text(machine, specification, spec)
     assert automaton_from(text.encode(), specification, spec) == machine
+
+
+@settings(max_examples=60)
+@given(formulas_with_automata, formulas_with_automata, st.sampled_from(["and", "or"]))
+def test_joining_the_automata_of_operands_gives_that_of_the_whole(first, second, operator) -> None:
+    formula = Boolean(operator, (first, second))
+    propositions = Propositions(formula)
+    skeleton, count = Skeleton(formula, propositions), len(propositions.all)
+    kind, operands = skeleton.split(skeleton.root)
+    machines = [merged(progressed(skeleton, count, each)) for each in operands]
+    whole = least(reduce(lambda one, other: joined(one, other, kind == "and"), machines))
+    assert automaton_of(whole, "s", propositions.all) == compiled(formula)

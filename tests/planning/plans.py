@@ -42,6 +42,7 @@ def record_plan_of(
     recorded_settings=None,
     recorded_as=lambda sample: sample,
     most_recorded=None,
+    rate_hz=None,
     **options,
 ):
     """Record a planned run, and return its steps.
@@ -49,10 +50,11 @@ def record_plan_of(
     Args:
         recorded_settings: the settings in the log, if they differ from those of the planner.
         recorded_as: gives the sample in the log for each sample.
+        rate_hz: how many samples a second has, for bounds in seconds.
         most_recorded: how many decisions and outcomes the log holds; all of them if it is None.
     """
     specification = replace(sr.parse_specification(text), filename="task.spatial")
-    box = BlackBox(Planner(specification, settings))
+    box = BlackBox(Planner(specification, settings, rate_hz=rate_hz))
     with run_log(path, [specification]) as log:
         about = plan_metadata(box.planner, "task.spatial")
         log.add_metadata(

@@ -10,7 +10,7 @@ import pytest
 import spatial_replay as sr
 from planning.kinematics import BLOCKS, run
 from planning.plans import PUSH, record_plan_of
-from spatial_replay import Planner, Settings
+from spatial_replay import NoAutomatonError, Planner, Settings
 from spatial_replay.planning import (
     Grid,
     Workspace,
@@ -47,6 +47,21 @@ def test_the_planner_waits_as_long_as_time_has_to_pass(text, samples):
     assert f"wait for {samples} samples" in steps[0].reason
     assert steps[0].aim.candidates == ()
     assert verdict(text, table.samples) == "satisfied"
+
+
+def test_bounds_in_seconds_count_samples_at_the_stated_rate(tmp_path):
+    text = f"use spatial_spec\nF[3s,90s] ({DONE})"
+    with pytest.raises(NoAutomatonError, match="state the samples a second"):
+        Planner(sr.parse_specification(text), PUSH)
+    # the table without physics has ten samples a second
+    timed = Planner(sr.parse_specification(text), PUSH, rate_hz=10)
+    assert timed.bounds == "at 10 Hz, `F[3s, 90s]` is `F[30, 900]`"
+    steps, table = run(timed, BLOCKS)
+    assert [step.kind for step in steps] == ["wait", "execute", "hold"]
+    assert len(steps[0].ahead) == 29
+    assert verdict(f"F[3s,90s] ({DONE})", table.samples) == "satisfied"
+    record_plan_of(tmp_path / "run.mcap", text, rate_hz=10)
+    assert recompute_decisions(open_source(tmp_path / "run.mcap")).differences == ()
 
 
 def test_the_planner_does_not_wait_before_a_deadline():
