@@ -119,7 +119,12 @@ def redo_decisions(
     settings = changed_settings(old.settings, changes)
     if name is None and specification is None:
         name = old.automaton.name
-    planner = Planner(old.specification if specification is None else specification, settings, name=name)
+    planner = Planner(
+        old.specification if specification is None else specification,
+        settings,
+        name=name,
+        rate_hz=old.rate_hz,
+    )
     changed = (*_specification_changes(old, planner), *changes_text(old.settings, settings))
     faults: list[str] = []
 
