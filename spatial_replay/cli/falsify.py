@@ -86,7 +86,7 @@ def falsify(
 
     Exits with 1 if a run violates, 4 if none does and any is unknown, 0 if none was found.
 
-    \\b
+    \b
     Examples:
       spatial-replay falsify push --spec safety.spatial -o found/
       spatial-replay falsify push --spec safety.spatial --vary start=0.02 --vary slip@T -o found/
