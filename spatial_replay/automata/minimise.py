@@ -61,8 +61,7 @@ def _machine(
 
 
 def merged(machine: Machine) -> Machine:
-    """Return a machine that accepts the same runs, without equivalent states and those never reached."""
-    machine = _ordered(machine, _reachable(machine))
+    """Return a machine that accepts the same runs, without equivalent states."""
     classes = _classes(machine)
     places, decisions = _relabelled(machine, classes)
     firsts = np.unique(classes, return_index=True)[1]

@@ -9,8 +9,19 @@ from typing import Any
 import spatial_replay as sr
 from spatial_replay.simulation.worlds import default_specification
 
-RESPONSES = " and ".join(f"(G ((a{n} >= 0) -> F b{n} >= 0))" for n in range(4))
+
+def _responses(count: int) -> str:
+    return " and ".join(f"(G ((a{n} >= 0) -> F b{n} >= 0))" for n in range(count))
+
+
+RESPONSES = _responses(4)
 """Four requests, each of which is to be answered: 16 states, 256 transitions."""
+
+MANY_S = 1.0
+"""What twelve of them may take: 4,096 states, 49,152 decisions, 16.8 million transitions."""
+
+DEADLINES = " and ".join(f"(F[0, 300] a{n} >= 0)" for n in range(4))
+"""Four tasks, each with 300 samples: 4,503 states."""
 
 PICK_PLACE = default_specification("pick-place").source
 """The paper's pick-and-place: 32 states, 243 transitions."""
@@ -39,6 +50,16 @@ def bench_automaton(measure: Any) -> None:
         )
     deadline = sr.parse_specification(DEADLINE)
     measure("deadline in 1000 samples, own", lambda _: sr.automaton(deadline, compiler="own"))
+    deadlines = sr.parse_specification(DEADLINES)
+    measure("four deadlines in 300 samples, own", lambda _: sr.automaton(deadlines, compiler="own"))
+
+
+def bench_many_responses(measure: Any) -> None:
+    """Automata whose transitions cannot be listed; 24 times the decisions may take 24 times as long."""
+    eight, twelve = (sr.parse_specification(_responses(count)) for count in (8, 12))
+    few = measure("8 responses", lambda _: sr.automaton(eight, compiler="own"))
+    many = measure("12 responses", lambda _: sr.automaton(twelve, compiler="own"), limit_s=MANY_S)
+    measure.ratio("12 responses, of 8", many.median_s / few.median_s, 24.0)
 
 
 def bench_automata_at_once(measure: Any) -> None:
