@@ -28,6 +28,7 @@ if TYPE_CHECKING:
         diff_specifications,
         evaluate_logs,
         info,
+        learn,
         read_results,
         replay_log,
         tune,
@@ -52,6 +53,7 @@ if TYPE_CHECKING:
     from spatial_replay.falsification.failure_search import falsify
     from spatial_replay.falsification.failures import Coverage, Failure, Falsification, SearchedRun
     from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
+    from spatial_replay.learning.learned import Learned
     from spatial_replay.monitor.causes import Cause, LeastPart
     from spatial_replay.monitor.evaluate import Evaluation, evaluate
     from spatial_replay.monitor.monitor import Ending, Monitor, NodeUpdate, SpecUpdate, Update
@@ -118,6 +120,7 @@ __all__ = [
     "Guards",
     "Instant",
     "Knot",
+    "Learned",
     "LeastPart",
     "LogDiff",
     "LogError",
@@ -181,6 +184,7 @@ __all__ = [
     "evaluate_logs",
     "falsify",
     "info",
+    "learn",
     "load_specification",
     "parse_specification",
     "plan",
@@ -201,6 +205,7 @@ __getattr__, __dir__ = loaded_when_used(
             "diff_specifications",
             "evaluate_logs",
             "info",
+            "learn",
             "read_results",
             "replay_log",
             "tune",
@@ -225,6 +230,7 @@ __getattr__, __dir__ = loaded_when_used(
         "falsification.failure_search": ("falsify",),
         "falsification.failures": ("Coverage", "Failure", "Falsification", "SearchedRun"),
         "geometry.footprint": ("ConvexPart", "Footprint", "TrackedObject"),
+        "learning.learned": ("Learned",),
         "monitor.causes": ("Cause", "LeastPart"),
         "monitor.evaluate": ("Evaluation", "evaluate"),
         "monitor.monitor": ("Ending", "Monitor", "NodeUpdate", "SpecUpdate", "Update"),

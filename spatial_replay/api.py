@@ -1,4 +1,4 @@
-"""What the commands do with whole logs, as functions: replay, report, diff, clip, tune, verify, info."""
+"""What commands do with whole logs, as functions: replay, report, diff, clip, tune, learn, verify, info."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from spatial_replay.compare.clips import Clip, cut_clip
 from spatial_replay.compare.runs import LogDiff, diff_sources
 from spatial_replay.compare.specifications import SpecificationDiff, diff_over_source
 from spatial_replay.errors import UsageError
+from spatial_replay.learning.learned import DEFAULT_LINES, Learned, learn_runs
 from spatial_replay.logs.downloads import local_copy
 from spatial_replay.logs.remote import LogFile, local_files, log_file, sendable
 from spatial_replay.logs.source import MemorySource, Source
@@ -29,6 +30,7 @@ from spatial_replay.sources.open_log import open_source, read_trace
 from spatial_replay.sources.overview import Overview, overview_of
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.overrides import load_specifications
+from spatial_replay.spec.relations import DEFAULT_PROFILE
 from spatial_replay.trace.sample import FOREVER
 from spatial_replay.trace.trace import Trace
 from spatial_replay.tuning.margins import load_runs
@@ -304,6 +306,34 @@ def tune(
         (file,) = load_specifications([local_copy(specification)], constants=constants)
     runs = load_runs(_logs(good), _logs(bad), lambda path: read_trace(path, **reading))
     return tune_runs(file, runs, dict(vary or {}), each=each, seed=seed)
+
+
+def learn(
+    good: Log | Sequence[Log],
+    bad: Log | Sequence[Log] = (),
+    *,
+    lines: int = DEFAULT_LINES,
+    profile: str = DEFAULT_PROFILE,
+    **reading: Unpack[Reading],
+) -> Learned:
+    """Find a short specification that all good runs satisfy; each of its lines is violated by some bad run.
+
+    Without bad runs its lines say what good runs have in common: how they end, what always holds, what comes
+    before what. Limits keep a margin from the good runs (see `docs/learning.md`).
+
+    Args:
+        good, bad: logs in any format, or traces; at least two good ones.
+        lines: write at most so many specs, the most telling ones.
+        profile: of the relations, "paper" or "spatial_spec".
+        reading: how to read the logs, as for `read_trace`.
+
+    Raises:
+        UsageError: fewer than two good runs, a run that is too short, runs that are equal or in other units,
+            nothing that the good runs have in common.
+        LogError: a log cannot be read.
+    """
+    runs = load_runs(_logs(good), _logs(bad), lambda path: read_trace(path, **reading))
+    return learn_runs(runs, lines=lines, profile=profile)
 
 
 def _logs(logs: Log | Sequence[Log]) -> list[LogFile | Trace]:

@@ -149,6 +149,12 @@ def test_what_is_wrong_with_a_specification_is_found_and_its_shortest_runs_are_l
     assert Path("served.html").stat().st_size > 10_000
 
 
+@pytest.mark.usefixtures("desk")
+def test_a_specification_is_learned_from_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    follow("learning.md", {}, capsys)
+    assert 'spec cup_apart_lamp_always "LEARNED-1: ' in Path("learned.spatial").read_text()
+
+
 @pytest.fixture
 def gate(desk: Path, monkeypatch: pytest.MonkeyPatch) -> list[Block]:
     """The blocks of the page about CI, with its files and logs made, in a folder of its own."""

@@ -46,6 +46,7 @@ COMMANDS: dict[str, str] = {
     "export": "Export the robustness of every node as a table.",
     "falsify": "Search for simulated runs that violate a specification.",
     "info": "Show what a log contains.",
+    "learn": "Find a specification that distinguishes good runs from bad ones.",
     "monitor": "Monitor a running robot.",
     "plan": "Plan a run in a simulated world.",
     "record": "Record a run as a log.",

@@ -39,7 +39,7 @@ _MOST_LISTED = 20
 """The most runs that are listed; JSON has all."""
 
 
-class _ManyLogs(JsonCommand):
+class ManyLogs(JsonCommand):
     """A command whose options --good and --bad take all that follows, as shells expand `good/*.mcap`."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
@@ -80,7 +80,7 @@ def _read_ranges(
     return ranges
 
 
-@click.command(cls=_ManyLogs)
+@click.command(cls=ManyLogs)
 @click.option(
     "--spec",
     "spec",

@@ -19,6 +19,7 @@ _VIEWS: Mapping[str, str] = MappingProxyType(
         "spatial_replay.automata.automaton": "automaton_view",
         "spatial_replay.compare.runs": "diff_view",
         "spatial_replay.compare.specifications": "diff_view",
+        "spatial_replay.learning.learned": "learned_view",
         "spatial_replay.monitor.evaluate": "evaluation_view",
         "spatial_replay.monitor.result": "evaluation_view",
         "spatial_replay.planning.decisions": "planning_view",

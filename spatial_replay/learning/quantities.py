@@ -1,0 +1,236 @@
+"""What is measured of runs to learn from: distances, relations and signals of what they have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations, permutations
+from types import MappingProxyType
+from typing import Final, Literal, TypeAlias
+
+import numpy as np
+
+from spatial_replay.monitor.atoms.measurements import leaf_values
+from spatial_replay.monitor.atoms.terms import TraceScene
+from spatial_replay.spec.expressions import Signal
+from spatial_replay.spec.format import format_relation
+from spatial_replay.spec.formula import (
+    Atom,
+    Expression,
+    Formula,
+    Group,
+    Quantified,
+    SignedDistance,
+    TrackedName,
+    Variable,
+)
+from spatial_replay.spec.relations import PROFILES
+from spatial_replay.text import counted
+from spatial_replay.trace.trace import ABSENT, Trace
+
+MOST_OBJECTS: Final = 60
+MOST_PAIRS: Final = 400
+MOST_MEMBERS: Final = 30
+"""Bounds of what is compared: objects, pairs of them, members of a class."""
+MOST_MEASURED: Final = 1 << 26
+"""At most so many pairs in so many samples, or two pairs in any case."""
+MOST_SIGNALS: Final = 50
+_SAMPLED: Final = 33
+"""Samples of the first run in which pairs are compared, so that those that come near are measured first."""
+
+Relation: TypeAlias = Literal["dist", "oriented", "signal", "enclosedin", "ovlp", "leftof", "below", "prec"]
+_EITHER_WAY: tuple[Relation, ...] = ("dist", "ovlp", "oriented")
+_ONE_WAY: tuple[Relation, ...] = ("enclosedin", "leftof", "below", "prec")
+WITH_LIMIT: frozenset[Relation] = frozenset({"dist", "oriented", "signal"})
+"""Relations with a number to learn; the others hold or do not."""
+_PARAMETERS: Mapping[str, tuple[float | str, ...]] = MappingProxyType({"oriented": (0.0,), "prec": ("z",)})
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Party:
+    """One side of a relation: an object by its name, or every object of a class."""
+
+    name: str
+    is_class: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """A number of every sample: the robustness of a relation, or what a limit is learned for.
+
+    Attributes:
+        parties: whom it is about, two of them; none for a signal.
+        signal: the name of a signal, or "".
+        formula: what is measured: for "dist" the signed distance, for "oriented" the negated misalignment,
+            for "signal" the signal. Over classes it is the least one of all members.
+        reach: over classes, the least one of all members' negated numbers; else `formula`.
+    """
+
+    relation: Relation
+    parties: tuple[Party, ...]
+    signal: str
+    formula: Formula
+    reach: Formula
+
+    @property
+    def pair(self) -> frozenset[Party]:
+        """Whom it is about, in any order."""
+        return frozenset(self.parties)
+
+    @property
+    def is_symmetric(self) -> bool:
+        """Whether it is the same of its parties in the other order."""
+        return self.relation in _EITHER_WAY
+
+
+@dataclass(frozen=True, slots=True)
+class Comparable:
+    """The quantities of some runs, and what was left out of them, in sentences."""
+
+    quantities: tuple[Quantity, ...]
+    left_out: tuple[str, ...]
+
+
+def scope_of(traces: Sequence[Trace], profile: str) -> Comparable:
+    """Return what can be measured in all of some runs.
+
+    Objects are compared by their names; those of a class also all at once, as in `forall a, b in class
+    "block"`, if every run has two of them, or has them under other names.
+
+    Args:
+        profile: of the relations.
+    """
+    common = set(traces[0].names).intersection(*(trace.names for trace in traces[1:]))
+    names = sorted(common)
+    left_out = []
+    if len(names) > MOST_OBJECTS:
+        left_out.append(
+            f"{counted(len(names) - MOST_OBJECTS, 'object')} beyond the first {MOST_OBJECTS} by name"
+        )
+        names = names[:MOST_OBJECTS]
+    samples = sum(map(len, traces))
+    most = min(MOST_PAIRS, max(2, MOST_MEASURED // max(1, samples)))
+    members = [members_of(trace) for trace in traces]
+    classes, crowded = _classes(members, common)
+    if crowded:
+        left_out.append(f"classes with more than {MOST_MEMBERS} objects: {', '.join(crowded)}")
+    class_pairs = list(_class_pairs(classes, members, names, common))
+    pairs = _nearest_first(traces[0], [*combinations(map(Party, names), 2)])
+    kept = [*class_pairs[:most], *pairs[: max(0, most - len(class_pairs))]]
+    if missing := len(class_pairs) + len(pairs) - len(kept):
+        left_out.append(
+            f"{counted(missing, 'pair')} of objects that come less near than {len(kept):,} others"
+        )
+    signals = sorted(set(traces[0].signals).intersection(*(trace.signals for trace in traces[1:])))
+    if len(signals) > MOST_SIGNALS:
+        left_out.append(f"{counted(len(signals) - MOST_SIGNALS, 'signal')} beyond the first {MOST_SIGNALS}")
+    taken = common | {each for trace in traces for each in trace.names}
+    found = [quantity for a, b in kept for quantity in _quantities(a, b, profile, taken)]
+    for name in signals[:MOST_SIGNALS]:
+        atom = Atom(format_relation("signal", (), (name, ">=", 0.0)), "signal", Signal(name))
+        found.append(Quantity("signal", (), name, atom, atom))
+    return Comparable(tuple(found), tuple(left_out))
+
+
+def members_of(trace: Trace) -> dict[str, set[str]]:
+    """Return the names of all objects of each class."""
+    found: dict[str, set[str]] = {}
+    for column, name in enumerate(trace.names):
+        rows = trace.rows[:, column]
+        rows = rows[rows != ABSENT]
+        codes = np.unique(trace.class_code[np.where(rows < 0, -2 - rows, rows)])
+        for code in codes.tolist():
+            if class_name := trace.classes[code]:
+                found.setdefault(class_name, set()).add(name)
+    return found
+
+
+def _classes(members: Sequence[Mapping[str, set[str]]], common: set[str]) -> tuple[list[str], list[str]]:
+    """Return the classes to compare as a whole, and those that are too large for that."""
+    shared = set(members[0]).intersection(*members[1:])
+    fitting = sorted(
+        name
+        for name in shared
+        if all(len(each[name]) > 1 for each in members) or not members[0][name] <= common
+    )
+    crowded = [name for name in fitting if any(len(each[name]) > MOST_MEMBERS for each in members)]
+    return [name for name in fitting if name not in crowded], crowded
+
+
+def _class_pairs(
+    classes: Sequence[str], members: Sequence[Mapping[str, set[str]]], names: Sequence[str], common: set[str]
+) -> Iterator[tuple[Party, Party]]:
+    for name in classes:
+        if all(len(each[name]) > 1 for each in members):
+            yield Party(name, True), Party(name, True)
+        for other in names:
+            if not any(other in each[name] for each in members):
+                yield Party(name, True), Party(other)
+    for a, b in combinations(classes, 2):
+        if not all(each[a] <= common and each[b] <= common for each in members):
+            yield Party(a, True), Party(b, True)
+
+
+def _nearest_first(trace: Trace, pairs: list[tuple[Party, Party]]) -> list[tuple[Party, Party]]:
+    if len(pairs) < 2 or not len(trace):
+        return pairs
+    few = trace.take(np.unique(np.linspace(0, len(trace) - 1, _SAMPLED).astype(np.int64)))
+    atoms = [_atom("dist", TrackedName(a.name), TrackedName(b.name), "paper") for a, b in pairs]
+    nearest = leaf_values(TraceScene(few, {}), atoms, {})[0].min(axis=1)
+    # a pair that is not always known comes after those that are
+    key = np.where(np.isfinite(nearest), nearest, np.inf)
+    return [pairs[index] for index in np.argsort(key, kind="stable").tolist()]
+
+
+def _quantities(a: Party, b: Party, profile: str, taken: set[str]) -> Iterator[Quantity]:
+    for relation in _EITHER_WAY:
+        yield _quantity(relation, a, b, profile, taken)
+    ways = [(a, b)] if a == b else [*permutations((a, b))]
+    for relation in _ONE_WAY:
+        for one, other in ways:
+            yield _quantity(relation, one, other, profile, taken)
+
+
+def _quantity(relation: Relation, a: Party, b: Party, profile: str, taken: set[str]) -> Quantity:
+    variables = variables_of((a, b), taken)
+    terms = [
+        Variable(variable) if party.is_class else TrackedName(party.name)
+        for party, variable in zip((a, b), variables, strict=True)
+    ]
+    atom = _atom(relation, terms[0], terms[1], profile)
+    formula: Formula = _over((a, b), variables, atom)
+    reach = formula
+    if formula is not atom:
+        reach = _over((a, b), variables, Atom(atom.text, relation, -atom.expression))
+    return Quantity(relation, (a, b), "", formula, reach)
+
+
+def variables_of(parties: Sequence[Party], taken: set[str]) -> tuple[str, str]:
+    """Return a name for a member of each class that no object has."""
+    found = []
+    for name in ("a", "b"):
+        while name in taken or name in {party.name for party in parties}:
+            name += "_"
+        found.append(name)
+    return found[0], found[1]
+
+
+def _over(parties: tuple[Party, Party], variables: tuple[str, str], atom: Atom) -> Atom | Quantified:
+    groups = [Group("", class_name=party.name) for party in parties]
+    if parties[0].is_class and parties[0] == parties[1]:
+        return Quantified("forall", variables, groups[0], atom)
+    formula: Atom | Quantified = atom
+    for party, variable, group in reversed(list(zip(parties, variables, groups, strict=True))):
+        if party.is_class:
+            formula = Quantified("forall", (variable,), group, formula)
+    return formula
+
+
+def _atom(relation: str, a: TrackedName | Variable, b: TrackedName | Variable, profile: str) -> Atom:
+    parameters = _PARAMETERS.get(relation, ())
+    expression: Expression
+    if relation == "dist":
+        expression, parameters = SignedDistance(a, b), (">=", 0.0)
+    else:
+        expression = PROFILES[profile][relation](a, b, *parameters)
+    return Atom(format_relation(relation, (a, b), parameters), relation, expression)
