@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from spatial_replay.learning.facts import Fact, Line
+from spatial_replay.learning.facts import LimitedRelation, Line
 from spatial_replay.learning.fit import ALWAYS, EVENTUALLY, FINALLY, PATTERNS, FittedLimits
 from spatial_replay.learning.quantities import Party, Quantity
 
@@ -257,13 +257,13 @@ def _invariants(fit: FittedLimits) -> list[Line]:
     return [line for _, index, line in scored if (line.fact.direction, index) not in hidden]
 
 
-def _chain(fit: FittedLimits, goals: Sequence[Fact]) -> Iterator[Line]:
+def _chain(fit: FittedLimits, goals: Sequence[LimitedRelation]) -> Iterator[Line]:
     """Yield the order in which goals are reached, each before the next."""
     times, _ = fit.times(goals, fit.good)
     medians = np.median(times, axis=1) if len(goals) else np.empty(0)
     gaps = {(line.fact, line.later): (line, gap) for line, gap, _ in fit.orders(goals)}
     reached = [goals[index] for index in np.argsort(medians, kind="stable").tolist()]
-    last: Fact | None = None
+    last: LimitedRelation | None = None
     for first, later in pairwise(reached):
         key = (last or first).near, later.near
         if key in gaps:
@@ -276,7 +276,7 @@ def _chain(fit: FittedLimits, goals: Sequence[Fact]) -> Iterator[Line]:
 
 def _joined(lines: Sequence[Line]) -> Iterator[Line]:
     """Yield lines with the two limits of one distance in one."""
-    limits: dict[tuple[str, Quantity, int], Fact] = {
+    limits: dict[tuple[str, Quantity, int], LimitedRelation] = {
         (line.pattern, line.fact.quantity, line.fact.direction): line.fact
         for line in lines
         if line.fact.quantity.relation == "dist" and line.pattern in ("always", "finally")

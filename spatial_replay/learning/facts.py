@@ -43,7 +43,7 @@ _NAMED: Mapping[str, tuple[str, str]] = MappingProxyType(
 
 
 @dataclass(frozen=True, slots=True)
-class Fact:
+class LimitedRelation:
     """A relation that holds in a sample, or not.
 
     Attributes:
@@ -130,11 +130,11 @@ class Fact:
         return text if text[0].isalpha() else f"_{text}"
 
     @property
-    def near(self) -> Fact:
+    def near(self) -> LimitedRelation:
         """The same, of a distance between two limits only the greater one."""
-        return self if self.other_limit is None else Fact(self.quantity, 1, self.other_limit)
+        return self if self.other_limit is None else LimitedRelation(self.quantity, 1, self.other_limit)
 
-    def opposite(self) -> Fact:
+    def opposite(self) -> LimitedRelation:
         """Return that it does not hold."""
         return replace(self, direction=1 - self.direction, limit=0.0 - self.limit)
 
@@ -153,8 +153,8 @@ class Line:
     """
 
     pattern: Pattern
-    fact: Fact
-    later: Fact | None = None
+    fact: LimitedRelation
+    later: LimitedRelation | None = None
 
     def formula(self, taken: set[str]) -> str:
         """Return its formula as a text; `taken` are names that no variable may have."""
@@ -191,12 +191,12 @@ class Line:
         return f"{self.fact.name}_{ends[self.pattern]}"
 
     @property
-    def facts(self) -> tuple[Fact, ...]:
+    def facts(self) -> tuple[LimitedRelation, ...]:
         """Its facts."""
         return (self.fact,) if self.later is None else (self.fact, self.later)
 
 
-def ordered(first: Fact, later: Fact) -> Line:
+def ordered(first: LimitedRelation, later: LimitedRelation) -> Line:
     """Return that a fact holds before another one does, in the words that need the fewer negations."""
     is_positive = later.quantity.relation not in WITH_LIMIT and not later.direction
     return Line("before" if is_positive else "until", first, later)

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from spatial_replay.geometry.arrays import Booleans, Floats, Integers
-from spatial_replay.learning.facts import Fact, Line, Pattern, ordered
+from spatial_replay.learning.facts import LimitedRelation, Line, Pattern, ordered
 from spatial_replay.learning.observed import Observed
 from spatial_replay.learning.quantities import WITH_LIMIT, Party, Quantity, members_of
 
@@ -103,14 +103,16 @@ class FittedLimits:
             apart[each] = 1.0
         return cls(tuple(quantities), tuple(good), tuple(bad), limits, lowest, margins, apart)
 
-    def fact(self, pattern: int, direction: int, quantity: int) -> Fact:
+    def fact(self, pattern: int, direction: int, quantity: int) -> LimitedRelation:
         """Return a quantity with its limit, as a short decimal that still holds."""
         found = self.quantities[quantity]
         if found.relation not in WITH_LIMIT:
-            return Fact(found, direction, 0.0)
+            return LimitedRelation(found, direction, 0.0)
         where = pattern, direction, quantity
         limit, lowest = float(self.limits[where]), float(self.lowest[where])
-        return Fact(found, direction, _short(limit, max(lowest - limit, _FINEST * abs(lowest)), lowest))
+        return LimitedRelation(
+            found, direction, _short(limit, max(lowest - limit, _FINEST * abs(lowest)), lowest)
+        )
 
     @cached_property
     def scale(self) -> float:
@@ -182,7 +184,7 @@ class FittedLimits:
         bits[ALWAYS] = tight
         return np.where(np.isfinite(self.limits), np.clip(bits, 0.0, _MOST_BITS), 0.0)
 
-    def events(self) -> list[Fact]:
+    def events(self) -> list[LimitedRelation]:
         """Return facts that hold at the end of all good runs, not at their beginning, the rarest first."""
         begun = np.stack([each.first[:, 1] for each in self.good], axis=-1).max(axis=-1)
         limits = self.limits[FINALLY]
@@ -192,7 +194,7 @@ class FittedLimits:
         order = np.argsort(-self.bits[FINALLY][found], kind="stable")[:_MOST_EVENTS]
         return [self.fact(FINALLY, direction, index) for direction, index in where[order].tolist()]
 
-    def times(self, facts: Sequence[Fact], runs: Sequence[Observed]) -> tuple[Integers, Integers]:
+    def times(self, facts: Sequence[LimitedRelation], runs: Sequence[Observed]) -> tuple[Integers, Integers]:
         """Return in which sample each fact first holds for sure, and in which it first may, (F, R) each."""
         found = [
             [
@@ -204,7 +206,7 @@ class FittedLimits:
         sure, possible = np.array(found, np.int64).reshape(2, len(facts), len(runs))
         return sure, possible
 
-    def orders(self, facts: Sequence[Fact]) -> list[tuple[Line, int, Booleans]]:
+    def orders(self, facts: Sequence[LimitedRelation]) -> list[tuple[Line, int, Booleans]]:
         """Return which facts come before which others in all good runs.
 
         Returns:
@@ -233,6 +235,10 @@ def _by_pattern(run: Observed, end: int) -> Floats:
 
 def _leave_out(valid: Booleans, quantities: Sequence[Quantity], lowest: Floats) -> None:
     """Mark what another quantity says better, or what no one would write."""
+    inside: dict[frozenset[Party], Booleans] = {}
+    for index, quantity in enumerate(quantities):
+        if quantity.relation == "enclosedin":
+            inside[quantity.pair] = inside.get(quantity.pair, np.zeros(3, bool)) | valid[:, 0, index]
     for index, quantity in enumerate(quantities):
         if quantity.relation == "oriented":
             valid[:, 1, index] = False
@@ -242,6 +248,8 @@ def _leave_out(valid: Booleans, quantities: Sequence[Quantity], lowest: Floats) 
             valid[:, 1, index] &= lowest[:, 1, index] <= 0.0
             valid[EVENTUALLY, 0, index] = False
         elif quantity.relation == "ovlp":
+            # what is inside overlaps, too
+            valid[:, 0, index] &= ~inside.get(quantity.pair, np.zeros(3, bool))
             valid[:, 1, index] = False
         elif quantity.relation not in WITH_LIMIT:
             # that it does not hold is worth saying if it never does
