@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, Literal
 
@@ -11,7 +11,7 @@ from spatial_replay.errors import SpatialReplayError
 from spatial_replay.geometry.footprint import TrackedObject
 from spatial_replay.monitor.evaluate import evaluate
 from spatial_replay.sanity.conditions import Fact
-from spatial_replay.sanity.placement import CannotPlaceError, Setting, place
+from spatial_replay.sanity.placement import MAX_TURNED, CannotPlaceError, Setting, place
 from spatial_replay.sanity.shortest_words import Word, WordSearch
 from spatial_replay.spec.checks import object_names, signal_names
 from spatial_replay.spec.formula import (
@@ -105,7 +105,7 @@ def _placed(
     if len(facts) > MAX_SAMPLES:
         raise CannotPlaceError(f"it takes {len(facts)} samples")
     alone = replace(specification, specs=(replace(spec, is_result=True),))
-    setting = _setting(alone, spec)
+    setting = _setting(specification, spec)
     for period_ns in (_SECOND_NS,) if is_exact else (_SECOND_NS, _TENTH_NS):
         for samples in place(setting, facts, period_ns):
             try:
@@ -117,22 +117,35 @@ def _placed(
     return None
 
 
-def _setting(alone: Specification, spec: NamedSpec) -> Setting:
-    """Return what a spec is about."""
-    atoms = [each for each in iter_formulas(spec.formula) if isinstance(each, Atom)]
-    measured = [part for atom in atoms for part in iter_expressions(atom.expression)]
-    upright = any(isinstance(each, Projection) and each.axis == "z" for each in measured)
-    turned = [
-        base.name
-        for each in measured
-        if isinstance(each, Misalignment)
-        for base in map(base_of, measured_terms(each))
-        if isinstance(base, TrackedName)
-    ]
-    bases = [base_of(term) for atom in atoms for term in terms_of(atom.expression)]
+def _setting(specification: Specification, spec: NamedSpec) -> Setting:
+    """Return what there is to place: what the other specs are about, too, so that they can be evaluated."""
+    own = _atoms(spec)
+    every = [*own, *(atom for each in specification.results for atom in _atoms(each))]
+    upright = any(
+        isinstance(part, Projection) and part.axis == "z"
+        for atom in every
+        for part in iter_expressions(atom.expression)
+    )
+    turned = dict.fromkeys(_turned(own))
+    if len({*turned, *_turned(every)}) <= MAX_TURNED:
+        turned.update(dict.fromkeys(_turned(every)))
+    bases = [base_of(term) for atom in own for term in terms_of(atom.expression)]
     regions = [base.name for base in bases if isinstance(base, RegionName)]
-    named = {name: alone.regions[name] for name in dict.fromkeys(regions)}
-    return Setting(object_names(alone), signal_names(alone), named, upright, tuple(dict.fromkeys(turned)))
+    named = {name: specification.regions[name] for name in dict.fromkeys(regions)}
+    objects, signals = object_names(specification), signal_names(specification)
+    return Setting(objects, signals, named, upright, tuple(turned))
+
+
+def _atoms(spec: NamedSpec) -> list[Atom]:
+    return [each for each in iter_formulas(spec.formula) if isinstance(each, Atom)]
+
+
+def _turned(atoms: Iterable[Atom]) -> list[str]:
+    """Return the objects whose orientations are compared."""
+    parts = (part for atom in atoms for part in iter_expressions(atom.expression))
+    terms = (term for part in parts if isinstance(part, Misalignment) for term in measured_terms(part))
+    bases = map(base_of, terms)
+    return [base.name for base in bases if isinstance(base, TrackedName)]
 
 
 def _row(sample: Sample) -> dict[str, Any]:
