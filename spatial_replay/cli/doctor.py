@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -139,10 +140,14 @@ def _write(found: Examination, output: Path, inputs: list[Path]) -> dict[tuple[s
     except OSError as error:
         raise OutputError(f"{output}: cannot be made: {error.strerror}; choose another folder") from error
     files: dict[tuple[str, str], Path] = {}
+    stems: Counter[str] = Counter()
     for spec in found.specs:
+        stem = _UNSAFE.sub("-", spec.name).strip("-") or "spec"
+        stems[stem] += 1
+        if stems[stem] > 1:
+            stem += f"-{stems[stem]}"
         for example in (spec.satisfied, spec.violated):
             if example is not None and example.samples is not None:
-                stem = _UNSAFE.sub("-", spec.name).strip("-") or "spec"
                 path = output / f"{stem}.{example.verdict}.jsonl"
                 with replacing(path, inputs) as stream:
                     stream.write(example.jsonl.encode())
