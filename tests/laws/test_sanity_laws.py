@@ -119,6 +119,56 @@ def test_what_the_doctor_excludes_happens_in_no_run(one: str, other: str, seed: 
                 assert max(values[0], -values[1]) >= -ROUNDING
 
 
+SLACK = 0.001
+PLACES = (*NAMES, "left_bin", "right_bin", "tall")
+PAIRS = [(a, b) for a, b in product(PLACES, repeat=2) if a != b and a in NAMES]
+
+
+def measured(relations: list[str], trace: sr.Trace) -> list[float]:
+    """The robustness of relations in the first sample."""
+    specs = "".join(f"spec r{number} = {each}\n" for number, each in enumerate(relations))
+    results = sr.evaluate(sr.parse_specification(REGIONS + specs), trace).results
+    return [0.0 if each.robustness is None else each.robustness for each in results]
+
+
+def true_literals(trace: sr.Trace) -> list[str]:
+    """Relations that hold in the first sample, with thresholds that are as tight as can be."""
+    literals = []
+    for (a, b), number in zip(PAIRS, measured([f"{a} dist {b} >= 0" for a, b in PAIRS], trace), strict=True):
+        literals += [f"{a} dist {b} >= {number - SLACK:.6f}", f"{a} dist {b} <= {number + SLACK:.6f}"]
+    for (a, b), number in zip(PAIRS, measured([f"{a} enclosedin {b}" for a, b in PAIRS], trace), strict=True):
+        if number > SLACK:
+            literals.append(f"enlarge({a}, {number - SLACK:.6f}) enclosedin {b}")
+            if b in ("left_bin", "right_bin"):
+                literals.append(f"not (enlarge({a}, {number + SLACK:.6f}) enclosedin {b})")
+        elif number < -SLACK:
+            literals += [
+                f"{a} moved[{-number - SLACK:.6f}] {b}",
+                f"not ({a} moved[{SLACK - number:.6f}] {b})",
+            ]
+    for axis in "xyz":
+        pairs = [pair for pair in PAIRS if axis != "z" or pair[1] in (*NAMES, "tall")]
+        gaps = measured([f"{a} prec[{axis}] {b}" for a, b in pairs], trace)
+        for (a, b), number in zip(pairs, gaps, strict=True):
+            if number > SLACK and axis != "z":
+                literals.append(f"enlarge({a}, {number - SLACK:.6f}) prec[{axis}] {b}")
+                literals.append(f"not (enlarge({a}, {number + SLACK:.6f}) prec[{axis}] {b})")
+            elif abs(number) > SLACK:
+                literals.append(f"{a} prec[{axis}] {b}" if number > 0 else f"not ({a} prec[{axis}] {b})")
+    return literals
+
+
+@settings(max_examples=25)
+@given(st.integers(0, 2**32))
+def test_the_doctor_excludes_nothing_that_is_measured(seed: int) -> None:
+    literals = true_literals(crowded_trace(seed, 1))
+    assert len(literals) > 30
+    specification = sr.parse_specification(f"{REGIONS}spec all_of_it = F ({' and '.join(literals)})\n")
+    examined = sr.doctor(specification, examples=False)
+    assert examined.findings == ()
+    assert examined.specs[0].undecided == ()
+
+
 @settings(max_examples=60)
 @given(spatial_formulas())
 def test_a_placed_run_is_evaluated_to_the_verdict_that_it_shows(text: str) -> None:
