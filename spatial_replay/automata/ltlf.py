@@ -42,7 +42,7 @@ def in_samples(bound: Bound, rate_hz: float) -> Bound | None:
 
 def bounds_in_samples(formula: Formula, rate_hz: float) -> str:
     """Return what bounds in seconds become: "at 30 Hz, `F[0s, 3s]` is `F[0, 90]`"; "" without any."""
-    found = {}
+    found: dict[str, None] = {}
     for node in _temporal(formula):
         if node.bound is not None and _counts_seconds(node.bound):
             bound = in_samples(node.bound, rate_hz)

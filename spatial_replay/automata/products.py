@@ -1,7 +1,7 @@
 """Automata of conjunctions and disjunctions, from those of their operands.
 
-Each operand is compiled and minimised by itself, and joined with the others, the smallest ones first, so that
-a state that no run can tell from another is dropped before it is multiplied with those of the next operand.
+Each operand is compiled and minimised by itself, and joined with the others, the smallest ones first: states
+that accept the same runs are merged before they are multiplied with those of the next operand.
 """
 
 from __future__ import annotations

@@ -99,7 +99,7 @@ def _rate_of(about: Mapping[str, str]) -> float | None:
     try:
         return None if text is None else float(text)
     except ValueError:
-        raise LogError(f"the plan's rate_hz is {text!r:.40}, which is no number") from None
+        raise LogError(f"the plan's rate_hz is {text!r:.40}, which is not a number") from None
 
 
 def _plan_of(source: Source) -> Mapping[str, str]:

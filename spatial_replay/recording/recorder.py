@@ -414,12 +414,8 @@ class Recorder(SampleWriter):
 
     def _add_plan(self, planner: Planner) -> None:
         """Write the settings, which may depend on the first sample."""
-        from spatial_replay.logs.topics import PLAN_METADATA
-        from spatial_replay.planning.decision_log import plan_metadata
-
         if isinstance(self._log, FileLog):
-            name = self._log.files[self._files.index(planner.specification)]
-            self._log.add_metadata(PLAN_METADATA, plan_metadata(planner, name))
+            self._log.add_plan(planner, self._files.index(planner.specification))
 
     def next_step(self) -> Step:
         """Return the planner's next step, and record it with everything that it depends on.

@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Final, Literal, NamedTuple, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 
@@ -21,11 +21,15 @@ from spatial_replay.geometry.measure import Operand
 from spatial_replay.logs.mcap.writer import LogWriter
 from spatial_replay.logs.messages import MemorySink, Messages
 from spatial_replay.logs.output_file import Durability, open_output
+from spatial_replay.logs.topics import PLAN_METADATA
 from spatial_replay.recording.recording import Recording, RunEvent
 from spatial_replay.spec import object_names, signal_names
 from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
+
+if TYPE_CHECKING:
+    from spatial_replay.planning.planner import Planner
 
 GATHER_S: Final = 0.2
 """How long samples are gathered before they are encoded. A few together cost hardly more than one, and while
@@ -105,7 +109,7 @@ class FileLog:
         """Begin the file, with everything compiled that writing to it takes."""
         self.backlog = 0
         self._unevaluated: deque[Trace] = deque()
-        self._metadata: deque[tuple[str, Mapping[str, str]]] = deque()
+        self._plans: deque[Mapping[str, str]] = deque()
         self._at_once = _AT_FIRST
         self._stream = open_output(path, durability)
         try:
@@ -120,8 +124,8 @@ class FileLog:
 
     def add(self, samples: Sequence[Sample], trace: Trace, messages: Messages) -> None:
         """See `RecorderLog`."""
-        while self._metadata:
-            self._recording.add_metadata(*self._metadata.popleft())
+        while self._plans:
+            self._recording.add_metadata(PLAN_METADATA, self._plans.popleft())
         if len(trace) or len(messages):
             self._recording.add_samples(trace, messages)
         if len(trace):
@@ -137,14 +141,11 @@ class FileLog:
         """See `RecorderLog`."""
         self._recording.report(event)
 
-    @property
-    def files(self) -> Sequence[str]:
-        """The names of the specifications in the log."""
-        return [file.filename for file in self._recording.files]
+    def add_plan(self, planner: Planner, number: int) -> None:
+        """Write the settings of a planner of a specification with what is added next; from any thread."""
+        from spatial_replay.planning.decision_log import plan_metadata
 
-    def add_metadata(self, name: str, data: Mapping[str, str]) -> None:
-        """Write a metadata record with what is added next; from any thread."""
-        self._metadata.append((name, data))
+        self._plans.append(plan_metadata(planner, self._recording.files[number].filename))
 
     @property
     def is_busy(self) -> bool:

@@ -45,10 +45,10 @@ def numbered(count: int) -> list[str]:
 FAMILIES: dict[str, Callable[[int], str]] = {
     "all at some time": lambda n: both(*(f"(F {each})" for each in numbered(n))),
     "all again and again": lambda n: both(*(f"(G F {each})" for each in numbered(n))),
-    "one for good": lambda n: either(*(f"(F G {each})" for each in numbered(n))),
+    "one to the end": lambda n: either(*(f"(F G {each})" for each in numbered(n))),
     "fairness implies fairness": lambda n: f"({both(*(f'(G F {p(k)})' for k in range(n)))} -> G F {p(n)})",
     "some time or always": lambda n: both(*(f"((F {p(k)}) or G {p(k + 1)})" for k in range(n))),
-    "again or for good": lambda n: both(*(f"((G F {p(k)}) or F G {p(k + 1)})" for k in range(n))),
+    "again or to the end": lambda n: both(*(f"((G F {p(k)}) or F G {p(k + 1)})" for k in range(n))),
     "until to the right": lambda n: nested(lambda one, two: f"({one} U {two})", numbered(n + 1)),
     "one after the other": lambda n: nested(lambda one, two: f"(F ({one} and X {two}))", numbered(n + 1)),
     "counter": lambda n: both(
