@@ -29,7 +29,8 @@ def are_many(a_count: int, b_count: int) -> bool:
 @inlined
 def _height(vertices: Floats, edges: Floats, i: int, j: int) -> float:
     """Return the height of vertex j above the line through the edge from vertex i."""
-    return edges[i, 0] * (vertices[j, 0] - vertices[i, 0]) + edges[i, 1] * (vertices[j, 1] - vertices[i, 1])
+    dx, dy = vertices[j, 0] - vertices[i, 0], vertices[j, 1] - vertices[i, 1]
+    return float(edges[i, 0] * dx + edges[i, 1] * dy)
 
 
 @inlined

@@ -206,7 +206,9 @@ class LeafCode:
     def _constant(self, value: float) -> int:
         return self._row(CONSTANT, self.constants.setdefault(value, len(self.constants)))
 
-    def _expression(self, expression: Expression, bindings: Bindings) -> int:
+    def _expression(self, expression: Expression | ClosestPair, bindings: Bindings) -> int:
+        if isinstance(expression, ClosestPair):
+            return self._row(CLOSEST, self.closest.setdefault(expression, len(self.closest)))
         match expression:
             case Number():
                 return self._constant(expression.value)
@@ -226,8 +228,6 @@ class LeafCode:
                 for other in others:
                     row = self._row(op, row, other)
                 return row
-        if isinstance(expression, ClosestPair):
-            return self._row(CLOSEST, self.closest.setdefault(expression, len(self.closest)))
         measurement = map_terms(expression, lambda term: substitute_term(term, bindings))
         return self._row(MEASURED, self.measurements.setdefault(measurement, len(self.measurements)))
 
