@@ -367,10 +367,7 @@ class Recorder(SampleWriter):
         return None if self._box is None else self._box.planner
 
     def attach(self, planner: Planner, *, timings: bool = False) -> None:
-        """Let a planner observe every sample that is written from now on, and record its decisions.
-
-        Args:
-            timings: also record how long each decision took, as a sentence on /spatial/log.
+        """Let a planner observe every sample from now on, and record its decisions; `timings`: how long, too.
 
         Raises:
             UsageError: a second planner, one whose specification is not recorded, one that has observed

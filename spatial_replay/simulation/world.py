@@ -77,13 +77,13 @@ class TreeNode(NamedTuple):
     Attributes:
         kind: such as Sequence, Selector, Retry, or Action for a leaf.
         parent: place of the node above among the nodes; None for the root.
-        status: INVALID if it was not ticked since the tree began or was reset.
+        status: RUNNING, SUCCESS or FAILURE; INVALID if it was not ticked since the tree began or was reset.
     """
 
     name: str
     kind: str
     parent: int | None
-    status: Literal["INVALID", "RUNNING", "SUCCESS", "FAILURE"]
+    status: str
 
 
 class TreeTick(NamedTuple):
