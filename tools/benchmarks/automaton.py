@@ -62,6 +62,19 @@ def bench_many_responses(measure: Any) -> None:
     measure.ratio("12 responses, of 8", many.median_s / few.median_s, 24.0)
 
 
+def bench_doctor(measure: Any) -> None:
+    """What is wrong with a specification, and the shortest runs of its results, placed and evaluated."""
+    spatial = " and ".join(f"(G (a{n} leftof b{n} -> F a{n} ovlp b{n}))" for n in range(8))
+    several = "\n".join(
+        f"spec s{n} = G (a dist b >= 0.{n + 10}) and F (a leftof c{n} and b ovlp c{n})" for n in range(12)
+    )
+    deadline = "G (a leftof b -> F[0, 1000] a ovlp b)"
+    tasks = {"pick-place": PICK_PLACE, "8 responses": spatial, "12 specs": several, "1000 samples": deadline}
+    for name, text in tasks.items():
+        specification = sr.parse_specification(text)
+        measure(f"doctor, {name}", lambda _, it=specification: sr.doctor(it), limit_s=1.0)
+
+
 def bench_automata_at_once(measure: Any) -> None:
     """100 automata from 4 processes at once, each compared with what one process alone makes."""
     compiler = "own" if shutil.which("mona") is None else "mona"
