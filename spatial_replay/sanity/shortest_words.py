@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from heapq import heappop, heappush
+from itertools import count
 from typing import Final, NamedTuple, TypeAlias
 
 from spatial_replay.automata.automaton import Automaton
@@ -104,25 +106,32 @@ class WordSearch:
         return self._conflict(cube) is not None
 
     def _search(self, sides: Sequence[Side], *, geometry: bool) -> Word | None:
-        start = tuple(side.automaton.initial for side in sides)
+        """Return the shortest run by A*: automata say how many samples it takes at least from here on."""
         before: dict[tuple[int, ...], tuple[tuple[int, ...] | None, Cube]] = {}
-        waiting = [start]
-        for number, states in enumerate(waiting):
-            moves, leaves = self._joined(sides, states)
-            ahead = [leaf for leaf in leaves if all(map(_may_agree, sides, self._tuples[leaf]))]
-            # ends come first: a run is found without a look at all that its last sample might do instead
-            for leaf in sorted(ahead, key=lambda leaf: not all(map(_agrees, sides, self._tuples[leaf]))):
+        order = count()
+        # what geometry says is asked when a move is taken out, of few of all that are put in
+        waiting: list[tuple[int, int, int, int, int, tuple[int, ...] | None]] = []
+
+        def put_in(moves: int, leaves: Sequence[int], length: int, source: tuple[int, ...] | None) -> None:
+            for leaf in leaves:
                 after = self._tuples[leaf]
-                if after in before:
-                    continue
-                cube = self._cube(self._leading(moves, leaf)) if geometry else {}
-                if cube is None:
-                    continue
-                # samples may lead back to the state before the first one
-                before[after] = (states if number else None), cube
-                if all(map(_agrees, sides, after)):
-                    return tuple(reversed(list(_back(after, before))))
-                waiting.append(after)
+                if after not in before and all(map(_may_agree, sides, after)):
+                    least = length + max(map(_least_left, sides, after))
+                    heappush(waiting, (least, -length, next(order), moves, leaf, source))
+
+        put_in(*self._joined(sides, tuple(side.automaton.initial for side in sides)), 1, None)
+        while waiting:
+            _, length, _, moves, leaf, source = heappop(waiting)
+            after = self._tuples[leaf]
+            if after in before:
+                continue
+            cube = self._cube(self._leading(moves, leaf)) if geometry else {}
+            if cube is None:
+                continue
+            before[after] = source, cube
+            if all(map(_agrees, sides, after)):
+                return tuple(reversed(list(_back(after, before))))
+            put_in(*self._joined(sides, after), 1 - length, after)
         return None
 
     def _spend(self, steps: int) -> None:
@@ -313,6 +322,11 @@ def _agrees(side: Side, state: int) -> bool:
 
 def _may_agree(side: Side, state: int) -> bool:
     return state in (side.automaton.can_accept if side.accepts else side.automaton.can_reject)
+
+
+def _least_left(side: Side, state: int) -> int:
+    """Return how many samples it takes at least to end as a side has to."""
+    return side.automaton.distances[state] if side.accepts else int(not _agrees(side, state))
 
 
 def _back(
