@@ -59,6 +59,7 @@ if TYPE_CHECKING:
 @click.pass_context
 def plan(
     context: click.Context,
+    /,
     log: LogFile | None,
     changes: Mapping[str, Any],
     **options: Any,

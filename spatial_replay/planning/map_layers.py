@@ -191,11 +191,12 @@ def _causes(gradient: GradientMap, avoided: Booleans) -> tuple[tuple[BlockedBy, 
     """Return what blocks cells, and the number of its cause for each."""
     maps, blocked = gradient.made_of.now, gradient.blocked
     codes = np.full(blocked.shape, -1, np.int64)
-    for reason, kind in _KIND_OF.items():
-        codes[blocked == reason] = kind * _NUMBERS
+    for reason, family in _KIND_OF.items():
+        codes[blocked == reason] = family * _NUMBERS
     stands = blocked == OCCUPIED
     codes[stands] += maps.distances.argmin(axis=0)[stands]
-    held, texts = blocked == CONSTRAINED, ()
+    held = blocked == CONSTRAINED
+    texts: tuple[str, ...] = ()
     if held.any():
         texts, which = _most_dangerous(gradient.made_of, blocked.shape)
         codes[held] += which[held]

@@ -177,21 +177,21 @@ class _Redoing:
                 self._differ(sample, None, step, messages)
             return
         for decision in decisions:
-            self._repeat(sample, decision, recorded)
-            if self._redone is not None:
+            if not self._repeat(sample, decision, recorded):
                 return
 
-    def _repeat(self, sample: Sample, decision: PlanDecision, recorded: list[PlannerMessage]) -> None:
+    def _repeat(self, sample: Sample, decision: PlanDecision, recorded: list[PlannerMessage]) -> bool:
+        """Repeat a decision or its outcome; return whether the same was done."""
         before = self._new.last
         self._old.repeat(decision)
         messages = self._new.repeat(decision)
         if messages is None or decision.HasField("outcome"):
             if messages is not None:
                 self._messages.append(_on_redone_topics(messages))
-            return
+            return True
         old, new = self._old.last, self._new.last
         if old is None or new is None:
-            return
+            return True
         refuse_other(self._source, old, decision)
         if new is before or not _does_the_same(old, new):
             first = min(
@@ -199,11 +199,12 @@ class _Redoing:
             )
             explained = explained_decision(old, self._old.box.planner, first)
             self._differ(sample, RedoneStep(old, explained), new, messages)
-            return
+            return False
         self._messages.append(_on_redone_topics(messages))
         if self._same == self._alike and _has_all(recorded, messages):
             self._same += 1
         self._alike += 1
+        return True
 
     def _differ(self, sample: Sample, recorded: RedoneStep | None, step: Step, messages: Messages) -> None:
         self._sample, self._recorded = sample, recorded
