@@ -135,6 +135,8 @@ def map_fields(message: GridMessage) -> dict[str, np.ndarray]:
     if not rows or not columns or cell * columns > row:
         return {}
     types = {
+        # a field without a type is a number
+        PackedElementField.UNKNOWN: "<f4",
         PackedElementField.FLOAT32: "<f4",
         PackedElementField.UINT16: "<u2",
         PackedElementField.UINT8: "u1",
