@@ -133,7 +133,7 @@ class Annotator:
 
     def redraw(self) -> None:
         """Draw the whole scene with the next sample, for a viewer that shows nothing yet."""
-        self._scene = SceneState()
+        self._scene = SceneState(first_ns=self._scene.first_ns)
 
     def messages(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> list[Messages]:
         """Return what to write beside the next samples.

@@ -308,7 +308,7 @@ class EventReporter:
             return
         missed = found.missed if isinstance(found, DecidingLeaf) else None
         is_response = missed is not None and missed.is_condition
-        self.over = missed.response if missed and is_response else self._leaf_text(found.leaf)
+        self.over = f"missed {missed.response}" if missed and is_response else self._leaf_text(found.leaf)
 
     def _leaf_text(self, leaf: int) -> str:
         return format_formula(substitute(self._leaves[leaf], self._bindings), relations=self._relations)

@@ -9,7 +9,7 @@ from typing import Any, Final, NamedTuple
 
 from spatial_replay.annotate.rings import SceneBounds
 from spatial_replay.annotate.specification import ReportedTree
-from spatial_replay.annotate.standing import FinalStanding
+from spatial_replay.annotate.standing import FinalStanding, worst_first
 from spatial_replay.annotate.viewer_panels import (
     Panel,
     constants,
@@ -49,6 +49,7 @@ class LayoutContents(NamedTuple):
         axes: those of the source, which the title of the scene says where they are not ours.
         units: those that are declared, see `unit_of`.
         outcomes: of each tree, what it came to; empty while that can change.
+        order: the places of the trees, the worst first; empty while that is not known.
         images: the topics with images.
     """
 
@@ -60,6 +61,17 @@ class LayoutContents(NamedTuple):
     units: Mapping[str, str] = MappingProxyType({})
     outcomes: Sequence[FinalStanding] = ()
     images: Sequence[str] = ()
+    order: Sequence[int] = ()
+
+    def worst_first(self) -> LayoutContents:
+        """Return the same with the worst results first, which then have lights and curves if not all can."""
+        order = self.order or worst_first(self.outcomes) or range(len(self.trees))
+        return self._replace(
+            trees=[self.trees[place] for place in order],
+            has_states=[self.has_states[place] for place in order],
+            outcomes=[self.outcomes[place] for place in order] if self.outcomes else (),
+            order=(),
+        )
 
 
 def layout_attachment(contents: LayoutContents) -> Attachment:
@@ -77,12 +89,14 @@ def viewer_layout(contents: LayoutContents) -> dict[str, Any]:
 
     If the log has a planner's decisions, its map lies under the scene, and the reasons are listed below it.
     """
+    contents = contents.worst_first()
     return _layout(contents, _scene_panels(contents), _evaluation_panels(contents))
 
 
 def layout_for_live(contents: LayoutContents) -> dict[str, Any]:
     """Return the layout for a server that replays a log: with the curves of the whole log at any time, and
     the constants that a viewer may edit."""
+    contents = contents.worst_first()
     left = [*_scene_panels(contents), (constants(), 1.5)]
     panels = _evaluation_panels(contents)
     if panels:

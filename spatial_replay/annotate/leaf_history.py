@@ -45,6 +45,7 @@ class DecidingLeaf(NamedTuple):
         number: its own number there, its sign not turned.
         time_ns: of the sample.
         missed: the implication above it that failed, if a violation is due to one.
+        response: where it is the condition's, the leaf by which the response came closest, if one did.
     """
 
     node: int
@@ -52,6 +53,7 @@ class DecidingLeaf(NamedTuple):
     number: float
     time_ns: int
     missed: MissedResponse | None = None
+    response: DecidingLeaf | None = None
 
 
 class SettledViolation(NamedTuple):
@@ -64,6 +66,11 @@ class SettledViolation(NamedTuple):
 
     time_ns: int
     leaf: DecidingLeaf | None
+
+    @property
+    def shown(self) -> DecidingLeaf | None:
+        """The leaf to point at: that of a response that was missed, not of the condition that held."""
+        return self.leaf if self.leaf is None or self.leaf.response is None else self.leaf.response
 
 
 class LeafHistory:
@@ -121,7 +128,7 @@ class LeafHistory:
             node = next(each for each in conjuncts if series[each, 3] < 0.0)
         done = evaluate_unfinished(self._formula, self._order, samples.leaves, samples.times_ns)
         path = deciding_path(self._formula, done, samples.times_ns, node, _END_OF[verdict], goes_on=True)
-        return self._leaf(path, samples, done, verdict)
+        return self._leaf(path, samples, done, verdict, goes_on=True)
 
     def finished(self, node: int, values: Floats, final: Floats) -> DecidingLeaf | None:
         """Return what decides a node that was pending up to the end of the log; None beyond the bound.
@@ -153,9 +160,30 @@ class LeafHistory:
         return self._blocks[0] if time_ns is None else self._blocks[0].between(0, time_ns + 1)
 
     def _leaf(
-        self, path: DecidingPath, samples: SeriesBlock, done: OfflineNodes | UnfinishedNodes, verdict: Verdict
+        self,
+        path: DecidingPath,
+        samples: SeriesBlock,
+        done: OfflineNodes | UnfinishedNodes,
+        verdict: Verdict,
+        *,
+        goes_on: bool = False,
     ) -> DecidingLeaf | None:
-        """Return the leaf at the end of a path; None if it has no finite number."""
+        """Return the leaf at the end of a path, with what was missed; None if it has no finite number."""
+        found = self._end_of(path, samples)
+        if found is None or verdict is not Verdict.VIOLATED:
+            return found
+        nodes = [substitute(each, self._bindings) for each in self._nodes]
+        missed = missed_response(path, nodes, done, samples.times_ns)
+        response = None
+        if missed is not None and missed.is_condition:
+            at = missed.node, End.HIGH
+            best = deciding_path(
+                self._formula, done, samples.times_ns, *at, goes_on=goes_on, sample=missed.sample
+            )
+            response = self._end_of(best, samples)
+        return found._replace(missed=missed, response=response)
+
+    def _end_of(self, path: DecidingPath, samples: SeriesBlock) -> DecidingLeaf | None:
         node, sample = path.steps[-1].node, path.steps[-1].sample
         index = self._leaf_of[node]
         if index is None:
@@ -164,8 +192,4 @@ class LeafHistory:
         number = float(samples.leaves[high if path.end is End.HIGH else low, index, sample])
         if not math.isfinite(number):
             return None
-        missed = None
-        if verdict is Verdict.VIOLATED:
-            nodes = [substitute(each, self._bindings) for each in self._nodes]
-            missed = missed_response(path, nodes, done, samples.times_ns)
-        return DecidingLeaf(node, index, number + 0.0, int(samples.times_ns[sample]), missed)
+        return DecidingLeaf(node, index, number + 0.0, int(samples.times_ns[sample]))

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.spec.formula import (
     ANY_CLASS,
+    FUTURE_OPERATORS,
     Atom,
     Boolean,
     Earlier,
@@ -106,6 +107,8 @@ class Requirement(NamedTuple):
         groups: open groups, whose members are objects too.
         conjunct: the conjunct of the formula that it is in.
         can_violate: whether failing now may be what violates its obligation; not a goal beside invariants.
+        is_condition: whether it is left of an implication, which is met without it, too.
+        lasts: whether it is asked of samples without end; else only of those up to a deadline.
     """
 
     node: int
@@ -116,6 +119,8 @@ class Requirement(NamedTuple):
     groups: frozenset[ClassMembers]
     conjunct: Obligation = Obligation(0, 1.0)
     can_violate: bool = True
+    is_condition: bool = False
+    lasts: bool = False
 
     def standing(self, series: Floats, at: Integers) -> NDArray[np.uint8]:
         """Return (S,) how it stands, see `Standing`.
@@ -206,6 +211,7 @@ class _Place(NamedTuple):
     Attributes:
         sign: 0 where it counts in both.
         always: whether no operator above it but conjunctions and those that need it at every sample.
+        is_condition, lasts: see `Requirement`.
     """
 
     formula: Formula
@@ -214,6 +220,8 @@ class _Place(NamedTuple):
     obligation: Obligation | None
     conjunct: Obligation
     always: bool
+    is_condition: bool
+    lasts: bool
 
 
 def _places(formula: Formula) -> list[_Place]:
@@ -224,8 +232,12 @@ def _places(formula: Formula) -> list[_Place]:
         passed.append(0)
         if parent is None:
             sign, above, conjunct, always = 1.0, None, Obligation(0, 1.0), True
+            is_condition, lasts = False, False
         else:
             up = places[parent]
+            is_implied = operator_of(up.formula) == "->" and up.sign > 0.0
+            is_condition = up.is_condition or (is_implied and not passed[parent])
+            lasts = up.lasts or _is_endless(up.formula)
             sign = up.sign * _sign(up.formula, passed[parent])
             above, conjunct, always = up.obligation, up.conjunct, up.always and _needs_all(up)
             if conjunct == Obligation(parent, up.sign) and isinstance(up.formula, Boolean) and _needs_all(up):
@@ -233,7 +245,7 @@ def _places(formula: Formula) -> list[_Place]:
             passed[parent] += 1
         starts = above is None and isinstance(node, Temporal)
         obligation = Obligation(identifier, sign) if starts else above
-        places.append(_Place(node, parent, sign, obligation, conjunct, always))
+        places.append(_Place(node, parent, sign, obligation, conjunct, always, is_condition, lasts))
     return places
 
 
@@ -244,6 +256,14 @@ _NEEDS_ALL: Final[Mapping[float, frozenset[str]]] = MappingProxyType(
     }
 )
 """Operators that need all of their operands, by the sign in which they count themselves."""
+
+
+def _is_endless(formula: Formula) -> bool:
+    """Say whether an operator asks something of samples without end."""
+    is_ahead = operator_of(formula) in FUTURE_OPERATORS - {"X", "WX"}
+    return (
+        is_ahead and isinstance(formula, Temporal) and (formula.bound is None or formula.bound.upper is None)
+    )
 
 
 def _needs_all(place: _Place) -> bool:
@@ -294,6 +314,8 @@ def _requirement(identifier: int, place: _Place, object: str | None) -> Requirem
         frozenset(regions),
         frozenset(groups),
         place.conjunct,
+        is_condition=place.is_condition,
+        lasts=place.lasts,
     )
 
 

@@ -85,6 +85,16 @@ class FinalStanding(NamedTuple):
     over: str
 
 
+def worst_first(outcomes: Sequence[FinalStanding]) -> list[int]:
+    """Return the places of results, the worst first: of those violated, the one that was so first."""
+
+    def key(place: int) -> tuple[int, float]:
+        outcome = outcomes[place]
+        return int(_RANKS[outcome.standing]), outcome.since_s if outcome.standing == VIOLATED else 0.0
+
+    return sorted(range(len(outcomes)), key=key)
+
+
 class StandingEncoder:
     """Encodes how results stand, sample after sample.
 

@@ -108,13 +108,15 @@ class Violations(NamedTuple):
 
     Attributes:
         result: (S,) int64, which of the results it is of; -1 where nothing is violated.
-        node: (S,) int64, id of the requirement that is violated.
+        node: (S,) int64, id of the requirement that is violated, or of the atom that settled the violation.
         leaf: (S,) int64, index of what decides it among the leaves of the result's program; -1 for none.
         is_shown: (S,), whether there are two points to show it between.
         points: (S, 2, 2), a point of the first of the pair and one of the second.
         top: (S,), the upper end of the higher one, NaN if neither has a height.
         robustness: (S,), at most 0: of the requirement, or of the atom that settled the violation; in the
             unit of the log, where `scale` divides the number of the atom.
+        holds: (S,), whether the atom holds, where it should not.
+        moment_ns: (S,) int64, of which sample the number is; -1 for the sample itself.
     """
 
     result: Integers
@@ -124,6 +126,8 @@ class Violations(NamedTuple):
     points: Floats
     top: Floats
     robustness: Floats
+    holds: NDArray[np.bool_]
+    moment_ns: Integers
 
 
 def leaf_pairs(
@@ -191,16 +195,15 @@ def first_violations(results: Sequence[EvaluatedResult], trace: Trace, samples: 
 
     It is shown at the atom that gives the requirement its number: between the two points at which the signed
     distance of its two terms is attained or, of an enclosure, along which the one sticks out of the other.
-    In the sample that settled the formula's violation that is the atom that settled it.
+    In the sample that settled the formula's violation that is the atom that settled it. What is asked only up
+    to a deadline is still pointed at after that, with the number that settled it. Conditions of implications
+    are not pointed at: those hold, and what had to follow does not.
 
     Args:
         samples: (S,) int64, indices.
     """
     times_ns = trace.times_ns[samples]
     which, requirement, robustness = _first(results, times_ns)
-    for index, result in enumerate(results):
-        # what settled a violation may be a goal whose time is over
-        which[(which < 0) & _is_settled_at(result, times_ns)] = index
     found = Violations(
         result=which,
         node=np.full(len(samples), -1, np.int64),
@@ -209,6 +212,8 @@ def first_violations(results: Sequence[EvaluatedResult], trace: Trace, samples: 
         points=np.full((len(samples), 2, 2), np.nan),
         top=np.full(len(samples), np.nan),
         robustness=robustness,
+        holds=np.zeros(len(samples), np.bool_),
+        moment_ns=np.full(len(samples), -1, np.int64),
     )
     for index, result in enumerate(results):
         here = np.flatnonzero(which == index)
@@ -216,7 +221,7 @@ def first_violations(results: Sequence[EvaluatedResult], trace: Trace, samples: 
             nodes = np.array([each.node for each in result.requirements], np.int64)
             found.node[here] = nodes[requirement[here]]
             at = np.searchsorted(result.block.times_ns, times_ns[here])
-            found.leaf[here] = _deciding(result, result.leaf_pairs, requirement[here], at)
+            found.leaf[here], found.holds[here] = _deciding(result, result.leaf_pairs, requirement[here], at)
             _point_at_settled(result, times_ns, here, found)
             leaf = found.leaf[here]
             known = here[leaf >= 0]
@@ -225,27 +230,39 @@ def first_violations(results: Sequence[EvaluatedResult], trace: Trace, samples: 
     return found
 
 
-def _is_settled_at(result: EvaluatedResult, times_ns: Integers) -> NDArray[np.bool_]:
-    """Return (S,), whether a sample settled the violation of a result by an atom in it."""
+def _shows_settled(result: EvaluatedResult, times_ns: Integers) -> NDArray[np.bool_]:
+    """Return (S,), in which samples a result is pointed at by what settled its violation.
+
+    That is the sample that settled it and, if the atom is asked only up to a deadline, all after it.
+    """
     settled = result.settled
-    if result.leaf_pairs is None or not result.requirements or settled is None or settled.leaf is None:
+    if result.leaf_pairs is None or settled is None or settled.shown is None:
         return np.zeros(len(times_ns), np.bool_)
-    is_now = settled.leaf.time_ns == settled.time_ns
-    return np.asarray((times_ns == settled.time_ns) & is_now)
+    within = _requirement_of(result, settled.shown.node)
+    if within is None:
+        return np.zeros(len(times_ns), np.bool_)
+    return np.asarray(times_ns == settled.time_ns if within.lasts else times_ns >= settled.time_ns)
+
+
+def _requirement_of(result: EvaluatedResult, node: int) -> Requirement | None:
+    """Return the requirement that a leaf is in."""
+    within = [each for each in result.requirements if each.node <= node]
+    return within[-1] if within else None
 
 
 def _point_at_settled(result: EvaluatedResult, times_ns: Integers, here: Integers, found: Violations) -> None:
-    """Name the leaf that settled the violation in the sample that did; none if that was an earlier one's."""
+    """Name the leaf that settled the violation, where that is what is pointed at."""
     if result.settled is None:
         return
     found.leaf[here[times_ns[here] == result.settled.time_ns]] = -1
-    leaf = result.settled.leaf
-    for sample in here[_is_settled_at(result, times_ns[here])].tolist():
-        if leaf is not None:
-            found.leaf[sample] = leaf.leaf
-            within = [each for each in result.requirements if each.node <= leaf.node]
-            found.node[sample] = within[-1].node if within else found.node[sample]
-            found.robustness[sample] = -abs(leaf.number)
+    leaf = result.settled.shown
+    there = here[_shows_settled(result, times_ns[here])]
+    if leaf is None or not len(there):
+        return
+    found.leaf[there], found.node[there] = leaf.leaf, leaf.node
+    found.robustness[there] = -abs(leaf.number)
+    found.holds[there] = leaf.number > 0.0
+    found.moment_ns[there] = np.where(times_ns[there] == leaf.time_ns, -1, leaf.time_ns)
 
 
 def _robustness(
@@ -278,29 +295,46 @@ def _first(results: Sequence[EvaluatedResult], times_ns: Integers) -> tuple[Inte
         since_ns = (
             np.zeros(len(result.requirements), np.int64) if result.since_ns is None else result.since_ns
         )
-        for number, (_, now) in enumerate(_robustness(result, times_ns)):
+        is_over = np.zeros(len(times_ns), np.bool_)
+        if result.settled is not None:
+            is_over = times_ns >= result.settled.time_ns
+        for number, (requirement, now) in enumerate(_robustness(result, times_ns)):
+            if requirement.is_condition:
+                continue
             is_first = (now < 0.0) & (now > -np.inf) & (since_ns[number] < earliest)
+            if not requirement.lasts:
+                is_first &= ~is_over
             which[is_first], place[is_first], violated[is_first] = index, number, now[is_first]
             earliest[is_first] = since_ns[number]
+        if result.settled is not None and result.settled.shown is not None:
+            # what settled a violation may be a goal whose time is over
+            is_first = _shows_settled(result, times_ns) & (result.settled.time_ns < earliest)
+            which[is_first], violated[is_first] = index, -abs(result.settled.shown.number)
+            earliest[is_first] = result.settled.time_ns
     return which, place, violated
 
 
-def _deciding(result: EvaluatedResult, pairs: LeafPairs, requirement: Integers, at: Integers) -> Integers:
-    """Return (H,) the leaf that gives a requirement (H,) its number in a sample (H,); -1 for none."""
-    leaf = np.full(len(at), -1, np.int64)
+def _deciding(
+    result: EvaluatedResult, pairs: LeafPairs, requirement: Integers, at: Integers
+) -> tuple[Integers, NDArray[np.bool_]]:
+    """Return (H,) the leaf that gives a requirement (H,) its number in a sample (H,), -1 for none, and
+    whether that leaf counts with its sign turned, so that it holds where the requirement fails."""
+    leaf, is_turned = np.full(len(at), -1, np.int64), np.zeros(len(at), np.bool_)
     leaves = result.block.leaves
     low, high = low_and_high(len(leaves), wide=False)
-    for number in np.unique(requirement).tolist():
+    for number in np.unique(requirement[requirement >= 0]).tolist():
         there = np.flatnonzero(requirement == number)
-        below = pairs.below[number]
+        below, own = pairs.below[number], result.requirements[number]
         if not len(below.indices):
             continue  # a constant
         places = below.indices[:, None], at[there][None, :]
         lows, highs = leaves[low][places], leaves[high][places]
-        now = result.block.series[result.requirements[number].node, 1, at[there]]
+        now = result.block.series[own.node, 1, at[there]]
         is_hit = (lows == highs) & (lows * below.signs[:, None] == now)
-        leaf[there] = np.where(is_hit.any(axis=0), below.indices[is_hit.argmax(axis=0)], -1)
-    return leaf
+        first = is_hit.argmax(axis=0)
+        leaf[there] = np.where(is_hit.any(axis=0), below.indices[first], -1)
+        is_turned[there] = own.sign * below.signs[first] < 0.0
+    return leaf, is_turned
 
 
 def _locate(pairs: LeafPairs, trace: Trace, samples: Integers, here: Integers, found: Violations) -> None:

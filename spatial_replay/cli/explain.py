@@ -21,7 +21,7 @@ from spatial_replay.cli.options import (
     open_inputs,
     warn_of_input,
 )
-from spatial_replay.cli.output import VERDICT_COLOURS, are_many, others_text, worst_of
+from spatial_replay.cli.output import MANY, VERDICT_COLOURS, counts_text, others_text, worst_of
 from spatial_replay.cli.progress import progress
 from spatial_replay.cli.terminal import Coloured, Line, fitted, show, show_json, warn
 from spatial_replay.errors import UsageError
@@ -82,9 +82,12 @@ def explain(
     if at is not None and not goes_on and replayed.end_ns < inputs.window.end_ns - 1:
         warn(f"--at {at} is after the last sample, at {time_text(replayed.end_ns, replayed.first_ns)}")
     others: Sequence[SpecResult] = ()
+    counts = ""
     if not as_json and object_name is None:
         fitting = [each for each in replayed.results if verdict_of(each, node, goes_on=goes_on) is not None]
-        if are_many(fitting):
+        if len(fitting) > MANY:
+            verdicts_of_all = [verdict_of(each, node, goes_on=goes_on) for each in fitting]
+            counts = f"{len(fitting):,} results: {counts_text(map(str, verdicts_of_all))}"
             shown, others = worst_of(fitting)
             replayed = replace(replayed, results=tuple(shown))
     results = explain_results(replayed, node=node, object=object_name, goes_on=goes_on)
@@ -92,7 +95,7 @@ def explain(
     if as_json:
         show_json([*(each.document for each in results), *map(idle_document, idle)])
     else:
-        texts = list(_texts(results))
+        texts = [*([[counts]] if counts else []), *_texts(results)]
         if idle:
             texts.append([each.message for each in idle])
         if others:

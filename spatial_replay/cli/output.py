@@ -116,16 +116,14 @@ def counts_text(verdicts: Iterable[str]) -> str:
     return ", ".join(f"{counts[verdict]:,} {verdict}" for verdict in WORST_FIRST if counts[verdict])
 
 
-def are_many(results: Sequence[SpecResult]) -> bool:
-    """Return whether only the worst of some results are printed."""
-    return len(results) > _MOST_SHOWN
-
-
 def worst_of(results: Sequence[SpecResult]) -> tuple[Sequence[SpecResult], Sequence[SpecResult]]:
     """Return the results to print and, of too many, the others; the worst first where they are several."""
     if len(results) > MANY:
-        results = sorted(results, key=_severity)
-    shown = _SHOWN if are_many(results) else len(results)
+        # imported here since it loads numerical libraries
+        from spatial_replay.monitor.result import worst_first
+
+        results = [results[place] for place in worst_first(results)]
+    shown = _SHOWN if len(results) > _MOST_SHOWN else len(results)
     return results[:shown], results[shown:]
 
 
@@ -134,12 +132,6 @@ def others_text(others: Sequence[SpecResult]) -> str:
     one = ", --each VAR=OBJECT shows one" if any(each.object is not None for each in others) else ""
     counts = counts_text(each.verdict for each in others)
     return f"… and {len(others):,} more: {counts}; --json has all{one}"
-
-
-def _severity(result: SpecResult) -> tuple[int, float]:
-    """Return what to sort results by: the worst verdict first, and then the least robustness."""
-    number = result.upper if math.isnan(result.robustness) else result.robustness
-    return WORST_FIRST.index(str(result.verdict)), number
 
 
 def _titled(result: SpecResult) -> str:

@@ -469,3 +469,18 @@ def no_such_node(name: str, names: Iterable[str], place: str = "") -> str:
     listed = f"there are {', '.join(known)}" if known else "there are none yet"
     hint = nearest_hint(name, known) if isinstance(name, str) else ""
     return f"no node is named {name!r}{place}; {f'{hint} ' if hint else ''}{listed}"
+
+
+def worst_first(results: Sequence[SpecResult]) -> list[int]:
+    """Return the places of results: those violated, those unknown, the others.
+
+    Of those violated, the one that was so for certain first; else they stay in the order of the files.
+    Robustness of different results is not compared: their units may differ.
+    """
+    severity = {Verdict.VIOLATED: 0, Verdict.UNKNOWN: 1}
+
+    def key(place: int) -> tuple[int, int]:
+        violated_ns = results[place].violated_at_ns
+        return severity.get(results[place].verdict, 2), NEVER if violated_ns is None else violated_ns
+
+    return sorted(range(len(results)), key=key)

@@ -25,7 +25,7 @@ from spatial_replay.annotate.specification import logged_specifications
 from spatial_replay.errors import SpecificationError, UsageError
 from spatial_replay.logs.messages import Attachment
 from spatial_replay.logs.source import MemorySource, Source, units_of
-from spatial_replay.monitor.result import SpecResult
+from spatial_replay.monitor.result import SpecResult, worst_first
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.monitor.verdict import Verdict, worst_verdict
 from spatial_replay.replay.engine import Replayed, idle_templates, replayed_specs
@@ -326,7 +326,8 @@ class Evaluated:
     def layout(self) -> Attachment:
         """The viewer layout for a server of this log."""
         topics = {each.topic for each in self.loaded.own.channels}
-        return live_layout_attachment(self.evaluation.contents(SceneBounds.of(self.loaded.inside), topics))
+        contents = self.evaluation.contents(SceneBounds.of(self.loaded.inside), topics)
+        return live_layout_attachment(contents._replace(order=worst_first(self.replayed.results)))
 
     def annotator(self, scene: SceneState | None = None, arrow: str = "") -> Annotator:
         """Return the annotator of these samples, before the first; see `AnnotatedEvaluation`."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
@@ -10,7 +9,7 @@ from typing import Final, NamedTuple
 from spatial_replay.annotate.specification import ReportedTree
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.monitor.result import NodeResult, SpecResult
+from spatial_replay.monitor.result import NodeResult, SpecResult, worst_first
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.vacuity import Vacuous
 from spatial_replay.monitor.verdict import Verdict, worst_verdict
@@ -161,19 +160,3 @@ class RunReport:
 def worst_results(results: Sequence[SpecResult]) -> list[int]:
     """Return which results are explained and drawn, in the order of `worst_first`: `MOST_DRAWN` at most."""
     return worst_first(results)[:MOST_DRAWN]
-
-
-def worst_first(results: Sequence[SpecResult]) -> list[int]:
-    """Return the places of results: those violated, those unknown, the others.
-
-    A few of one verdict stay in the order of the files; more are sorted, the least robustness first.
-    """
-    severity = {Verdict.VIOLATED: 0, Verdict.UNKNOWN: 1}
-    are_many = len(results) > MANY
-
-    def key(number: int) -> tuple[int, float]:
-        result = results[number]
-        least = result.upper if math.isnan(result.robustness) else result.robustness
-        return severity.get(result.verdict, 2), least if are_many and not math.isnan(least) else 0.0
-
-    return sorted(range(len(results)), key=key)

@@ -17,11 +17,12 @@ from typing import Final
 
 from spatial_replay import __version__
 from spatial_replay.monitor.causes import settled_time
+from spatial_replay.monitor.result import worst_first
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.notebook.figures import Html, element
 from spatial_replay.palette import NEGATIVE, NEUTRAL, POSITIVE, hexadecimal
 from spatial_replay.report.compact import json_text, sentence_parts
-from spatial_replay.report.contents import MANY, ReportedResult, RunReport, worst_first
+from spatial_replay.report.contents import MANY, ReportedResult, RunReport
 from spatial_replay.report.data import page_data
 from spatial_replay.report.tree_panel import final_text
 from spatial_replay.spec.formula import iter_nodes

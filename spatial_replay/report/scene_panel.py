@@ -156,6 +156,11 @@ def scene_value(
             "points": packing.add(box.steps(_joined([each.ends for each in arrows])), "u2"),
             "labels": [each.label for each in arrows],
             "robustness": packing.add(np.array([each.robustness for each in arrows]), "f8"),
+            "holds": packing.add(np.array([each.holds for each in arrows]), "u1"),
+            # of those about an earlier sample
+            "moments": [
+                None if each.moment_ns is None else (each.moment_ns - first_ns) / 1e9 for each in arrows
+            ],
             # the result and the node of the page, -1 where the page leaves them out
             "places": packing.add(
                 np.array([places.get((each.result, each.node), (-1, -1)) for each in arrows]), "i4"

@@ -107,6 +107,8 @@ def requirement_values(
         {
             "node": place[requirement.node],
             "sign": requirement.sign,
+            "is_condition": requirement.is_condition,
+            "lasts": requirement.lasts,
             "outcome": json_number(float(requirement.outcome(ends, np.zeros(1, np.int64))[0])),
             "entities": entities_of(requirement),
             "standing": packing.add(requirement.standing(result.series, samples), "u1"),

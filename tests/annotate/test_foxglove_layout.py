@@ -191,11 +191,22 @@ def test_results_of_different_units_are_plotted_apart_with_a_line_at_0(tmp_path)
     assert axes == ["footprint units", "no unit"]
 
 
+def test_the_worst_of_many_results_have_lights_and_curves(tmp_path):
+    # only the last one of the file is violated
+    text = "\n".join(f"spec s{index} = G a farfrom[{0 if index < 44 else 4.5}] b" for index in range(45))
+    layout = check_layout(run(tmp_path, text))
+    lights = [panel for name, panel in layout["configById"].items() if name.startswith("Indicator!")]
+    titles = {light["foxglovePanelTitle"].partition(",")[0] for light in lights}
+    assert titles == {"s44", *(f"s{index}" for index in range(23))}
+    assert layout["configById"]["Indicator!result0"]["foxglovePanelTitle"].startswith("s44, violated since")
+    assert next(iter(curves(layout))) == "s44"
+
+
 def test_there_are_as_many_strips_as_results(tmp_path):
     text = "\n".join(f"spec s{index} = G a farfrom[{index}] b" for index in range(30))
     layout = check_layout(run(tmp_path, text))
     labels = [path["label"] for path in layout["configById"]["StateTransitions!verdicts"]["paths"]]
-    assert labels[:30] == [f"s{index}" for index in range(30)]
+    assert sorted(labels[:30]) == sorted(f"s{index}" for index in range(30))
 
 
 def test_an_instance_of_a_template_has_a_curve_of_its_own(tmp_path):

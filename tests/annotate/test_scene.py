@@ -425,7 +425,7 @@ def test_the_arrow_of_a_direction_joins_what_is_nearest():
 
 def test_a_requirement_not_to_hold_is_pointed_at_too():
     [message] = pointed("spec s = G not a closeto[3] b", {"a": box_at(0.0), "b": box_at(2.0)})
-    assert arrow(message)[2] == "a closeto[3] b: -2"
+    assert arrow(message)[2] == "a closeto[3] b: holds by 2"
 
 
 def test_a_constant_has_no_arrow():

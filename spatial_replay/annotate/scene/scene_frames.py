@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spatial_replay.annotate.rings import Rings
-from spatial_replay.annotate.scene.scene_template import OBJECT, REGION, Banner, Region, border_of
-from spatial_replay.annotate.scene.scene_text import robustness_text
+from spatial_replay.annotate.scene.scene_template import OBJECT, REGION, Banner, Cause, Region, border_of
+from spatial_replay.annotate.scene.scene_text import violation_text
 from spatial_replay.annotate.violations import Presence, Violations
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.geometry.batch import FootprintBatch
@@ -71,9 +71,12 @@ class DrawnViolation(NamedTuple):
         ends: (2, 2), from where to where it points.
         label: what decides it and the robustness, as it is written beside the arrow.
         result: which of the results is violated.
-        node: id of the requirement that is violated.
+        node: id of the requirement that is violated, or of the atom that settled the violation.
         robustness: that of the requirement, in the sign that counts.
         leaf: what decides it, an index among the leaves of the result's program.
+        moment_ns: the time of the earlier sample that the number is of, which settled the violation; None if
+            it is of this one.
+        holds: whether it is an atom that holds and should not.
     """
 
     ends: Floats
@@ -82,6 +85,8 @@ class DrawnViolation(NamedTuple):
     node: int
     robustness: float
     leaf: int = -1
+    moment_ns: int | None = None
+    holds: bool = False
 
 
 class SceneFrame(NamedTuple):
@@ -143,9 +148,11 @@ class SceneFrames:
         if found.is_shown[index]:
             robustness = float(found.robustness[index])
             which, node, leaf = (int(each[index]) for each in (found.result, found.node, found.leaf))
-            number = robustness_text(robustness, self._unit)
-            label = f"{content.causes[content.arrow[index] - FIRST_FORM]}: {number}"
-            violation = DrawnViolation(found.points[index], label, which, node, robustness, leaf)
+            number = violation_text(found, index, self._unit)
+            label = f"{content.causes[content.arrow[index] - FIRST_FORM].text}{number}"
+            moment_ns = int(found.moment_ns[index]) if found.moment_ns[index] >= 0 else None
+            ends, holds = found.points[index], bool(found.holds[index])
+            violation = DrawnViolation(ends, label, which, node, robustness, leaf, moment_ns, holds)
         is_violated = bool((self.objects[index] < 0.0).any() or (self.regions[index] < 0.0).any())
         return SceneFrame(entities, violation, is_violated)
 
@@ -174,7 +181,7 @@ class SceneContent(NamedTuple):
     rings: Rings
     violations: Violations
     arrow: Integers
-    causes: tuple[str, ...]
+    causes: tuple[Cause, ...]
     banner: Integers
     banners: tuple[Banner | None, ...]
 

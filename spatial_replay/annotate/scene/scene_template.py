@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
@@ -43,9 +43,6 @@ BANNER: Final = "verdict"
 LEVELS: Final = 8
 """How many heights there are between large flat objects and small ones."""
 
-LABEL_LENGTH: Final = 8
-"""Characters of an arrow's number, including the spaces after it."""
-
 _LABEL_LIFT: Final = 0.01
 """The height of a region's name above it, by the region's size."""
 
@@ -62,6 +59,23 @@ class Banner(NamedTuple):
     text: str
     colour: tuple[float, float, float]
     place: tuple[float, float]
+
+
+class Cause(NamedTuple):
+    """What is written beside an arrow.
+
+    Attributes:
+        text: all before the number.
+        words: how long the number is with its unit and the spaces after it, in words of 8 bytes.
+    """
+
+    text: str
+    words: int
+
+
+def words_in(text: str) -> int:
+    """Return how many words of 8 bytes a text takes."""
+    return -(-len(text.encode()) // 8)
 
 
 class DrawnObject(NamedTuple):
@@ -84,14 +98,14 @@ class SceneLayout(NamedTuple):
     Attributes:
         deleted: objects that were in the message before and are gone.
         objects: those observed.
-        witness: what decides the worst violation, which an arrow points at; None deletes the arrow of the
-            message before, and without one it is "".
+        witness: what decides the worst violation, which an arrow points at; "deleted" deletes the arrow of
+            the message before, and without one it is None.
         banner: None without any result.
     """
 
     deleted: tuple[str, ...]
     objects: tuple[DrawnObject, ...]
-    witness: str | None = ""
+    witness: Cause | Literal["deleted"] | None = None
     banner: Banner | None = None
 
 
@@ -144,7 +158,7 @@ def make_template(layout: SceneLayout, regions: tuple[Region, ...], lift: float)
     message = SceneUpdate()
     for name in layout.deleted:
         message.deletions.add(id=OBJECT + name, type=SceneEntityDeletion.MATCHING_ID, timestamp=_A_STAMP)
-    if layout.witness is None:
+    if layout.witness == "deleted":
         message.deletions.add(id=WITNESS, type=SceneEntityDeletion.MATCHING_ID, timestamp=_A_STAMP)
     for region in regions:
         # larger ones lie lower, so that they hide no smaller one
@@ -155,14 +169,17 @@ def make_template(layout: SceneLayout, regions: tuple[Region, ...], lift: float)
         _add_object(_add_entity(message, OBJECT + drawn.name), drawn, lift)
     if layout.banner is not None:
         _add_banner(_add_entity(message, BANNER), layout.banner, lift)
-    if layout.witness:
-        point_at(_add_entity(message, WITNESS), f"{layout.witness}: {_A_LABEL}", lift)
+    number = ""
+    if isinstance(layout.witness, Cause):
+        number = "#" * (8 * layout.witness.words)
+        point_at(_add_entity(message, WITNESS), layout.witness.text + number, lift)
     payload = np.frombuffer(message.SerializeToString(deterministic=True), np.uint8).copy()
     words = WireTemplate.of(message).word_offsets
     slots = words[np.isnan(payload[words[:, None] + np.arange(8)].view("<f8")[:, 0])]
-    if layout.witness:
+    if number:
         # the end of the last text of all
-        slots = np.append(slots, payload.tobytes().rindex(_A_LABEL.encode()))
+        begin = payload.tobytes().rindex(number.encode())
+        slots = np.append(slots, np.arange(begin, begin + len(number), 8))
     payload[slots[:, None] + np.arange(8)] = 0
     return SceneTemplate(
         WireTemplate(payload, slots, np.empty(0, np.int64)), _stamp_offsets(payload.tobytes())
@@ -221,7 +238,7 @@ def words_of_witness(points: Floats, z: Floats, scale: float, labels: Sequence[s
         points: (S, 2, 2), its begin and its end.
         z: (S,), its height.
         scale: the size of objects in the scene.
-        labels: S texts, of at most `LABEL_LENGTH` ASCII characters.
+        labels: S texts, each of as many words of 8 bytes (see `words_in`).
 
     Returns:
         columns (S, n).
@@ -232,7 +249,7 @@ def words_of_witness(points: Floats, z: Floats, scale: float, labels: Sequence[s
     head = np.minimum(0.5 * length, ARROW_HEAD * scale)
     arrow = [begin, z, np.sin(half), np.cos(half), length - head, head]
     middle = [(begin + end) / 2.0, z + ARROW_HEAD * scale]
-    text = "".join([label.ljust(LABEL_LENGTH) for label in labels]).encode()
+    text = b"".join([label.encode().ljust(8 * words_in(label)) for label in labels])
     label = np.frombuffer(text, "<f8")
     return [column.reshape(len(points), -1) for column in (*arrow, *middle, label)]
 
@@ -301,9 +318,6 @@ def _raised(ring: Floats, height: Floats) -> Floats:
     """Return points (S, n, 2) at heights (S,) as (S, 3 n): x, y, z, x, y, z …"""
     z = np.broadcast_to(height[:, None, None], (*ring.shape[:2], 1))
     return _flat(np.concatenate([ring, z], axis=2))
-
-
-_A_LABEL: Final = "#" * LABEL_LENGTH
 
 
 # ------------------------------------------------------------------------------------------- timestamps

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spatial_replay.annotate.robustness import standing_codes
-from spatial_replay.annotate.scene.scene_template import LABEL_LENGTH, Banner
+from spatial_replay.annotate.scene.scene_template import Banner, Cause, words_in
 from spatial_replay.annotate.violations import EvaluatedResult, Violations
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.schemas.Robustness_pb2 import (
@@ -21,6 +21,7 @@ from spatial_replay.logs.schemas.Robustness_pb2 import (
     VIOLATED,
 )
 from spatial_replay.palette import FAILING, HOLDING, NEGATIVE, NEUTRAL, POSITIVE
+from spatial_replay.text import Instant
 
 
 def labelled_objects(
@@ -90,24 +91,37 @@ def _banner(titles: Sequence[str], codes: NDArray[np.uint8], place: tuple[float,
     return None if colour is None else Banner("; ".join(parts), colour, place)
 
 
-def causes_of(results: Sequence[EvaluatedResult], found: Violations) -> tuple[tuple[str, ...], Integers]:
-    """Return what decides violations, in words, and which of them (S,) decides each."""
-    pairs, which = np.unique(np.stack([found.result, found.leaf], axis=1), axis=0, return_inverse=True)
-    texts = []
-    for result, leaf in pairs.tolist():
+def causes_of(
+    results: Sequence[EvaluatedResult], found: Violations, first_ns: int, unit: str
+) -> tuple[tuple[Cause, ...], Integers]:
+    """Return what decides violations, in words, and which of them (S,) decides each.
+
+    Args:
+        first_ns: the time of the log's first sample.
+        unit: of lengths.
+    """
+    words = np.array([words_in(violation_text(found, index, unit)) for index in range(len(found.result))])
+    columns = [found.result, found.leaf, found.holds, found.moment_ns, words]
+    kinds, which = np.unique(np.stack(columns, axis=1), axis=0, return_inverse=True)
+    causes = []
+    for result, leaf, holds, moment_ns, length in kinds.tolist():
         known = results[result].leaf_pairs if result >= 0 and leaf >= 0 else None
         text = "" if known is None else known.texts[leaf]
-        texts.append(text if len(text) <= _LONGEST_CAUSE else f"{text[: _LONGEST_CAUSE - 1]}…")
-    return tuple(texts), which.reshape(-1)
+        text = text if len(text) <= _LONGEST_CAUSE else f"{text[: _LONGEST_CAUSE - 1]}…"
+        at = "" if moment_ns < 0 else f" at {Instant(moment_ns, first_ns)}"
+        causes.append(Cause(f"{text}{at}: {'holds by ' if holds else ''}", length))
+    return tuple(causes), which.reshape(-1)
 
 
 _LONGEST_CAUSE: Final = 60
 
 
-def robustness_text(number: float, unit: str = "") -> str:
-    """Return a number with three digits, or as many as fit, and its unit if that fits, too."""
-    text = f"{number:.3g}"
-    if len(text) > LABEL_LENGTH:
-        text = next(text for digits in (2, 1) if len(text := f"{number:.{digits}g}") <= LABEL_LENGTH)
-    whole = f"{text} {unit}"
-    return whole if unit.isascii() and unit and len(whole) <= LABEL_LENGTH else text
+def violation_text(found: Violations, index: int, unit: str) -> str:
+    """Return the number of an arrow: by how much an atom holds that should not, else the robustness."""
+    number = float(found.robustness[index])
+    return robustness_text(-number if found.holds[index] else number, unit)
+
+
+def robustness_text(number: float, unit: str) -> str:
+    """Return a number with three digits and its unit."""
+    return f"{number:.3g} {unit}" if unit not in ("", "1") else f"{number:.3g}"

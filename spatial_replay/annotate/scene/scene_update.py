@@ -9,7 +9,7 @@ from bisect import bisect_left
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import Final, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ from spatial_replay.annotate.scene.scene_frames import (
 from spatial_replay.annotate.scene.scene_template import (
     LEVELS,
     Banner,
+    Cause,
     DrawnObject,
     Region,
     SceneLayout,
@@ -35,7 +36,7 @@ from spatial_replay.annotate.scene.scene_template import (
     words_of_region,
     words_of_witness,
 )
-from spatial_replay.annotate.scene.scene_text import banners_of, causes_of, labelled_objects, robustness_text
+from spatial_replay.annotate.scene.scene_text import banners_of, causes_of, labelled_objects, violation_text
 from spatial_replay.annotate.violations import (
     EvaluatedResult,
     Presence,
@@ -70,6 +71,7 @@ class SceneState:
     """What the next message depends on besides its own sample.
 
     Attributes:
+        first_ns: the time of the first sample, or None before it.
         written_ns: the time of the last message, or None before the first.
         shown: the objects in it.
         is_pointing: whether it has an arrow at a violation.
@@ -79,6 +81,7 @@ class SceneState:
         templates: those of the layouts so far; a cache that changes no message.
     """
 
+    first_ns: int | None = None
     written_ns: int | None = None
     shown: tuple[str, ...] = ()
     is_pointing: bool = False
@@ -94,7 +97,8 @@ def scene_start(trace: Trace, regions: Mapping[str, Outline]) -> SceneState:
         trace: from the first sample on.
     """
     rows = trace.rows[spaced(trace.times_ns, None)]
-    return SceneEncoder(regions).scaled(SceneState(), trace, rows)[0]
+    state = SceneState(first_ns=int(trace.times_ns[0]) if len(trace) else None)
+    return SceneEncoder(regions).scaled(state, trace, rows)[0]
 
 
 class SceneMessages(NamedTuple):
@@ -139,6 +143,8 @@ class SceneEncoder:
             state: what the call before returned, or None to begin.
         """
         state = state or SceneState()
+        if state.first_ns is None and len(trace):
+            state = replace(state, first_ns=int(trace.times_ns[0]))
         written = spaced(trace.times_ns, state.written_ns)
         times_ns = trace.times_ns[written]
         if not len(written):
@@ -152,7 +158,8 @@ class SceneEncoder:
         objects, regions = worst_robustness(results, presence, [region.name for region in self._drawn])
         has_label = labelled_objects(results, names, rows >= 0, objects)
         banners = banners_of(results, times_ns, state.place or _NOWHERE, first)
-        content = _content(trace, names, rows, state, scale, violations, results, has_label, banners)
+        causes = causes_of(results, violations, state.first_ns or 0, self.unit)
+        content = _content(trace, names, rows, state, scale, violations, causes, has_label, banners)
         shades = colours(objects, scales), colours(regions, scales)
         templates = dict(state.templates)
         payloads = [b""] * len(written)
@@ -165,6 +172,7 @@ class SceneEncoder:
                 payloads[sample] = payload
         last = content.forms[-1] >= FIRST_FORM
         after = SceneState(
+            first_ns=state.first_ns,
             written_ns=int(times_ns[-1]),
             shown=tuple(
                 name for name, is_shown in zip(content.names, last.tolist(), strict=True) if is_shown
@@ -224,14 +232,14 @@ class SceneEncoder:
             bottom, top = content.footprints.bottom[rows], content.footprints.top[rows]
             colour = objects[samples, column]
             columns += words_of_object(drawn, points, bottom, top, colour, _LIFT * scale)
-        if layout.witness:
+        if isinstance(layout.witness, Cause):
             columns += _words_of_arrow(content.violations, samples, scale, self.unit)
         return np.concatenate([np.empty((len(samples), 0)), *columns], axis=1)
 
 
 def _words_of_arrow(found: Violations, samples: Integers, scale: float, unit: str) -> list[Floats]:
     z = np.fmax(found.top[samples], 0.0) + 3.0 * _LIFT * scale
-    labels = [robustness_text(number, unit) for number in found.robustness[samples].tolist()]
+    labels = [violation_text(found, index, unit) for index in samples.tolist()]
     return words_of_witness(found.points[samples], z, scale, labels)
 
 
@@ -277,7 +285,7 @@ def _content(
     before: SceneState,
     scale: float,
     found: Violations,
-    results: Sequence[EvaluatedResult],
+    decided: tuple[tuple[Cause, ...], Integers],
     has_label: NDArray[np.bool_],
     banners: tuple[Integers, tuple[Banner | None, ...]],
 ) -> SceneContent:
@@ -292,7 +300,7 @@ def _content(
     styles = np.full(rows.shape, -1, np.int64)
     styles[is_present] = 2 * _levels(extents(footprints), scale) + has_label[is_present]
     was_pointing = np.append(before.is_pointing, found.is_shown[:-1])
-    causes, cause = causes_of(results, found)
+    causes, cause = decided
     witness = np.where(found.is_shown, FIRST_FORM + cause, np.where(was_pointing, DELETED, ABSENT))
     return SceneContent(
         names, rows, forms, styles, observations, footprints, rings, found, witness, causes, *banners
@@ -335,5 +343,7 @@ def _layout(content: SceneContent, key: NDArray[np.int64]) -> SceneLayout:
         if form >= FIRST_FORM
     )
     deleted = tuple(name for name, form, _ in listed if form == DELETED)
-    cause = None if arrow == DELETED else "" if arrow == ABSENT else content.causes[arrow - FIRST_FORM]
+    cause: Cause | Literal["deleted"] | None = None
+    if arrow != ABSENT:
+        cause = "deleted" if arrow == DELETED else content.causes[arrow - FIRST_FORM]
     return SceneLayout(deleted, shown, cause, content.banners[banner])

@@ -59,12 +59,12 @@ function readScene(run) {
   const size = [scene.high[0] - scene.low[0], scene.high[1] - scene.low[1]];
   const coordinates = (steps) => Float64Array.from(
     steps, (step, index) => scene.low[index % 2] + step / STEPS_OF_SCENE * size[index % 2]);
-  const {labels, ...found} = scene.violations;
+  const {labels, moments, ...found} = scene.violations;
   const points = coordinates(numbers(found.points)), places = numbers(found.places);
-  const robustness = numbers(found.robustness);
+  const robustness = numbers(found.robustness), holds = numbers(found.holds);
   const violations = new Map(Array.from(numbers(found.frames), (frame, index) => [frame, {
     ends: points.subarray(4 * index, 4 * index + 4), label: labels[index], robustness: robustness[index],
-    result: places[2 * index], node: places[2 * index + 1],
+    result: places[2 * index], node: places[2 * index + 1], holds: holds[index] === 1, moment: moments[index],
   }]));
   const maps = run.decisions.flatMap((decision) => decision.maps);
   // two runs side by side are drawn in one frame
@@ -343,16 +343,18 @@ function wordsOf(clock, scene, frame) {
       return ["the arrow: ", element("code", {}, pointer.text),
         ` of ${run.results[clock.result].title} held here, and what had to follow did not`];
     }
-    const how = pointer.number < 0 ? "fails" : "must not hold, and does";
     return ["the arrow, what decided the verdict: ", element("code", {}, pointer.text),
-      ` of ${run.results[clock.result].title} ${how} by ${numberText(Math.abs(pointer.number))}${spaced(run.lengths)}`];
+      ` of ${run.results[clock.result].title} ${signWords(pointer.number, run.lengths)}`];
   }
   const violation = violationAt(clock, scene, frame);
   if (violation) return ["the arrow: ", ...violationWords(run, scene.times[frame], violation)];
   const chosen = run.results.slice(clock.result, clock.result + 1);
   const open = requirementsAt(chosen, clock.sample);
   const inState = (state) => open.filter(({standing}) => standing === state);
-  const violated = inState(VIOLATED);
+  // a condition holds, and what had to follow did not; what had a deadline was asked before
+  const isLost = chosen.some((result) =>
+    statusOf(run, result, result.nodes[0], placeIn(result, clock.sample)) === "violated");
+  const violated = inState(VIOLATED).filter((each) => !each.isCondition && (each.lasts || !isLost));
   if (violated.length) return [...failureWords(violated[0]), others(violated), "; no arrow can show it"];
   if (scene.isViolated[frame] && run.results.length < 2) {
     return ["something is violated now that no arrow can show"];
@@ -379,9 +381,13 @@ function lostBefore({run, sample, result: chosen}) {
 }
 
 // What the arrow points at; of a requirement that the page leaves out, only the number.
-function violationWords(run, time, {result: which, node: index, label, robustness}) {
-  if (which < 0) return [`${label.replace("-", "−")}, which is violated there`];
+function violationWords(run, time, {result: which, node: index, label, robustness, holds, moment}) {
+  const number = holds ? -robustness : robustness;
+  if (which < 0) return [`${label.replace(": -", ": −")}, which is violated there`];
   const result = run.results[which], node = result.nodes[index];
+  if (moment !== null) {
+    return [...partWords({result, node}), ` ${signWords(number, run.lengths)} at ${secondsText(moment)}, what decided the verdict`];
+  }
   const sample = indexAt(run.times, time), place = placeIn(result, sample);
   if (Math.abs(run.times[sample] - time) < 1e-9 && place !== null && place < result.samples) {
     return failureWords({result, node, place});
@@ -393,8 +399,12 @@ function violationWords(run, time, {result: which, node: index, label, robustnes
 function failureWords(part) {
   // in the unit of the log, as the number beside the arrow
   const node = atomOf(part), number = node.series[NOW][part.place] * node.divisor;
-  const how = number < 0 ? "fails" : "must not hold, and does";
-  return [...partWords({...part, node}), ` ${how} by ${numberText(Math.abs(number))}${spaced(declaredUnit(node))} now`];
+  return [...partWords({...part, node}), ` ${signWords(number, declaredUnit(node))} now`];
+}
+
+// An atom that decides a violation and holds is one that should not, or the condition of what failed.
+function signWords(number, unit) {
+  return `${number < 0 ? "fails" : "holds"} by ${numberText(Math.abs(number))}${spaced(unit)}`;
 }
 
 function spaced(unit) {
@@ -418,7 +428,8 @@ function requirementsAt(results, sample) {
     const place = placeIn(result, sample);
     if (place === null || place >= result.samples) return [];
     return result.requirements
-      .map(({node, standing}) => ({result, node: result.nodes[node], place, standing: standing[place]}))
+      .map(({node, standing, is_condition: isCondition, lasts}) =>
+        ({result, node: result.nodes[node], place, standing: standing[place], isCondition, lasts}))
       .filter(({standing}) => standing !== FULFILLED);
   });
 }

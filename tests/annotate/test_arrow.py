@@ -1,0 +1,88 @@
+"""What the arrow of a scene says in every message: numbers that are true where they are read."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from mcap.reader import make_reader
+
+import spatial_replay as sr
+from spatial_replay.logs import MemorySource
+from spatial_replay.replay import run_replay
+
+STEP_NS = 100_000_000
+
+
+def labels(folder: Path, text: str, gaps: list[float], unit: str = "") -> list[str]:
+    """The arrow's label in each message, where two boxes are that far apart at 10 Hz."""
+    samples = [
+        sr.Sample(
+            index * STEP_NS,
+            {"a": sr.Footprint.box(0, 0, 1, 1), "b": sr.Footprint.box(1 + gap, 0, 2 + gap, 1)},
+        )
+        for index, gap in enumerate(gaps)
+    ]
+    trace = replace(sr.Trace.from_samples(samples), units={"": unit} if unit else {})
+    output = folder / "annotated.mcap"
+    run_replay(MemorySource(trace, "run"), [sr.parse_specification(text)], output=output)
+    found = []
+    with output.open("rb") as stream:
+        for _, _, message in make_reader(stream).iter_messages(["/spatial/scene"]):
+            drawn = SceneUpdate.FromString(message.data).entities
+            texts = [
+                each.text.rstrip() for entity in drawn if entity.id == "witness" for each in entity.texts
+            ]
+            found.append("".join(texts))
+    return found
+
+
+NEARING = [5.0 - step / 4 for step in range(20)]
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        # only the first sample is asked: the number stays that which decided
+        (
+            "(a dist b <= 6) -> F[0s, 0.4s] (a dist b <= 1.5)",
+            {3: "", 4: "a dist b <= 1.5: -2.5", **dict.fromkeys((5, 18), "a dist b <= 1.5 at 0.400 s: -2.5")},
+        ),
+        (
+            "(a dist b >= 6) and F (a dist b <= 0.5)",
+            {0: "a dist b >= 6: -1", **dict.fromkeys((1, 10, 19), "a dist b >= 6 at 0.000 s: -1")},
+        ),
+        # the condition holds: what had to follow is what fails
+        (
+            "G ((a dist b >= 2) -> F[0s, 0.4s] (a dist b <= 0.5))",
+            {3: "", 4: "a dist b <= 0.5: -3.5", 10: "a dist b <= 0.5: -2", 18: ""},
+        ),
+        # an atom that should not hold is not written as if it failed
+        (
+            "G not (a dist b <= 4)",
+            {4: "", 5: "a dist b <= 4: holds by 0.25", 10: "a dist b <= 4: holds by 1.5"},
+        ),
+    ],
+    ids=["deadline", "first sample", "response", "negation"],
+)
+def test_what_the_arrow_says_is_true_in_every_sample(
+    tmp_path: Path, text: str, expected: dict[int, str]
+) -> None:
+    found = labels(tmp_path, f"spec s = {text}", NEARING)
+    assert {index: found[index] for index in expected} == expected
+
+
+def test_every_label_of_an_arrow_has_its_unit_and_three_digits(tmp_path: Path) -> None:
+    sizes = [2.5534e-05, 0.00141421, 0.0517, 0.132, 12.3456, 987654.0]
+    found = labels(tmp_path, "spec s = G (a dist b >= 987655)", [987655 - 1.5, 987000.0], unit="mm")
+    assert found[0] == "a dist b >= 987655: -1.5 mm"
+    for index, size in enumerate(sizes):
+        folder = tmp_path / str(index)
+        folder.mkdir()
+        [label, *_] = labels(folder, "spec s = G (a dist b <= 0)", [size], unit="µm")
+        prefix, _, number = label.partition(": ")
+        assert (prefix, number.endswith(" µm")) == ("a dist b <= 0", True)
+        assert np.isclose(float(number.removesuffix(" µm")), -size, rtol=5e-3)
