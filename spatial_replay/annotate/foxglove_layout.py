@@ -15,7 +15,7 @@ from spatial_replay.annotate.viewer_panels import (
     constants,
     decision_reason,
     event_list,
-    image_panel,
+    image_panels,
     indicators,
     node_table,
     part_curves,
@@ -113,13 +113,13 @@ _Weighted = tuple[Panel, float]
 
 
 def _scene_panels(contents: LayoutContents) -> list[_Weighted]:
-    """Return the picture of a camera, the scene and, of a planner, its reasons."""
+    """Return the pictures of cameras, the scene and, of a planner, its reasons."""
     about = _camera(contents.extent), contents.topics, contents.axes
     scenes = [(scene_panel(*about), 4.0)]
     if REDONE_MAP in contents.topics:
         scenes.append((scene_panel(*about, redone=True), 4.0))
-    camera = [(image_panel(contents.images, contents.topics), 4.0)] if contents.images else []
-    return [*camera, *scenes, *([(decision_reason(), 1.0)] if PLAN_DECISION in contents.topics else [])]
+    cameras = [(each, 4.0) for each in image_panels(contents.images, contents.topics)]
+    return [*cameras, *scenes, *([(decision_reason(), 1.0)] if PLAN_DECISION in contents.topics else [])]
 
 
 def _evaluation_panels(contents: LayoutContents) -> list[_Weighted]:

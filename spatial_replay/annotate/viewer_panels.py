@@ -37,6 +37,7 @@ from spatial_replay.logs.topics import (
     SCENE,
     SPECIFICATION,
     STANDING,
+    topic_of_camera,
 )
 from spatial_replay.monitor.online.operators import looks_ahead
 from spatial_replay.palette import CURVES, FAILING, HOLDING, NEGATIVE, NEUTRAL, POSITIVE, hexadecimal, lighter
@@ -238,15 +239,32 @@ def decision_reason() -> Panel:
     return _titled("RawMessages!decision", "Why the planner decided so", config)
 
 
-def image_panel(images: Sequence[str], topics: Collection[str]) -> Panel:
-    """Return the picture of a camera, of our own or else of the first of the topics with images, with the
-    outlines that we draw on it."""
-    mode: Config = {"imageTopic": CAMERA_VIDEO if CAMERA_VIDEO in images else images[0]}
-    if CAMERA_CALIBRATION in topics:
-        mode["calibrationTopic"] = CAMERA_CALIBRATION
-    if CAMERA_ANNOTATIONS in topics:
-        mode["annotations"] = {CAMERA_ANNOTATIONS: {"visible": True}}
-    return _titled("Image!camera", "Camera", {"imageMode": mode, "synchronize": False})
+def image_panels(images: Sequence[str], topics: Collection[str]) -> list[Panel]:
+    """Return the picture of each camera that objects were found by, with the outlines that we draw on it.
+
+    Of a log without such, that is the first of the topics with images.
+    """
+    own = {topic_of_camera(CAMERA_VIDEO, number) for number in range(1, len(images) + 1)}
+    copied = iter([each for each in images if each not in own])
+    panels = []
+    for number in range(1, len(images) + 1):
+        video, calibration, annotations = (
+            topic_of_camera(each, number) for each in (CAMERA_VIDEO, CAMERA_CALIBRATION, CAMERA_ANNOTATIONS)
+        )
+        if number > 1 and annotations not in topics:
+            break
+        shown = video if video in images else next(copied, None)
+        if shown is None:
+            continue
+        mode: Config = {"imageTopic": shown}
+        if calibration in topics:
+            mode["calibrationTopic"] = calibration
+        if annotations in topics:
+            mode["annotations"] = {annotations: {"visible": True}}
+        name = "camera" if number == 1 else f"camera{number}"
+        title = "Camera" if number == 1 else f"Camera {number}"
+        panels.append(_titled(f"Image!{name}", title, {"imageMode": mode, "synchronize": False}))
+    return panels
 
 
 def constants() -> Panel:

@@ -161,7 +161,7 @@ def planning_command(scenario: str) -> click.Command:
                 injections=parse_injections(simulation["inject"]),
                 starts=parse_starts(simulation["start"]),
                 gui=simulation["gui"],
-                camera=simulation["camera"],
+                cameras=simulation["cameras"],
                 inputs=local_files(named),
                 advance=advance,
                 durability=durability,

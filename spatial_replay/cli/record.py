@@ -80,10 +80,12 @@ _SIMULATION = (
     ),
     click.option(
         "--camera",
+        "cameras",
         metavar="VIDEO",
+        multiple=True,
         type=click.Path(path_type=Path),
-        help="Film the run with AprilTags on the objects: a video, and its tags file beside it. Needs the"
-        " extra `vision`.",
+        help="Film the run with AprilTags on the objects: a video, and its tags file beside it. Given"
+        " twice, from two sides, so that the arm hides less. Needs the extra `vision`.",
     ),
 )
 
@@ -96,7 +98,7 @@ class SimulationArguments(TypedDict):
     inject: tuple[str, ...]
     start: tuple[str, ...]
     gui: bool
-    camera: Path | None
+    cameras: tuple[Path, ...]
 
 
 def simulation_options(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -106,10 +108,13 @@ def simulation_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 def show_film(simulation: SimulationArguments) -> None:
     """Print how to read the video of a run, if there is one."""
-    video = simulation["camera"]
-    if video is not None:
-        tags = video.with_suffix(".tags.yaml")
-        show(f"filmed {video}: spatial-replay record video {video} --tags {tags} -o seen.mcap")
+    videos = simulation["cameras"]
+    if videos:
+        from spatial_replay.runs.filmed import tags_of_film
+
+        listed = " ".join(str(video) for video in videos)
+        tags = tags_of_film(videos)
+        show(f"filmed {listed}: spatial-replay record video {listed} --tags {tags} -o seen.mcap")
 
 
 def parse_injections(texts: Sequence[str]) -> list[Injection]:
@@ -191,7 +196,7 @@ def recording_command(scenario: str) -> click.Command:
                 injections=parse_injections(simulation["inject"]),
                 starts=parse_starts(simulation["start"]),
                 gui=simulation["gui"],
-                camera=simulation["camera"],
+                cameras=simulation["cameras"],
                 inputs=local_files(specs),
                 advance=advance,
                 durability=durability,

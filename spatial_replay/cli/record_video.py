@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -42,9 +42,23 @@ def duration_ns(context: click.Context, parameter: click.Parameter, text: str | 
 
 
 @click.command()
-@click.argument("source", metavar="[FILE|LOG]", type=LogPath(), required=False)
+@click.argument("sources", metavar="[FILE|LOG]...", type=LogPath(), nargs=-1)
 @click.option("--camera", metavar="N", type=click.IntRange(0), help="Camera of this machine, such as 0.")
-@click.option("--topic", metavar="TOPIC", help="Of a log: its image topic.  [default: the only one]")
+@click.option(
+    "--topic",
+    "topics",
+    metavar="TOPIC",
+    multiple=True,
+    help="Of a log: its image topic; repeat for several cameras.  [default: the only one]",
+)
+@click.option(
+    "--offset",
+    "offsets",
+    metavar="NAME=T",
+    multiple=True,
+    help="Of several cameras: shift the stamps of a video or topic, such as right.mp4=0.12s, or by its"
+    " number, 2=-40ms.",
+)
 @click.option(
     "--tags",
     "tags_file",
@@ -78,9 +92,10 @@ def duration_ns(context: click.Context, parameter: click.Parameter, text: str | 
     "--for", "length_ns", metavar="T", callback=duration_ns, help="Of a camera: end after so much time."
 )
 def video(
-    source: LogFile | None,
+    sources: tuple[LogFile, ...],
     camera: int | None,
-    topic: str | None,
+    topics: tuple[str, ...],
+    offsets: tuple[str, ...],
     tags_file: LogFile,
     output: Path,
     durability: Durability,
@@ -96,7 +111,8 @@ def video(
 
     Reads a video file, an image topic of a log, or a camera of this machine. Objects carry AprilTags; the
     tags file says which. Every footprint comes with its uncertainty, so that a verdict near a threshold is
-    unknown rather than guessed. Needs the extra `vision`.
+    unknown rather than guessed. Several videos or topics are cameras that see the same scene: their frames
+    of one time make one sample. Needs the extra `vision`.
 
     Exits with 0 if all specifications are satisfied, 1 if any is violated, 4 if none is violated and any is
     unknown, 3 if the video is damaged: what was recorded up to then is whole.
@@ -104,33 +120,37 @@ def video(
     \b
     Examples:
       spatial-replay record video table.mp4 --tags tags.yaml --spec table.spatial -o run.mcap
+      spatial-replay record video left.mp4 right.mp4 --tags tags.yaml -o run.mcap --offset right.mp4=0.12s
       spatial-replay record video drive.bag --topic /camera/image_raw --tags tags.yaml -o run.mcap
       spatial-replay record video --camera 0 --tags tags.yaml --spec table.spatial -o run.mcap --for 60s
     """
     # imported here so that --help stays fast
+    from spatial_replay.perception.simultaneous import camera_names
     from spatial_replay.perception.tags_file import load_tags
     from spatial_replay.runs.seen import record_seen
 
-    if (source is None) == (camera is None):
-        raise UsageError("give either a video or a log, or --camera N")
+    if bool(sources) == (camera is not None):
+        raise UsageError("give either videos or a log, or --camera N")
     if length_ns is not None and camera is None:
         raise UsageError("--for ends a run with --camera; leave it out")
     files = load_spec_options(specs, profile, constants)
     show_diagnostics(warning for file in files for warning in file.warnings)
     tags = load_tags(tags_file)
-    frames = _opened(source, camera, topic, rate, length_ns)
+    cameras = _opened(sources, camera, topics, rate, length_ns)
+    offsets_ns = _offsets_ns(offsets, camera_names(cameras))
     first_ns: list[int] = []
 
     def show_change(change: VerdictChange) -> None:
         show(change_line(change, first_ns[0] if first_ns else change.time_ns))
 
-    given = [*([source] if source is not None else []), tags_file, *specs]
+    given = [*sources, tags_file, *specs]
     with progress("frames") as advance:
         seen = record_seen(
-            frames,
+            cameras,
             tags,
             output,
             files,
+            offsets_ns=offsets_ns,
             hold_ns=hold_ns,
             keep=keep,
             inputs=local_files(given),
@@ -141,23 +161,59 @@ def video(
         )
     warn(*seen.remarks, *seen.faults)
     show(f"wrote {output}: {counted(seen.samples, 'sample')} over {seen.seconds:.3f} s")
-    if seen.fit is not None:
-        number, off = seen.fit.worst
-        show(f"reference tags fit within {seen.fit.rms:.2f} pixels; tag {number} is off most, by {off:.2f}")
+    for name, fit in seen.fits:
+        if fit is not None:
+            number, off = fit.worst
+            where = f" in {name}" if len(seen.fits) > 1 else ""
+            fits = f"reference tags fit within {fit.rms:.2f} pixels{where}"
+            show(f"{fits}; tag {number} is off most, by {off:.2f}")
     show(*ending_lines(seen.endings))
     verdicts = [str(each.verdict) for each in seen.endings]
     return exit_code_from_verdicts(verdicts or ["satisfied"], damaged=bool(seen.faults))
 
 
 def _opened(
-    source: LogFile | None, camera: int | None, topic: str | None, rate: float | None, length_ns: int | None
-) -> FrameSource:
+    sources: Sequence[LogFile],
+    camera: int | None,
+    topics: Sequence[str],
+    rate: float | None,
+    length_ns: int | None,
+) -> list[FrameSource]:
     from spatial_replay.perception.camera_frames import CameraFrames
     from spatial_replay.perception.image_topics import open_frames
 
-    if source is not None:
-        return open_frames(source, topic=topic, rate=rate)
-    for option, value in (("--topic", topic), ("--rate", rate)):
-        if value is not None:
+    if camera is None:
+        if len(sources) > 1 and topics:
+            raise UsageError(
+                "--topic names topics of one log; give that log alone, or videos without --topic"
+            )
+        if len(set(topics)) < len(topics) or len({str(source) for source in sources}) < len(sources):
+            raise UsageError("a video or topic is given twice; each camera counts once")
+        wanted: list[str | None] = [*topics] or [None] * len(sources)
+        each_source = [*sources] * len(topics) if topics else sources
+        return [
+            open_frames(source, topic=topic, rate=rate)
+            for source, topic in zip(each_source, wanted, strict=True)
+        ]
+    for option, is_given in (("--topic", bool(topics)), ("--rate", rate is not None)):
+        if is_given:
             raise UsageError(f"{option} does not apply to a camera; leave it out")
-    return CameraFrames(camera or 0, length_ns=length_ns)
+    return [CameraFrames(camera, length_ns=length_ns)]
+
+
+def _offsets_ns(texts: Sequence[str], names: Sequence[str]) -> list[int]:
+    """Return by how much the stamps of each camera are shifted, so that none is before the start."""
+    offsets = [0] * len(names)
+    for text in texts:
+        name, _, value = text.rpartition("=")
+        places = [place for place, each in enumerate(names, 1) if name in (each, str(place))]
+        if len(places) != 1:
+            listed = ", ".join(f"{place} ({each})" for place, each in enumerate(names, 1))
+            what = "is no camera" if not places else "is the name of several cameras"
+            raise UsageError(
+                f"--offset {text}: {name or text!r} {what}; write the number and a time: {listed}"
+            )
+        with naming_option("--offset"):
+            duration_ns = duration_ns_from_text(value.removeprefix("-"))
+        offsets[places[0] - 1] = -duration_ns if value.startswith("-") else duration_ns
+    return [offset - min(0, *offsets) for offset in offsets]

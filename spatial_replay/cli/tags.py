@@ -139,10 +139,10 @@ def calibrate(
     """
     # imported here so that --help stays fast
     from spatial_replay.logs.output_file import refuse_inputs
-    from spatial_replay.perception.calibration import calibrate_camera
+    from spatial_replay.perception.calibration import calibrate_camera, camera_text
     from spatial_replay.perception.image_topics import open_frames
     from spatial_replay.perception.tag_sheet import TagSheet
-    from spatial_replay.perception.tags_file import camera_text, load_tags
+    from spatial_replay.perception.tags_file import load_tags
 
     if output is not None:
         refuse_inputs(output, local_files([source, *([tags_file] if tags_file is not None else [])]))

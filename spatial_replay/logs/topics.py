@@ -46,6 +46,12 @@ CAMERA_CALIBRATION = "/camera/calibration"
 CAMERA_FRAMES = "/tf"
 """Topics of a run that a camera saw; a replay copies them."""
 
+
+def topic_of_camera(topic: str, number: int) -> str:
+    """Return the topic of one of several cameras, from 1: `/camera/video`, `/camera2/video`."""
+    return topic if number == 1 else topic.replace("/camera/", f"/camera{number}/", 1)
+
+
 MAGIC = b"\x89MCAP0\r\n"
 """The first bytes of an MCAP file, and the last."""
 

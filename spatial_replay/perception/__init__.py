@@ -9,6 +9,9 @@
     tags_file       which tag is on which object, where the plane is
     plane           pixels to places
     object_poses    corners to poses and their covariance
+    camera_view     one camera: its tags, its plane, poses of objects
+    camera_pose     where a camera is
+    simultaneous    frames of several cameras that belong together
     observer        frames to samples
     camera_messages what the log shows of it
     calibration     a camera from views of known tags
@@ -28,7 +31,12 @@ if TYPE_CHECKING:
     from spatial_replay.perception.camera_frames import CameraFrames
     from spatial_replay.perception.frame import Frame
     from spatial_replay.perception.image_topics import open_frames
-    from spatial_replay.perception.observer import Observation, TagObserver, observe_frames
+    from spatial_replay.perception.observer import (
+        Observation,
+        TagObserver,
+        observe_cameras,
+        observe_frames,
+    )
     from spatial_replay.perception.tags_file import TagsFile, load_tags, parse_tags
 
 __all__ = [
@@ -38,6 +46,7 @@ __all__ = [
     "TagObserver",
     "TagsFile",
     "load_tags",
+    "observe_cameras",
     "observe_frames",
     "open_frames",
     "parse_tags",
@@ -49,7 +58,7 @@ __getattr__, __dir__ = loaded_when_used(
         "camera_frames": ("CameraFrames",),
         "frame": ("Frame",),
         "image_topics": ("open_frames",),
-        "observer": ("Observation", "TagObserver", "observe_frames"),
+        "observer": ("Observation", "TagObserver", "observe_cameras", "observe_frames"),
         "tags_file": ("TagsFile", "load_tags", "parse_tags"),
     },
 )

@@ -10,7 +10,7 @@ import numpy as np
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.perception.frame import Frame
-from spatial_replay.perception.opencv import Calibration, TagDetector, calibrate
+from spatial_replay.perception.opencv import Calibration, Camera, TagDetector, calibrate
 from spatial_replay.perception.tags_file import ReferenceTag
 from spatial_replay.text import counted
 
@@ -112,3 +112,17 @@ def _remarks(found: Calibration, pixels: Sequence[Floats], size: tuple[int, int]
             " picture sharp?"
         )
     return remarks
+
+
+def camera_text(camera: Camera) -> str:
+    """Return the part of a tags file that describes a camera."""
+    (fx, fy), (cx, cy), (width, height) = camera.focal, camera.centre, camera.size
+    lines = [
+        "camera:",
+        f"  size: [{width}, {height}]",
+        f"  focal: [{fx:.3f}, {fy:.3f}]",
+        f"  centre: [{cx:.3f}, {cy:.3f}]",
+    ]
+    if camera.distortion:
+        lines.append(f"  distortion: [{', '.join(f'{each:.6g}' for each in camera.distortion)}]")
+    return "\n".join(lines) + "\n"

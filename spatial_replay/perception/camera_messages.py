@@ -24,26 +24,34 @@ from spatial_replay.logs.topics import (
     CAMERA_FRAMES,
     CAMERA_VIDEO,
     protobuf_channel,
+    topic_of_camera,
 )
 from spatial_replay.monitor.monitor import Update
 from spatial_replay.palette import FAILING, NEGATIVE, NEUTRAL, POSITIVE
-from spatial_replay.perception.observer import Observation
+from spatial_replay.perception.camera_view import View
 from spatial_replay.perception.opencv import Camera
 from spatial_replay.perception.plane import CameraPlane
 from spatial_replay.spec.formula import ANY_CLASS, Specification
 from spatial_replay.trace.sample import Sample
 
-VIDEO: Final = protobuf_channel(CAMERA_VIDEO, CompressedVideo)
-ANNOTATIONS: Final = protobuf_channel(CAMERA_ANNOTATIONS, ImageAnnotations)
-CALIBRATION: Final = protobuf_channel(CAMERA_CALIBRATION, CameraCalibration)
 TRANSFORMS: Final = protobuf_channel(CAMERA_FRAMES, FrameTransforms)
 
-_OPTICAL: Final = "camera"
 _AROUND: Final = 24
 """Points of the outline of a disc."""
 _THICKNESS, _LETTERS = 3.0, 16.0
 
 Colour = tuple[float, float, float]
+
+
+class CameraChannels:
+    """The channels of one of several cameras, and the name of its frame; a process for one run."""
+
+    def __init__(self, number: int) -> None:
+        """Name them: `/camera/video`, `/camera2/video`."""
+        self.frame = "camera" if number == 1 else f"camera{number}"
+        self.video = protobuf_channel(topic_of_camera(CAMERA_VIDEO, number), CompressedVideo)
+        self.annotations = protobuf_channel(topic_of_camera(CAMERA_ANNOTATIONS, number), ImageAnnotations)
+        self.calibration = protobuf_channel(topic_of_camera(CAMERA_CALIBRATION, number), CameraCalibration)
 
 
 class AskedColours:
@@ -93,23 +101,23 @@ def _members(requirement: Requirement, sample: Sample) -> set[str]:
     return names
 
 
-def encode_video(time_ns: int, data: bytes) -> bytes:
+def encode_video(time_ns: int, data: bytes, frame: str) -> bytes:
     """Return the message of one frame in H.264."""
-    message = CompressedVideo(frame_id=_OPTICAL, data=data, format="h264")
+    message = CompressedVideo(frame_id=frame, data=data, format="h264")
     _stamp(message.timestamp, time_ns)
     return message.SerializeToString(deterministic=True)
 
 
-def encode_annotations(seen: Observation, colours: Mapping[str, Colour]) -> bytes:
-    """Return the outlines and names of the objects, and the outlines and numbers of all tags."""
+def encode_annotations(seen: View, sample: Sample, colours: Mapping[str, Colour]) -> bytes:
+    """Return the outlines and names of the objects, and the outlines and numbers of all tags, in a view."""
     message = ImageAnnotations()
-    time_ns = seen.sample.time_ns
+    time_ns = seen.frame.time_ns
     for detection in seen.detections:
         _outline(message, time_ns, detection.corners, NEUTRAL, 1.0)
         _text(message, time_ns, str(detection.id), detection.corners.mean(axis=0), NEUTRAL, 0.7 * _LETTERS)
     if seen.plane is None:
         return message.SerializeToString(deterministic=True)
-    for name, each in seen.sample.objects.items():
+    for name, each in sample.objects.items():
         if not isinstance(each, TrackedObject):
             continue
         colour = colours.get(name, NEUTRAL)
@@ -130,12 +138,12 @@ def encode_annotations(seen: Observation, colours: Mapping[str, Colour]) -> byte
     return message.SerializeToString(deterministic=True)
 
 
-def encode_calibration(time_ns: int, camera: Camera) -> bytes:
+def encode_calibration(time_ns: int, camera: Camera, frame: str) -> bytes:
     """Return the calibration of a camera."""
     width, height = camera.size
     numbers = list(camera.distortion)
     message = CameraCalibration(
-        frame_id=_OPTICAL,
+        frame_id=frame,
         width=width,
         height=height,
         distortion_model="plumb_bob" if len(numbers) <= 5 else "rational_polynomial",
@@ -148,10 +156,10 @@ def encode_calibration(time_ns: int, camera: Camera) -> bytes:
     return message.SerializeToString(deterministic=True)
 
 
-def encode_camera_pose(time_ns: int, plane: CameraPlane) -> bytes:
+def encode_camera_pose(time_ns: int, plane: CameraPlane, frame: str) -> bytes:
     """Return where the camera is in the frame of the scene."""
     message = FrameTransforms()
-    each = message.transforms.add(parent_frame_id=FRAME, child_frame_id=_OPTICAL)
+    each = message.transforms.add(parent_frame_id=FRAME, child_frame_id=frame)
     _stamp(each.timestamp, time_ns)
     x, y, z = (-plane.rotation.T @ plane.pose[3:]).tolist()
     each.translation.x, each.translation.y, each.translation.z = x, y, z

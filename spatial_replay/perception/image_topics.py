@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
+from os import PathLike
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
@@ -14,7 +15,7 @@ from spatial_replay.bags.topic import Topic
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.downloads import local_copy
-from spatial_replay.logs.remote import LogFile
+from spatial_replay.logs.remote import LogFile, log_file
 from spatial_replay.logs.topics import is_image_type
 from spatial_replay.mapping.message_types import short_type
 from spatial_replay.perception.frame import LARGEST_PICTURE, Frame, Image
@@ -191,7 +192,7 @@ def _stamp_ns(value: Any) -> int:
 
 
 def open_frames(
-    path: LogFile, *, topic: str | None = None, rate: float | None = None
+    path: str | PathLike[str] | LogFile, *, topic: str | None = None, rate: float | None = None
 ) -> VideoFile | ImageTopic:
     """Open a video, or the image topic of a log of messages; the content decides which it is.
 
@@ -204,6 +205,7 @@ def open_frames(
         LogError: it is neither.
         UsageError: an option that does not fit what it is, or a topic that is not there.
     """
+    path = log_file(path)
     if is_log(path):
         if rate is not None:
             raise UsageError(f"{path.name} is a log, whose messages have stamps; leave out --rate")

@@ -14,7 +14,8 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.perception.plane import CameraPlane, Plane, rotations
+from spatial_replay.perception.camera_pose import rotations
+from spatial_replay.perception.plane import CameraPlane, Plane
 from spatial_replay.perception.tags_file import MountedTag
 
 _STEP: Final = 1e-3

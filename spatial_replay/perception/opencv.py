@@ -11,14 +11,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from types import MappingProxyType
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from spatial_replay.errors import LogError, UsageError, importing
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.perception.corners import refined_corners
 from spatial_replay.perception.frame import LARGEST_PICTURE, Image, encoded_size
+
+_Number = TypeVar("_Number", np.uint8, np.float64)
 
 FAMILIES: Final[Mapping[str, str]] = MappingProxyType(
     {
@@ -252,6 +255,13 @@ def reduce(image: Image, factor: int) -> Image:
     cv2 = _load()
     size = (image.shape[1] // factor, image.shape[0] // factor)
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def enlarge(picture: NDArray[_Number], factor: int) -> NDArray[_Number]:
+    """Return a picture with `factor` times as many pixels along each edge, interpolated."""
+    cv2 = _load()
+    size = (picture.shape[1] * factor, picture.shape[0] * factor)
+    return np.asarray(cv2.resize(np.ascontiguousarray(picture), size, interpolation=cv2.INTER_LINEAR))
 
 
 def blur(image: Image, sigma: float) -> Image:

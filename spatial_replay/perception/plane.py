@@ -16,6 +16,7 @@ import numpy as np
 
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats
+from spatial_replay.perception.camera_pose import rotations
 from spatial_replay.perception.opencv import Camera, fit_homography, fit_pose, projection
 from spatial_replay.perception.tags_file import ReferenceTag, TagsFile
 
@@ -224,18 +225,6 @@ def given_plane(tags: TagsFile, size: tuple[int, int]) -> Plane | None:
     if tags.pose is not None and tags.camera is not None:
         return CameraPlane(tags.camera, tags.pose, np.zeros((6, 6)), error)
     return None
-
-
-def rotations(vectors: Floats) -> Floats:
-    """Return the rotation matrices (N, 3, 3) of rotation vectors (N, 3)."""
-    angle = np.linalg.norm(vectors, axis=1)
-    safe = np.where(angle > 1e-12, angle, 1.0)
-    x, y, z = (vectors / safe[:, None]).T
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
-    sine, versine = np.sin(angle)[:, None, None], (1 - np.cos(angle))[:, None, None]
-    matrices: Floats = np.eye(3) + sine * cross + versine * (cross @ cross)
-    return matrices
 
 
 def _through(matrix: Floats, points: Floats) -> Floats:

@@ -10,9 +10,9 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from spatial_replay.geometry.arrays import Floats
+from spatial_replay.perception.camera_pose import rotations
 from spatial_replay.perception.frame import Image
 from spatial_replay.perception.opencv import Camera, blur, fit_homography, reduce, tag_cells, warp
-from spatial_replay.perception.plane import rotations
 
 _BLACK, _WHITE = 30, 220
 _OVERSAMPLED: Final = 4
@@ -54,7 +54,7 @@ class Flaws:
     """What makes an image worse.
 
     Attributes:
-        noise: standard deviation of a pixel's value, of 255.
+        noise: standard deviation of a pixel's brightness, of 255.
         blur: standard deviation of the lens's blur, in pixels.
     """
 
@@ -84,13 +84,26 @@ def render(
     width, height = camera.size
     base = np.full((height, width), 120, np.uint8) if backdrop is None else backdrop.image
     depth = None if backdrop is None else backdrop.depth
-    exposed = [_exposed(family, plates, camera, pose, base, depth) for plates in instants]
-    image = exposed[0] if len(exposed) == 1 else np.mean(exposed, axis=0).round().astype(np.uint8)
+    # most plates stand still, and are drawn once
+    moves = [
+        any((each.centre != same[0].centre).any() or (each.axes != same[0].axes).any() for each in same)
+        for same in zip(*instants, strict=True)
+    ]
+    still = [plate for plate, is_moved in zip(instants[0], moves, strict=True) if not is_moved]
+    image = _exposed(family, still, camera, pose, base, depth)
+    if any(moves):
+        total = np.zeros(image.shape, np.uint16)
+        for plates in instants:
+            moving = [plate for plate, is_moved in zip(plates, moves, strict=True) if is_moved]
+            total += _exposed(family, moving, camera, pose, image, depth)
+        image = ((total + len(instants) // 2) // len(instants)).astype(np.uint8)
     if flaws.blur:
         image = blur(image, flaws.blur)
     if flaws.noise:
-        drawn = np.random.default_rng(list(seed)).normal(0.0, flaws.noise, image.shape)
-        image = np.clip(image + drawn, 0, 255).round().astype(np.uint8)
+        # of the brightness: the same in all colours
+        drawn = np.random.default_rng(list(seed)).standard_normal(image.shape[:2], np.float32)
+        noise = np.rint(drawn * flaws.noise).astype(np.int16)
+        image = np.clip(image + (noise if image.ndim == 2 else noise[..., None]), 0, 255).astype(np.uint8)
     return np.ascontiguousarray(image)
 
 

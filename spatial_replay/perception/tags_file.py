@@ -6,7 +6,7 @@ import json
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib.resources import files
 from os import PathLike
@@ -20,6 +20,7 @@ from spatial_replay.geometry.arrays import Floats
 from spatial_replay.geometry.footprint import Footprint
 from spatial_replay.logs.remote import log_file
 from spatial_replay.mapping.yaml_document import Document, Place, checked_document, read_yaml_text
+from spatial_replay.perception.camera_pose import pose_looking_at
 from spatial_replay.perception.opencv import Camera
 from spatial_replay.trace.time_points import duration_ns_from_text
 
@@ -105,6 +106,7 @@ class TagsFile:
         camera: None if it is not calibrated.
         pose: (6,), rotation vector and translation from the plane's frame to the camera's; None where the
             reference tags give it.
+        cameras: of several, by the name or number of each; instead of `camera` and `pose`.
         corner_error: standard deviation of a corner in pixels; None to measure it.
         reference_error: how far a reference tag may be from its place, in footprint units.
         sigmas: standard deviations that the stated uncertainty covers.
@@ -120,6 +122,7 @@ class TagsFile:
     references: tuple[ReferenceTag, ...] = ()
     camera: Camera | None = None
     pose: Floats | None = None
+    cameras: Mapping[str, tuple[Camera, Floats | None]] = field(default_factory=lambda: MappingProxyType({}))
     corner_error: float | None = None
     reference_error: float = 0.0
     sigmas: float = 4.0
@@ -136,6 +139,37 @@ class TagsFile:
     def ids(self) -> frozenset[int]:
         """All tags that it names."""
         return frozenset([*self.by_id, *(each.id for each in self.references)])
+
+    def of_camera(self, name: str, number: int = 1, *, count: int = 1) -> TagsFile:
+        """Return what the file says for one of several cameras.
+
+        Args:
+            name: of its video or topic.
+            number: from 1, in the order in which they are given.
+            count: how many cameras there are.
+
+        Raises:
+            UsageError: the file does not say what this one does, or says that all have one pose or one image.
+        """
+        if self.cameras:
+            found = self.cameras.get(name, self.cameras.get(str(number)))
+            if found is None:
+                listed = ", ".join(self.cameras)
+                raise UsageError(
+                    f"{self.name} has no camera {name or number}; its cameras are {listed}; name this one"
+                    f" by its video or topic, or by its number, {number}"
+                )
+            return replace(self, camera=found[0], pose=found[1])
+        if count > 1 and self.is_image:
+            raise UsageError(
+                f"{self.name}: plane: image is that of one camera; for several, give reference tags"
+            )
+        if count > 1 and self.pose is not None:
+            raise UsageError(
+                f"{self.name} gives one pose for {count} cameras; write cameras, one for each by the"
+                " name of its video, or leave out the pose, which the reference tags give"
+            )
+        return self
 
 
 def load_tags(path: str | PathLike[str]) -> TagsFile:
@@ -164,13 +198,15 @@ def parse_tags(text: str, name: str = "tags") -> TagsFile:
     plane = value.get("plane", {})
     is_image = plane == "image"
     camera = _camera(camera_value) if camera_value else None
+    several: Mapping[str, Any] = value.get("cameras", {})
     try:
         objects = tuple(
-            _object(own_name, entry, size, value, has_camera=camera is not None)
+            _object(own_name, entry, size, value, has_camera=bool(camera or several))
             for own_name, entry in value["objects"].items()
         )
         references = () if is_image else tuple(_references(plane, size))
-        pose = _pose(camera_value["pose"]) if "pose" in camera_value else None
+        pose = _pose(camera_value)
+        cameras = {each: (_camera(entry), _pose(entry)) for each, entry in several.items()}
     except (UsageError, GeometryError) as error:
         raise UsageError(f"{name}: {error}") from None
     return TagsFile(
@@ -181,6 +217,7 @@ def parse_tags(text: str, name: str = "tags") -> TagsFile:
         references=references,
         camera=camera,
         pose=pose,
+        cameras=MappingProxyType(cameras),
         corner_error=value.get("corner_error"),
         reference_error=0.0 if is_image else _length(plane.get("error", 0.0)),
         sigmas=float(value.get("sigmas", 4.0)),
@@ -188,20 +225,6 @@ def parse_tags(text: str, name: str = "tags") -> TagsFile:
         by_id=MappingProxyType({tag.id: (each, tag) for each in objects for tag in each.tags}),
         text=text,
     )
-
-
-def camera_text(camera: Camera) -> str:
-    """Return the part of a tags file that describes a camera."""
-    (fx, fy), (cx, cy), (width, height) = camera.focal, camera.centre, camera.size
-    lines = [
-        "camera:",
-        f"  size: [{width}, {height}]",
-        f"  focal: [{fx:.3f}, {fy:.3f}]",
-        f"  centre: [{cx:.3f}, {cy:.3f}]",
-    ]
-    if camera.distortion:
-        lines.append(f"  distortion: [{', '.join(f'{each:.6g}' for each in camera.distortion)}]")
-    return "\n".join(lines) + "\n"
 
 
 def _object(
@@ -261,58 +284,13 @@ def _camera(value: Mapping[str, Any]) -> Camera:
     )
 
 
-def _pose(value: Mapping[str, Any]) -> Floats:
-    """Return the pose (6,) of a camera that is at a place and looks at a point."""
+def _pose(camera: Mapping[str, Any]) -> Floats | None:
+    """Return the pose (6,) of a camera that is at a place and looks at a point; None if that is not given."""
+    value = camera.get("pose")
+    if value is None:
+        return None
     eye, target = (np.array([_length(each) for each in value[key]]) for key in ("position", "look_at"))
     return pose_looking_at(eye, target, np.array(value.get("up", (0.0, 0.0, 1.0)), np.float64))
-
-
-def pose_looking_at(eye: Floats, target: Floats, up: Floats) -> Floats:
-    """Return the pose (6,), rotation vector and translation from the plane's frame to that of a camera.
-
-    Args:
-        eye, target: (3,), where the camera is, and a point in the middle of its image.
-        up: (3,), what points up in the image.
-
-    Raises:
-        UsageError: the camera is at the target, or `up` is where it looks.
-    """
-    forward = target - eye
-    right = np.cross(forward, up)
-    if not np.linalg.norm(forward) > 0 or not np.linalg.norm(right) > 1e-9 * np.linalg.norm(forward):
-        raise UsageError(
-            "the camera's pose is not determined: give another look_at than its position, and an up that is"
-            " not where it looks, such as up: [0, 1, 0] for a camera that looks straight down"
-        )
-    forward, right = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    return np.concatenate([rotation_vector(rotation), -rotation @ eye])
-
-
-def rotation_vector(rotation: Floats) -> Floats:
-    """Return the rotation vector (3,) of a rotation matrix (3, 3)."""
-    # through the quaternion, whose largest component is never small
-    xx, yy, zz = np.diag(rotation)
-    four = np.array([1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz])
-    index = int(four.argmax())
-    part = math.sqrt(max(four[index], 0.0)) / 2
-    antisymmetric = np.array(
-        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
-    )
-    symmetric = rotation + rotation.T
-    if index == 0:
-        w, vector = part, antisymmetric / (4 * part)
-    else:
-        axis = index - 1
-        w = antisymmetric[axis] / (4 * part)
-        vector = symmetric[axis] / (4 * part)
-        vector[axis] = part
-    if w < 0:
-        w, vector = -w, -vector
-    sine = float(np.linalg.norm(vector))
-    angle = 2 * math.atan2(sine, w)
-    turn: Floats = vector * (angle / sine if sine > 1e-12 else 2.0)
-    return turn
 
 
 def _length(value: Any) -> float:
@@ -352,7 +330,9 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
             faults.append((place, f"tag {number} is {used[number]} already; a tag is in one place"))
         used.setdefault(number, what)
 
-    camera = value.get("camera")
+    camera = value.get("camera") or value.get("cameras")
+    if "camera" in value and "cameras" in value:
+        faults.append((("cameras",), "give either camera, of one or of all, or cameras, one for each"))
     for name, entry in cast("dict[str, Any]", value["objects"]).items():
         if not isinstance(entry, dict):
             continue
@@ -389,7 +369,8 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
             own_size = isinstance(entry, dict) and "size" in entry
             if not own_size and "size" not in value and "size" not in plane:
                 faults.append((own, "the size of the tag is missing; give size for all, or for this one"))
-    has_pose = isinstance(camera, dict) and "pose" in camera
+    each_camera = list(camera.values()) if "cameras" in value and isinstance(camera, dict) else [camera]
+    has_pose = all(isinstance(each, dict) and "pose" in each for each in each_camera)
     are_enough = isinstance(references, dict) and len(references) >= LEAST_REFERENCES
     if plane != "image" and not has_pose and not are_enough:
         faults.append(

@@ -1,30 +1,29 @@
-"""Simulated worlds through a camera: a video of a run whose truth is known, and its tags file."""
+"""Simulated worlds through cameras: videos of a run whose truth is known, and their tags file."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Final, Self, TypeVar
+from typing import Final, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from spatial_replay.errors import OutputError, UsageError
+from spatial_replay.geometry.arrays import Floats
 from spatial_replay.logs.output_file import refuse_inputs
+from spatial_replay.perception.calibration import camera_text
+from spatial_replay.perception.camera_pose import pose_looking_at
 from spatial_replay.perception.frame import Frame
-from spatial_replay.perception.opencv import Camera
+from spatial_replay.perception.opencv import Camera, enlarge
 from spatial_replay.perception.rendering import Backdrop, Flaws, Plate, render
-from spatial_replay.perception.tags_file import camera_text, pose_looking_at
 from spatial_replay.perception.video import VideoWriter
 from spatial_replay.simulation.shapes import Box, Pose
 from spatial_replay.simulation.tabletop import SAMPLES_PER_S, Tabletop
 from spatial_replay.simulation.world import Body
 from spatial_replay.trace.sample import Sample
-
-_Number = TypeVar("_Number", np.uint8, np.float64)
 
 FAMILY: Final = "36h11"
 _FIRST_REFERENCE: Final = 100
@@ -40,25 +39,35 @@ _NUDGED: Final = 0.01
 _HOLD: Final = "10s"
 """How long hidden objects are held: what has become too uncertain to matter is as good as unknown."""
 
-_COARSE: Final = 2
-"""Pixels along each edge that share one of the simulator's picture, which costs most of the time."""
+
+class _Look(NamedTuple):
+    """Where a camera is, and what is in the middle of its picture, in metres."""
+
+    eye: tuple[float, float, float]
+    look_at: tuple[float, float, float]
+
+    @property
+    def pose(self) -> Floats:
+        """(6,), rotation vector and translation from the scene's frame to the camera's."""
+        return pose_looking_at(np.array(self.eye), np.array(self.look_at), np.array([0.0, 0.0, 1.0]))
 
 
 @dataclass(frozen=True, slots=True)
-class _View:
-    """Where the camera of a scenario is, and the tags that it sees.
+class _Views:
+    """Where the cameras of a scenario are, all of one kind, and the tags that they see.
 
     Attributes:
+        coarse: pixels along each edge that share one of the simulator's picture, which costs most time.
         focal: in pixels; the principal point is in the middle.
-        eye, look_at: in metres.
+        looks: that of each camera: what the arm hides from one is seen from another.
         tag: edge of the tags on objects, in metres.
         reference: edge of those on the table, at `places`.
     """
 
     size: tuple[int, int]
+    coarse: int
     focal: float
-    eye: tuple[float, float, float]
-    look_at: tuple[float, float, float]
+    looks: tuple[_Look, ...]
     tag: float
     reference: float
     places: tuple[tuple[float, float], ...]
@@ -70,41 +79,57 @@ class _View:
         return Camera((self.focal, self.focal), ((width - 1) / 2, (height - 1) / 2), self.size)
 
 
-_WHOLE_TABLE: Final = _View(
+_WHOLE_TABLE: Final = _Views(
     (1280, 960),
+    4,
     1150.0,
-    (0.9, 0.0, 1.5),
-    (0.27, 0.0, 0.0),
+    (_Look((0.9, 0.0, 1.5), (0.27, 0.0, 0.0)),),
     0.05,
     0.08,
     ((0.8, -0.4), (0.8, 0.4), (-0.3, -0.75), (-0.3, 0.75), (0.3, -0.7), (0.3, 0.7)),
 )
-_VIEWS: Final[Mapping[str, _View]] = MappingProxyType(
+_PUSHED: Final = _Views(
+    (800, 600),
+    2,
+    850.0,
+    (_Look((0.95, 0.0, 0.8), (0.48, 0.0, 0.0)),),
+    0.032,
+    0.05,
+    ((0.28, -0.27), (0.68, -0.25), (0.68, 0.25), (0.28, 0.27), (0.3, 0.18)),
+)
+_WHOLE_TABLE_TWICE: Final = replace(
+    _WHOLE_TABLE, looks=(*_WHOLE_TABLE.looks, _Look((-0.3, -1.05, 1.35), (0.27, 0.0, 0.0)))
+)
+_PUSHED_TWICE: Final = replace(
+    _PUSHED,
+    size=(1280, 960),
+    coarse=4,
+    focal=1680.0,
+    looks=(_Look((1.39, 0.0, 0.55), (0.48, 0.0, 0.0)), _Look((0.07, 0.81, 0.55), (0.48, 0.0, 0.0))),
+)
+_VIEWS: Final[Mapping[str, tuple[_Views, ...]]] = MappingProxyType(
     {
-        "push": _View(
-            (800, 600),
-            850.0,
-            (0.95, 0.0, 0.8),
-            (0.48, 0.0, 0.0),
-            0.032,
-            0.05,
-            ((0.28, -0.27), (0.68, -0.25), (0.68, 0.25), (0.28, 0.27), (0.3, 0.18)),
-        ),
-        "pick-place": _WHOLE_TABLE,
-        "table-setting": _WHOLE_TABLE,
+        "push": (_PUSHED, _PUSHED_TWICE),
+        "pick-place": (_WHOLE_TABLE, _WHOLE_TABLE_TWICE),
+        "table-setting": (_WHOLE_TABLE, _WHOLE_TABLE_TWICE),
     }
 )
+"""By the number of cameras."""
+
+MOST_CAMERAS: Final = 2
 
 
 class Film:
-    """A camera above a simulated world, as a context manager; a process for one run.
+    """Cameras above a simulated world, as a context manager; a process for one run.
 
     Every object carries a tag on a card on its top, those that things are put on two; further tags lie on the
-    table. The picture has the blur of lens and motion, and noise; what the arm hides is hidden.
+    table. The pictures have the blur of lens and motion, and noise; what the arm hides is hidden.
     """
 
-    def __init__(self, world: Tabletop, video: Path, *, seed: int = 0, flaws: Flaws | None = None) -> None:
-        """Open the video, and write the tags file beside it.
+    def __init__(
+        self, world: Tabletop, videos: Sequence[Path], *, seed: int = 0, flaws: Flaws | None = None
+    ) -> None:
+        """Open the videos, one or two, and write the tags file beside the first.
 
         Args:
             seed: of the noise.
@@ -113,20 +138,20 @@ class Film:
             UsageError: the extra `vision` is not installed, or the name is not that of a video.
             OutputError: a file cannot be written.
         """
-        refuse_inputs(video, ())
         self._world, self._seed, self._flaws = world, seed, flaws
-        self._view = _VIEWS[world.name]
-        eye, target = np.array(self._view.eye), np.array(self._view.look_at)
-        self._pose = pose_looking_at(eye, target, np.array([0.0, 0.0, 1.0]))
+        self._views = _VIEWS[world.name][len(videos) - 1]
         self._before: tuple[int, dict[str, Pose]] | None = None
         self._taken = 0
-        self.tags = video.with_suffix(".tags.yaml")
+        tags = tags_of_film(videos)
         self._opened = ExitStack()
-        self._writer = self._opened.enter_context(VideoWriter(video, SAMPLES_PER_S))
+        self._writers: list[VideoWriter] = []
         try:
-            self.tags.write_text(tags_text(world), encoding="utf-8")
+            for video in videos:
+                refuse_inputs(video, ())
+                self._writers.append(self._opened.enter_context(VideoWriter(video, SAMPLES_PER_S)))
+            tags.write_text(tags_text(world, len(videos)), encoding="utf-8")
         except OSError as error:
-            raise OutputError(f"{self.tags}: {(error.strerror or str(error)).lower()}") from None
+            raise OutputError(f"{tags}: {(error.strerror or str(error)).lower()}") from None
 
     def __enter__(self) -> Self:
         return self
@@ -135,39 +160,45 @@ class Film:
         self._opened.close()
 
     def take(self, sample: Sample) -> None:
-        """Add the frame of a sample, while the world is in its state."""
-        self._writer.write(self.frame(sample.time_ns))
+        """Add the frames of a sample, while the world is in its state."""
+        for writer, frame in zip(self._writers, self.frames(sample.time_ns), strict=True):
+            writer.write(frame)
 
-    def frame(self, time_ns: int) -> Frame:
-        """Return the picture of the world as it is now."""
-        scene = self._world.scene
+    def frames(self, time_ns: int) -> Iterator[Frame]:
+        """Yield the picture that each camera has of the world as it is now."""
+        scene, views = self._world.scene, self._views
         poses = {name: scene.pose(name) for name in scene.bodies}
-        instants = [self._plates(poses, 0.0, time_ns)]
+        instants = [self._plates(poses, 0.0)]
         if self._before is not None:
-            shares = (-_EXPOSURE / 2, 0.0, _EXPOSURE / 2)
-            instants = [self._plates(poses, share, time_ns) for share in shares]
+            instants = [self._plates(poses, share) for share in (-_EXPOSURE / 2, 0.0, _EXPOSURE / 2)]
         self._before = time_ns, poses
         self._taken += 1
-        view = self._view
-        size = (view.size[0] // _COARSE, view.size[1] // _COARSE)
-        colours, depth = scene.engine.picture(size, view.focal / _COARSE, view.eye, view.look_at)
-        backdrop = Backdrop(_enlarged(colours[..., ::-1]), _enlarged(depth))
-        image = render(
-            FAMILY,
-            instants,
-            view.camera,
-            self._pose,
-            flaws=self._flaws,
-            seed=(self._seed, self._taken),
-            backdrop=backdrop,
-        )
-        return Frame(time_ns, image)
+        size = (views.size[0] // views.coarse, views.size[1] // views.coarse)
+        for number, look in enumerate(views.looks):
+            colours, depth = scene.engine.picture(size, views.focal / views.coarse, look.eye, look.look_at)
+            # of a plane, the inverse of its depth is linear in the picture
+            nearness = 1 / depth
+            # the simulator takes the depths at the lower edges of pixels
+            nearness[1:] = (nearness[1:] + nearness[:-1]) / 2
+            image = render(
+                FAMILY,
+                instants,
+                views.camera,
+                look.pose,
+                flaws=self._flaws,
+                # of one camera as before there were two
+                seed=(self._seed, self._taken, *([number] if number else [])),
+                backdrop=Backdrop(
+                    enlarge(colours[..., ::-1], views.coarse), 1 / enlarge(nearness, views.coarse)
+                ),
+            )
+            yield Frame(time_ns, image)
 
-    def _plates(self, poses: Mapping[str, Pose], share: float, time_ns: int) -> list[Plate]:
+    def _plates(self, poses: Mapping[str, Pose], share: float) -> list[Plate]:
         """Return all tags, moved on by a share of the way since the frame before."""
         plates = [
-            Plate(_FIRST_REFERENCE + index, np.array([x, y, 0.0]), np.eye(3)[:2], self._view.reference)
-            for index, (x, y) in enumerate(self._view.places)
+            Plate(_FIRST_REFERENCE + index, np.array([x, y, 0.0]), np.eye(3)[:2], self._views.reference)
+            for index, (x, y) in enumerate(self._views.places)
         ]
         for number, body in _numbered(self._world):
             pose = poses[body.name]
@@ -176,13 +207,18 @@ class Film:
                 moved = share * (pose.position - self._before[1][body.name].position)
             for index, (x, y) in enumerate(_spots(body)):
                 there = pose.rotation @ np.array([x, y, body.shape.height / 2]) + pose.position + moved
-                plates.append(Plate(number + index, there, pose.rotation.T[:2], self._view.tag))
+                plates.append(Plate(number + index, there, pose.rotation.T[:2], self._views.tag))
         return plates
 
 
-def tags_text(world: Tabletop) -> str:
-    """Return the tags file of a world that is at rest."""
-    view = _VIEWS[world.name]
+def tags_of_film(videos: Sequence[Path]) -> Path:
+    """Return where the tags file of a film is."""
+    return videos[0].with_suffix(".tags.yaml")
+
+
+def tags_text(world: Tabletop, cameras: int = 1) -> str:
+    """Return the tags file of a world that is at rest, for one or two cameras."""
+    view = _VIEWS[world.name][cameras - 1]
     lines = [f"family: {FAMILY}", f"size: {view.tag:g}", "objects:"]
     for number, body in _numbered(world):
         shape = body.shape
@@ -226,19 +262,21 @@ def _spots(body: Body) -> list[tuple[float, float]]:
     return [(r, 0.0), (-r, 0.0)]
 
 
-def _enlarged(picture: NDArray[_Number]) -> NDArray[_Number]:
-    return np.ascontiguousarray(picture.repeat(_COARSE, axis=0).repeat(_COARSE, axis=1))
-
-
-def open_film(world: Tabletop, video: Path | None, *, seed: int) -> AbstractContextManager[Film | None]:
+def open_film(world: Tabletop, videos: Sequence[Path], *, seed: int) -> AbstractContextManager[Film | None]:
     """Return a context of the film of a world; of None without a name for it.
 
     Raises:
-        UsageError: the extra `vision` is not installed, or the name is not that of a video.
+        UsageError: the extra `vision` is not installed, or a name that is not that of a video or comes
+            twice, more cameras than there are places for.
         OutputError: a file cannot be written.
     """
-    if video is None:
+    if not videos:
         return nullcontext()
-    if video.suffix.lower() not in (".mp4", ".mkv", ".mov", ".ts"):
-        raise UsageError(f"{video}: a film is a video; name it {video.stem}.mp4")
-    return Film(world, video, seed=seed)
+    if len(videos) > MOST_CAMERAS:
+        raise UsageError(f"{len(videos)} cameras: a run is filmed by one or two; leave out the others")
+    for video in videos:
+        if video.suffix.lower() not in (".mp4", ".mkv", ".mov", ".ts"):
+            raise UsageError(f"{video}: a film is a video; name it {video.stem}.mp4")
+    if len({video.resolve() for video in videos}) < len(videos):
+        raise UsageError(f"{videos[0]} is the film of two cameras; give each a name of its own")
+    return Film(world, videos, seed=seed)

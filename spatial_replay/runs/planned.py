@@ -229,7 +229,7 @@ def record_plan(
     injections: Sequence[Injection] = (),
     starts: Sequence[Start] = (),
     gui: bool = False,
-    camera: Path | None = None,
+    cameras: Sequence[Path] = (),
     inputs: Sequence[Path] = (),
     advance: Callable[[int], None] = lambda samples: None,
     durability: Durability = "process",
@@ -244,7 +244,7 @@ def record_plan(
         also: further specifications to evaluate, of which the planner knows nothing.
         name: the result to plan for, if there are several. All are evaluated.
         starts: where bodies are at the beginning, in place of where the seed puts them.
-        camera: a video to make of the run, beside which its tags file is written.
+        cameras: one or two videos to make of the run; beside the first, their tags file is written.
         inputs: files that the output must not be.
         advance: called with the number of new samples.
         durability: "disk" for a log of which the disk has each chunk as soon as it is written.
@@ -274,7 +274,7 @@ def record_plan(
         # a replay does not know the rate, and has no automaton for bounds in seconds: neither has the log
         known = _known(kept, planner.automaton) if planner.rate_hz is None else []
         with (
-            open_film(world, camera, seed=seed) as film,
+            open_film(world, cameras, seed=seed) as film,
             run_log(output, [kept, *others], about, inputs, known, durability) as log,
         ):
             log.add_metadata(PLAN_METADATA, plan_metadata(planner, kept.filename))

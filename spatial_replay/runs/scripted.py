@@ -66,7 +66,7 @@ def record_script(
     injections: Sequence[Injection] = (),
     starts: Sequence[Start] = (),
     gui: bool = False,
-    camera: Path | None = None,
+    cameras: Sequence[Path] = (),
     inputs: Sequence[Path] = (),
     advance: Callable[[int], None] = lambda samples: None,
     durability: Durability = "process",
@@ -76,7 +76,7 @@ def record_script(
     Args:
         files: specifications to evaluate during the run; None takes that of the scenario.
         starts: where bodies are at the beginning, in place of where the seed puts them.
-        camera: a video to make of the run, beside which its tags file is written.
+        cameras: one or two videos to make of the run; beside the first, their tags file is written.
         duration_ns: duration in simulated time; None ends with the script.
         inputs: files that the output must not be.
         advance: called with the number of new samples.
@@ -96,7 +96,7 @@ def record_script(
     with closing(made) as world:
         refuse_unknown_names(files, world.sample())
         with (
-            open_film(world, camera, seed=seed) as film,
+            open_film(world, cameras, seed=seed) as film,
             run_log(output, files, about, inputs, durability=durability) as log,
         ):
             result = _follow_script(world, log, film, duration_ns, advance)

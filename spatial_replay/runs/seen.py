@@ -1,9 +1,9 @@
-"""A video or a camera, recorded: frames to samples, verdicts as they change, and a log with the picture."""
+"""Videos or a camera, recorded: frames to samples, verdicts as they change, and a log with the pictures."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -14,22 +14,24 @@ import numpy as np
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.logs.messages import Channel, Messages, messages_of
 from spatial_replay.logs.output_file import Durability
-from spatial_replay.logs.topics import CAMERA_PREFIX, OWN_PREFIX
+from spatial_replay.logs.topics import CAMERA_CALIBRATION, CAMERA_FRAMES, CAMERA_PREFIX, OWN_PREFIX
 from spatial_replay.monitor.monitor import Ending, Monitor, Update
 from spatial_replay.perception.camera_messages import (
-    ANNOTATIONS,
-    CALIBRATION,
     TRANSFORMS,
-    VIDEO,
     AskedColours,
+    CameraChannels,
+    Colour,
     encode_annotations,
     encode_calibration,
     encode_camera_pose,
     encode_video,
 )
+from spatial_replay.perception.camera_view import View
 from spatial_replay.perception.frame import Frame
 from spatial_replay.perception.observer import Observation, TagObserver
+from spatial_replay.perception.opencv import Camera
 from spatial_replay.perception.plane import CameraPlane, Fit
+from spatial_replay.perception.simultaneous import camera_names, simultaneous
 from spatial_replay.perception.tags_file import TagsFile
 from spatial_replay.perception.video import H264Encoder
 from spatial_replay.recording.changes import VerdictChange, VerdictChanges
@@ -37,9 +39,13 @@ from spatial_replay.recording.recording import refuse_templates
 from spatial_replay.runs.run_log import RunLog, run_log
 from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.axes import Axes
+from spatial_replay.trace.sample import Sample
 
 KeepVideo: TypeAlias = Literal["copy", "h264", "none"]
 """How a log keeps a video: as it came, encoded again, or not at all."""
+
+_NOT_YET_ALONE: Final = 2
+"""Samples at the end that a camera may lack, as its last frame comes before that of another."""
 
 _POSE_EVERY_NS: Final = 10**9
 """How often a log repeats the camera's calibration and pose, which do not change."""
@@ -72,30 +78,31 @@ class SeenRun:
     """The result of recording what a camera saw.
 
     Attributes:
-        samples: number of frames, each of which is a sample.
+        samples: their number; each is of one frame, of several cameras one each.
         seconds: from the first to the last.
         endings: the result of each spec at the end.
-        fit: how the reference tags fit; None without any.
+        fits: of each camera its name and how the reference tags fit; None without any.
         remarks: tags and objects that were missing, doubtful or not mapped.
         faults: what was lost of the video.
-        kept: how the video is in the log.
+        kept: how the video of each camera is in the log.
     """
 
     samples: int
     seconds: float
     endings: tuple[Ending, ...]
-    fit: Fit | None
+    fits: tuple[tuple[str, Fit | None], ...]
     remarks: tuple[str, ...]
     faults: tuple[str, ...]
-    kept: KeepVideo
+    kept: tuple[KeepVideo, ...]
 
 
 def record_seen(
-    frames: FrameSource,
+    cameras: Sequence[FrameSource],
     tags: TagsFile,
     output: Path,
     files: Sequence[Specification] = (),
     *,
+    offsets_ns: Sequence[int] = (),
     hold_ns: int | None = None,
     keep: KeepVideo | None = None,
     inputs: Sequence[Path] = (),
@@ -104,58 +111,114 @@ def record_seen(
     advance: Callable[[int], None] = lambda samples: None,
     durability: Durability = "process",
 ) -> SeenRun:
-    """Record the objects that frames show, with verdicts; equal frames give equal bytes.
+    """Record the objects that cameras show, with verdicts; equal frames give equal bytes.
 
     Args:
+        cameras: one or several, whose frames of one time make one sample.
+        offsets_ns: what is added to the stamps of each camera; nothing unless given.
         hold_ns: how long a hidden object stays where it was, with growing uncertainty; None for what the
             tags file says.
-        keep: how the log keeps the video; None copies it where that is possible, and encodes it otherwise.
+        keep: how the log keeps the videos; None copies each where that is possible, and encodes it otherwise.
         inputs: files that the output must not be.
-        begin: takes the time of the first frame.
+        begin: takes the time of the first sample.
         show: takes each change of a verdict.
-        advance: called with 1 for each frame.
+        advance: called with 1 for each sample.
 
     Raises:
         UsageError: a specification that cannot be recorded, reference tags that do not fit, a camera that was
-            calibrated for another size, a video that cannot be copied.
+            calibrated for another size or that the tags file does not have, a video that cannot be copied.
         LogError: there is no frame.
         OutputError: the output cannot be written.
     """
     refuse_templates(files)
-    if keep == "copy" and frames.copy_fault is not None:
-        raise UsageError(f"the video cannot be copied: {frames.copy_fault}; write --keep-video h264")
-    kept: KeepVideo = keep or ("copy" if frames.copy_fault is None else "h264")
-    observer = TagObserver(tags, hold_ns=hold_ns)
-    coming = iter(frames)
+    names = camera_names(cameras)
+    kept: list[KeepVideo] = []
+    for camera in cameras:
+        if keep == "copy" and camera.copy_fault is not None:
+            raise UsageError(f"the video cannot be copied: {camera.copy_fault}; write --keep-video h264")
+        kept.append(keep or ("copy" if camera.copy_fault is None else "h264"))
+    observer = TagObserver(tags, hold_ns=hold_ns, cameras=names)
+    coming = simultaneous(cameras, offsets_ns)
     first = next(coming, None)
     if first is None:
-        raise LogError("; ".join([f"{frames.name} has no frame that can be read", *frames.faults[:1]]))
+        faults = [fault for camera in cameras for fault in camera.faults[:1]]
+        listed = " and ".join(dict.fromkeys(camera.name for camera in cameras))
+        raise LogError("; ".join([f"{listed}: no frame can be read", *faults]))
     # reference tags that do not fit raise here, before the output is touched
-    begun = observer.observe(first)
+    begun = observer.observe(*first)
     monitors = [Monitor(file, units={"": tags.unit}) for file in files]
     changes, colours = VerdictChanges(files), AskedColours(files)
-    options = {"tags": tags.name, "hold_ns": observer.hold_ns, "keep_video": kept}
-    about = {"source": frames.name, "options": json.dumps(options)}
+    options = {
+        "tags": tags.name,
+        "hold_ns": observer.hold_ns,
+        "keep_video": kept[0] if len(kept) == 1 else kept,
+        **({"cameras": names, "offsets_ns": [*offsets_ns]} if len(cameras) > 1 else {}),
+    }
+    sources = list(dict.fromkeys(camera.name for camera in cameras))
+    about = {"source": ", ".join(sources), "options": json.dumps(options)}
     about |= Axes(unit=tags.unit).metadata()
-    samples, last_ns = 0, first.time_ns
-    begin(first.time_ns)
+    of_cameras = [tags.of_camera(name, number, count=len(names)) for number, name in enumerate(names, 1)]
+    alone = _Alone(names)
+    samples, first_ns = 0, begun.sample.time_ns
+    last_ns = first_ns
+    begin(first_ns)
     with run_log(output, files, about, inputs, durability=durability) as log:
         log.add_attachment(f"{CAMERA_PREFIX}{tags.name}", "application/yaml", tags.text.encode())
-        video = _Video(frames, kept, first)
+        pictures = [_Picture(number, *each) for number, each in enumerate(zip(cameras, kept, strict=True), 1)]
         beside = _Beside(log)
-        for seen in chain([begun], map(observer.observe, coming)):
+        for seen in chain([begun], (observer.observe(*frames) for frames in coming)):
             samples, last_ns = samples + 1, seen.sample.time_ns
             log.write(seen.sample)
             updates: list[Update] = [monitor.update(seen.sample) for monitor in monitors]
-            video.write(beside, seen.frame)
-            beside.write(ANNOTATIONS, last_ns, encode_annotations(seen, colours.of(seen.sample, updates)))
-            _write_camera(beside, tags, seen)
+            coloured = colours.of(seen.sample, updates)
+            for picture, view, own in zip(pictures, seen.views, of_cameras, strict=True):
+                if view is not None:
+                    picture.write(beside, view, seen.sample, coloured, own.camera)
+            alone.count(seen)
             for change in changes.after(updates):
                 show(change)
             advance(1)
     endings = tuple(each for monitor in monitors for each in monitor.endings())
-    seconds = (last_ns - first.time_ns) / 1e9
-    return SeenRun(samples, seconds, endings, observer.fit, observer.remarks(), tuple(frames.faults), kept)
+    faults = tuple(dict.fromkeys(fault for camera in cameras for fault in camera.faults))
+    remarks = (*observer.remarks(), *alone.remarks(first_ns, last_ns))
+    fits = tuple(zip(names, observer.fits, strict=True))
+    return SeenRun(samples, (last_ns - first_ns) / 1e9, endings, fits, remarks, faults, tuple(kept))
+
+
+class _Alone:
+    """Which cameras have frames of one time, and when each ends."""
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self._names = names
+        self._last: list[int] = [0] * len(names)
+        self._samples = self._together = 0
+        self._last_of = [-1] * len(names)
+
+    def count(self, seen: Observation) -> None:
+        """Take in a sample."""
+        self._samples += 1
+        there = [place for place, view in enumerate(seen.views) if view is not None]
+        self._together += len(there) > 1
+        for place in there:
+            self._last[place], self._last_of[place] = self._samples, seen.sample.time_ns
+
+    def remarks(self, first_ns: int, last_ns: int) -> Iterator[str]:
+        """Yield which cameras ended before the others, or that their times have nothing in common."""
+        if len(self._names) == 1:
+            return
+        if not self._together:
+            yield (
+                f"no frames of {' and '.join(self._names)} are of the same time; are their clocks the same?"
+                " --offset shifts one"
+            )
+        for name, last, ended_ns in zip(self._names, self._last, self._last_of, strict=True):
+            if not last:
+                yield f"{name} has no frame"
+            elif self._samples - last > _NOT_YET_ALONE:
+                yield (
+                    f"{name} ends after {(ended_ns - first_ns) / 1e9:.3f} s, and the run after"
+                    f" {(last_ns - first_ns) / 1e9:.3f} s: what only it showed is hidden from there on"
+                )
 
 
 class _Beside:
@@ -164,47 +227,63 @@ class _Beside:
     def __init__(self, log: RunLog) -> None:
         self._log = log
         self._written: dict[str, int] = {}
-        self.last_ns: dict[str, int] = {}
 
     def write(self, channel: Channel, time_ns: int, payload: bytes) -> None:
         number = self._written.get(channel.topic, 0)
         self._written[channel.topic] = number + 1
-        self.last_ns[channel.topic] = time_ns
         times = np.array([time_ns], np.int64)
         messages: Messages = messages_of(channel, times, [payload], number)
         self._log.write_messages(messages)
 
 
-class _Video:
-    """The picture, on its way into the log."""
+class _Picture:
+    """What the log keeps of one camera: the picture, what is drawn on it, its calibration and its pose."""
 
-    def __init__(self, frames: FrameSource, kept: KeepVideo, first: Frame) -> None:
-        self._kept, self._channel = kept, frames.channel
-        if self._channel is not None and self._channel.topic.startswith(OWN_PREFIX):
+    def __init__(self, number: int, camera: FrameSource, kept: KeepVideo) -> None:
+        self._channels = CameraChannels(number)
+        self._kept, self._copied = kept, camera.channel
+        if self._copied is not None and self._copied.topic.startswith(OWN_PREFIX):
             self._kept = "none"
-        height, width = first.image.shape[:2]
-        self._encoder = H264Encoder(width, height) if kept == "h264" else None
+        self._encoder: H264Encoder | None = None
+        self._placed_ns: dict[str, int] = {}
 
-    def write(self, beside: _Beside, frame: Frame) -> None:
-        channel, data = self._channel, frame.data
-        if self._encoder is not None:
-            channel, data = None, self._encoder.encode(frame)
-        elif self._kept == "none":
+    def write(
+        self,
+        beside: _Beside,
+        view: View,
+        sample: Sample,
+        colours: Mapping[str, Colour],
+        camera: Camera | None,
+    ) -> None:
+        """Write what a frame shows."""
+        time_ns = view.frame.time_ns
+        self._write_frame(beside, view.frame)
+        beside.write(self._channels.annotations, time_ns, encode_annotations(view, sample, colours))
+        frame = self._channels.frame
+        if camera is not None and self._is_due(CAMERA_CALIBRATION, time_ns):
+            beside.write(self._channels.calibration, time_ns, encode_calibration(time_ns, camera, frame))
+        if isinstance(view.plane, CameraPlane) and self._is_due(CAMERA_FRAMES, time_ns):
+            beside.write(TRANSFORMS, time_ns, encode_camera_pose(time_ns, view.plane, frame))
+
+    def _write_frame(self, beside: _Beside, frame: Frame) -> None:
+        channel, data = self._copied, frame.data
+        if self._kept == "none":
             return
+        if self._kept == "h264":
+            if self._encoder is None:
+                height, width = frame.image.shape[:2]
+                self._encoder = H264Encoder(width, height)
+            channel, data = None, self._encoder.encode(frame)
         if channel is not None:
             beside.write(channel, frame.time_ns, data)
         elif data:
-            beside.write(VIDEO, frame.time_ns, encode_video(frame.time_ns, data))
+            encoded = encode_video(frame.time_ns, data, self._channels.frame)
+            beside.write(self._channels.video, frame.time_ns, encoded)
 
-
-def _write_camera(beside: _Beside, tags: TagsFile, seen: Observation) -> None:
-    """Write the calibration and the pose of the camera, from time to time."""
-    time_ns = seen.sample.time_ns
-    for channel in (CALIBRATION, TRANSFORMS):
-        last_ns = beside.last_ns.get(channel.topic)
+    def _is_due(self, what: str, time_ns: int) -> bool:
+        """Return whether what does not change is repeated now."""
+        last_ns = self._placed_ns.get(what)
         if last_ns is not None and time_ns - last_ns < _POSE_EVERY_NS:
-            continue
-        if channel is CALIBRATION and tags.camera is not None:
-            beside.write(channel, time_ns, encode_calibration(time_ns, tags.camera))
-        elif channel is TRANSFORMS and isinstance(seen.plane, CameraPlane):
-            beside.write(channel, time_ns, encode_camera_pose(time_ns, seen.plane))
+            return False
+        self._placed_ns[what] = time_ns
+        return True

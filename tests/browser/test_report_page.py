@@ -97,7 +97,7 @@ def _film(folder: Path) -> None:
         return
     write_approach(folder, 12)
     log, specifications = folder / "filmed.mcap", [sr.load_specification(folder / "apart.spatial")]
-    record_seen(open_frames(folder / "table.mp4"), load_tags(folder / "tags.yaml"), log, specifications)
+    record_seen([open_frames(folder / "table.mp4")], load_tags(folder / "tags.yaml"), log, specifications)
     source = open_source(log)
     write_report(source, load_files([], source), folder / "filmed.html")
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from spatial_replay.perception import Frame, TagsFile, parse_tags
+from spatial_replay.perception.camera_pose import pose_looking_at
 from spatial_replay.perception.opencv import Camera
 from spatial_replay.perception.rendering import Flaws, Plate, render
-from spatial_replay.perception.tags_file import pose_looking_at
 from spatial_replay.perception.video import VideoWriter
 
 PERIOD_NS = 40_000_000
@@ -28,6 +28,9 @@ TABLE = f"{BLOCKS}\n{REFERENCES}\n{CAMERA}\n"
 LENS = Camera((640.0, 640.0), (239.5, 179.5), (480, 360))
 FROM_THE_SIDE = pose_looking_at(
     np.array([0.9, 0.04, 0.78]), np.array([0.49, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
+)
+FROM_THE_OTHER = pose_looking_at(
+    np.array([0.45, 0.42, 0.78]), np.array([0.47, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
 )
 
 Poses = Mapping[int, tuple[float, float, float]]
@@ -47,10 +50,15 @@ def plates(tags: TagsFile, poses: Poses, top: float = 0.04) -> list[Plate]:
 
 
 def picture(
-    scene: Sequence[Plate], *, seed: int = 0, flaws: Flaws | None = None, lens: Camera = LENS
+    scene: Sequence[Plate],
+    *,
+    seed: int = 0,
+    flaws: Flaws | None = None,
+    lens: Camera = LENS,
+    pose: np.ndarray = FROM_THE_SIDE,
 ) -> np.ndarray:
-    """Return what the camera from the side sees."""
-    return render("36h11", [scene], lens, FROM_THE_SIDE, seed=(seed,), flaws=flaws)
+    """Return what a camera sees, the one from the side unless another is given."""
+    return render("36h11", [scene], lens, pose, seed=(seed,), flaws=flaws)
 
 
 def film(poses_at: Callable[[int], Poses], count: int, text: str = TABLE) -> Iterator[Frame]:

@@ -21,10 +21,9 @@ from perception.filmed import (
 )
 from spatial_replay import TrackedObject, UsageError
 from spatial_replay.perception import Frame, TagObserver, observe_frames, parse_tags
+from spatial_replay.perception.camera_pose import pose_looking_at, rotations
 from spatial_replay.perception.opencv import Camera, TagDetector, corners_from_apriltag
-from spatial_replay.perception.plane import rotations
 from spatial_replay.perception.rendering import Flaws, Plate, render
-from spatial_replay.perception.tags_file import pose_looking_at
 
 pytest.importorskip("cv2")
 
@@ -217,7 +216,7 @@ plane: {{tags: {{{", ".join(f"{number}: [{x}, {y}]" for number, (x, y) in places
         observer.observe(Frame(0, render("36h11", [scene], lens, pose)))
         return observer
 
-    fit = seen_at(15.0).fit
+    (fit,) = seen_at(15.0).fits
     assert fit is not None
     assert fit.worst[1] < 0.3
     with pytest.raises(UsageError, match=r"tags\.yaml: the plane is seen edge-on, .* from further above"):
@@ -255,5 +254,5 @@ def test_lens_distortion_is_taken_out() -> None:
     # without being calibrated, its reference tags do not fit as well, and everything is less certain
     informed, blind = TagObserver(parse_tags(calibrated)), TagObserver(parse_tags(TABLE))
     stated = [each.observe(frame).sample.objects["red"].uncertainty for each in (informed, blind)]
-    assert blind.fit.rms > 3 * informed.fit.rms
+    assert blind.fits[0].rms > 3 * informed.fits[0].rms
     assert stated[1] > 2 * stated[0]

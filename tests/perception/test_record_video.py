@@ -320,7 +320,7 @@ BAD = {
     "a topic of a video": (["table.mp4", "--topic", "/a"], 2, "leave out --topic"),
     "a rate for a log": (["run.mcap", "--rate", "30"], 2, "leave out --rate"),
     "no camera": (["--camera", "93"], 2, "camera 93 cannot be opened"),
-    "nothing": ([], 2, "give either a video or a log, or --camera N"),
+    "nothing": ([], 2, "give either videos or a log, or --camera N"),
     "a video that cannot be copied": (["mpeg.avi", "--keep-video", "copy"], 2, "write --keep-video h264"),
 }
 
@@ -383,6 +383,6 @@ def test_a_camera_that_is_unplugged_leaves_a_whole_log(folder: Path) -> None:
 
     # a capture that ends is what an unplugged camera is
     camera = CameraFrames(0, opened=lambda number: cv2.VideoCapture(str(folder / "table.mp4")))
-    seen = record_seen(camera, parse_tags(TABLE), folder / "camera.mcap")
+    seen = record_seen([camera], parse_tags(TABLE), folder / "camera.mcap")
     assert seen.samples == COUNT and "is it unplugged?" in seen.faults[0]
     assert len(read_trace(folder / "camera.mcap")) == COUNT
