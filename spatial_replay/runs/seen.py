@@ -141,9 +141,9 @@ def record_seen(
     coming = simultaneous(cameras, offsets_ns)
     first = next(coming, None)
     if first is None:
-        faults = [fault for camera in cameras for fault in camera.faults[:1]]
+        began = [fault for camera in cameras for fault in camera.faults[:1]]
         listed = " and ".join(dict.fromkeys(camera.name for camera in cameras))
-        raise LogError("; ".join([f"{listed}: no frame can be read", *faults]))
+        raise LogError("; ".join([f"{listed}: no frame can be read", *began]))
     # reference tags that do not fit raise here, before the output is touched
     begun = observer.observe(*first)
     monitors = [Monitor(file, units={"": tags.unit}) for file in files]
