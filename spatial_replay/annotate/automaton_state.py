@@ -133,18 +133,20 @@ class AutomatonRun:
         numbers = ", ".join(map(str, states[:_MOST_NAMED])) + (", …" if len(states) > _MOST_NAMED else "")
         title = f"state {numbers}" if len(states) == 1 else f"one of the states {numbers}"
         accepting, can_accept, can_reject = self._about[states].T
-        if not can_reject.any():
-            meaning = "satisfied, whatever comes"
-        elif not can_accept.any():
-            meaning = "violated, whatever comes"
-        elif accepting.all():
-            meaning = "satisfied if nothing more came"
-        elif len(states) > 1 or len(self._automaton.states) > _MOST_SEARCHED:
-            meaning = "not satisfied yet"
-        else:
+        possible = {
+            "satisfied, whatever comes": ~can_reject,
+            "satisfied if nothing more came": accepting & can_reject,
+            "not satisfied yet": ~accepting & can_accept & can_reject,
+            "violated, whatever comes": ~can_accept,
+        }
+        *others, last = [meaning for meaning, holds in possible.items() if holds.any()]
+        if others:
+            return f"{title}: either {'; or '.join([*others, last])}"
+        is_searched = len(states) == 1 and len(self._automaton.states) <= _MOST_SEARCHED
+        if last == "not satisfied yet" and is_searched:
             [first, *_] = next(self._automaton.paths(states[0]))
-            meaning = f"still to come: {_shortened(self._guard(first), _LONGEST_STEP)}"
-        return f"{title}: {meaning}"
+            last = f"still to come: {_shortened(self._guard(first), _LONGEST_STEP)}"
+        return f"{title}: {last}"
 
     def _guard(self, move: Transition) -> str:
         return self._named(self._automaton.guard_words(move))

@@ -44,6 +44,7 @@ MIXED = "mixed"
 FOOTPRINT_UNITS = ""
 
 _DEFINED = re.compile(r"^\s*def\s+(\w+)", re.MULTILINE)
+_QUANTIFIER = re.compile(r"[(\s]*(forall|exists)\b")
 _CALL = re.compile(r"[(\s]*(\w+)\s*\(")
 
 
@@ -84,16 +85,20 @@ class ReportedTree(NamedTuple):
     def written(self, source: str) -> list[str]:
         """Return the text of each node as the file writes it, with the object in place of the parameter.
 
-        What a `def` stands for is in canonical form, below the node that has its call.
+        What a `def` stands for is in canonical form, below the node that has its call. So is what a
+        quantifier stands for, with its objects, which the file writes once for all of them.
 
         Args:
             source: of the file.
         """
-        texts, spans = [], []
+        texts, spans, is_quantifier = [], [], []
         for _, parent, node in iter_nodes(self.formula):
             spans.append(node.span)
+            own = " ".join(source[node.span.start : node.span.end].split())
+            is_bound = parent is not None and is_quantifier[parent]
+            is_quantifier.append(is_bound or _QUANTIFIER.match(own) is not None)
             is_expanded = parent is not None and spans[parent] == node.span
-            text = "" if is_expanded else " ".join(source[node.span.start : node.span.end].split())
+            text = "" if is_expanded or is_bound else own
             texts.append(self.named(text or format_formula(node)))
         return texts
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import colorsys
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -108,6 +109,34 @@ def test_every_message_says_how_all_results_stand_and_the_last_what_the_log_come
     assert states[1].endswith("satisfied if nothing more came")
     assert states[2].endswith("violated, whatever comes")
     assert found[0].results[0].automaton.endswith("still to come: a closeto[1] b")
+
+
+def test_a_set_of_states_is_described_by_all_that_it_may_be(tmp_path: Path) -> None:
+    """Before an object is first seen, an invariant may hold or be violated for good."""
+    samples = moving([5.0, 4.0, 1.5])
+    samples[:2] = [replace(each, objects={"a": each.objects["a"]}) for each in samples[:2]]
+    log = annotated(tmp_path, "spec away = G (a dist b >= 0.5)\nspec met = F (a dist b <= 1)", samples)
+    found = [message for _, message in messages(log, StandingUpdate, "/spatial/standing")]
+    away, met = ([message.results[index].automaton for message in found] for index in (0, 1))
+    assert away[0].startswith("one of the states 0, 1: either ")
+    assert set(away[0].partition("either ")[2].split("; or ")) == {
+        "satisfied if nothing more came",
+        "violated, whatever comes",
+    }
+    assert set(met[0].partition("either ")[2].split("; or ")) == {
+        "satisfied, whatever comes",
+        "not satisfied yet",
+    }
+
+
+def test_rows_of_a_quantifier_name_their_objects(tmp_path: Path) -> None:
+    text = "group both = a, b\nregion table = box(-9, -9, 9, 9)\n"
+    text += "spec safe = G forall d in both: d enclosedin table"
+    log = annotated(tmp_path, text, moving([5.0, 4.0]))
+    [*_, (_, last)] = messages(log, StandingUpdate, "/spatial/standing")
+    texts = [each.text for each in last.nodes]
+    assert texts[-2:] == ["a enclosedin table", "b enclosedin table"]
+    assert len(set(texts)) == len(texts)
 
 
 def test_messages_say_since_when_by_how_much_and_over_what_results_are_violated(tmp_path: Path) -> None:
