@@ -199,10 +199,11 @@ class Player:
         self._turns += 1
         if self._turns % _CURVES_EVERY == 0:
             self._send_curves(time_ns)
-        if self._turns % _PLAYBACK_EVERY == 0 or time_ns == self._playback.end_ns:
-            self._viewers.send_playback()
         if time_ns == self._playback.end_ns:
             self._viewers.send_state(self._session.finish())
+            self._viewers.send_playback()
+        elif self._turns % _PLAYBACK_EVERY == 0:
+            self._viewers.send_playback()
 
 
 def _on_topics(messages: Messages, topics: Collection[str]) -> Messages:

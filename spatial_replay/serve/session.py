@@ -58,6 +58,7 @@ class Session:
         self._requested = Condition()
         self._is_over = False
         self._loops = False
+        self._is_behind = False
         self._arrow = ""
         self.failure: SpatialReplayError | None = None
 
@@ -111,6 +112,8 @@ class Session:
             now = self._pace.now()
             if seek_ns is None and is_playing and self._transport.state(now).status is Status.ENDED:
                 seek_ns = self._transport.start_ns
+            # what was played since the last turn is still to be sent
+            self._is_behind = seek_ns is None and not is_playing and (self._is_behind or self._plays(now))
             self._transport.set_speed(speed, now)
             if seek_ns is not None:
                 self._transport.move_to(seek_ns, now)
@@ -119,6 +122,9 @@ class Session:
             self._pending.is_controlled = True
             self._requested.notify()
             return self._transport.state(now, did_seek=seek_ns is not None)
+
+    def _plays(self, now: float) -> bool:
+        return self._transport.state(now).status is Status.PLAYING
 
     def steer(self, values: Mapping[str, float | str | bool]) -> PlaybackState:
         """Play, pause, seek, change the speed or begin again at the end, as some of `PLAYBACK` say.
@@ -230,7 +236,7 @@ class Session:
             return pending
 
     def play_up_to(self, reach_ns: int) -> PlaySpan | None:
-        """Return what to play now; None if it is paused, or has to seek first.
+        """Return what to play now, after a pause up to its time; None if nothing, or if it has to seek first.
 
         Args:
             reach_ns: as far as can be played at once; it falls behind the clock rather than go farther.
@@ -239,7 +245,9 @@ class Session:
             elapsed_s = self._pace.next_turn()
             now = self._pace.now()
             state = self._transport.state(now)
-            if state.status is not Status.PLAYING or self._pending.seek_ns is not None:
+            is_due = self._is_behind or state.status is Status.PLAYING
+            self._is_behind = False
+            if not is_due or self._pending.seek_ns is not None:
                 return None
             if reach_ns < state.time_ns:
                 self._transport.move_to(reach_ns, now)

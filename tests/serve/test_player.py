@@ -60,7 +60,7 @@ class RecordingViewers:
         self.sent.put(values)
 
     def send_playback(self) -> None:
-        pass
+        self.sent.put({"playback": "sent"})
 
     def send_note(self, note: Note) -> None:
         self.sent.put(note)
@@ -161,6 +161,30 @@ def test_late_turns_lose_no_sample(step_ns: float, speed: float, waits: list[flo
         play_to_the_end(session, clock, [*waits, 0.2])
         counts = Counter(robustness_times(viewers.until(is_over)))
         assert counts == {index * step_ns: 1 for index in range(1, 300)}
+
+
+@pytest.mark.parametrize("speed", [1.0, 10.0, 100.0])
+def test_after_a_pause_viewers_show_the_time_of_the_pause(speed: float) -> None:
+    clock, step_ns = Clock(), 10_000_000
+    with playing(loaded_of(3_000, step_ns), clock) as (session, viewers):
+        session.control(is_playing=True, speed=speed)
+        clock.now += 0.1
+        sent = viewers.until(lambda each: isinstance(each, int) and each > 0)
+        clock.now += 0.1
+        paused_ns = session.control(is_playing=False, speed=speed).time_ns
+        sent += viewers.until(lambda each: each == paused_ns)
+        assert robustness_times(sent)[-1] == paused_ns // step_ns * step_ns
+        assert session.state.time_ns == paused_ns
+
+
+def test_at_the_end_viewers_are_told_that_nothing_plays() -> None:
+    clock = Clock()
+    with playing(loaded_of(20), clock) as (session, viewers):
+        session.control(is_playing=True, speed=1.0)
+        play_to_the_end(session, clock, [0.1])
+        viewers.until(is_over)
+        assert viewers.until(lambda each: each == {"playback": "sent"})
+        assert session.playback["playback.play"] is False
 
 
 def test_a_fast_playback_is_thinned_to_what_viewers_can_take() -> None:
