@@ -6,18 +6,21 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+import numpy as np
+
 from spatial_replay import __version__
 from spatial_replay.annotate.annotated_evaluation import AnnotatedEvaluation
 from spatial_replay.annotate.automaton_state import SpecAutomaton
 from spatial_replay.annotate.certificate import EvaluationHashes, specifications_json
 from spatial_replay.annotate.specification import logged_specifications, specification_attachments
 from spatial_replay.errors import UsageError
-from spatial_replay.logs.messages import Attachment, Channel, Messages, Sink, merge, messages_of
+from spatial_replay.logs.messages import Attachment, Channel, Messages, Sink, merge, messages_of, select
 from spatial_replay.logs.objects.encode import encode_objects
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.topics import (
     AUTOMATA,
     CERTIFICATE,
+    DERIVED,
     ENDING,
     METADATA,
     OBJECTS,
@@ -164,16 +167,18 @@ class Recording:
     def _own(self, trace: Trace, beside: Messages | None) -> Messages:
         """Return samples and messages beside them as they are written; count and hash them."""
         own = messages_of(_OBJECTS, trace.times_ns, encode_objects(trace), self._samples)
+        written = own
         if beside is not None and len(beside):
-            own = merge([own, beside])
+            kept = _kept(beside)
+            own, written = merge([own, kept]), merge([own, beside])
             self._topics.update(channel.topic for channel in beside.channels.values())
             self._images |= image_topics(beside.channels.values())
-            self._messages += len(beside)
-        if len(own):
-            self._end_ns = max(self._end_ns, int(own.log_time_ns[-1]))
+            self._messages += len(kept)
+        if len(written):
+            self._end_ns = max(self._end_ns, int(written.log_time_ns[-1]))
         self._samples += len(trace)
         self._hashes.add_samples(trace, own)
-        return own
+        return written
 
     def add_metadata(self, name: str, data: Mapping[str, str]) -> None:
         """Write a metadata record; the certificate covers that of a plan."""
@@ -249,3 +254,11 @@ def refuse_templates(files: Sequence[Specification]) -> None:
 
 
 _OBJECTS = protobuf_channel(OBJECTS, ObjectStates)
+
+
+def _kept(messages: Messages) -> Messages:
+    """Return messages without those on topics that a replay writes anew, such as planning times."""
+    derived = [number for number, channel in messages.channels.items() if channel.topic in DERIVED]
+    if not derived:
+        return messages
+    return select(messages, np.flatnonzero(~np.isin(messages.channel, derived)))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import sys
 from dataclasses import replace
 from importlib.machinery import SourceFileLoader
@@ -13,6 +14,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from mcap.reader import make_reader
 
 import spatial_replay as sr
 from planning.kinematics import BLOCKS, Table, block, run
@@ -338,6 +341,46 @@ def test_a_recorder_is_the_black_box_of_any_robot(tmp_path, is_attached):
     assert (recomputed.decisions, recomputed.differences, recomputed.faults) == (3, (), ())
     assert read_decisions(tmp_path / "run.mcap").decisions[0].outcome.succeeded
     assert sr.read_trace(tmp_path / "run.mcap").times_ns[-1] == robot.samples[-1].time_ns
+
+
+def messages_by_topic(path):
+    with path.open("rb") as stream:
+        found = {}
+        for _, channel, message in make_reader(stream).iter_messages():
+            found.setdefault(channel.topic, []).append((message.log_time, message.data))
+        return found
+
+
+def test_planning_times_are_sentences_that_no_certificate_covers(tmp_path):
+    specification = sr.parse_specification("F (a rightof b)")
+    logs = tmp_path / "untimed.mcap", tmp_path / "timed.mcap"
+    for log in logs:
+        planner = Planner(specification, TABLE)
+        robot = Robot(dict(THINGS), planner)
+        with sr.Recorder(log, specifications=specification) as recorder:
+            robot.recorder = recorder
+            sr.plan(planner, robot, recorder, timings=log == logs[1])
+    untimed, timed = map(messages_by_topic, logs)
+    added = [each for each in timed["/spatial/log"] if each not in untimed["/spatial/log"]]
+    decisions = read_decisions(logs[1]).decisions
+    assert [time_ns for time_ns, _ in added] == [each.time_ns for each in decisions]
+    for each, (_, data) in zip(decisions, added, strict=True):
+        assert re.fullmatch(rf"decision {each.number} took \d+\.\d ms", Log.FromString(data).message)
+    timed["/spatial/log"] = [each for each in timed["/spatial/log"] if each not in added]
+    assert timed == untimed
+    # metadata has the certificate, verdicts, settings, and how many messages were recorded
+    assert list(open_source(logs[1]).metadata()) == list(open_source(logs[0]).metadata())
+    assert sr.verify(logs[1]).differences == ()
+    assert recompute_decisions(open_source(logs[1])).differences == ()
+
+
+def test_planning_times_are_asked_for_where_a_planner_is_attached(tmp_path):
+    planner = Planner(sr.parse_specification("F (a rightof b)"), TABLE)
+    with (
+        sr.Recorder(tmp_path / "run.mcap", planner=planner) as recorder,
+        pytest.raises(sr.UsageError, match="leave them out"),
+    ):
+        sr.plan(planner, Robot(dict(THINGS), planner), recorder, timings=True)
 
 
 def test_a_recorder_takes_one_planner_before_its_first_sample(tmp_path):

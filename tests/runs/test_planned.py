@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from contextlib import closing
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
 import spatial_replay as sr
+from spatial_replay.logs.schemas.BehaviourTree_pb2 import BehaviourTree
 from spatial_replay.planning import centre_of, read_decisions, recompute_decisions
 from spatial_replay.replay import load_files, run_replay, verify_certificate
 from spatial_replay.runs.planned import PlannedRun, record_plan, settings_for
 from spatial_replay.simulation.worlds import make_world
 from spatial_replay.sources import open_source
+
+RUNNING, SUCCESS = BehaviourTree.STATUS_RUNNING, BehaviourTree.STATUS_SUCCESS
 
 
 @pytest.fixture(scope="module")
@@ -108,8 +112,21 @@ def test_a_knife_is_turned_to_its_place(tmp_path: Path) -> None:
     knife = sr.parse_specification(
         "F (plate leftof knife and knife dist plate <= 0.08 and knife oriented[0.05] mat)"
     )
-    planned = record_plan("table-setting", tmp_path / "run.mcap", knife)
+    log = tmp_path / "run.mcap"
+    planned = record_plan("table-setting", log, knife, timings=True)
     assert planned.satisfied
-    decision, *_ = read_decisions(tmp_path / "run.mcap").decisions
+    decision, *_ = read_decisions(log).decisions
     assert decision.target.object == "knife"
     assert decision.target.turn != 0.0
+    assert sr.verify(log).differences == recompute_decisions(open_source(log)).differences == ()
+
+    payloads = (each for batch, _ in open_source(log).iter_payloads("/plan/behaviour_tree") for each in batch)
+    ticks = [BehaviourTree.FromString(each) for each in payloads]
+    assert [tick.time_ns for tick in ticks] == sorted(tick.time_ns for tick in ticks)
+    statuses = [{node.name: node.status for node in tick.nodes} for tick in ticks]
+    assert all(one != other for one, other in pairwise(statuses))
+    assert [tick.tick for tick in ticks] == sorted({tick.tick for tick in ticks})
+    picked = next(place for place, each in enumerate(statuses) if each["pick knife"] == SUCCESS)
+    placed = next(place for place, each in enumerate(statuses) if each["place knife"] == SUCCESS)
+    assert picked < placed
+    assert statuses[0]["pick knife"] == RUNNING and statuses[-1]["set"] == SUCCESS

@@ -8,6 +8,7 @@ import pytest
 
 from simulation.worlds import off, world
 from spatial_replay import Trace, evaluate
+from spatial_replay.simulation.world import TreeTick
 from spatial_replay.simulation.worlds import default_specification
 
 
@@ -31,9 +32,15 @@ def test_a_behaviour_tree_retries_after_a_drop() -> None:
 
 def test_a_behaviour_tree_does_not_move_an_object_at_its_goal() -> None:
     with world("table-setting") as (made, _):
+        ticks: list[TreeTick] = []
+        made.attach(lambda sample: None, ticks.append)
         x, y, _ = made.scene.pose("cup").position.tolist()
         assert made.place("cup", x, y).succeeded
         assert made.time_ns == 0
+    (tick,) = ticks
+    status = {node.name: node.status for node in tick.nodes}
+    assert status["set"] == status["is cup placed?"] == "SUCCESS"
+    assert status["move cup"] == status["pick cup"] == "INVALID"
 
 
 def test_a_behaviour_tree_fails_with_the_last_reason() -> None:

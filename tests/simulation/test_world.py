@@ -9,6 +9,7 @@ import pytest
 
 from simulation.worlds import centre, off, world
 from spatial_replay import Sample, TrackedObject, UsageError
+from spatial_replay.simulation.injection import Start
 from spatial_replay.simulation.shapes import Box, footprint, height
 from spatial_replay.simulation.worlds import SCENARIOS, default_specification, make_world
 from spatial_replay.spec import object_names
@@ -122,6 +123,13 @@ def test_an_impossible_placement_fails_with_a_reason() -> None:
         done = made.place("banana", *can)
         assert not done.succeeded
         assert done.reason == "no room for the fingers around banana where it should go"
+        assert made.time_ns == 0
+    beside = Start("gelatin", can[0], can[1] + 0.05)
+    with world("pick-place", starts=(beside,)) as (made, _):
+        done = made.place("gelatin", 0.42, 0.2)
+        assert done.reason == "no room for the fingers around gelatin where it lies"
+        done = made.place("gelatin", *centre(made, "mug"))
+        assert done.reason == "no room for the fingers around gelatin where it lies and should go"
         assert made.time_ns == 0
 
 

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 import pytest
 
 from spatial_replay import Sample
-from spatial_replay.simulation.injection import Injection
+from spatial_replay.simulation.injection import Injection, Start
 from spatial_replay.simulation.tabletop import Tabletop
 from spatial_replay.simulation.worlds import make_world
 
@@ -18,12 +18,17 @@ NO_SIMULATOR = "PyBullet is not installed; it has wheels for Python 3.11"
 
 @contextmanager
 def world(
-    name: str, *, seed: int = 0, noise_m: float = 0.0, inject: tuple[str, ...] = ()
+    name: str,
+    *,
+    seed: int = 0,
+    noise_m: float = 0.0,
+    inject: tuple[str, ...] = (),
+    starts: tuple[Start, ...] = (),
 ) -> Iterator[tuple[Tabletop, list[Sample]]]:
     """Create a world; yield it with the list of its samples so far."""
     pytest.importorskip("pybullet", reason=NO_SIMULATOR)
     injections = [Injection.parse(text) for text in inject]
-    made = make_world(name, seed=seed, noise_m=noise_m, injections=injections)
+    made = make_world(name, seed=seed, noise_m=noise_m, injections=injections, starts=starts)
     seen: list[Sample] = []
     made.attach(seen.append)
     try:
