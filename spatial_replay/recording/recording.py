@@ -257,7 +257,7 @@ _OBJECTS = protobuf_channel(OBJECTS, ObjectStates)
 
 
 def _kept(messages: Messages) -> Messages:
-    """Return messages without those on topics that a replay writes anew, such as planning times."""
+    """Return messages without those on topics that a replay does not keep, such as planning times."""
     derived = [number for number, channel in messages.channels.items() if channel.topic in DERIVED]
     if not derived:
         return messages
