@@ -91,7 +91,8 @@ class ReportedTree(NamedTuple):
         Args:
             source: of the file.
         """
-        texts, spans, is_quantifier = [], [], []
+        texts, spans = [], []
+        is_quantifier: list[bool] = []
         for _, parent, node in iter_nodes(self.formula):
             spans.append(node.span)
             own = " ".join(source[node.span.start : node.span.end].split())

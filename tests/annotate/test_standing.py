@@ -112,7 +112,7 @@ def test_every_message_says_how_all_results_stand_and_the_last_what_the_log_come
 
 
 def test_a_set_of_states_is_described_by_all_that_it_may_be(tmp_path: Path) -> None:
-    """Before an object is first seen, an invariant may hold or be violated for good."""
+    """Before an object is first seen, an invariant may hold or be violated permanently."""
     samples = moving([5.0, 4.0, 1.5])
     samples[:2] = [replace(each, objects={"a": each.objects["a"]}) for each in samples[:2]]
     log = annotated(tmp_path, "spec away = G (a dist b >= 0.5)\nspec met = F (a dist b <= 1)", samples)

@@ -177,7 +177,7 @@ def test_after_a_pause_viewers_show_the_time_of_the_pause(speed: float) -> None:
         assert session.state.time_ns == paused_ns
 
 
-def test_at_the_end_viewers_are_told_that_nothing_plays() -> None:
+def test_at_the_end_viewers_learn_that_nothing_plays() -> None:
     clock = Clock()
     with playing(loaded_of(20), clock) as (session, viewers):
         session.control(is_playing=True, speed=1.0)
