@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from spatial_replay.annotate.rings import Rings
-from spatial_replay.annotate.scene.scene_template import OBJECT, REGION, Banner, Cause, Region, border_of
+from spatial_replay.annotate.scene.scene_template import OBJECT, REGION, Banner, CauseText, Region, border_of
 from spatial_replay.annotate.scene.scene_text import violation_text
 from spatial_replay.annotate.violations import Presence, Violations
 from spatial_replay.geometry.arrays import Floats, Integers
@@ -181,7 +181,7 @@ class SceneContent(NamedTuple):
     rings: Rings
     violations: Violations
     arrow: Integers
-    causes: tuple[Cause, ...]
+    causes: tuple[CauseText, ...]
     banner: Integers
     banners: tuple[Banner | None, ...]
 

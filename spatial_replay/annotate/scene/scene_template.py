@@ -61,7 +61,7 @@ class Banner(NamedTuple):
     place: tuple[float, float]
 
 
-class Cause(NamedTuple):
+class CauseText(NamedTuple):
     """What is written beside an arrow.
 
     Attributes:
@@ -105,7 +105,7 @@ class SceneLayout(NamedTuple):
 
     deleted: tuple[str, ...]
     objects: tuple[DrawnObject, ...]
-    witness: Cause | Literal["deleted"] | None = None
+    witness: CauseText | Literal["deleted"] | None = None
     banner: Banner | None = None
 
 
@@ -170,7 +170,7 @@ def make_template(layout: SceneLayout, regions: tuple[Region, ...], lift: float)
     if layout.banner is not None:
         _add_banner(_add_entity(message, BANNER), layout.banner, lift)
     number = ""
-    if isinstance(layout.witness, Cause):
+    if isinstance(layout.witness, CauseText):
         number = "#" * (8 * layout.witness.words)
         point_at(_add_entity(message, WITNESS), layout.witness.text + number, lift)
     payload = np.frombuffer(message.SerializeToString(deterministic=True), np.uint8).copy()

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spatial_replay.annotate.robustness import standing_codes
-from spatial_replay.annotate.scene.scene_template import Banner, Cause, words_in
+from spatial_replay.annotate.scene.scene_template import Banner, CauseText, words_in
 from spatial_replay.annotate.violations import EvaluatedResult, Violations
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.schemas.Robustness_pb2 import (
@@ -93,7 +93,7 @@ def _banner(titles: Sequence[str], codes: NDArray[np.uint8], place: tuple[float,
 
 def causes_of(
     results: Sequence[EvaluatedResult], found: Violations, first_ns: int, unit: str
-) -> tuple[tuple[Cause, ...], Integers]:
+) -> tuple[tuple[CauseText, ...], Integers]:
     """Return what decides violations, in words, and which of them (S,) decides each.
 
     Args:
@@ -109,7 +109,7 @@ def causes_of(
         text = "" if known is None else known.texts[leaf]
         text = text if len(text) <= _LONGEST_CAUSE else f"{text[: _LONGEST_CAUSE - 1]}…"
         at = "" if moment_ns < 0 else f" at {Instant(moment_ns, first_ns)}"
-        causes.append(Cause(f"{text}{at}: {'holds by ' if holds else ''}", length))
+        causes.append(CauseText(f"{text}{at}: {'holds by ' if holds else ''}", length))
     return tuple(causes), which.reshape(-1)
 
 

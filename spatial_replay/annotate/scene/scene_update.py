@@ -26,7 +26,7 @@ from spatial_replay.annotate.scene.scene_frames import (
 from spatial_replay.annotate.scene.scene_template import (
     LEVELS,
     Banner,
-    Cause,
+    CauseText,
     DrawnObject,
     Region,
     SceneLayout,
@@ -232,7 +232,7 @@ class SceneEncoder:
             bottom, top = content.footprints.bottom[rows], content.footprints.top[rows]
             colour = objects[samples, column]
             columns += words_of_object(drawn, points, bottom, top, colour, _LIFT * scale)
-        if isinstance(layout.witness, Cause):
+        if isinstance(layout.witness, CauseText):
             columns += _words_of_arrow(content.violations, samples, scale, self.unit)
         return np.concatenate([np.empty((len(samples), 0)), *columns], axis=1)
 
@@ -285,7 +285,7 @@ def _content(
     before: SceneState,
     scale: float,
     found: Violations,
-    decided: tuple[tuple[Cause, ...], Integers],
+    decided: tuple[tuple[CauseText, ...], Integers],
     has_label: NDArray[np.bool_],
     banners: tuple[Integers, tuple[Banner | None, ...]],
 ) -> SceneContent:
@@ -343,7 +343,7 @@ def _layout(content: SceneContent, key: NDArray[np.int64]) -> SceneLayout:
         if form >= FIRST_FORM
     )
     deleted = tuple(name for name, form, _ in listed if form == DELETED)
-    cause: Cause | Literal["deleted"] | None = None
+    cause: CauseText | Literal["deleted"] | None = None
     if arrow != ABSENT:
         cause = "deleted" if arrow == DELETED else content.causes[arrow - FIRST_FORM]
     return SceneLayout(deleted, shown, cause, content.banners[banner])
