@@ -77,15 +77,16 @@ def least(machine: Machine) -> Machine:
     that does not accept if there is a choice.
     """
     machine = merged(machine)
-    same = np.flatnonzero(machine.moves == machine.start)
+    reachable = _reachable(machine)
+    # compilers differ in states that no run is in
+    same = np.array([state for state in reachable if machine.moves[state] == machine.start], np.int64)
     if len(same):
         first = int(same[np.argmin(machine.accepting[same])])
     else:
         first = len(machine.moves)
         moves, accepting = np.append(machine.moves, machine.start), np.append(machine.accepting, False)
         machine = Machine(moves, machine.decisions, accepting, machine.start)
-    others = [state for state in _reachable(machine) if state != first]
-    return _ordered(machine, [first, *others])
+    return _ordered(machine, [first, *(state for state in reachable if state != first)])
 
 
 def _reachable(machine: Machine) -> list[int]:

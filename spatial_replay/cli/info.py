@@ -130,11 +130,11 @@ def info(
 def _print_decisions(log: LogFile, as_json: bool) -> int:
     """Print the decisions of a planned run."""
     from spatial_replay.planning.read import read_decisions
-    from spatial_replay.replay import first_sample_ns
+    from spatial_replay.replay import known_start_ns
     from spatial_replay.sources.open_log import open_source
 
     recorded = read_decisions(log)
-    warn(*counted_from(recorded.faults, first_sample_ns(open_source(log)) if recorded.faults else 0))
+    warn(*counted_from(recorded.faults, known_start_ns(open_source(log)) if recorded.faults else 0))
     if as_json:
         rows = decision_rows(recorded.decisions)
         document = {"name": log.name, "damaged": bool(recorded.faults), "decisions": rows}

@@ -36,7 +36,7 @@ def redo(
     """Decide again on the samples of a log, and show the first decision that differs."""
     # imported here so that --help stays fast
     from spatial_replay.planning.redo import RedoneSource, redo_decisions
-    from spatial_replay.replay import ReplayOptions, first_sample_ns, load_files, run_replay
+    from spatial_replay.replay import ReplayOptions, known_start_ns, load_files, run_replay
     from spatial_replay.sources.open_log import open_source
 
     source = open_source(log)
@@ -46,7 +46,7 @@ def redo(
         require_choice(file, of)
     with progress("samples") as advance:
         redone = redo_decisions(source, file, changes, name=of, advance=advance)
-    warn(*counted_from(redone.faults, first_sample_ns(source) if redone.faults else 0))
+    warn(*counted_from(redone.faults, known_start_ns(source) if redone.faults else 0))
     if output is not None:
         files = load_files((), source) if file is None else [file]
         beside = RedoneSource(source, redone.messages)

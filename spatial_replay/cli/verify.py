@@ -73,7 +73,7 @@ def verify(
     from spatial_replay.logs.output_file import replacing
     from spatial_replay.logs.read_options import ReadOptions
     from spatial_replay.planning.recompute import recompute_decisions
-    from spatial_replay.replay import first_sample_ns
+    from spatial_replay.replay import known_start_ns
     from spatial_replay.replay.signatures import sign_certificate, signer_of
     from spatial_replay.replay.verification import recorded_reading, verify_certificate
     from spatial_replay.sources.open_log import open_source
@@ -96,11 +96,12 @@ def verify(
     differences = [f"{log.name}: {each}" for each in verified.differences]
     if verified.recorded and not differences:
         show(f"{log.name}: samples, messages, specifications and results match")
+        show(*(f"{log.name}: {each}" for each in verified.notes if not decisions))
     if decisions:
         planned = own if original is None else original
         with progress("samples") as advance:
             recomputed = recompute_decisions(planned, advance)
-        faults += counted_from(recomputed.faults, first_sample_ns(planned) if recomputed.faults else 0)
+        faults += counted_from(recomputed.faults, known_start_ns(planned) if recomputed.faults else 0)
         differences += [f"{planned.name}: {each}" for each in recomputed.differences]
         if not recomputed.differences:
             show(

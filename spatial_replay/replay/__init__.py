@@ -31,6 +31,7 @@ if TYPE_CHECKING:
         Window,
         first_sample_ns,
         has_samples_from,
+        known_start_ns,
     )
     from spatial_replay.replay.specification_files import SpecificationFiles, write_constants
     from spatial_replay.replay.table import QUANTITIES, export_table
@@ -56,6 +57,7 @@ __all__ = [
     "first_sample_ns",
     "has_samples_from",
     "idle_document",
+    "known_start_ns",
     "load_files",
     "recorded_texts",
     "run_replay",
@@ -77,7 +79,14 @@ __getattr__, __dir__ = loaded_when_used(
         ),
         "engine": ("Replay", "Replayed"),
         "playback": ("Playback",),
-        "selection": ("LogNames", "ReplayOptions", "Window", "first_sample_ns", "has_samples_from"),
+        "selection": (
+            "LogNames",
+            "ReplayOptions",
+            "Window",
+            "first_sample_ns",
+            "has_samples_from",
+            "known_start_ns",
+        ),
         "specification_files": ("SpecificationFiles", "write_constants"),
         "table": ("QUANTITIES", "export_table"),
         "loaded_log": ("Evaluated", "LoadedLog", "constant_text", "constant_values"),

@@ -96,6 +96,14 @@ def first_sample_ns(source: Source) -> int:
     raise LogError(f"{source.name} has no sample")
 
 
+def known_start_ns(source: Source) -> int:
+    """Return the time of the first sample that can be read of a damaged log; 0 if it has none."""
+    try:
+        return first_sample_ns(source)
+    except LogError:
+        return 0
+
+
 def has_samples_from(source: Source, time_ns: int) -> bool:
     """Say whether a log has samples at or after a time."""
     return any(len(block.trace) for block in read_blocks(reading_only(source), time_ns))

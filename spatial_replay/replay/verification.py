@@ -34,6 +34,9 @@ _HASHES: Mapping[str, str] = MappingProxyType(
 )
 """The meaning of a difference, for each hash of a certificate."""
 
+_NOT_COVERED = (
+    "plan settings are not covered by this certificate; --decisions recomputes what followed from them"
+)
 _NO_PLAN = "no plan settings: the log was planned, and its decisions cannot be recomputed without"
 
 _READING = ("on_time_jump", "late", "rate", "lost", "y_down", "concave")
@@ -52,6 +55,7 @@ class Verified:
             empty unless it was asked for.
         lacks_plan: whether the log says that it was planned, and neither has settings nor was certified with
             any.
+        notes: what the certificate does not cover, as sentences.
     """
 
     recorded: Mapping[str, str]
@@ -59,6 +63,7 @@ class Verified:
     faults: tuple[str, ...] = ()
     explanation: tuple[str, ...] = ()
     lacks_plan: bool = False
+    notes: tuple[str, ...] = ()
 
     @property
     def differences(self) -> tuple[str, ...]:
@@ -124,7 +129,9 @@ def verify_certificate(
             computed.pop(PLAN_SHA256, None)
     lacks_plan = about.get("planned") == "true" and plan is None and PLAN_SHA256 not in recorded
     lacks_plan = lacks_plan and not options.get("layer")
-    verified = Verified(dict(recorded), computed, replayed.faults, lacks_plan=lacks_plan)
+    is_covered = plan is None or PLAN_SHA256 in recorded
+    notes = () if is_covered else (_NOT_COVERED,)
+    verified = Verified(dict(recorded), computed, replayed.faults, lacks_plan=lacks_plan, notes=notes)
     if not explain:
         return verified
     found: Mapping[str, Sentence] = {}

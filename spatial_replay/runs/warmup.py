@@ -37,6 +37,7 @@ spec apart = G (cup dist jug >= 0 -> F[0, 2] cup leftof jug)
 spec timed = G[0s, 2s] (cup oriented[1] jug) and H[0, 2] (cup farfrom[0.1] jug[-1])
 spec open = G (forall x in things: x dist goal >= 0) and (load >= 1) U[0, 3] (cup touch[1] jug)
 spec nested = G (F[0, 2] G[0, 1] (cup ovlp jug))
+spec crowd = G (forall x, y in things: x dist y >= 0)
 """
 _NO_WINDOWS = "spec apart = G (cup dist jug >= 0)"
 """Takes the monitors' shorter way, which windows below operators keep others from."""

@@ -157,5 +157,5 @@ def test_a_goal_out_of_reach_fails_with_a_reason() -> None:
         assert made.place("banana", 0.1, 0.1).reason == "(0.10, 0.10) is out of the robot's reach"
     with world("push") as (made, _):
         done = made.push("green", [(0.9, 0.0)])
-        assert done.reason == "the robot does not reach far enough to push green there"
+        assert done.reason == "the robot does not reach (0.90, 0.00), where green should go"
         assert made.time_ns == 0
