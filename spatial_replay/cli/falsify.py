@@ -49,7 +49,12 @@ _MOST_LISTED = 20
     " slip@2s:9s; repeat for several.  [default: start]",
 )
 @click.option(
-    "--budget", metavar="N", type=click.IntRange(1), default=200, show_default=True, help="Most runs."
+    "--budget",
+    metavar="N",
+    type=click.IntRange(1),
+    default=200,
+    show_default=True,
+    help="Most runs of the search; to make the failures found smaller takes more.",
 )
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the search.")
 @click.option("--planned", is_flag=True, help="Let the planner act for the scenario's task, not the script.")
@@ -143,8 +148,10 @@ def _lines(found: Falsification) -> Iterator[str]:
         yield f"  {counted(found.impossible, 'case')} left out, in which objects would lie in each other"
     if found.simulations:
         yield f"{counted(found.simulations, 'more run')} made the failures smaller"
-    if found.failures and (command := found.failures[0].command) is not None:
-        yield f"the worst again: {command}"
+    worst = min(found.failures, key=lambda each: each.smaller.robustness, default=None)
+    if worst is not None and worst.command is not None:
+        less = " with less" if worst.is_smaller else ""
+        yield f"the worst again, run {worst.run.number}{less}: {worst.command}"
 
 
 def _judged(run: SearchedRun) -> str:

@@ -192,17 +192,27 @@ def _claim(files: LocalFolder, identity: Mapping[str, Any]) -> None:
         what = {
             "seed": f"its seed is {other.get('seed')}",
             "simulation": f"it is of {other.get('simulation')}",
-            "varied": f"it varies {_ranges(other.get('varied'))}, not {_ranges(identity['varied'])}",
+            "varied": _difference(other.get("varied"), identity["varied"]),
             "specifications": "it has other specifications",
             "version": f"it is of version {other.get('version')}",
         }.get(key, f"its {key} is {other.get(key)}")
         raise UsageError(f"{files} holds another search: {what}; give another folder, or delete it")
 
 
-def _ranges(varied: object) -> str:
-    """Return what is varied in a few words."""
-    listed = varied if isinstance(varied, dict) else {}
-    return ", ".join(f"{name} {low} to {high}" for name, (low, high) in listed.items()) or "nothing"
+def _difference(other: object, varied: Mapping[str, list[Any]]) -> str:
+    """Return how what another search varies differs, by the first range that does."""
+    others = other if isinstance(other, dict) else {}
+    for name, ends in varied.items():
+        if name not in others:
+            return f"it does not vary {name}"
+        if others[name] != ends:
+            one, this = (" to ".join(map(_end_text, each)) for each in (others[name], ends))
+            return f"it varies {name} from {one}, not from {this}"
+    return f"it varies {next((name for name in others if name not in varied), 'nothing')}, too"
+
+
+def _end_text(end: object) -> str:
+    return "the end of the run" if end == "inf" else str(end)
 
 
 class _Search:
@@ -257,6 +267,14 @@ class _Search:
         (first,) = yield [self._space.at_rest()]
         runs = [first.numbered(1)]
         self._space = space = self._space.ending_at(first.seconds)
+        late = next(
+            (each for each in space.parameters if each.unit == "s" and each.low >= first.seconds), None
+        )
+        if late is not None and not first.is_violated:
+            raise UsageError(
+                f"--vary {late.name}@{late.low:g}s:{late.high:g}s: with nothing varied the run ends after"
+                f" {first.seconds:g} s; begin before that, in another folder"
+            )
         descents = Descents(len(space.ordered), seed) if space.ordered else None
         random, barren = np.random.default_rng([seed, 1]), 0
         costs = {key_of(first.case): _cost(first)}

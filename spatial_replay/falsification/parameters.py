@@ -81,7 +81,10 @@ def refuse_range(name: str, low: float, high: float) -> None:
     Raises:
         UsageError: it is empty or not finite.
     """
-    if not (math.isfinite(low) and math.isfinite(high) and low < high):
+    for end in (low, high):
+        if not math.isfinite(end):
+            raise UsageError(f"--vary {name}: {end:g} is no end of a range; write a finite number")
+    if low >= high:
         raise UsageError(f"--vary {name}: {low:g} to {high:g} is no range; write the lower end first")
 
 

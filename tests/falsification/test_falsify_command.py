@@ -38,7 +38,9 @@ def test_a_failure_is_the_log_that_its_command_records(
     assert worst["smaller"]["start.red.x"] == worst["case"]["start.red.x"]
     assert f"with less: found/{worst['smaller_log']}" in said
     *_, repeated = said.splitlines()
-    again = repeated.removeprefix("the worst again: spatial-replay ")
+    label, again = repeated.split(": spatial-replay ")
+    least = min(found["failures"], key=lambda each: each["smaller_robustness"])
+    assert label == f"the worst again, run {least['run']} with less"
     assert f"--start red={worst['case']['start.red.x']}," in again
     assert run(shlex.split(again)) == 0
     assert Path("again.mcap").read_bytes() == Path("found", worst["smaller_log"]).read_bytes()
@@ -64,6 +66,15 @@ def test_what_was_covered_is_said_where_nothing_is_found(
     assert sorted(said[4].split()[5:]) == ["0"] * 9 + ["1"]
 
 
+def test_a_mishap_after_the_end_of_the_run_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["falsify", "push", "-o", str(tmp_path / "found"), "--vary", "slip@100s:200s"]) == 2
+    said = capsys.readouterr().err
+    assert "--vary slip@100s:200s: with nothing varied the run ends after " in said
+    assert "begin before that, in another folder" in said
+
+
 def test_a_planner_is_searched_as_a_script_is(tmp_path: Path) -> None:
     # so much noise that it sees nothing to do
     vary = ["noise=0.2:0.3"]
@@ -81,9 +92,10 @@ def test_a_planner_is_searched_as_a_script_is(tmp_path: Path) -> None:
     [
         ("noise", "--vary: 'noise' is incomplete; write NAME=LOW:HIGH, such as noise=0:0.01"),
         ("noise=-1:1", "--vary noise=-1:1: noise is not below 0; begin at 0"),
-        ("drop@T", "--vary drop@T: drop@1s: nothing is held in push; slip can be injected there"),
+        ("drop@T", "--vary drop@T: nothing is held in push; slip can be injected there"),
         ("slip", "--vary slip: write slip@T for any time of the run, or slip@2s:9s"),
         ("slip@2:3", "--vary slip@2:3: '2' is not a duration"),
+        ("noise=0:nan", "--vary noise: nan is no end of a range; write a finite number"),
         ("slip@3s:1s", "--vary slip: 3 to 1 is no range; write the lower end first"),
         ("start.gren", "--vary start.gren: push has no 'gren'; did you mean 'green'?"),
         ("start=0", "--vary start=0: write how far an object may be from its place"),
