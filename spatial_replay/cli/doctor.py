@@ -100,6 +100,9 @@ def _lines(found: Examination, files: Mapping[tuple[str, str], Path]) -> Iterato
                 yield f"  {verdict} by no run"
             elif example is not None:
                 yield from (f"  {line}" for line in _example(example, files.get((spec.name, verdict))))
+            elif spec.reason:
+                why = "without an automaton runs are guesses, and none was confirmed"
+                yield f"  {verdict}: no run is shown, since {why}"
         yield ""
     yield from found.notes
     if found.findings:

@@ -158,7 +158,20 @@ class FactDiagrams:
         if key not in self._numbers:
             self._numbers[key] = len(self.facts)
             self.facts.append(fact)
-        return self.diagrams.variable(self._numbers[key])
+        number = self._numbers[key]
+        known = self.facts[number]
+        # another relation may say without "not" what this one says with it
+        first, second = (
+            new if is_negated(old) and not is_negated(new) else old
+            for old, new in zip(known.texts, fact.texts, strict=True)
+        )
+        self.facts[number] = known._replace(texts=(first, second))
+        return self.diagrams.variable(number)
+
+
+def is_negated(text: str) -> bool:
+    """Return whether a fact is told by a relation that does not hold."""
+    return text.startswith(("not (", "not a part of "))
 
 
 def _compared(linear: Linear) -> tuple[Weights, Fraction, bool]:

@@ -343,13 +343,17 @@ _SAME: Final = "leave one of them out"
 def _joint(one: Answer | None, other: Answer | None) -> Answer:
     found = [each for each in (one, other) if each is not None]
     exclusions = dict.fromkeys(exclusion for each in found for exclusion in each.exclusions)
-    return Answer(None, all(each.by_logic for each in found), tuple(exclusions))
+    opposites = dict.fromkeys(opposite for each in found for opposite in each.opposites)
+    return Answer(None, all(each.by_logic for each in found), tuple(exclusions), tuple(opposites))
 
 
 def _reason(found: Answer) -> str:
     """Return why there is no such run."""
     if found.by_logic or not found.exclusions:
-        return "by logic alone, whatever is measured"
+        opposites = "".join(
+            f"; `{one}` and `{other}` are opposites" for one, other in found.opposites[:_SHOWN]
+        )
+        return f"by logic alone, whatever is measured{opposites}"
     texts = [_exclusion_text(each) for each in found.exclusions[:_SHOWN]]
     more = len(found.exclusions) - len(texts)
     return "; ".join(texts) + (f"; and {more} more" if more else "")

@@ -80,7 +80,9 @@ def shortest_example(
     verdict: Literal["satisfied", "violated"] = "satisfied" if satisfied else "violated"
     facts = [[(search.fact(number), value) for number, value in sorted(cube.items())] for cube in word]
     sentences = tuple(
-        " and ".join(fact.texts[0 if value else 1] for fact, value in each) or "true" for each in facts
+        # two facts of one quantity may read the same
+        " and ".join(dict.fromkeys(fact.texts[0 if value else 1] for fact, value in each)) or "any sample"
+        for each in facts
     )
     words = Example(verdict, sentences)
     try:

@@ -11,7 +11,7 @@ from typing import Final, NamedTuple, TypeAlias
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.diagrams import LEAF, NO, YES
 from spatial_replay.errors import NoAutomatonError
-from spatial_replay.sanity.conditions import Fact, FactDiagrams
+from spatial_replay.sanity.conditions import Fact, FactDiagrams, is_negated
 from spatial_replay.sanity.laws import laws
 from spatial_replay.sanity.linear import solve
 from spatial_replay.spec.formula import Protrusion, Signal
@@ -54,11 +54,13 @@ class Answer:
         word: of the shortest run; None if there is none.
         by_logic: whether there is none whatever the facts are about.
         exclusions: facts that exclude each other, without which there would be one.
+        opposites: if it is by logic, relations that are each other's opposites, so that logic knows.
     """
 
     word: Word | None
     by_logic: bool = False
     exclusions: tuple[tuple[str, ...], ...] = ()
+    opposites: tuple[tuple[str, str], ...] = ()
 
 
 class WordSearch:
@@ -88,7 +90,9 @@ class WordSearch:
             if word is not None:
                 return Answer(word)
             if self._search(sides, geometry=False) is None:
-                return Answer(None, by_logic=True)
+                facts = (self.fact(number) for number in sorted(self._read(sides)))
+                opposites = [each.texts for each in facts if not any(map(is_negated, each.texts))]
+                return Answer(None, by_logic=True, opposites=tuple(opposites))
         except (NoAutomatonError, RecursionError) as error:
             raise UndecidedError from error
         return Answer(None, exclusions=tuple(self._texts_of(each) for each in self._about(sides)))
@@ -293,6 +297,13 @@ class WordSearch:
 
     def _about(self, sides: Sequence[Side]) -> Iterator[frozenset[tuple[int, bool]]]:
         """Yield the exclusions between facts that automata read."""
+        facts = self._read(sides)
+        for each in self._exclusions:
+            if facts.issuperset(fact for fact, _ in each):
+                yield each
+
+    def _read(self, sides: Sequence[Side]) -> set[int]:
+        """Return the facts that automata read."""
         facts: set[int] = set()
         waiting = [
             self._conditions.of(each.formula) for side in sides for each in side.automaton.propositions
@@ -304,12 +315,11 @@ class WordSearch:
                 facts.add(variable)
                 waiting += {low, high} - visited
                 visited |= {low, high}
-        for each in self._exclusions:
-            if facts.issuperset(fact for fact, _ in each):
-                yield each
+        return facts
 
     def _texts_of(self, exclusion: frozenset[tuple[int, bool]]) -> tuple[str, ...]:
-        return tuple(self.fact(number).texts[0 if value else 1] for number, value in sorted(exclusion))
+        texts = (self.fact(number).texts[0 if value else 1] for number, value in sorted(exclusion))
+        return tuple(dict.fromkeys(texts))
 
     def fact(self, number: int) -> Fact:
         """Return a fact by its number."""

@@ -61,6 +61,12 @@ def test_the_files_of_shortest_runs_are_recorded_and_replayed_to_their_verdicts(
         assert verdicts[spec] == verdict
 
 
+def test_a_run_that_is_not_shown_says_why(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert doctor(tmp_path, "spec late = F[3s, 4s] (mode == 3)\n") == 0
+    said = capsys.readouterr().out
+    assert "\n  satisfied: no run is shown, since without an automaton runs are guesses, " in said
+
+
 def test_json_has_findings_and_tracks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert doctor(tmp_path, WRONG, "--json") == 1
     document = json.loads(capsys.readouterr().out)

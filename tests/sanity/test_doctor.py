@@ -86,6 +86,20 @@ def test_contradictions_of_logic_alone_are_said_to_be() -> None:
     assert exclusions("a leftof b and a rightof b") == ()
 
 
+def test_relations_are_told_as_they_are_written_and_opposites_are_named() -> None:
+    specification = sr.parse_specification("spec s = F (a dist b <= 0.2)\nspec t = G (b dist a >= 0.2)")
+    examined = sr.doctor(specification)
+    (finding,) = examined.findings
+    assert finding.kind == "contradiction"
+    assert finding.reason.endswith("; `b dist a >= 0.2` and `a dist b <= 0.2` are opposites")
+    one, _ = examined.specs
+    assert one.violated is not None
+    assert one.violated.sentences == ("b dist a >= 0.2",)
+    (never,) = sr.doctor(sr.parse_specification("F (a dist b <= 0.2) and G (a dist b >= 0.2)")).specs
+    assert never.violated is not None
+    assert never.violated.sentences == ("any sample",)
+
+
 def test_specs_are_compared_with_each_other() -> None:
     found = findings(
         "spec far = G (cup dist mug >= 0.2)\n"
