@@ -18,7 +18,7 @@ export interface Event extends DrawnEvent {
   readonly witness: number | null;
 }
 
-/** Which result is shown: the reader's choice or, without one, the one that went worst. */
+/** Which result is shown: the reader's choice or, without one, the worst: of those violated, the one that was so first. */
 export class Results {
   all: readonly ResultMessage[] = [];
   events: Event[] = [];
@@ -45,10 +45,13 @@ export class Results {
     return found >= 0 ? found : this.worst;
   }
 
-  /** Finds the result that went worst, by the events so far. */
+  /** Finds the worst result, by the events so far: of those violated the one that was so first, else one unknown. */
   findWorst(): void {
-    const verdicts = this.all.map((each) => this.newest(each, Infinity)?.verdict);
-    this.worst = ["violated", "unknown"].map((bad) => verdicts.indexOf(bad)).find((place) => place >= 0) ?? 0;
+    const newest = this.all.map((each) => this.newest(each, Infinity));
+    const violated = newest.filter((each) => each?.verdict === "violated");
+    const since = Math.min(...violated.map((each) => each!.known));
+    const first = newest.findIndex((each) => each?.verdict === "violated" && each.known === since);
+    this.worst = Math.max(first >= 0 ? first : newest.findIndex((each) => each?.verdict === "unknown"), 0);
   }
 
   get shown(): ResultMessage | undefined {

@@ -157,7 +157,8 @@ class Player:
         """Choose the result that the arrow is about; say whether there is such a one."""
         titles = [tree.title for tree in self._playback.evaluated.evaluation.trees]
         if arrow and arrow not in titles:
-            hint = nearest_hint(arrow, titles) or f"the results are: {', '.join(titles[:_MOST_NAMED])}"
+            named = ", ".join(titles[:_MOST_NAMED]) + (", …" if len(titles) > _MOST_NAMED else "")
+            hint = nearest_hint(arrow, titles) or f"the results are: {named}"
             self._viewers.send_note(Note(ARROW, Level.ERROR, f"there is no result {arrow!r}; {hint}"))
             self._session.point_at(self._playback.arrow)
             self._viewers.send_playback()

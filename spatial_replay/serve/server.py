@@ -337,9 +337,22 @@ def _json_service(
         )
         for schema in (request, response)
     )
+
+    def respond(given: ServiceRequest) -> bytes:
+        try:
+            return handle(given)
+        except SpatialReplayError as error:
+            raise _FailureError(str(error)) from None
+
     return Service(
-        name, schema=foxglove.ServiceSchema(name, request=asked, response=answered), handler=handle
+        name, schema=foxglove.ServiceSchema(name, request=asked, response=answered), handler=respond
     )
+
+
+class _FailureError(Exception):
+    """Why a service fails; viewers are shown the name of the class before the reason."""
+
+    __qualname__ = "failed"
 
 
 class _Listener(protocol.ServerListener):

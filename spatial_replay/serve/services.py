@@ -15,6 +15,7 @@ from spatial_replay.errors import UsageError
 from spatial_replay.logs.topics import LAYOUT
 from spatial_replay.replay.document import document_from_replay, explain_results
 from spatial_replay.replay.loaded_log import Evaluated
+from spatial_replay.serve.pace import FASTEST, SLOWEST
 from spatial_replay.serve.session import PLAYBACK
 
 _MOST_BYTES: Final = 1 << 16
@@ -159,7 +160,12 @@ SERVICES: Final[Mapping[str, Service]] = MappingProxyType(
 
 _TIME, _PLAY, _SPEED, _ = PLAYBACK
 _SECONDS = {"description": "Seconds after the first sample.", "type": "number", "minimum": 0}
-_TIMES = {"description": "Seconds of the log in a second.", "type": "number", "exclusiveMinimum": 0}
+_TIMES = {
+    "description": "Seconds of the log in a second.",
+    "type": "number",
+    "minimum": SLOWEST,
+    "maximum": FASTEST,
+}
 
 STEERING: Final[Mapping[str, Steering]] = MappingProxyType(
     {

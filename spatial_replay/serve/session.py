@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 
 from spatial_replay.errors import SpatialReplayError, UsageError
 from spatial_replay.replay.loaded_log import EditedFiles, Evaluated, LoadedLog, constant_values
-from spatial_replay.serve.pace import Pace, PlaybackState, Status, Transport
+from spatial_replay.serve.pace import FASTEST, SLOWEST, Pace, PlaybackState, Status, Transport
 from spatial_replay.serve.requests import PendingRequests, Values, session_over
 
 PLAYBACK: Final = ("playback.time", "playback.play", "playback.speed", "playback.loop")
@@ -133,14 +133,16 @@ class Session:
             UsageError: a value of another kind, or a number that is out of the question.
         """
         now = self.playback
+        time, play, speed, loop = PLAYBACK
         for name, value in values.items():
             is_flag = isinstance(now[name], bool)
             if isinstance(value, str) or isinstance(value, bool) != is_flag:
                 kind = "true or false" if is_flag else "a number"
                 raise UsageError(f"{name} cannot be {value!r}: give {kind}")
+            if name == speed and not (SLOWEST <= value <= FASTEST):
+                raise UsageError(f"{name} cannot be {value!r}: give a number from {SLOWEST:g} to {FASTEST:g}")
             if not is_flag and not (0.0 <= value < float("inf")):
                 raise UsageError(f"{name} cannot be {value!r}: give a number of seconds, at least 0")
-        time, play, speed, loop = PLAYBACK
         self._loops = bool(values.get(loop, self._loops))
         seek_ns = None
         if time in values:

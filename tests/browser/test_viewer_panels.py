@@ -285,11 +285,12 @@ def test_texts_of_a_log_are_shown_as_text(open_panel: Open, logs: Mapping[str, P
     expect(page.locator("img")).to_have_count(0)
 
 
-def test_the_worst_of_several_results_is_shown_first_unless_the_reader_chose(
+def test_the_result_violated_first_is_shown_unless_the_reader_chose(
     open_panel: Open, logs: Mapping[str, Path], tmp_path: Path
 ) -> None:
     log = tmp_path / "several.mcap"
-    text = "spec near = F (a dist b <= 30)\nspec apart = G (a dist b >= 4)\nspec met = F (a ovlp b)"
+    later = "spec late = G (a dist b >= 3)"
+    text = f"spec near = F (a dist b <= 30)\n{later}\nspec apart = G (a dist b >= 4)\nspec met = F (a ovlp b)"
     specification = sr.parse_specification(text)
     with sr.Recorder(log, specifications=[specification]) as recorder:
         for t in range(40):
