@@ -305,7 +305,7 @@ class ScenarioRuns:
                     raise UsageError(f"write {kind}@T for any time of the run, or {kind}@2s:9s")
                 span = duration_ns_from_text(begin) / 1e9, duration_ns_from_text(end) / 1e9
         except UsageError as error:
-            # that a second was tried is nobody's concern
+            # that a second was tried concerns no one
             why = str(error).removeprefix(f"{kind}@1s: ")
             raise UsageError(f"--vary {kind}@{when}: {why}") from None
         if colon:

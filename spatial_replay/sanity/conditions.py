@@ -170,7 +170,7 @@ class FactDiagrams:
 
 
 def is_negated(text: str) -> bool:
-    """Return whether a fact is told by a relation that does not hold."""
+    """Return whether a fact is reported by a relation that does not hold."""
     return text.startswith(("not (", "not a part of "))
 
 

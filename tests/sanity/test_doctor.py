@@ -86,7 +86,7 @@ def test_contradictions_of_logic_alone_are_said_to_be() -> None:
     assert exclusions("a leftof b and a rightof b") == ()
 
 
-def test_relations_are_told_as_they_are_written_and_opposites_are_named() -> None:
+def test_relations_are_reported_as_they_are_written_and_opposites_are_named() -> None:
     specification = sr.parse_specification("spec s = F (a dist b <= 0.2)\nspec t = G (b dist a >= 0.2)")
     examined = sr.doctor(specification)
     (finding,) = examined.findings
