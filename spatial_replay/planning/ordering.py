@@ -114,17 +114,19 @@ class MotionOrder:
 
     def _reached(self, scene: Foreseen, state: int, is_first: bool) -> int | None:
         """Return the state after a motion; None if that is not one on the way."""
-        allowed = self._idle | {self._aims[0].target}
+        aim, is_strict = self._aims[0].target, is_first or len(self._aims) == 1
         for _ in range(len(self._aims)):
             states = self._expected.states_after(scene, state)
             (after,) = states if len(states) == 1 else (-1,)
             if after not in self._expected.automaton.can_accept:
                 return None
-            if (is_first or len(self._aims) == 1) and after not in allowed:
+            if is_strict and after != aim and after not in self._idle:
                 return None
             if after == state:
                 break
             state = after
+            # once the edge is taken, time alone may lead on
+            is_strict = is_strict and state != aim
         return state
 
     def _place_of(self, scene: Foreseen, name: str) -> Pose:

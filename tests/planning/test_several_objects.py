@@ -82,6 +82,17 @@ def test_blocks_are_pushed_to_a_goal_about_all_of_them():
     assert end == "hold"
 
 
+def test_one_push_that_leads_all_the_way_comes_before_two():
+    # the shortest push for the first goal does not reach the second one
+    places = {"a": (-0.54, -1.3), "b": (4.44, 4.22), "c": (4.03, -2.51)}
+    settings = Settings(Workspace(Grid(-6, -6, 1, 12, 12)), "push", margin=0.3, attempts=1)
+    things = {name: block(*place, size=1) for name, place in places.items()}
+    moved, end, steps, _ = planned("F (b leftof c and X (b leftof a))", settings, things)
+    assert moved == ["b"]
+    assert end == "hold"
+    assert len(steps[0].aim.motions) == 1
+
+
 def test_what_is_in_the_way_is_moved_first():
     moved, end, _, _ = planned("region spot = box(7.2, 0.2, 8.8, 1.8)\nspec s = F (a enclosedin spot)")
     assert moved == ["c", "a"]
