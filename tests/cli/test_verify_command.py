@@ -142,7 +142,8 @@ def test_a_motion_cut_off_by_the_end_of_the_log_is_marked(tmp_path: Path) -> Non
 def test_decisions_of_a_truncated_log_are_printed(tmp_path: Path) -> None:
     record_plan_of(tmp_path / "run.mcap", slips=1)
     whole = (tmp_path / "run.mcap").read_bytes()
-    (tmp_path / "cut.mcap").write_bytes(whole[: len(whole) * 2 // 3])
+    # the samples of so short a run come after its maps
+    (tmp_path / "cut.mcap").write_bytes(whole[: whole.index(b"spatial_replay_certificate")])
     code, said = call("info", tmp_path / "cut.mcap", "--decisions")
     assert code == 3
     assert "step 0 at 0.000 s, state 0" in said
