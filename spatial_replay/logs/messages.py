@@ -6,14 +6,15 @@ numbers, so that equal logs give equal files.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Protocol
+from typing import Protocol, overload
 
 import numpy as np
+from numpy.typing import NDArray
 
-from spatial_replay.geometry.arrays import Integers
+from spatial_replay.geometry.arrays import Integers, starts_from_counts
 from spatial_replay.trace.trace import Trace
 
 BLOCK_SAMPLES = 8_192
@@ -48,6 +49,65 @@ class Channel:
 
 def _none() -> Integers:
     return np.zeros(0, np.int64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Payloads(Sequence[bytes]):
+    """M encoded messages in one buffer; each becomes an object of its own when it is asked for.
+
+    Attributes:
+        data: the buffer.
+        begin, end: (M,) int64, where each lies in it.
+    """
+
+    data: bytes
+    begin: Integers
+    end: Integers
+
+    @classmethod
+    def of(cls, payloads: Sequence[bytes]) -> Payloads:
+        """Return some messages in one buffer."""
+        if isinstance(payloads, cls):
+            return payloads
+        starts = starts_from_counts(np.fromiter(map(len, payloads), np.int64, len(payloads)))
+        return cls(b"".join(payloads), starts[:-1], starts[1:])
+
+    def __len__(self) -> int:
+        return len(self.begin)
+
+    @overload
+    def __getitem__(self, index: int) -> bytes: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> Payloads: ...
+
+    def __getitem__(self, index: int | slice) -> bytes | Payloads:
+        if isinstance(index, slice):
+            return Payloads(self.data, self.begin[index], self.end[index])
+        return self.data[self.begin[index] : self.end[index]]
+
+    def __iter__(self) -> Iterator[bytes]:
+        return map(self.data.__getitem__, map(slice, self.begin.tolist(), self.end.tolist()))
+
+    @property
+    def lengths(self) -> Integers:
+        """(M,) int64, in bytes."""
+        return np.asarray(self.end - self.begin)
+
+    def take(self, chosen: Integers) -> Payloads:
+        """Return the messages with the given indices, in that order."""
+        return Payloads(self.data, self.begin[chosen], self.end[chosen])
+
+    def rows(self) -> NDArray[np.uint8]:
+        """Return messages of one length L as (M, L) uint8."""
+        first, length = (int(self.begin[0]), int(self.lengths[0])) if len(self) else (0, 0)
+        if not length:
+            return np.empty((len(self), 0), np.uint8)
+        if (self.begin[1:] - self.begin[:-1] == length).all():
+            # they follow each other, as where samples are all that was read
+            return np.ndarray((len(self), length), np.uint8, self.data, first)
+        anywhere = np.ndarray((len(self.data) - length + 1, length), np.uint8, self.data, 0, (1, 1))
+        return anywhere[self.begin]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,8 +205,13 @@ def select(messages: Messages, chosen: Integers) -> Messages:
         sequence=messages.sequence[chosen],
         log_time_ns=messages.log_time_ns[chosen],
         publish_time_ns=messages.publish_time_ns[chosen],
-        payloads=[messages.payloads[index] for index in chosen.tolist()],
+        payloads=chosen_payloads(messages.payloads, chosen),
     )
+
+
+def chosen_payloads(payloads: Sequence[bytes], chosen: Integers) -> Sequence[bytes]:
+    """Return the payloads with the given indices, in that order."""
+    return payloads.take(chosen) if isinstance(payloads, Payloads) else [payloads[i] for i in chosen.tolist()]
 
 
 def _rank(channel: Channel) -> tuple[str, str, str, str, bytes, tuple[tuple[str, str], ...]]:

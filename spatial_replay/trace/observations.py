@@ -142,9 +142,12 @@ def _duplicates(observed: Observations) -> dict[int, str]:
 def _finite(observed: Observations) -> Booleans:
     """Return whether all numbers of each observation are finite, (R,); an absent yaw or height is."""
     shapes = observed.shapes
-    infinite = np.asarray(~np.isfinite(shapes.vertices).all(axis=1))
-    bad_vertices = count_in_rows(infinite, shapes.vertex_start)
-    bad_parts = count_in_rows((bad_vertices > 0) | ~np.isfinite(shapes.radius), shapes.part_start)
+    is_bad = ~np.isfinite(shapes.radius)
+    finite = np.isfinite(shapes.vertices)
+    if not finite.all():
+        # looked at in pairs only now: that takes ten times as long
+        is_bad |= count_in_rows(np.asarray(~finite.all(axis=1)), shapes.vertex_start) > 0
+    bad_parts = count_in_rows(is_bad, shapes.part_start)
     no_height = np.isnan(shapes.bottom) & np.isnan(shapes.top)
     return np.asarray(
         (bad_parts == 0)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from spatial_replay.geometry.arrays import Floats, Integers, starts_from_counts
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.footprint import Concave
+from spatial_replay.logs.messages import Payloads
 from spatial_replay.logs.objects.wire import Bytes, LayoutError, WireTemplate, Words, rows_of
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectState, ObjectStates
 from spatial_replay.text import Instant, Sentence
@@ -179,10 +180,10 @@ class _Pieces:
     """Encodings, each of a message or of fields of one, with the samples that they belong to."""
 
     samples: Integers
-    payloads: Sequence[bytes]
+    payloads: Payloads
 
     def take(self, places: Integers) -> _Pieces:
-        return _Pieces(self.samples[places], [self.payloads[place] for place in places.tolist()])
+        return _Pieces(self.samples[places], self.payloads.take(places))
 
 
 def decode_objects(
@@ -199,7 +200,7 @@ def decode_objects(
         the trace of the messages that can be used, and what is wrong with the others, each with its time.
     """
     faults: dict[int, str] = {}
-    groups = _groups(payloads, faults)
+    groups = _groups(Payloads.of(payloads), faults)
     faults = _wrong_times(groups, times_ns) | _signals_given_twice(groups) | faults
     trace, wrong = trace_from_observations(_observations(groups, times_ns), concave=concave)
     faults = wrong | faults
@@ -213,7 +214,7 @@ def decode_objects(
     ]
 
 
-def _groups(payloads: Sequence[bytes], faults: dict[int, str]) -> list[_Group]:
+def _groups(payloads: Payloads, faults: dict[int, str]) -> list[_Group]:
     """Group all numbers of all messages by layout; payloads that are not messages go to `faults`.
 
     Where most messages have a layout of their own, their objects do not: these are read piece by piece.
@@ -223,7 +224,7 @@ def _groups(payloads: Sequence[bytes], faults: dict[int, str]) -> list[_Group]:
     if len(left.samples):
         split = [_fields(payload) or [payload] for payload in left.payloads]
         samples = np.repeat(left.samples, [len(fields) for fields in split])
-        pieces = _Pieces(samples, [piece for fields in split for piece in fields])
+        pieces = _Pieces(samples, Payloads.of([piece for fields in split for piece in fields]))
         groups += _grouped(pieces, faults, 0)[0]
     return groups
 
@@ -237,21 +238,23 @@ def _grouped(pieces: _Pieces, faults: dict[int, str], worth: int) -> tuple[list[
     groups: list[_Group] = []
     left: list[Integers] = []
     tried = served = 0
-    lengths = np.fromiter(map(len, pieces.payloads), np.int64, len(pieces.payloads))
+    lengths = pieces.payloads.lengths
     values, counts = np.unique(lengths, return_counts=True)
     for length in values[np.argsort(-counts, kind="stable")].tolist():
         places = np.flatnonzero(lengths == length)
         if (tried - FIRST_LAYOUTS) * worth > served:
             left.append(places)
             continue
-        rows = rows_of([pieces.payloads[place] for place in places.tolist()])
+        rows = pieces.payloads.take(places).rows()
         while len(places) and (tried - FIRST_LAYOUTS) * worth <= served:
             tried += 1
             group, same = _first_group(pieces.take(places[:1]), rows, faults)
             if group is not None:
                 groups.append(replace(group, samples=pieces.samples[places[same]]))
             served += int(np.count_nonzero(same))
-            places, rows = places[~same], rows[~same]
+            if not same.all():
+                rows = rows[~same]
+            places = places[~same]
         left.append(places)
     rest = np.concatenate([np.empty(0, np.int64), *left])
     return groups, pieces.take(np.sort(rest))
@@ -271,7 +274,8 @@ def _first_group(
         return None, alone
     same = template.matches(rows) if len(template) == rows.shape[1] else ~alone
     if same[0]:
-        return _Group(first.samples, layout, _padded(template.words(rows[same]))), same
+        chosen = rows if same.all() else rows[same]
+        return _Group(first.samples, layout, _padded(template.words(chosen))), same
     # another encoder's order of fields: the library's own bytes mean the same
     row = rows_of([message.SerializeToString(deterministic=True)])
     return _Group(first.samples, layout, _padded(template.words(row))), alone

@@ -10,7 +10,6 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 from google.protobuf.descriptor import FieldDescriptor
@@ -28,6 +27,9 @@ _NARROW = FieldDescriptor.TYPE_ENUM
 # Two sets of sentinels that differ in every byte, and are finite as doubles: where two encodings differ,
 # there is a slot.
 _SENTINELS = ((0x40404040 << 32, 1), (0xBFBFBFBF << 32 | 0xFFFFFFFF, 2))
+
+_TOGETHER = 256
+"""Messages that are compared at once."""
 
 
 class LayoutError(ValueError):
@@ -91,24 +93,24 @@ class WireTemplate:
 
     def matches(self, rows: Bytes) -> NDArray[np.bool_]:
         """Return (n,) which of n encoded messages (n, L) have this layout."""
-        fixed = np.ones(len(self), np.bool_)
-        fixed[self.mark_offsets] = False
+        fixed = np.full(len(self), 0xFF, np.uint8)
+        fixed[self.mark_offsets] = 0
         for offset in self.word_offsets.tolist():
-            fixed[offset : offset + 8] = False
-        return np.asarray(((rows == self.payload) | ~fixed).all(axis=1))
+            fixed[offset : offset + 8] = 0
+        same = np.ones(len(rows), np.bool_)
+        for begin in range(0, len(rows), _TOGETHER):
+            # so few that all passes over them stay within the processor's cache
+            differing = (rows[begin : begin + _TOGETHER] ^ self.payload) & fixed
+            if differing.any():
+                same[begin : begin + _TOGETHER] = ~differing.any(axis=1)
+        return same
 
     def words(self, rows: Bytes) -> Words:
         """Return (n, W) the words of n messages (n, L) of this layout."""
-        contents = np.empty((len(rows), 8 * len(self.word_offsets)), np.uint8)
-        for offset, word, count in self._runs():
-            contents[:, 8 * word : 8 * (word + count)] = rows[:, offset : offset + 8 * count]
-        return contents.view("<u8")
-
-    def _runs(self) -> Iterator[tuple[int, int, int]]:
-        """Yield offset, number of the first word and count of adjacent words."""
-        breaks = np.flatnonzero(np.diff(self.word_offsets, prepend=-9) != 8).tolist()
-        for word, after in pairwise([*breaks, len(self.word_offsets)]):
-            yield int(self.word_offsets[word]), word, after - word
+        if not self.word_offsets.size:
+            return np.empty((len(rows), 0), np.uint64)
+        anywhere = np.ndarray((len(rows), len(self) - 7), "<u8", rows, 0, (len(self), 1))
+        return np.asarray(anywhere[:, self.word_offsets], np.uint64)
 
 
 def rows_of(payloads: list[bytes]) -> Bytes:
