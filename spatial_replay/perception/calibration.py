@@ -61,6 +61,8 @@ def calibrate_camera(
     size: tuple[int, int] | None = None
     seen = 0
     for frame in frames:
+        if frame.detections is not None:
+            raise UsageError(f"{name} has detections without images; a camera is calibrated from its images")
         size = frame.image.shape[1], frame.image.shape[0]
         found = {each.id: each.corners for each in detector.detect(frame.image) if each.id in known}
         seen += len(found) >= _LEAST_TAGS

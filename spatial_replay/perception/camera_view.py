@@ -11,9 +11,9 @@ import numpy as np
 
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.perception.frame import Frame
+from spatial_replay.perception.frame import Detection, Frame
 from spatial_replay.perception.object_poses import ObjectPose, pose_in_space, poses_on_plane
-from spatial_replay.perception.opencv import Detection, TagDetector
+from spatial_replay.perception.opencv import TagDetector
 from spatial_replay.perception.plane import CameraPlane, Fit, Plane, given_plane, plane_from_references
 from spatial_replay.perception.tags_file import LEAST_REFERENCES, TagsFile
 from spatial_replay.text import counted
@@ -78,15 +78,28 @@ class CameraView:
             UsageError: the camera is calibrated for another size, or the reference tags do not fit.
         """
         self.frames += 1
-        detections = self._detector.detect(frame.image)
+        if frame.detections is None:
+            detections = self._detector.detect(frame.image)
+            height, width = frame.image.shape[:2]
+        else:
+            detections = [each for each in frame.detections if each.family in ("", self.tags.family)]
+            width, height = self._size_without_image()
         usable = self._single(detections)
-        height, width = frame.image.shape[:2]
         if self._size != (width, height):
             self._size, self._plane = (width, height), given_plane(self.tags, (width, height))
             self._averages.clear()
         self._refer(usable)
         poses = {} if self._plane is None else self._poses(self._plane, usable)
         return View(frame, tuple(detections), self._plane), poses
+
+    def _size_without_image(self) -> tuple[int, int]:
+        """Return the size (width, height) of images that are not there; (0, 0) where it does not matter."""
+        if self.tags.is_image:
+            raise UsageError(
+                f"{self.tags.name}: plane: image counts from the lower edge of the image, and detections do"
+                " not say where that is; give reference tags, or map the topic (docs/mapping.md) for pixels"
+            )
+        return (0, 0) if self.tags.camera is None else self.tags.camera.size
 
     def _single(self, detections: Iterable[Detection]) -> dict[int, Floats]:
         """Return the corners of the tags that are in the image once: of two, no one knows which it is."""

@@ -1,13 +1,15 @@
-"""Frames: images with their times."""
+"""Frames: images, or the tags that were found in them, with their times."""
 
 from __future__ import annotations
 
 import struct
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from spatial_replay.geometry.arrays import Floats
 
 Image = NDArray[np.uint8]
 """(height, width) grey or (height, width, 3) blue, green, red."""
@@ -20,6 +22,26 @@ _JPEG_FRAMES: Final = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 """Markers of the segments of a JPEG that have its size."""
 
 
+NO_IMAGE: Final[Image] = np.zeros((0, 0), np.uint8)
+"""Of a frame of which only the tags were kept."""
+NO_IMAGE.setflags(write=False)
+
+
+class Detection(NamedTuple):
+    """A tag in an image.
+
+    Attributes:
+        id: its number in the family.
+        corners: (4, 2) in pixels, of the black square: bottom left, bottom right, top right, top left as
+            seen on an upright tag.
+        family: as a tags file names it; "" if it is that of the file.
+    """
+
+    id: int
+    corners: Floats
+    family: str = ""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
     """One image of a camera.
@@ -29,12 +51,14 @@ class Frame:
         image: (height, width) grey, or (height, width, 3) blue, green, red.
         data: the frame as H.264 in Annex B form, where it came like that; b"" otherwise.
         is_key: whether `data` can be decoded without the frames before.
+        detections: the tags that a robot found in it, which is not there itself; None to find them.
     """
 
     time_ns: int
     image: Image
     data: bytes = field(default=b"", repr=False)
     is_key: bool = False
+    detections: tuple[Detection, ...] | None = None
 
 
 def encoded_size(data: bytes) -> tuple[int, int] | None:

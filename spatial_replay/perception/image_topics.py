@@ -1,4 +1,4 @@
-"""Image topics of MCAP files and ROS bags as frames, with the stamps inside their messages."""
+"""Topics of MCAP files and ROS bags with images, or with the tags in them, as frames of their own stamps."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from spatial_replay.logs.downloads import local_copy
 from spatial_replay.logs.remote import LogFile, log_file
 from spatial_replay.logs.topics import is_image_type
 from spatial_replay.mapping.message_types import short_type
-from spatial_replay.perception.frame import LARGEST_PICTURE, Frame, Image
-from spatial_replay.perception.opencv import decode_image
+from spatial_replay.perception.frame import LARGEST_PICTURE, NO_IMAGE, Detection, Frame, Image
+from spatial_replay.perception.opencv import FAMILIES, corners_from_apriltag, decode_image
 from spatial_replay.perception.video import H264Decoder, VideoFile, has_key
 from spatial_replay.text import nearest_hint, time_text
 
@@ -36,9 +36,17 @@ _CHANNELS: Final[Mapping[str, tuple[int, tuple[int, ...]]]] = MappingProxyType(
 )
 """Encodings of raw images: bytes of a pixel, and which of them are blue, green and red, or grey."""
 
+_DETECTIONS: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        "apriltag_msgs/AprilTagDetectionArray": "detections",
+        "apriltag_msgs/ApriltagArrayStamped": "apriltags",
+    }
+)
+"""Types of messages with the tags of an image, and the field that lists them."""
+
 
 class ImageTopic:
-    """Frames of one image topic of a log; a process for one run.
+    """Frames of one topic of a log with images, or with AprilTag detections; a process for one run.
 
     Attributes:
         name: of the log.
@@ -53,12 +61,12 @@ class ImageTopic:
         """Open the log, and choose the topic.
 
         Args:
-            topic: its name; None for the only one with images.
+            topic: its name; None for the only one with images, or else with detections.
 
         Raises:
             MissingFileError: there is no such file.
             LogError: it is not a log of messages.
-            UsageError: no such topic, or none or several with images.
+            UsageError: no such topic, or none or several to choose from.
         """
         self._reader = open_messages(path)
         self.name = self._reader.name
@@ -76,7 +84,9 @@ class ImageTopic:
             place = f"{self.name}: {self.topic} after {time_text(message.log_time_ns, first_ns)}"
             try:
                 value: Any = self._decode(message.payload)
-                image = _image(value, self._type, decoder)
+                listed = _DETECTIONS.get(self._type)
+                found = None if listed is None else _detections(getattr(value, listed))
+                image = NO_IMAGE if found is not None else _image(value, self._type, decoder)
             except LogError as error:
                 self.faults.append(f"{place}: {error}; left out")
                 continue
@@ -87,7 +97,7 @@ class ImageTopic:
                 self.faults.append(f"{place}: its stamp is not after that of the frame before; left out")
                 continue
             last_ns = time_ns
-            yield Frame(time_ns, image, message.payload)
+            yield Frame(time_ns, image, message.payload, detections=found)
         self.faults += self._reader.take_faults()
 
     def frames_at(self, times_ns: Sequence[int]) -> Iterator[Frame]:
@@ -142,17 +152,22 @@ class _Shown(NamedTuple):
 
 def _chosen(name: str, topics: tuple[Topic, ...], wanted: str | None) -> Topic:
     images = {each.name: each for each in topics if is_image_type(each.type)}
+    detections = {each.name: each for each in topics if short_type(each.type) in _DETECTIONS}
+    if wanted is None and not images and len(detections) == 1:
+        return next(iter(detections.values()))
     if wanted is None:
         if len(images) == 1:
             return next(iter(images.values()))
         what = f"several image topics: {', '.join(images)}" if images else "no topic with images"
         raise UsageError(f"{name} has {what}; choose one with --topic" if images else f"{name} has {what}")
-    if wanted in images:
-        return images[wanted]
+    if wanted in images or wanted in detections:
+        return {**images, **detections}[wanted]
     every = [each.name for each in topics]
     if wanted in every:
         found = next(each for each in topics if each.name == wanted)
-        raise UsageError(f"{name}: {wanted} has messages of {found.type}, which are not images")
+        raise UsageError(
+            f"{name}: {wanted} has messages of {found.type}, neither images nor AprilTag detections"
+        )
     hint = nearest_hint(wanted, every) or f"image topics are {', '.join(images) or 'none'}"
     raise UsageError(f"{name} has no topic {wanted!r}; {hint}")
 
@@ -182,6 +197,23 @@ def _image(value: Any, type_name: str, decoder: H264Decoder | None) -> Image | N
     return np.ascontiguousarray(pixels[..., 0] if size == 1 else pixels[..., order])
 
 
+def _detections(listed: Any) -> tuple[Detection, ...]:
+    """Return the tags that a message lists.
+
+    Raises:
+        LogError: one has not four corners.
+    """
+    found = []
+    for each in listed:
+        corners = np.array([(corner.x, corner.y) for corner in each.corners], np.float64)
+        if corners.shape != (4, 2) or not np.isfinite(corners).all():
+            raise LogError(f"tag {each.id} has not four corners that are numbers")
+        family = str(each.family).removeprefix("tag")
+        known = family if family in FAMILIES else ""
+        found.append(Detection(int(each.id), corners_from_apriltag(corners), known))
+    return tuple(sorted(found, key=lambda tag: (tag.id, *tag.corners[0].tolist())))
+
+
 def _stamp_ns(value: Any) -> int:
     """Return the stamp inside a message; 0 without one."""
     stamp = getattr(value, "timestamp", None) or getattr(getattr(value, "header", None), "stamp", None)
@@ -194,10 +226,10 @@ def _stamp_ns(value: Any) -> int:
 def open_frames(
     path: str | PathLike[str] | LogFile, *, topic: str | None = None, rate: float | None = None
 ) -> VideoFile | ImageTopic:
-    """Open a video, or the image topic of a log of messages; the content decides which it is.
+    """Open a video, or a topic of a log with images or AprilTag detections; the content decides which it is.
 
     Args:
-        topic: of a log; None for the only one with images.
+        topic: of a log; None for the only one with images, or else with detections.
         rate: frames a second of a video, instead of its own stamps.
 
     Raises:

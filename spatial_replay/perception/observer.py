@@ -14,9 +14,8 @@ from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
 from spatial_replay.perception.camera_view import CameraView, View, tags_listed
-from spatial_replay.perception.frame import Frame
+from spatial_replay.perception.frame import Detection, Frame
 from spatial_replay.perception.object_poses import ObjectPose, fused, radius
-from spatial_replay.perception.opencv import Detection
 from spatial_replay.perception.plane import Fit, Plane
 from spatial_replay.perception.simultaneous import camera_names, simultaneous
 from spatial_replay.perception.tags_file import TaggedObject, TagsFile

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from spatial_replay.errors import LogError, UsageError, importing
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.perception.corners import refined_corners
-from spatial_replay.perception.frame import LARGEST_PICTURE, Image, encoded_size
+from spatial_replay.perception.frame import LARGEST_PICTURE, Detection, Image, encoded_size
 
 _Number = TypeVar("_Number", np.uint8, np.float64)
 
@@ -35,19 +35,6 @@ FAMILIES: Final[Mapping[str, str]] = MappingProxyType(
 
 _OURS_FROM_OPENCV: Final = [1, 0, 3, 2]
 """OpenCV's pictures of AprilTags are upside down, and its corners begin at their top left, clockwise."""
-
-
-class Detection(NamedTuple):
-    """A tag in an image.
-
-    Attributes:
-        id: its number in the family.
-        corners: (4, 2) in pixels, of the black square: bottom left, bottom right, top right, top left as
-            seen on an upright tag.
-    """
-
-    id: int
-    corners: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -276,7 +263,13 @@ def open_camera(number: int) -> Any:
         UsageError: there is no such camera.
     """
     cv2 = _load()
-    capture = cv2.VideoCapture(number)
+    # the error below says it in one sentence
+    log = cv2.utils.logging
+    level = log.setLogLevel(log.LOG_LEVEL_ERROR)
+    try:
+        capture = cv2.VideoCapture(number)
+    finally:
+        log.setLogLevel(level)
     if not capture.isOpened():
         raise UsageError(
             f"camera {number} cannot be opened; check that it is plugged in (/dev/video{number}) and that no"

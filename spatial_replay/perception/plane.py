@@ -8,7 +8,7 @@ place far from all reference tags is known to be less certain.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple, Protocol
 
@@ -173,22 +173,17 @@ def plane_from_references(tags: TagsFile, corners: Mapping[int, Floats]) -> Fit:
     references = [each for each in tags.references if each.id in corners]
     known = np.concatenate([each.corners for each in references])
     seen = np.concatenate([corners[each.id] for each in references])
-    flat = np.concatenate([known, np.zeros((len(known), 1))], axis=1)
-    found = fit_homography(known, seen) if tags.camera is None else fit_pose(flat, seen, tags.camera)
-    if found is None or (tags.camera is None and abs(found[2, 2]) < 1e-12):
+    solved = _solved(known, seen, tags.camera)
+    if solved is None:
         raise UsageError(f"{tags.name}: {_edge_on()}")
-    if tags.camera is None:
-        found = found / found[2, 2]
-        fitted, derivative = _homography_jacobian(found, known)
-    else:
-        fitted, derivative = projection(flat, found, tags.camera)
+    found, (fitted, derivative) = solved, _appearing(known, solved, tags.camera)
     off = np.linalg.norm(fitted - seen, axis=1)
     unknowns = derivative.shape[-1]
     rms = float(np.sqrt(np.square(off).sum() / max(2 * len(off) - unknowns, 1)))
     by_tag = off.reshape(-1, 4).mean(axis=1)
     place = int(by_tag.argmax())
     worst = references[place].id, float(by_tag[place])
-    _refuse_misfit(tags, references[place], worst[1], seen, known)
+    _refuse_misfit(tags, references, by_tag, seen, known)
     error = tags.corner_error or max(rms, LEAST_CORNER_ERROR)
     flat_derivative = derivative.reshape(-1, unknowns)
     # a place that is wrong by some length moves the tag's corners by that many pixels
@@ -263,14 +258,60 @@ def _pixels_per_unit(seen: Floats, known: Floats) -> float:
     return float((lengths[0] / lengths[1]).max())
 
 
-def _refuse_misfit(tags: TagsFile, reference: ReferenceTag, off: float, seen: Floats, known: Floats) -> None:
+def _refuse_misfit(
+    tags: TagsFile, references: Sequence[ReferenceTag], off: Floats, seen: Floats, known: Floats
+) -> None:
+    """Check that no tag is off (K,) by more pixels than noise and `error` explain."""
     limit = _WORST_RESIDUAL + 2 * tags.reference_error * _pixels_per_unit(seen, known)
-    if off > limit:
+    if off.max() <= limit:
+        return
+    alone = _off_alone(tags, seen, known)
+    if alone is not None and alone[2] <= limit:
+        place, away, _ = alone
         raise UsageError(
-            f"{tags.name}: the reference tags do not fit each other: tag {reference.id} is off most, by"
-            f" {off:.1f} pixels; check its place, its yaw and the size of the tags, or calibrate the camera"
-            " if its lens bends straight lines (tags calibrate)"
+            f"{tags.name}: the reference tags do not fit each other: tag {references[place].id} is off by"
+            f" {away:.1f} pixels from where the others place it; check its place, its yaw and its size"
         )
+    worst = references[int(off.argmax())].id
+    raise UsageError(
+        f"{tags.name}: the reference tags do not fit each other: tag {worst} is off most, by"
+        f" {off.max():.1f} pixels; check the places, the yaw and the size of the tags, or"
+        " calibrate the camera if its lens bends straight lines (tags calibrate)"
+    )
+
+
+def _off_alone(tags: TagsFile, seen: Floats, known: Floats) -> tuple[int, float, float] | None:
+    """Return the place of the tag without which the others fit best, by how many pixels it is off from where
+    they place it, and by how many they are off at most."""
+    found: list[tuple[float, int, float]] = []
+    for place in range(len(known) // 4):
+        others = np.arange(len(known)) // 4 != place
+        solved = _solved(known[others], seen[others], tags.camera)
+        if solved is not None:
+            off = np.linalg.norm(_appearing(known, solved, tags.camera)[0] - seen, axis=1)
+            by_tag = off.reshape(-1, 4).mean(axis=1)
+            found.append((float(np.delete(by_tag, place).max()), place, float(by_tag[place])))
+    if not found:
+        return None
+    most, place, away = min(found)
+    return place, away, most
+
+
+def _solved(known: Floats, seen: Floats, camera: Camera | None) -> Floats | None:
+    """Return the homography (3, 3), or with a camera its pose (6,), with which places appear at pixels."""
+    if camera is not None:
+        return fit_pose(_flat(known), seen, camera)
+    found = fit_homography(known, seen)
+    return None if found is None or abs(found[2, 2]) < 1e-12 else np.asarray(found / found[2, 2])
+
+
+def _appearing(known: Floats, found: Floats, camera: Camera | None) -> tuple[Floats, Floats]:
+    """Return where places appear, and the derivative by what was found."""
+    return _homography_jacobian(found, known) if camera is None else projection(_flat(known), found, camera)
+
+
+def _flat(places: Floats) -> Floats:
+    return np.concatenate([places, np.zeros((len(places), 1))], axis=1)
 
 
 def _refuse_edge_on(tags: TagsFile, seen: Floats, known: Floats) -> None:

@@ -369,15 +369,18 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
             own_size = isinstance(entry, dict) and "size" in entry
             if not own_size and "size" not in value and "size" not in plane:
                 faults.append((own, "the size of the tag is missing; give size for all, or for this one"))
-    each_camera = list(camera.values()) if "cameras" in value and isinstance(camera, dict) else [camera]
-    has_pose = all(isinstance(each, dict) and "pose" in each for each in each_camera)
+    each_camera = camera if "cameras" in value and isinstance(camera, dict) else {"camera": camera}
+    lacking = [str(name) for name, of in each_camera.items() if not (isinstance(of, dict) and "pose" in of)]
     are_enough = isinstance(references, dict) and len(references) >= LEAST_REFERENCES
-    if plane != "image" and not has_pose and not are_enough:
+    if plane != "image" and lacking and not are_enough:
+        least = f"{LEAST_REFERENCES} or more tags with known places"
+        other = "the camera with its pose, or write plane: image for pixels"
+        if "cameras" in value:
+            other = f"the pose of each camera; {lacking[0]} has none"
         faults.append(
             (
                 ("plane",),
-                f"the plane is not determined: give {LEAST_REFERENCES} or more tags with known places, or the"
-                " camera with its pose, or write plane: image for pixels",
+                f"the plane is not determined: give {least}, or {other}",
             )
         )
     return faults

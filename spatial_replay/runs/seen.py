@@ -144,6 +144,8 @@ def record_seen(
         began = [fault for camera in cameras for fault in camera.faults[:1]]
         listed = " and ".join(dict.fromkeys(camera.name for camera in cameras))
         raise LogError("; ".join([f"{listed}: no frame can be read", *began]))
+    if keep == "h264" and any(frame is not None and frame.detections is not None for frame in first):
+        raise UsageError("detections have no images to encode; leave out --keep-video h264")
     # reference tags that do not fit raise here, before the output is touched
     begun = observer.observe(*first)
     monitors = [Monitor(file, units={"": tags.unit}) for file in files]

@@ -92,14 +92,17 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Path]:
 
 
 def _film(folder: Path) -> None:
-    """Write the page of a filmed run, if what that takes is installed."""
+    """Write the pages of a run filmed by one camera and by two, if what that takes is installed."""
     if find_spec("av") is None or find_spec("cv2") is None:
         return
     write_approach(folder, 12)
-    log, specifications = folder / "filmed.mcap", [sr.load_specification(folder / "apart.spatial")]
-    record_seen([open_frames(folder / "table.mp4")], load_tags(folder / "tags.yaml"), log, specifications)
-    source = open_source(log)
-    write_report(source, load_files([], source), folder / "filmed.html")
+    (folder / "other.mp4").write_bytes((folder / "table.mp4").read_bytes())
+    for page, videos in (("filmed", ["table.mp4"]), ("filmed_twice", ["table.mp4", "other.mp4"])):
+        log, specifications = folder / f"{page}.mcap", [sr.load_specification(folder / "apart.spatial")]
+        cameras = [open_frames(folder / video) for video in videos]
+        record_seen(cameras, load_tags(folder / "tags.yaml"), log, specifications)
+        source = open_source(log)
+        write_report(source, load_files([], source), folder / f"{page}.html")
 
 
 def quoted(name: str) -> str:
@@ -527,10 +530,13 @@ def test_light_and_dark_can_be_chosen(open_page: Open) -> None:
     assert page.evaluate(ground) == dark
 
 
-def test_the_picture_at_the_cursor_is_shown_and_one_of_the_strip_leads_to_its_time(open_page: Open) -> None:
+@pytest.mark.parametrize("name", ["filmed", "filmed_twice"])
+def test_the_picture_at_the_cursor_is_shown_and_one_of_the_strip_leads_to_its_time(
+    name: str, open_page: Open
+) -> None:
     pytest.importorskip("av")
     pytest.importorskip("cv2")
-    page = open_page("filmed")
+    page = open_page(name)
     picture, strip = page.locator(".picture"), page.locator(".pictures button")
     expect(strip).to_have_count(12)
     page.keyboard.press("Home")

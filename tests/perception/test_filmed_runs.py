@@ -22,18 +22,31 @@ def outlines(trace: Trace, sample: int) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize(
-    ("command", "world", "length"),
-    [("record", "push", "300ms"), ("record", "pick-place", "100ms"), ("record", "table-setting", "100ms")],
+    ("command", "world", "names"),
+    [
+        ("record", "push", ["run.mp4"]),
+        ("record", "pick-place", ["run.mp4"]),
+        ("record", "table-setting", ["run.mp4"]),
+        ("plan", "push", ["run.mp4", "right.mp4"]),
+    ],
 )
-def test_the_truth_of_a_run_is_within_what_its_video_says(
-    command: str, world: str, length: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_the_truth_of_a_run_is_within_what_its_videos_say(
+    command: str, world: str, names: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    video, truth, seen = tmp_path / "run.mp4", tmp_path / "truth.mcap", tmp_path / "seen.mcap"
-    filmed = [command, world, "-o", str(truth), "--camera", str(video), "--duration", length]
-    assert run(filmed) == 0
+    videos, truth, seen = (
+        [f"{tmp_path / name}" for name in names],
+        tmp_path / "truth.mcap",
+        tmp_path / "seen.mcap",
+    )
+    # a plan that has come true at once ends after a second
+    (tmp_path / "at_once.spatial").write_text("spec done = F (red dist blue >= 0.01)\n")
+    how = ["--duration", "300ms" if world == "push" else "100ms"]
+    how = ["--spec", f"{tmp_path}/at_once.spatial"] if command == "plan" else how
+    cameras = [argument for video in videos for argument in ("--camera", video)]
+    assert run([command, world, "-o", str(truth), *cameras, *how]) == 0
     tags = tmp_path / "run.tags.yaml"
-    assert f"record video {video} --tags {tags} -o seen.mcap" in capsys.readouterr().out
-    assert run(["record", "video", str(video), "--tags", str(tags), "-o", str(seen)]) == 0
+    assert f"record video {' '.join(videos)} --tags {tags} -o seen.mcap" in capsys.readouterr().out
+    assert run(["record", "video", *videos, "--tags", str(tags), "-o", str(seen)]) == 0
     there, found = read_trace(truth), read_trace(seen)
     assert (there.times_ns // 10**6).tolist() == (found.times_ns // 10**6).tolist()
     stated = []

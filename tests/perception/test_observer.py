@@ -184,11 +184,20 @@ def test_what_is_strange_about_tags_is_listed_at_the_end() -> None:
     assert "no tag of family 36h11 is in any of 1 frame" in blank.remarks()[0]
 
 
-def test_reference_tags_that_do_not_fit_are_an_error_that_names_the_worst() -> None:
-    scene = plates(parse_tags(TABLE), {})
-    wrong = parse_tags(TABLE.replace("12: [0.65, 0.17]", "12: [0.6, 0.17]"), "tags.yaml")
-    with pytest.raises(UsageError, match=r"tags\.yaml: the reference tags do not fit .* tag 1\d is off most"):
-        TagObserver(wrong).observe(Frame(0, picture(scene)))
+@pytest.mark.parametrize("text", [TABLE, FLAT], ids=["camera", "homography"])
+def test_a_reference_tag_that_does_not_fit_is_named_with_how_far_it_is_off(text: str) -> None:
+    scene = plates(parse_tags(text), {})
+    for number, place, wrong_place in ((12, "0.65, 0.17", "0.6, 0.17"), (10, "0.3, -0.17", "0.3, -0.1")):
+        wrong = parse_tags(text.replace(f"{number}: [{place}]", f"{number}: [{wrong_place}]"), "tags.yaml")
+        said = (
+            rf"tags\.yaml: the reference tags do not fit .* tag {number} is off by \d+\.\d pixels from where"
+        )
+        with pytest.raises(UsageError, match=said):
+            TagObserver(wrong).observe(Frame(0, picture(scene)))
+    # if all are wrong, none is to blame
+    half = parse_tags(text.replace("size: 48mm", "size: 24mm"), "tags.yaml")
+    with pytest.raises(UsageError, match=r"tag 1\d is off most, by .* the size of the tags"):
+        TagObserver(half).observe(Frame(0, picture(scene)))
 
 
 @pytest.mark.parametrize("camera", [False, True])

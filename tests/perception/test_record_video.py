@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
+from threading import Thread
 
 import numpy as np
 import pytest
@@ -321,6 +323,11 @@ BAD = {
     "a rate for a log": (["run.mcap", "--rate", "30"], 2, "leave out --rate"),
     "no camera": (["--camera", "93"], 2, "camera 93 cannot be opened"),
     "nothing": ([], 2, "give either videos or a log, or --camera N"),
+    "a codec that is not there": (
+        ["codec.mkv"],
+        3,
+        "codec.mkv has a video that no codec here decodes; convert it",
+    ),
     "a video that cannot be copied": (["mpeg.avi", "--keep-video", "copy"], 2, "write --keep-video h264"),
 }
 
@@ -336,6 +343,9 @@ def test_bad_input_is_refused_in_words_and_nothing_is_written(
     (folder / "a.jsonl").write_text('{"time_ns": 0, "objects": []}\n')
     run(["record", "tracks", f"{folder}/a.jsonl", "-o", f"{folder}/plain.mcap"])
     _write_mpeg(folder / "mpeg.avi")
+    _write_streamed(folder / "table.mp4", folder / "codec.mkv")
+    whole = (folder / "codec.mkv").read_bytes()
+    (folder / "codec.mkv").write_bytes(whole.replace(b"V_MPEG4/ISO/AVC", b"V_NONE4/ISO/XYZ"))
     given = [
         each if each.startswith(("-", "/")) or each in ("30", "93", "copy", "h264") else f"{folder}/{each}"
         for each in arguments
@@ -381,8 +391,70 @@ def test_a_camera_that_is_unplugged_leaves_a_whole_log(folder: Path) -> None:
     from spatial_replay.perception import CameraFrames, parse_tags
     from spatial_replay.runs.seen import record_seen
 
-    # a capture that ends is what an unplugged camera is
-    camera = CameraFrames(0, opened=lambda number: cv2.VideoCapture(str(folder / "table.mp4")))
+    # for OpenCV, an unplugged camera is a capture that ends: here of a pipe whose other end stops in a frame
+    _write_streamed(folder / "table.mp4", folder / "plugged.ts")
+    sent = (folder / "plugged.ts").read_bytes()
+    os.mkfifo(folder / "camera")
+    cable = Thread(target=(folder / "camera").write_bytes, args=(sent[: len(sent) * 2 // 3],))
+    cable.start()
+    camera = CameraFrames(0, opened=lambda number: cv2.VideoCapture(str(folder / "camera")))
     seen = record_seen([camera], parse_tags(TABLE), folder / "camera.mcap")
-    assert seen.samples == COUNT and "is it unplugged?" in seen.faults[0]
-    assert len(read_trace(folder / "camera.mcap")) == COUNT
+    cable.join()
+    assert 4 <= seen.samples < COUNT and "is it unplugged?" in seen.faults[0]
+    assert len(read_trace(folder / "camera.mcap")) == seen.samples
+    assert run(["verify", f"{folder}/camera.mcap"]) == 0
+
+
+def test_detections_that_a_robot_recorded_say_what_their_images_say(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    from spatial_replay.perception import open_frames
+    from spatial_replay.perception.opencv import TagDetector
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    for name, fields in (
+        ("Point", "float64 x\nfloat64 y\n"),
+        ("AprilTagDetection", "string family\nint32 id\nPoint centre\nPoint[4] corners\n"),
+        ("AprilTagDetectionArray", "std_msgs/Header header\nAprilTagDetection[] detections\n"),
+    ):
+        store.register(get_types_from_msg(fields, f"apriltag_msgs/msg/{name}"))
+    point, detection, array = (
+        store.types[f"apriltag_msgs/msg/{name}"]
+        for name in ("Point", "AprilTagDetection", "AprilTagDetectionArray")
+    )
+    time, header = store.types["builtin_interfaces/msg/Time"], store.types["std_msgs/msg/Header"]
+    detector = TagDetector("36h11")
+    with Writer(folder / "robot", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        topic = writer.add_connection("/detections", array.__msgtype__, typestore=store)
+        for frame in open_frames(folder / "table.mp4"):
+            listed = [
+                # detectors of the AprilTag family count pixels from their corners, half a pixel further
+                detection("tag36h11", number, point(0, 0), [point(*corner) for corner in corners + 0.5])
+                for number, corners, _ in detector.detect(frame.image)
+            ]
+            # a tag of another family is not the one that the tags file means
+            listed.append(detection("tag16h5", 0, point(0, 0), [point(*corner) for corner in np.eye(4, 2)]))
+            message = array(header(time(5, frame.time_ns), "camera"), listed)
+            writer.write(topic, 10**18 + frame.time_ns, store.serialize_cdr(message, array.__msgtype__))
+    arguments = ["record", "video", f"{folder}/robot", "--tags", f"{folder}/tags.yaml"]
+    output = recorded(folder, "robot", "--topic", "/detections")
+    trace, of_video = read_trace(output), read_trace(folder / "run.mcap")
+    assert (trace.times_ns - 5 * 10**9).tolist() == of_video.times_ns.tolist()
+    assert np.allclose(trace.uncertainty, of_video.uncertainty)
+    assert np.allclose(trace.footprints.vertices, of_video.footprints.vertices, atol=1e-9)
+    assert len(payloads(output, "/detections")) == COUNT
+    assert run(["verify", str(output)]) == 0
+    capsys.readouterr()
+    refused = folder / "refused.mcap"
+    assert run([*arguments, "--keep-video", "h264", "-o", f"{refused}"]) == 2
+    assert "detections have no images to encode" in capsys.readouterr().err
+    (folder / "pixels.yaml").write_text("objects: {red: {tag: 0, disc: 20}}\nplane: image\n")
+    arguments[-1] = f"{folder}/pixels.yaml"
+    assert run([*arguments, "-o", f"{refused}"]) == 2
+    assert "give reference tags, or map the topic" in capsys.readouterr().err
+    assert run(["tags", "calibrate", f"{folder}/robot", "--tags", f"{folder}/tags.yaml"]) == 2
+    assert "a camera is calibrated from its images" in capsys.readouterr().err
+    assert not refused.exists()

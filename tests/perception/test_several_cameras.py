@@ -95,6 +95,36 @@ def test_what_is_hidden_from_one_camera_is_seen_by_the_other(
     assert read_trace(again).names == trace.names
 
 
+def test_when_one_video_breaks_off_within_a_frame_the_other_goes_on(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import av
+
+    broken, output = folder / "broken.ts", folder / "goes_on.mcap"
+    with VideoWriter(broken, 25) as writer:
+        for frame in frames(FROM_THE_OTHER, (RED,), COUNT - 2):
+            writer.write(frame)
+    with av.open(str(broken)) as container:
+        last = [packet for packet in container.demux(video=0) if packet.size][-1]
+        cut = last.pos + last.size // 2
+    broken.write_bytes(broken.read_bytes()[:cut])
+    given = [f"{folder}/left.mp4", f"{broken}", "--tags", f"{folder}/tags.yaml", "-o", f"{output}"]
+    assert run(["record", "video", *given]) == 3
+    said = capsys.readouterr().err
+    assert "broken.ts breaks off after 0.080 s, within a frame" in said
+    assert "broken.ts ends after 0.080 s, and the run after 0.200 s: what only it showed is hidden" in said
+    # whole is what was recorded: all of the left camera, and three frames of the right one
+    assert run(["verify", f"{output}"]) == 0
+    trace = read_trace(output)
+    red, blue = ((trace.rows[:, list(trace.names).index(name)] >= 0).tolist() for name in ("red", "blue"))
+    assert (red, blue) == ([True] * 3 + [False] * 3, [True] * COUNT)
+    assert (
+        run(["record", "video", f"{output}", "--topic", "/camera2/video", *given[2:-1], f"{folder}/y.mcap"])
+        == 0
+    )
+    assert len(read_trace(folder / "y.mcap")) == 3
+
+
 def test_a_layout_shows_each_camera(folder: Path) -> None:
     from mcap.reader import make_reader
 
@@ -139,6 +169,29 @@ def test_cameras_that_differ_are_named_in_the_tags_file(
     one = parse_tags(f"{BLOCKS}\n{REFERENCES}\ncamera: {{{lens}, {pose}}}\n", "tags.yaml")
     with pytest.raises(UsageError, match=r"tags\.yaml gives one pose for 2 cameras; write cameras"):
         TagObserver(one, cameras=["left.mp4", "right.mp4"])
+    # through the command line, without reference tags, by name and by number, and a third one
+    (folder / "third.mp4").write_bytes((folder / "right.mp4").read_bytes())
+    other = "pose: {position: [0.45, 0.42, 0.78], look_at: [0.47, 0, 0]}"
+    two = f"{{left.mp4: {{{lens}, {pose}}}, 2: {{{lens}, {other}}}"
+    for named, more in ((f"{two}}}", []), (f"{two}, third.mp4: {{{lens}, {other}}}}}", ["third.mp4"])):
+        (folder / "posed.yaml").write_text(f"{BLOCKS}\ncameras: {named}\n")
+        output, videos = (
+            folder / "posed.mcap",
+            [f"{folder}/{each}" for each in ("left.mp4", "right.mp4", *more)],
+        )
+        assert run(["record", "video", *videos, "--tags", f"{folder}/posed.yaml", "-o", f"{output}"]) == 0
+        trace = read_trace(output)
+        for name, number in (("red", RED), ("blue", BLUE)):
+            row = trace.rows[:1, list(trace.names).index(name)]
+            centre = trace.footprints.select(row).vertices.mean(axis=0)
+            assert np.linalg.norm(centre - PLACES[number][:2]) <= trace.uncertainty[row[0]] < 0.005
+        assert run(["info", f"{output}"]) == 0
+        assert ("/camera3/video" in capsys.readouterr().out) == bool(more)
+    (folder / "posed.yaml").write_text(
+        f"{BLOCKS}\ncameras: {{left.mp4: {{{lens}, {pose}}}, 2: {{{lens}}}}}\n"
+    )
+    assert run(["record", "video", *videos[:2], "--tags", f"{folder}/posed.yaml", "-o", f"{output}"]) == 2
+    assert "or the pose of each camera; 2 has none" in capsys.readouterr().err
     video = [
         f"{folder}/left.mp4",
         f"{folder}/right.mp4",
