@@ -93,6 +93,7 @@ class TagObserver:
         self._hidden: dict[str, str | None] = {}
         self._outlines = {each.name: _outline(each.footprint) for each in tags.objects}
         self._doubts: dict[str, tuple[str, int]] = {}
+        self._apart: dict[str, tuple[float, int]] = {}
         self._frames = 0
 
     @property
@@ -155,8 +156,23 @@ class TagObserver:
                 self._tracked(each, fused([pose for off, pose in sound if off <= latest]), latest)
                 for latest in sorted({off for off, _ in sound})
             ]
+            self._compare(each, [pose for _, pose in sound])
             if found_at:
                 yield each.name, min(found_at, key=lambda tracked: tracked.uncertainty)
+
+    def _compare(self, each: TaggedObject, poses: Sequence[ObjectPose]) -> None:
+        """Take note of tags that place an object further apart than it is large, beyond what is uncertain."""
+        if len(poses) < 2:
+            return
+        outline = self._outlines[each.name]
+        size = 2 * max(
+            float(np.linalg.norm(outline, axis=1).max()), *(part.radius for part in each.footprint.parts)
+        )
+        unsure = 2 * max(radius(pose, outline, self.tags.sigmas) for pose in poses)
+        apart = max(float(np.linalg.norm((poses[0].place - pose.place)[:2])) for pose in poses)
+        if apart > size + unsure:
+            most, count = self._apart.get(each.name, (0.0, 0))
+            self._apart[each.name] = max(most, apart), count + 1
 
     def _tracked(self, each: TaggedObject, pose: ObjectPose, off_ns: int) -> TrackedObject:
         height = each.height
@@ -221,6 +237,12 @@ class TagObserver:
         lines += of_cameras
         for each_name, (text, count) in sorted(self._doubts.items()):
             lines.append(f"{each_name} is unknown in {counted(count, 'frame')}: {text}")
+        for each_name, (most, count) in sorted(self._apart.items()):
+            where = f"in {counted(count, 'frame')}, by up to {most:.3g} {self.tags.unit}"
+            lines.append(
+                f"{each_name}: its tags contradict each other {where}; check their places on it, and of"
+                " cameras the pose and the --offset"
+            )
         return tuple(lines)
 
 

@@ -187,6 +187,12 @@ def test_cameras_that_differ_are_named_in_the_tags_file(
             assert np.linalg.norm(centre - PLACES[number][:2]) <= trace.uncertainty[row[0]] < 0.005
         assert run(["info", f"{output}"]) == 0
         assert ("/camera3/video" in capsys.readouterr().out) == bool(more)
+    # poses that are swapped are no secret
+    swapped = f"{{left.mp4: {{{lens}, {other}}}, right.mp4: {{{lens}, {pose}}}}}"
+    views = [list(frames(each, (RED, BLUE), 1)) for each in (FROM_THE_SIDE, FROM_THE_OTHER)]
+    observer = TagObserver(parse_tags(f"{BLOCKS}\ncameras: {swapped}\n"), cameras=["left.mp4", "right.mp4"])
+    observer.observe(*[view[0] for view in views])
+    assert "red: its tags contradict each other in 1 frame, by up to 0." in " ".join(observer.remarks())
     (folder / "posed.yaml").write_text(
         f"{BLOCKS}\ncameras: {{left.mp4: {{{lens}, {pose}}}, 2: {{{lens}}}}}\n"
     )
