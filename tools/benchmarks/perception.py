@@ -75,7 +75,7 @@ def _axes(yaw: float) -> np.ndarray:
 
 
 def bench_camera_truth(measure: Any) -> None:
-    """Runs of all simulated worlds, filmed from two sides: with --full whole ones, of `push` also planned.
+    """Runs of all simulated worlds, filmed from two sides: with --full whole ones, by script and planned.
 
     Else their beginnings. How often the truth is outside of what is stated, and verdicts of named specs are
     the opposite of the true ones, or unknown. The seeds are not those on which the least corner error was
@@ -98,9 +98,9 @@ def bench_camera_truth(measure: Any) -> None:
                 world, log, seed=_SEED, cameras=videos, duration_ns=None if measure.full else _BEGINNING_NS
             )
             totals[world] = compared(world, log, videos)
-        if measure.full:
-            record_plan("push", log, seed=_SEED, cameras=videos)
-            totals["push, planned"] = compared("push", log, videos)
+            if measure.full:
+                record_plan(world, log, seed=_SEED, cameras=videos)
+                totals[f"{world}, planned"] = compared(world, log, videos)
     for name, total in totals.items():
         measure.ratio(f"{name}: outlines outside", total.outside / total.outlines, 0.01)
         measure.ratio(f"{name}: robustness outside", total.beyond / total.values, 0.0)
