@@ -319,11 +319,14 @@ def measure_rows(
     second: Integers,
     edges: Floats,
     values: Floats,
+    begin: int,
+    end: int,
 ) -> None:
-    """Fill `values` (K, T) with K quantities in T samples; see `measure`.
+    """Fill `values` (K, T) with K quantities in the samples from `begin` to before `end`; see `measure`.
 
     In sample t, operand o has the `width[o]` rows from `members[member_start[o] + t * width[o]]` on;
-    `member_start` (O + 1,) ends with the total. `edges` (V, 4), one for each vertex, is room to work in.
+    `member_start` (O + 1,) ends with the total. `edges` (V, 4), one for each vertex, is room to work in;
+    calls for other samples may share it at the same time, since all write the same there.
     """
     # edges only of rows that distances need: a log has many more that are projected or unused
     is_filled = np.zeros(len(part_start), dtype=np.bool_)
@@ -331,9 +334,10 @@ def measure_rows(
     for k in range(len(quantity)):
         if quantity[k] < MIN_X:
             for operand in (first[k], second[k]):
-                operand_members = members[member_start[operand] : member_start[operand + 1]]
+                of_first = member_start[operand]
+                operand_members = members[of_first + begin * width[operand] : of_first + end * width[operand]]
                 _fill_rows(rows, operand_members, is_filled)
-    for t in range(values.shape[1]):
+    for t in range(begin, end):
         for k in range(values.shape[0]):
             a, b = first[k], second[k]
             start = member_start[a] + t * width[a]

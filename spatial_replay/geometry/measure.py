@@ -10,7 +10,7 @@ from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 
-from spatial_replay.compiled import inlined, kernel
+from spatial_replay.compiled import inlined, kernel, over_cores
 from spatial_replay.errors import GeometryError
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.geometry.batch import FootprintBatch
@@ -26,6 +26,8 @@ QUANTITY_CODES: Mapping[str, int] = MappingProxyType(
     {name: code for code, name in enumerate(get_args(Quantity))}
 )
 _BETWEEN_TWO = frozenset({"signed_distance", "protrusion"})
+_SHARE = 16_384
+"""So many quantities pay for a thread of their own."""
 _NO_ROWS = np.empty(0, dtype=np.int64)
 
 
@@ -82,7 +84,7 @@ def measure(batch: FootprintBatch, operands: Sequence[Operand], requests: Sequen
     for request in requests:
         _check_request(request, len(operands))
     values = np.empty((len(requests), samples.pop() if samples else 0))
-    measure_rows(
+    arguments = (
         batch.part_start,
         batch.vertex_start,
         batch.vertices,
@@ -99,6 +101,8 @@ def measure(batch: FootprintBatch, operands: Sequence[Operand], requests: Sequen
         np.empty((len(batch.vertices), 4)),
         values,
     )
+    least = _SHARE // max(len(requests), 1) + 1
+    over_cores(measure_rows, lambda begin, end: measure_rows(*arguments, begin, end), values.shape[1], least)
     return values
 
 

@@ -404,7 +404,10 @@ def _placed(vertices: Floats, centre: Floats, positions: Floats, turn: float) ->
         cosine, sine = math.cos(turn), math.sin(turn)
         x, y = local[:, 0], local[:, 1]
         local = np.stack((x * cosine - y * sine, x * sine + y * cosine), axis=1)
-    placed: Floats = positions[:, None, :] + local[None, :, :]
+    placed = np.empty((len(positions), len(local), 2))
+    # along the many positions, and not along the few vertices
+    for vertex, axis in np.ndindex(*local.shape):
+        np.add(positions[:, axis], local[vertex, axis], out=placed[:, vertex, axis])
     return placed
 
 

@@ -81,7 +81,9 @@ class Grid:
         """Return (rows * columns, 2): the middle of each cell, row by row."""
         x = self.xmin + (np.arange(self.columns) + 0.5) * self.cell_size
         y = self.ymin + (np.arange(self.rows) + 0.5) * self.cell_size
-        return np.stack(np.broadcast_arrays(x[None, :], y[:, None]), axis=-1).reshape(-1, 2)
+        centres = np.empty((*self.shape, 2))
+        centres[:, :, 0], centres[:, :, 1] = x[None, :], y[:, None]
+        return centres.reshape(-1, 2)
 
     def centre(self, row: int, column: int) -> tuple[float, float]:
         """Return the middle (x, y) of a cell."""
@@ -196,6 +198,8 @@ class Workspace:
 
         Cells outside the workspace's own grid are out of reach.
         """
+        if grid == self.grid and self.nearest <= 0.0 and self.farthest == math.inf:
+            return np.ones(grid.shape, np.bool_)
         centres = grid.centres()
         distance = np.hypot(*(centres - np.array(self.base)).T)
         reached = (distance >= self.nearest) & (distance <= self.farthest) & self.grid.contains(centres)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+import os
 
 import numpy as np
 import pytest
 
 from spatial_replay import Footprint, GeometryError
+from spatial_replay.compiled import only
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.measure import MeasureRequest, Operand, measure
 
@@ -177,3 +179,22 @@ def test_no_requests_give_no_measurements():
 def test_invalid_requests_are_refused(operands, request_, message):
     with pytest.raises(GeometryError, match=message):
         measure(FootprintBatch.from_footprints([UNIT]), operands, [request_])
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="the system does not pin processes to cores")
+def test_the_number_of_cores_changes_no_bit() -> None:
+    boxes = [Footprint.box(x, 0.1 * x, x + 0.3 + 0.01 * x, 1.0) for x in np.linspace(-2.0, 2.0, 200).tolist()]
+    batch = FootprintBatch.from_footprints(boxes)
+    rows = np.random.default_rng(4).integers(0, len(boxes), (40_000, 2))
+    operands = Operand(rows[:, :1]), Operand(rows[:, 1:], 0.05)
+    requests = [MeasureRequest("signed_distance", 0, 1), MeasureRequest("max_x", 1)]
+    cores = os.sched_getaffinity(0)
+    with only("compiled"):
+        measure(batch, operands, requests)
+        everywhere = measure(batch, operands, requests)
+        os.sched_setaffinity(0, {min(cores)})
+        try:
+            alone = measure(batch, operands, requests)
+        finally:
+            os.sched_setaffinity(0, cores)
+    assert everywhere.tobytes() == alone.tobytes()

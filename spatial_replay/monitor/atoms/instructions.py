@@ -68,12 +68,14 @@ def run_instructions(
     members: Flags,
     outputs: Integers,
     leaves: Floats,
+    begin: int,
+    end: int,
 ) -> None:
-    """Run the instructions over all samples; leaf j is what instruction outputs[j] gives."""
-    channels, _, samples = leaves.shape
-    columns = np.empty((code.shape[0], channels, min(TILE, samples)))
-    for t in range(0, samples, TILE):
-        count = min(TILE, samples - t)
+    """Run the instructions over some samples; leaf j is what instruction outputs[j] gives."""
+    channels = leaves.shape[0]
+    columns = np.empty((code.shape[0], channels, min(TILE, end - begin)))
+    for t in range(begin, end, TILE):
+        count = min(TILE, end - t)
         for i in range(code.shape[0]):
             op, a, b, c = code[i, 0], code[i, 1], code[i, 2], code[i, 3]
             for channel in range(channels):

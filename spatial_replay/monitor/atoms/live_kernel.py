@@ -259,6 +259,8 @@ def _measure(plan: PlanArrays, rows: SampleRows, values: Floats, spreads: Floats
         plan.second,
         np.empty((len(rows.vertices), 4)),
         measured,
+        0,
+        1,
     )
     of_operands = _spreads(plan.operand_start, members, places, here)
     for g in range(len(plan.geometric)):
@@ -355,7 +357,7 @@ def leaves_of_plan(packed_plan: PackedPlan, numbers: Floats) -> Floats:
     channels = _channels_of(values, spreads, rows.signals, closest, members)
     leaves = np.empty((channels, len(plan.outputs), 1))
     run_instructions(
-        plan.code, plan.constants, values, spreads, rows.signals, closest, members, plan.outputs, leaves
+        plan.code, plan.constants, values, spreads, rows.signals, closest, members, plan.outputs, leaves, 0, 1
     )
     return leaves
 

@@ -6,6 +6,7 @@ from collections.abc import Hashable, Sequence
 
 import numpy as np
 
+from spatial_replay.compiled import over_cores
 from spatial_replay.geometry.arrays import Flags, Floats
 from spatial_replay.geometry.closest import closest_pairs
 from spatial_replay.geometry.measure import MeasureRequest, Operand, Quantity, measure, misalignment
@@ -26,6 +27,9 @@ from spatial_replay.spec.formula import (
 )
 from spatial_replay.spec.walks import base_of, map_terms, measured_terms
 from spatial_replay.trace.trace import ABSENT
+
+_SHARE = 200_000
+"""So many instructions, each over one sample, pay for a thread of their own."""
 
 
 def measured(scene: TraceScene, measurements: Sequence[Measurement]) -> tuple[Floats, Floats]:
@@ -148,7 +152,7 @@ def leaf_values(scene: TraceScene, leaves: Sequence[Formula], bindings: Bindings
     is_sure = not spreads.any() and (closest[:, :2] == closest[:, 2:]).all()
     channels = 4 if not is_sure else 1 if is_known else 2
     result = np.empty((channels, len(outputs), len(scene)))
-    run_instructions(
+    arguments = (
         np.array(list(code.rows), np.int64).reshape(len(code.rows), 4),
         np.array(list(code.constants), np.float64),
         values,
@@ -158,6 +162,12 @@ def leaf_values(scene: TraceScene, leaves: Sequence[Formula], bindings: Bindings
         members,
         np.array(outputs, np.int64),
         result,
+    )
+    over_cores(
+        run_instructions,
+        lambda begin, end: run_instructions(*arguments, begin, end),
+        result.shape[2],
+        _SHARE // max(len(code.rows), 1) + 1,
     )
     return result
 
