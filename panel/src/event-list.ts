@@ -1,6 +1,6 @@
 // Lists over time: events, and whatever else has a row for each of its times.
 
-import { element, eventRow, keepInSight } from "report-drawing";
+import { element, eventRow, keepInSight, markedEvent } from "report-drawing";
 
 import type { Event } from "./results";
 import type { Cursor } from "./viewer";
@@ -17,9 +17,9 @@ export class TimedList {
     this.made.replaceChildren(...rows.map((row) => element("li", {}, row)));
   }
 
-  show(time: number): void {
-    let here = -1;
-    while (here + 1 < this.times.length && this.times[here + 1]! <= time + 1e-9) here += 1;
+  /** Marks the newest row; of several at once one that is chosen. */
+  show(time: number, isChosen: (place: number) => boolean = () => false): void {
+    const here = markedEvent(this.times, time, isChosen);
     if (here === this.here) return;
     this.rows[this.here]?.removeAttribute("aria-current");
     this.here = here;
@@ -38,12 +38,14 @@ export class EventList {
   private shown: readonly Event[] = [];
   private length = -1;
 
-  show(events: readonly Event[], cursor: Cursor, choose: (event: Event) => void): void {
+  show(
+    events: readonly Event[], cursor: Cursor, choose: (event: Event) => void, isChosen: (event: Event) => boolean,
+  ): void {
     if (events !== this.shown || events.length !== this.length) {
       [this.shown, this.length] = [events, events.length];
       this.list.fill(events.map((event) => event.time), events.map((event) => eventRow(event, () => choose(event))));
       this.count.textContent = events.length === 1 ? "1 event" : `${events.length} events`;
     }
-    this.list.show(cursor.time);
+    this.list.show(cursor.time, (place) => isChosen(events[place]!));
   }
 }

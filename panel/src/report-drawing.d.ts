@@ -111,6 +111,9 @@ declare module "report-drawing" {
   export function branch(node: DrawnNode, rows: TreeRow[], hasIntervals: boolean): HTMLElement;
   export function showRow(row: TreeRow, run: DrawnRun, result: DrawnResult, place: number | null, isLast: boolean): void;
   export function eventRow(event: DrawnEvent, choose: () => void): HTMLElement;
+  export function markedEvent(
+    starts: readonly number[], time: number, isChosen: (place: number) => boolean,
+  ): number;
   export function keepInSight(list: HTMLElement, row: HTMLElement): void;
   export function scrub(made: HTMLElement, clock: DrawnClock): void;
   export function columns(result: DrawnResult, curves: Curve[]): unknown;

@@ -23,7 +23,8 @@ export class Results {
   all: readonly ResultMessage[] = [];
   events: Event[] = [];
   private chosen: string | null;
-  private worst = 0;
+  /** The places of all results, the worst first. */
+  private order: readonly number[] = [];
 
   constructor(private readonly viewer: Viewer) {
     const { result } = viewer.state;
@@ -35,31 +36,34 @@ export class Results {
     this.findWorst();
   }
 
+  /** The titles of all results, the worst first. */
   get titles(): string[] {
-    return this.all.map((each) => printable(titleOf(each.name, each.object)));
+    return this.order.map((place) => printable(titleOf(this.all[place]!.name, this.all[place]!.object)));
   }
 
-  /** The place of the result that is shown; 0 without any. */
+  /** The place among the titles of the result that is shown; 0 without any. */
   get place(): number {
-    const found = this.all.findIndex((each) => titleOf(each.name, each.object) === this.chosen);
-    return found >= 0 ? found : this.worst;
+    const chosen = this.all.findIndex((each) => titleOf(each.name, each.object) === this.chosen);
+    return Math.max(this.order.indexOf(chosen), 0);
   }
 
-  /** Finds the worst result, by the events so far: of those violated the one that was so first, else one unknown. */
+  /** Finds the order of results, by the events so far: those violated, by time, those unknown, the others. */
   findWorst(): void {
-    const newest = this.all.map((each) => this.newest(each, Infinity));
-    const violated = newest.filter((each) => each?.verdict === "violated");
-    const since = Math.min(...violated.map((each) => each!.known));
-    const first = newest.findIndex((each) => each?.verdict === "violated" && each.known === since);
-    this.worst = Math.max(first >= 0 ? first : newest.findIndex((each) => each?.verdict === "unknown"), 0);
+    const keys = this.all.map((each) => {
+      const newest = this.newest(each, Infinity);
+      const rank = ["violated", "unknown"].indexOf(newest?.verdict ?? "");
+      return rank === 0 ? [0, newest!.known] as const : [rank < 0 ? 2 : rank, 0] as const;
+    });
+    this.order = this.all.map((_, place) => place)
+      .sort((one, other) => keys[one]![0] - keys[other]![0] || keys[one]![1] - keys[other]![1] || one - other);
   }
 
   get shown(): ResultMessage | undefined {
-    return this.all[this.place];
+    return this.all[this.order[this.place]!];
   }
 
   choose(place: number): void {
-    const result = this.all[place];
+    const result = this.all[this.order[place]!];
     if (!result) return;
     this.chosen = titleOf(result.name, result.object);
     this.viewer.save({ result: this.chosen });

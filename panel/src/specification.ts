@@ -62,7 +62,7 @@ export class SpecificationView implements View {
       const found = results.find(event.specification, event.object);
       if (found >= 0) this.chooseResult(found);
       this.viewer.seek(event.time);
-    });
+    }, (event) => results.find(event.specification, event.object) === results.all.indexOf(tree.message));
   }
 
   head(cursor: Cursor): ReactElement {

@@ -124,6 +124,13 @@ class AnnotatedEvaluation:
         return merge(self._annotator.end(time_ns, self.finals, vacuous))
 
     @property
+    def worst_first(self) -> Sequence[int]:
+        """The places of `trees`, the worst first, after `end`."""
+        from spatial_replay.annotate.standing import worst_first
+
+        return worst_first(self._annotator.outcomes)
+
+    @property
     def channels(self) -> tuple[Channel, ...]:
         """The channels of the messages that annotate a sample."""
         from spatial_replay.annotate.annotator import channels_of_results

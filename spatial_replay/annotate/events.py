@@ -271,7 +271,8 @@ class EventReporter:
         period, witness, sentence, decided = now
         facts = self._facts(reported) | self._facts_of(period, witness, "")
         if decided is not None:
-            facts |= {"witness_node": str(decided.node), "witness_ns": str(decided.time_ns)}
+            shown = decided.shown
+            facts |= {"witness_node": str(shown.node), "witness_ns": str(shown.time_ns)}
         if past is not None:
             before, sentence = past.period, f"{sentence} {past.sentence}"
             facts |= self._facts_of(before, past.witness, "_before")
@@ -317,8 +318,9 @@ class EventReporter:
         """Return what decided in words, and the same with how long ago; nothing for None."""
         if found is None:
             return "", ""
-        missed, before_ns = found.missed, now_ns - found.time_ns
-        words = self._words(LeafValue(found.leaf, found.number), past=before_ns > 0)
+        missed, shown = found.missed, found.shown
+        before_ns = now_ns - shown.time_ns
+        words = self._words(LeafValue(shown.leaf, shown.number), past=before_ns > 0)
         ago = f" ({time_text(before_ns)} earlier)" if before_ns else ""
         response = f"`{missed.condition}` held, but `{missed.response}` did not: " if missed else ""
         return words, f"{response}{words}{ago}"

@@ -55,6 +55,11 @@ class DecidingLeaf(NamedTuple):
     missed: MissedResponse | None = None
     response: DecidingLeaf | None = None
 
+    @property
+    def shown(self) -> DecidingLeaf:
+        """The leaf to point at: that of a response that was missed, not of the condition that held."""
+        return self if self.response is None else self.response
+
 
 class SettledViolation(NamedTuple):
     """What made a violation certain before the end of a log.
@@ -69,8 +74,8 @@ class SettledViolation(NamedTuple):
 
     @property
     def shown(self) -> DecidingLeaf | None:
-        """The leaf to point at: that of a response that was missed, not of the condition that held."""
-        return self.leaf if self.leaf is None or self.leaf.response is None else self.leaf.response
+        """The leaf to point at, if there is one."""
+        return None if self.leaf is None else self.leaf.shown
 
 
 class LeafHistory:

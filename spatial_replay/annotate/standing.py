@@ -76,6 +76,7 @@ class FinalStanding(NamedTuple):
         by: its robustness without its sign: the end of its interval that decides; NaN where it is unknown.
         unit: of the robustness.
         over: what decided it; "" if that is not known.
+        is_late: whether only the end of the log decided it.
     """
 
     standing: int
@@ -83,14 +84,18 @@ class FinalStanding(NamedTuple):
     by: float
     unit: str
     over: str
+    is_late: bool = False
 
 
 def worst_first(outcomes: Sequence[FinalStanding]) -> list[int]:
     """Return the places of results, the worst first: of those violated, the one that was so first."""
 
-    def key(place: int) -> tuple[int, float]:
+    def key(place: int) -> tuple[int, bool, float]:
         outcome = outcomes[place]
-        return int(_RANKS[outcome.standing]), outcome.since_s if outcome.standing == VIOLATED else 0.0
+        since_s, is_late = (
+            (outcome.since_s, outcome.is_late) if outcome.standing == VIOLATED else (0.0, False)
+        )
+        return int(_RANKS[outcome.standing]), is_late, since_s
 
     return sorted(range(len(outcomes)), key=key)
 
@@ -185,7 +190,7 @@ class StandingEncoder:
             over: of each tree, what decided it.
         """
         first_ns = time_ns if self._first_ns is None else self._first_ns
-        since_ns = [min(each, time_ns) for each in self._violated_ns]
+        since_ns = self._violated_ns
         outcomes, series = [], []
         for last, final in zip(self._last, finals, strict=True):
             ended = last.copy()
@@ -195,8 +200,9 @@ class StandingEncoder:
             code = int(standing_codes(ended[:1], final=True)[0, 0])
             low, high = ended[0, 2:, 0].tolist()
             by = -high if code == VIOLATED else low if code == SATISFIED else math.nan
-            since_s = (violated_ns - first_ns) / 1e9
-            outcomes.append(FinalStanding(code, since_s, by, unit_of(tree.formula, self._units), said))
+            since_s = (min(violated_ns, time_ns) - first_ns) / 1e9
+            unit = unit_of(tree.formula, self._units)
+            outcomes.append(FinalStanding(code, since_s, by, unit, said, violated_ns == LATEST_NS))
         self.outcomes = tuple(outcomes)
         words, times_ns = np.array(self._words, object)[:, None], np.array([time_ns], np.int64)
         [payload] = self._messages(times_ns, series, words, np.array(since_ns)[:, None], over, final=True)
@@ -225,7 +231,11 @@ class StandingEncoder:
         of_results = np.array([each[0] for each in codes])
         worst = worst_results(of_results, since_ns)
         # the first of those violated first
-        order = np.argsort(np.where(of_results == VIOLATED, since_ns, LATEST_NS), axis=0, kind="stable")
+        order = np.argsort(
+            np.where(of_results == VIOLATED, np.minimum(since_ns, LATEST_NS - 1), LATEST_NS),
+            axis=0,
+            kind="stable",
+        )
         counts = (of_results == VIOLATED).sum(axis=0)
         marks, numbers = self._rows(series, codes)
         payloads = [b""] * len(times_ns)
@@ -238,7 +248,8 @@ class StandingEncoder:
             rows = series[layout.worst][:_MOST_ROWS, :, members]
             own = [rounded(rows[:, [1, 0]]).reshape(-1, len(members))]
             for each, _ in layout.violated:
-                seconds = (since_ns[each, members] - (self._first_ns or 0)) / 1e9
+                certain_ns = np.minimum(since_ns[each, members], times_ns[members])
+                seconds = (certain_ns - (self._first_ns or 0)) / 1e9
                 own.append(np.stack([np.round(seconds, 3), rounded(-series[each][0, 3, members])]))
             filled = np.concatenate([numbers[:, members], *own]).T
             stamps = times_ns[members].astype(np.uint64)[:, None]

@@ -85,11 +85,12 @@ def explain(
     counts = ""
     if not as_json and object_name is None:
         fitting = [each for each in replayed.results if verdict_of(each, node, goes_on=goes_on) is not None]
+        shown: Sequence[SpecResult] = worst_of(replayed.results)[0]
         if len(fitting) > MANY:
             verdicts_of_all = [verdict_of(each, node, goes_on=goes_on) for each in fitting]
             counts = f"{len(fitting):,} results: {counts_text(map(str, verdicts_of_all))}"
             shown, others = worst_of(fitting)
-            replayed = replace(replayed, results=tuple(shown))
+        replayed = replace(replayed, results=tuple(shown))
     results = explain_results(replayed, node=node, object=object_name, goes_on=goes_on)
     idle = replayed.vacuous if node is None and object_name is None else ()
     if as_json:

@@ -369,11 +369,12 @@ def _container_lines(container: LogSummary, about: Mapping[str, NamedSpec], *, t
 
     if verdicts := list(_verdicts(container, about)):
         kinds = [(each["verdict"] or "").split(",")[0] for each in verdicts]
-        is_known = len(kinds) > MANY and set(kinds) <= set(WORST_FIRST)
+        is_known = set(kinds) <= set(WORST_FIRST)
+        # of those violated, the log has those first that were so first; logs of earlier versions have not
         places = sorted(
             range(len(kinds)), key=lambda place: WORST_FIRST.index(kinds[place]) if is_known else 0
         )
-        yield f"verdicts: {counts_text(kinds)}" if is_known else "verdicts"
+        yield f"verdicts: {counts_text(kinds)}" if is_known and len(kinds) > MANY else "verdicts"
         yield from _table(
             (each["name"] or "", each["verdict"] or "", requirement_text(each["requirement"], each["title"]))
             for each in (verdicts[place] for place in places)

@@ -117,12 +117,11 @@ def counts_text(verdicts: Iterable[str]) -> str:
 
 
 def worst_of(results: Sequence[SpecResult]) -> tuple[Sequence[SpecResult], Sequence[SpecResult]]:
-    """Return the results to print and, of too many, the others; the worst first where they are several."""
-    if len(results) > MANY:
-        # imported here since it loads numerical libraries
-        from spatial_replay.monitor.result import worst_first
+    """Return the results to print and, of too many, the others; the worst first."""
+    # imported here since it loads numerical libraries
+    from spatial_replay.monitor.result import worst_first
 
-        results = [results[place] for place in worst_first(results)]
+    results = [results[place] for place in worst_first(results)]
     shown = _SHOWN if len(results) > _MOST_SHOWN else len(results)
     return results[:shown], results[shown:]
 

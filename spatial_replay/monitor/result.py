@@ -32,6 +32,7 @@ from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Formula, NamedSpec, iter_nodes, operator_of
 from spatial_replay.spec.units import declared_unit
 from spatial_replay.text import Instant, Sentence, shortened_formula, with_unit
+from spatial_replay.trace.sample import LATEST_NS
 
 
 @dataclass(frozen=True, eq=False)
@@ -474,13 +475,14 @@ def no_such_node(name: str, names: Iterable[str], place: str = "") -> str:
 def worst_first(results: Sequence[SpecResult]) -> list[int]:
     """Return the places of results: those violated, those unknown, the others.
 
-    Of those violated, the one that was so for certain first; else they stay in the order of the files.
+    Of those violated, the one that was so for certain first, and those last that only the end of the log
+    decided; else they stay in the order of the files.
     Robustness of different results is not compared: their units may differ.
     """
     severity = {Verdict.VIOLATED: 0, Verdict.UNKNOWN: 1}
 
     def key(place: int) -> tuple[int, int]:
         violated_ns = results[place].violated_at_ns
-        return severity.get(results[place].verdict, 2), NEVER if violated_ns is None else violated_ns
+        return severity.get(results[place].verdict, 2), LATEST_NS if violated_ns is None else violated_ns
 
     return sorted(range(len(results)), key=key)

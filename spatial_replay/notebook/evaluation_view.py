@@ -12,7 +12,7 @@ from spatial_replay.annotate.specification import unit_of, unit_words
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.monitor.evaluate import Evaluation
-from spatial_replay.monitor.result import SpecResult
+from spatial_replay.monitor.result import SpecResult, worst_first
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.notebook import html, plot
 from spatial_replay.notebook.figures import (
@@ -119,8 +119,7 @@ def _worst_of(results: Sequence[SpecResult], most: int) -> Sequence[SpecResult]:
     """Return the results, or the `most` worst ones if there are more."""
     if len(results) <= most:
         return results
-    severity = {Verdict.VIOLATED: 0, Verdict.UNKNOWN: 1}
-    return sorted(results, key=lambda result: severity.get(result.verdict, 2))[:most]
+    return [results[place] for place in worst_first(results)[:most]]
 
 
 class _Curve(NamedTuple):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -24,6 +25,10 @@ _MOST_POINTS: Final = 2_000
 """The most objects of a cell's table, and points of a trail."""
 
 _MOST_LABELS: Final = 25
+_NAME_SIZE: Final = 8.0
+"""Of the names of objects, in points."""
+_STEPS: Final = (0.0, 1.2, -1.2, 2.4, -2.4, 3.6, -3.6, 4.8, -4.8)
+"""How far a name may be above its place, in multiples of its size."""
 
 
 @html.register(Trace)
@@ -53,6 +58,7 @@ def draw_trace(trace: Trace, ax: Axes | None = None, specification: Specificatio
             ax.fill(*ring.T, facecolor=NEUTRAL, alpha=0.15, edgecolor=NEUTRAL, linewidth=1.0)
             right, top = ring.max(axis=0).tolist()
             ax.text(right, top, plain(name), fontsize=8, ha="right", va="bottom")
+    ends: list[tuple[float, float, str]] = []
     shown = [column for column in range(len(trace.names)) if (trace.rows[:, column] >= 0).any()]
     for number, column in enumerate(shown):
         rows = trace.rows[:, column]
@@ -66,12 +72,40 @@ def draw_trace(trace: Trace, ax: Axes | None = None, specification: Specificatio
             ax.fill(*ring.T, facecolor=colour, edgecolor=colour, alpha=0.5)
         if len(shown) <= _MOST_LABELS:
             [(x, y)] = _centres(trace, rows[-1:]).tolist()
-            ax.text(x, y, plain(trace.names[column]), fontsize=8, ha="center", va="center")
+            ends.append((x, y, plain(trace.names[column])))
+    _write_names(ax, ends)
     unit = plain(trace.units.get("", "footprint units"))
     ax.set_xlabel(f"x [{unit}]")
     ax.set_ylabel(f"y [{unit}]")
     ax.set_title(plain(_title(trace)), loc="left", fontsize=10)
     return ax
+
+
+def _write_names(ax: Axes, ends: Sequence[tuple[float, float, str]]) -> None:
+    """Write names at places (x, y, name), each above or below its place if another one is there already."""
+    ax.apply_aspect()
+    inches = ax.transData + ax.figure.dpi_scale_trans.inverted()
+    taken: list[tuple[float, float, float]] = []
+    for x, y, name in ends:
+        across, up = (72.0 * inches.transform((x, y))).tolist()
+        half = 0.3 * _NAME_SIZE * len(name)
+        for step in _STEPS:
+            is_free = all(
+                abs(across - other) > half + other_half or abs(up + step * _NAME_SIZE - row) >= _NAME_SIZE
+                for other, row, other_half in taken
+            )
+            if is_free:
+                break
+        taken.append((across, up + step * _NAME_SIZE, half))
+        ax.annotate(
+            name,
+            (x, y),
+            (0.0, step * _NAME_SIZE),
+            textcoords="offset points",
+            fontsize=_NAME_SIZE,
+            ha="center",
+            va="center",
+        )
 
 
 def _title(trace: Trace) -> str:

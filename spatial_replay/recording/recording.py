@@ -200,13 +200,16 @@ class Recording:
         self._sink.add_attachment(layout.name, layout.media_type, layout.data)
         streams = self._evaluation.streams
         if self._samples and streams:
+            results = [
+                (self._evaluation.trees[place], streams[place]) for place in self._evaluation.worst_first
+            ]
             texts = {
                 tree.title: verdict_text(
                     each.verdict,
                     float(each.robustness[0]),
                     declared_unit(tree.formula, self._evaluation.units),
                 )
-                for tree, each in zip(self._evaluation.trees, streams, strict=True)
+                for tree, each in results
             }
             self._sink.add_metadata(VERDICTS, texts)
         self._sink.add_metadata(ENDING, ending)

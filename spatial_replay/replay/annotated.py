@@ -23,6 +23,7 @@ from spatial_replay.logs.topics import (
     REPLAYED_PREFIX,
     VERDICTS,
 )
+from spatial_replay.monitor.result import worst_first
 from spatial_replay.monitor.sentences import verdict_text
 from spatial_replay.replay.engine import Replay, Replayed
 from spatial_replay.replay.kept_messages import KEEP_ALL
@@ -81,7 +82,8 @@ def run_replay(
         layout = replay.layout()
         sink.add_attachment(layout.name, layout.media_type, layout.data)
         texts = {
-            each.title: verdict_text(each.verdict, each.robustness, each.unit) for each in replayed.results
+            each.title: verdict_text(each.verdict, each.robustness, each.unit)
+            for each in (replayed.results[place] for place in worst_first(replayed.results))
         }
         sink.add_metadata(VERDICTS, texts)
         sink.add_metadata(CERTIFICATE, replayed.certificate)

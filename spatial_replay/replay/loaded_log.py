@@ -308,8 +308,7 @@ class Evaluated:
     @property
     def summary(self) -> str:
         """The verdict of each result, the worst first, and which constants differ from the text."""
-        order = (Verdict.VIOLATED, Verdict.UNKNOWN, Verdict.SATISFIED)
-        results = sorted(self.replayed.results, key=lambda result: order.index(result.verdict))
+        results = [self.replayed.results[place] for place in worst_first(self.replayed.results)]
         text = "; ".join(map(_result_text, results[:_MOST_NAMED])) or "the template matched no objects"
         if len(results) > _MOST_NAMED:
             text += f"; and {len(results) - _MOST_NAMED} more, none worse"

@@ -38,12 +38,14 @@ class Pointer(NamedTuple):
         text: the atom's.
         number: its robustness, in the unit of the log where `scale` divides it.
         is_condition: whether it is in the condition of an implication, whose response is what was missed.
+        is_response: whether it is what came nearest to such a response.
     """
 
     ends: Floats
     text: str
     number: float
     is_condition: bool = False
+    is_response: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -250,6 +250,7 @@ def _pointer_value(each: ReportedResult, first_ns: int, lengths: str) -> Mapping
         "label": f"{each.pointer.number:.3g} {lengths}".rstrip(),
         "number": json_number(each.pointer.number),
         "is_condition": each.pointer.is_condition,
+        "is_response": each.pointer.is_response,
     }
 
 

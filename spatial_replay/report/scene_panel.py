@@ -20,6 +20,8 @@ MOST_FRAMES: Final = 3_000
 """Frames of a page, at most."""
 MOST_CORNERS: Final = 2_000_000
 """Corners of the outlines in all frames together, at most."""
+MOST_ARROWS: Final = 30_000
+"""Arrows in all frames together, at most: of so many results, the worst first, as may have one in each."""
 _ABSENT: Final = 65_535
 _STEPS: Final = 65_535
 """Steps of a coordinate along each side of the scene: 16 bits, finer than any screen."""
@@ -137,8 +139,16 @@ def scene_value(
         places: of results and their nodes, where the page has them.
     """
     entities = _entities(scene.frames)
-    violations = {number: frame.violation for number, frame in enumerate(scene.frames) if frame.violation}
-    arrows = list(violations.values())
+    # of one result there is one arrow in a frame
+    results = {result: place for (result, _), (place, _) in places.items()}
+    most = max(1, MOST_ARROWS // max(len(scene.frames), 1))
+    shown = [
+        (number, arrow)
+        for number, frame in enumerate(scene.frames)
+        for arrow in frame.violations
+        if results.get(arrow.result, most) < most
+    ]
+    arrows = [arrow for _, arrow in shown]
     box = _box(entities, arrows)
     return {
         "times": packing.add((scene.times_ns - first_ns) / 1e9, "f8"),
@@ -152,7 +162,7 @@ def scene_value(
         ],
         "is_violated": packing.add(np.array([frame.is_violated for frame in scene.frames]), "u1"),
         "violations": {
-            "frames": packing.add(np.array(list(violations)), "i4"),
+            "frames": packing.add(np.array([number for number, _ in shown]), "i4"),
             "points": packing.add(box.steps(_joined([each.ends for each in arrows])), "u2"),
             "labels": [each.label for each in arrows],
             "robustness": packing.add(np.array([each.robustness for each in arrows]), "f8"),
@@ -161,9 +171,12 @@ def scene_value(
             "moments": [
                 None if each.moment_ns is None else (each.moment_ns - first_ns) / 1e9 for each in arrows
             ],
-            # the result and the node of the page, -1 where the page leaves them out
+            # the result and the node of the page, -1 where the page leaves the node out
             "places": packing.add(
-                np.array([places.get((each.result, each.node), (-1, -1)) for each in arrows]), "i4"
+                np.array(
+                    [places.get((each.result, each.node), (results[each.result], -1)) for each in arrows]
+                ),
+                "i4",
             ),
         },
     }

@@ -167,8 +167,8 @@ def _results(
             source=file.source,
             relations=RELATION_NAMES | file.relations,
             sentences=result.sentences(replayed.first_ns) if is_explained else (),
-            decided_ns=None if witness is None else witness.time_ns,
-            decided_node=None if witness is None else witness.path[-1].node,
+            decided_ns=None if witness is None else _decided_ns(witness),
+            decided_node=None if witness is None else _decided_node(witness),
             pointer=None if witness is None else _pointer(witness),
             named={spec.name: spec for spec in file.specs},
             units=units_of(result.formula),
@@ -179,15 +179,27 @@ def _results(
         )
 
 
+def _decided_ns(witness: Witness) -> int:
+    """Return when to look: of a response that was missed, when it came nearest."""
+    return witness.time_ns if witness.closest is None else witness.closest[1]
+
+
+def _decided_node(witness: Witness) -> int:
+    """Return the atom to look at: of a response that was missed, the one by which it came nearest."""
+    return witness.path[-1].node if witness.closest_node is None else witness.closest_node
+
+
 def _pointer(witness: Witness) -> Pointer | None:
-    if witness.deciding is None or witness.deciding.unknown:
+    deciding = witness.deciding if witness.closest is None else witness.closest[0]
+    if deciding is None or deciding.unknown:
         return None
-    for measured in witness.deciding.measured:
+    for measured in deciding.measured:
         if measured.contact is not None:
             ends = np.array([measured.contact.first, measured.contact.second])
-            number = witness.deciding.value * divisor_of(witness.deciding.atom)
-            is_condition = witness.missed is not None and witness.missed.is_condition
-            return Pointer(ends, witness.deciding.text, number, is_condition)
+            number = deciding.value * divisor_of(deciding.atom)
+            is_response = witness.closest is not None
+            is_condition = not is_response and witness.missed is not None and witness.missed.is_condition
+            return Pointer(ends, deciding.text, number, is_condition, is_response)
     return None
 
 

@@ -63,6 +63,40 @@ def planned(tmp_path_factory: pytest.TempPathFactory) -> Page:
 # ---------------------------------------------------------------------------------- what the page says
 
 
+NEARING = [
+    sr.Sample(index * 10**9, {"a": sr.Footprint.disc(index, 0, 0.5), "b": sr.Footprint.disc(8, 0, 0.5)})
+    for index in range(6)
+]
+NEARING_SPECS = """
+spec late = F (a dist b <= 1)
+spec soon = (a dist b <= 9) -> F[0s, 2s] (a dist b <= 3)
+spec far = G (a dist b >= 4)
+"""
+
+
+def test_of_a_missed_response_all_is_about_what_came_nearest(tmp_path: Path) -> None:
+    page = report_of_samples(tmp_path / "run.html", NEARING, NEARING_SPECS)
+    soon = page.facts["results"][0]
+    assert soon["title"] == "soon"
+    pointer = soon["pointer"]
+    assert (pointer["text"], pointer["label"], pointer["time"]) == ("a dist b <= 3", "-2", 2.0)
+    assert soon["nodes"][soon["decided"]]["text"] == "a dist b <= 3"
+    [event] = [each for each in page.facts["events"] if each["specification"] == "soon"]
+    assert "did not: a dist b <= 3 fails by 2." in "".join(event["parts"])
+
+
+def test_each_violated_result_has_an_arrow_of_its_own(tmp_path: Path) -> None:
+    page = report_of_samples(tmp_path / "run.html", NEARING, NEARING_SPECS)
+    assert [each["title"] for each in page.facts["results"]] == ["soon", "far", "late"]
+    found = page.facts["scene"]["violations"]
+    frames = page.numbers(found["frames"]).tolist()
+    results = page.numbers(found["places"]).reshape(-1, 2)[:, 0].tolist()
+    labels = dict(zip(zip(frames, results, strict=True), found["labels"], strict=True))
+    assert labels[2, 0] == "a dist b <= 3: -2"
+    assert labels[5, 0] == "a dist b <= 3 at 2.000 s: -2"
+    assert labels[5, 1] == "a dist b >= 4: -2"
+
+
 def test_verdicts_and_explanations_can_be_read_without_scripts(violated: Page) -> None:
     said = violated.within("section#verdicts")
     assert "violatedtable_setrobustness -0.1552," in said

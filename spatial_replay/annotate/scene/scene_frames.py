@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -65,7 +66,7 @@ class DrawnEntity(NamedTuple):
 
 
 class DrawnViolation(NamedTuple):
-    """The arrow at the first violation in one message.
+    """The arrow at the first violation of a result in one message.
 
     Attributes:
         ends: (2, 2), from where to where it points.
@@ -89,17 +90,44 @@ class DrawnViolation(NamedTuple):
     holds: bool = False
 
 
+class Arrows(NamedTuple):
+    """The arrows of one result in S messages.
+
+    Attributes:
+        result: which of the results it is.
+        violations: of the S samples.
+        causes: (S,), what decides each, in words.
+    """
+
+    result: int
+    violations: Violations
+    causes: Sequence[str]
+
+    def at(self, index: int, unit: str) -> DrawnViolation | None:
+        """Return the arrow in one message, if there is one; `unit` is that of lengths."""
+        found = self.violations
+        if not found.is_shown[index]:
+            return None
+        robustness, holds = float(found.robustness[index]), bool(found.holds[index])
+        label = f"{self.causes[index]}{violation_text(found, index, unit)}"
+        moment_ns = int(found.moment_ns[index]) if found.moment_ns[index] >= 0 else None
+        node, leaf = int(found.node[index]), int(found.leaf[index])
+        return DrawnViolation(
+            found.points[index], label, self.result, node, robustness, leaf, moment_ns, holds
+        )
+
+
 class SceneFrame(NamedTuple):
     """What one message shows.
 
     Attributes:
         entities: by their ids.
-        violation: None without an arrow.
+        violations: of each result that an arrow can show it of.
         is_violated: whether a requirement on an object or a region is violated.
     """
 
     entities: Mapping[str, DrawnEntity]
-    violation: DrawnViolation | None
+    violations: tuple[DrawnViolation, ...]
     is_violated: bool
 
     @property
@@ -128,7 +156,12 @@ class SceneFrames:
     _presence: Presence
     _content: SceneContent
     _regions: tuple[Region, ...]
+    _find_arrows: Callable[[], Sequence[Arrows]]
     _unit: str = ""
+
+    @cached_property
+    def _arrows(self) -> Sequence[Arrows]:
+        return self._find_arrows()
 
     def frame(self, index: int) -> SceneFrame:
         """Return what one of the messages shows."""
@@ -144,17 +177,10 @@ class SceneFrames:
                 code = int(self._presence.class_code[index, column])
                 class_name = self._presence.classes[code] if code >= 0 else None
                 entities[OBJECT + name] = DrawnEntity(rings, colour, class_name)
-        found, violation = content.violations, None
-        if found.is_shown[index]:
-            robustness = float(found.robustness[index])
-            which, node, leaf = (int(each[index]) for each in (found.result, found.node, found.leaf))
-            number = violation_text(found, index, self._unit)
-            label = f"{content.causes[content.arrow[index] - FIRST_FORM].text}{number}"
-            moment_ns = int(found.moment_ns[index]) if found.moment_ns[index] >= 0 else None
-            ends, holds = found.points[index], bool(found.holds[index])
-            violation = DrawnViolation(ends, label, which, node, robustness, leaf, moment_ns, holds)
+        arrows = (each.at(index, self._unit) for each in self._arrows)
         is_violated = bool((self.objects[index] < 0.0).any() or (self.regions[index] < 0.0).any())
-        return SceneFrame(entities, violation, is_violated)
+        violations = tuple(each for each in arrows if each is not None)
+        return SceneFrame(entities, violations, is_violated)
 
 
 class SceneContent(NamedTuple):

@@ -22,6 +22,7 @@ from spatial_replay.logs.schemas.Robustness_pb2 import (
 )
 from spatial_replay.palette import FAILING, HOLDING, NEGATIVE, NEUTRAL, POSITIVE
 from spatial_replay.text import Instant
+from spatial_replay.trace.sample import LATEST_NS
 
 
 def labelled_objects(
@@ -77,13 +78,18 @@ def banners_of(
         codes[:, column] = np.where((own_ns[at] == times_ns) | result.is_final, now, 0)
     codes[:first] = 0
     kinds, which = np.unique(codes, axis=0, return_inverse=True)
-    return which.reshape(-1), tuple(_banner([each.title for each in titled], kind, place) for kind in kinds)
+    return which.reshape(-1), tuple(_banner(titled, kind, place) for kind in kinds)
 
 
-def _banner(titles: Sequence[str], codes: NDArray[np.uint8], place: tuple[float, float]) -> Banner | None:
-    parts, colour = [], None
+def _banner(
+    results: Sequence[EvaluatedResult], codes: NDArray[np.uint8], place: tuple[float, float]
+) -> Banner | None:
+    parts, colour, titles = [], None, [each.title for each in results]
     for code, (words, hue) in _STANDING_WORDS.items():
-        own = [title for title, each in zip(titles, codes.tolist(), strict=True) if each == code]
+        of_code = [result for result, each in zip(results, codes.tolist(), strict=True) if each == code]
+        if code == VIOLATED:  # the one that was so first comes first
+            of_code.sort(key=lambda each: LATEST_NS if each.settled is None else each.settled.time_ns)
+        own = [each.title for each in of_code]
         if own:
             few = own if len(own) <= _MOST_TITLES else [*own[:_MOST_TITLES], "…"]
             parts.append(f"{len(own)} {words}: {', '.join(few)}" if len(titles) > 1 else f"{own[0]} {words}")

@@ -8,6 +8,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from types import MappingProxyType
 from typing import Final, Literal, NamedTuple
 
@@ -19,6 +20,7 @@ from spatial_replay.annotate.scene.scene_frames import (
     ABSENT,
     DELETED,
     FIRST_FORM,
+    Arrows,
     SceneContent,
     SceneFrames,
     colours,
@@ -182,8 +184,9 @@ class SceneEncoder:
             place=state.place,
             templates=MappingProxyType(dict(list(templates.items())[-_MOST_TEMPLATES:])),
         )
+        find_arrows = partial(_arrows_of, results, trace, written, state.first_ns or 0, self.unit)
         frames = SceneFrames(
-            times_ns, objects, regions, *shades, scale, presence, content, self._drawn, self.unit
+            times_ns, objects, regions, *shades, scale, presence, content, self._drawn, find_arrows, self.unit
         )
         return SceneMessages(times_ns, payloads, after, frames)
 
@@ -235,6 +238,18 @@ class SceneEncoder:
         if isinstance(layout.witness, CauseText):
             columns += _words_of_arrow(content.violations, samples, scale, self.unit)
         return np.concatenate([np.empty((len(samples), 0)), *columns], axis=1)
+
+
+def _arrows_of(
+    results: Sequence[EvaluatedResult], trace: Trace, written: Integers, first_ns: int, unit: str
+) -> list[Arrows]:
+    """Return the arrows of each result in some samples, as if it were the only one."""
+    arrows = []
+    for number, result in enumerate(results):
+        found = first_violations([result], trace, written)
+        causes, which = causes_of([result], found, first_ns, unit)
+        arrows.append(Arrows(number, found, [causes[cause].text for cause in which.tolist()]))
+    return arrows
 
 
 def _words_of_arrow(found: Violations, samples: Integers, scale: float, unit: str) -> list[Floats]:

@@ -68,6 +68,7 @@ class Witness:
         gaps: of an unknown atom, when what it is about is missing.
         closest: of a missed response, the atom by which it came closest to holding, and the time of its
             sample; None if that is what decides, or if there is no such atom.
+        closest_node: the id of that atom's node.
         units: those that the log declares, of signals by their names, of lengths by "".
         unit: the declared one of `lower` and `upper`, or "".
     """
@@ -86,6 +87,7 @@ class Witness:
     missed: MissedResponse | None = None
     gaps: tuple[Gap, ...] = ()
     closest: tuple[DecidingAtom, int] | None = None
+    closest_node: int | None = None
     units: Mapping[str, str] = field(default_factory=dict, repr=False, hash=False)
     unit: str = ""
 
@@ -159,11 +161,11 @@ def find_witness(
         if other is not None and other.lower < other.upper:
             open_end = other, other_path[-1].time_ns
     missed = missed_response(found, nodes, done, times_ns) if verdict is Verdict.VIOLATED else None
-    closest = None
+    closest, closest_node = None, None
     if missed is not None and missed.is_condition:
         _, best_path, best = follow(End.HIGH, missed.node, missed.sample)
         if best is not None and not best.unknown:
-            closest = best, best_path[-1].time_ns
+            closest, closest_node = (best, best_path[-1].time_ns), best_path[-1].node
     return Witness(
         instance.name,
         instance.object,
@@ -179,6 +181,7 @@ def find_witness(
         missed,
         evidence.gaps(deciding.atom) if deciding is not None and deciding.unknown else (),
         closest,
+        closest_node,
         evidence.units,
         declared_unit(nodes[node], evidence.units),
     )

@@ -62,10 +62,15 @@ function readScene(run) {
   const {labels, moments, ...found} = scene.violations;
   const points = coordinates(numbers(found.points)), places = numbers(found.places);
   const robustness = numbers(found.robustness), holds = numbers(found.holds);
-  const violations = new Map(Array.from(numbers(found.frames), (frame, index) => [frame, {
-    ends: points.subarray(4 * index, 4 * index + 4), label: labels[index], robustness: robustness[index],
-    result: places[2 * index], node: places[2 * index + 1], holds: holds[index] === 1, moment: moments[index],
-  }]));
+  // of each frame, those of its violated results
+  const violations = new Map();
+  numbers(found.frames).forEach((frame, index) => {
+    if (!violations.has(frame)) violations.set(frame, []);
+    violations.get(frame).push({
+      ends: points.subarray(4 * index, 4 * index + 4), label: labels[index], robustness: robustness[index],
+      result: places[2 * index], node: places[2 * index + 1], holds: holds[index] === 1, moment: moments[index],
+    });
+  });
   const maps = run.decisions.flatMap((decision) => decision.maps);
   // two runs side by side are drawn in one frame
   const shown = [...maps, ...(run.frame ? [run.frame] : [])];
@@ -123,10 +128,9 @@ function drawScene(context, clock, scene, layers, width, height) {
   if (violation) drawViolation(context, violation, at, names, [width, height]);
 }
 
-// The arrow of the scene, if it is of the chosen result.
-function violationAt({run, result}, scene, frame) {
-  const violation = scene.violations.get(frame);
-  return violation && (run.results.length < 2 || violation.result === result) ? violation : undefined;
+// The arrow of the chosen result in a frame.
+function violationAt({result}, scene, frame) {
+  return scene.violations.get(frame)?.find((each) => each.result === result);
 }
 
 // The colours of entities in a frame: by the requirements of the chosen result, where there are several.
@@ -343,7 +347,7 @@ function wordsOf(clock, scene, frame) {
       return ["the arrow: ", element("code", {}, pointer.text),
         ` of ${run.results[clock.result].title} held here, and what had to follow did not`];
     }
-    return ["the arrow, what decided the verdict: ", element("code", {}, pointer.text),
+    return [`the arrow, ${pointer.is_response ? "what came nearest to what had to follow" : "what decided the verdict"}: `, element("code", {}, pointer.text),
       ` of ${run.results[clock.result].title} ${signWords(pointer.number, run.lengths)}`];
   }
   const violation = violationAt(clock, scene, frame);
@@ -355,9 +359,9 @@ function wordsOf(clock, scene, frame) {
   const isLost = chosen.some((result) =>
     statusOf(run, result, result.nodes[0], placeIn(result, clock.sample)) === "violated");
   const violated = inState(VIOLATED).filter((each) => !each.isCondition && (each.lasts || !isLost));
-  if (violated.length) return [...failureWords(violated[0]), others(violated), "; no arrow can show it"];
+  if (violated.length) return [...failureWords(violated[0]), others(violated), "; no arrow shows it"];
   if (scene.isViolated[frame] && run.results.length < 2) {
-    return ["something is violated now that no arrow can show"];
+    return ["something is violated now that no arrow shows"];
   }
   const unknown = inState(UNKNOWN);
   if (unknown.length) {
@@ -383,7 +387,7 @@ function lostBefore({run, sample, result: chosen}) {
 // What the arrow points at; of a requirement that the page leaves out, only the number.
 function violationWords(run, time, {result: which, node: index, label, robustness, holds, moment}) {
   const number = holds ? -robustness : robustness;
-  if (which < 0) return [`${label.replace(": -", ": −")}, which is violated there`];
+  if (index < 0) return [`${label.replace(": -", ": −")}, which is violated there`];
   const result = run.results[which], node = result.nodes[index];
   if (moment !== null) {
     return [...partWords({result, node}), ` ${signWords(number, run.lengths)} at ${secondsText(moment)}, what decided the verdict`];

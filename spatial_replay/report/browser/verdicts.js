@@ -123,15 +123,27 @@ function makeEvents(clock) {
   place.append(list);
   const starts = events.map((event) => event.time);
   let here = null;
-  clock.on("time", () => {
-    const now = starts[0] <= clock.time + 1e-9 ? indexAt(starts, clock.time) : -1;
+  const show = () => {
+    const {name, object} = clock.run.results[clock.result] ?? {};
+    const now = markedEvent(starts, clock.time, (place) =>
+      events[place].specification === name && (events[place].object ?? null) === (object ?? null));
     if (now === here) return;
     if (here !== null && here >= 0) rows[here].removeAttribute("aria-current");
     here = now;
     if (now < 0) return;
     rows[now].setAttribute("aria-current", "true");
     keepInSight(list, rows[now].parentElement);
-  });
+  };
+  clock.on("time", show);
+  clock.on("result", show);
+}
+
+// The last event that is not later than a time: of several at once the first that is of the chosen result, if one is.
+function markedEvent(starts, time, isChosen) {
+  if (!starts.length || starts[0] > time + 1e-9) return -1;
+  const last = indexAt(starts, time);
+  for (let place = starts.indexOf(starts[last]); place <= last; place++) if (isChosen(place)) return place;
+  return last;
 }
 
 function eventRow(event, choose) {
