@@ -49,7 +49,7 @@ def test_every_result_is_explained_in_a_few_sentences(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     code, text = said(capsys, *EXPLAIN)
-    done, met, apart = text.strip().split("\n\n")
+    met, apart, done = text.strip().split("\n\n")
     assert code == 1
     assert done.splitlines() == [
         "`done` is satisfied: robustness 0.1.",

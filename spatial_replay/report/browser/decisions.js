@@ -118,7 +118,12 @@ function layerChoice(run, map, show) {
     return {...map, values: layer.values, scale, picture: undefined};
   });
   const options = ["all that has to hold", ...map.layers.map((layer) => layer.title)];
-  const choice = element("select", {"aria-label": "Layer of the map", onchange: () => show([map, ...layers][choice.selectedIndex])},
+  const choose = () => {
+    // a long relation does not fit
+    choice.title = options[choice.selectedIndex];
+    show([map, ...layers][choice.selectedIndex]);
+  };
+  const choice = element("select", {"aria-label": "Layer of the map", title: options[0], onchange: choose},
     ...options.map((title) => element("option", {}, title)));
   return choice;
 }
