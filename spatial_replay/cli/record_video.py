@@ -49,7 +49,8 @@ def duration_ns(context: click.Context, parameter: click.Parameter, text: str | 
     "topics",
     metavar="TOPIC",
     multiple=True,
-    help="Of a log: its image topic; repeat for several cameras.  [default: the only one]",
+    help="Of a log: its topic with images or AprilTag detections; repeat for several cameras.  [default: the"
+    " only one]",
 )
 @click.option(
     "--offset",
@@ -109,10 +110,10 @@ def video(
 ) -> int:
     """Record the tagged objects that a camera saw, with verdicts as they change.
 
-    Reads a video file, an image topic of a log, or a camera of this machine. Objects carry AprilTags; the
-    tags file says which. Every footprint comes with its uncertainty, so that a verdict near a threshold is
-    unknown rather than guessed. Several videos or topics are cameras that see the same scene: their frames
-    of one time make one sample. Needs the extra `vision`.
+    Reads a video file, a topic of a log with images or AprilTag detections, or a camera of this machine.
+    Objects carry AprilTags; the tags file says which. Every footprint comes with its uncertainty, so that
+    a verdict near a threshold is unknown rather than guessed. Several videos or topics are cameras that
+    see the same scene: their frames of one time make one sample. Needs the extra `vision`.
 
     Exits with 0 if all specifications are satisfied, 1 if any is violated, 4 if none is violated and any is
     unknown, 3 if the video is damaged: what was recorded up to then is whole.
