@@ -470,6 +470,13 @@ def test_numbers_of_a_thinned_run_are_those_of_the_time_that_is_named(open_page:
         assert float(shown.inner_text().replace(MINUS, "-")) == pytest.approx(1 - x - 0.001, abs=6e-4)
 
 
+def test_of_events_at_once_the_one_of_the_chosen_result_is_marked(open_page: Open) -> None:
+    page = open_page("violated")
+    marked = page.locator("#events [aria-current] .sentence")
+    # one of its named parts is violated at the same time
+    expect(marked).to_have_text(re.compile("^table_set is violated"))
+
+
 def test_a_damaged_log_is_announced(open_page: Open) -> None:
     page = open_page("damaged")
     expect(page.get_by_role("alert")).to_contain_text("The log is damaged")
