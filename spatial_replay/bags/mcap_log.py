@@ -19,7 +19,8 @@ from spatial_replay.bags.decoders import topic_of, topics_by_name
 from spatial_replay.bags.reader import MessageReader
 from spatial_replay.bags.topic import Topic
 from spatial_replay.geometry.arrays import Integers
-from spatial_replay.logs.mcap.chunks import ChunkPlace, DamageError, plan_places, read_records, walk_records
+from spatial_replay.logs.mcap.chunk_records import DamageError, walk_records
+from spatial_replay.logs.mcap.chunks import ChunkPlace, plan_places, read_records
 from spatial_replay.logs.mcap.index import Directory, iter_attachments, iter_metadata, read_directory
 from spatial_replay.logs.mcap.reader import ChunkWalk, recovery_remarks
 from spatial_replay.logs.messages import Attachment, Channel

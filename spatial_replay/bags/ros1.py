@@ -31,7 +31,7 @@ from spatial_replay.bags.ros1_index import (
 from spatial_replay.bags.ros_definitions import full_type_name
 from spatial_replay.bags.topic import Topic
 from spatial_replay.geometry.arrays import Integers
-from spatial_replay.logs.mcap.chunks import DamageError
+from spatial_replay.logs.mcap.chunk_records import DamageError
 from spatial_replay.logs.messages import Channel, Schema
 from spatial_replay.text import Instant, Sentence
 

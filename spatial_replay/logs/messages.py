@@ -72,6 +72,17 @@ class Payloads(Sequence[bytes]):
         starts = starts_from_counts(np.fromiter(map(len, payloads), np.int64, len(payloads)))
         return cls(b"".join(payloads), starts[:-1], starts[1:])
 
+    @classmethod
+    def join(cls, several: Sequence[Payloads]) -> Payloads:
+        """Join messages, one after the other."""
+        sizes = starts_from_counts(list(map(len, [each.data for each in several])))[:-1]
+        shifts = np.repeat(sizes, list(map(len, several)))
+        return cls(
+            b"".join([each.data for each in several]),
+            _joined([each.begin for each in several]) + shifts,
+            _joined([each.end for each in several]) + shifts,
+        )
+
     def __len__(self) -> int:
         return len(self.begin)
 

@@ -18,7 +18,8 @@ from typing import BinaryIO
 from mcap import records
 from mcap.opcode import Opcode
 
-from spatial_replay.logs.mcap.chunks import RECORD_HEAD, ChunkPlace, DamageError, chunk_place, decoded
+from spatial_replay.logs.mcap.chunk_records import RECORD_HEAD, DamageError, decoded
+from spatial_replay.logs.mcap.chunks import ChunkPlace, chunk_place
 from spatial_replay.logs.messages import Attachment
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.logs.topics import LIBRARY, MAGIC

@@ -18,7 +18,7 @@ from mcap import records
 from mcap.opcode import Opcode
 
 from spatial_replay.geometry.arrays import Integers
-from spatial_replay.logs.mcap.chunks import RECORD_HEAD, encoded
+from spatial_replay.logs.mcap.chunk_records import RECORD_HEAD, encoded
 from spatial_replay.logs.messages import Messages
 
 _MESSAGE = np.dtype(

@@ -11,7 +11,6 @@ from contextlib import contextmanager, suppress
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import cached_property
-from operator import itemgetter
 from types import MappingProxyType
 from typing import BinaryIO
 
@@ -19,16 +18,20 @@ import numpy as np
 from mcap import records
 
 from spatial_replay.errors import LogError, UsageError
+from spatial_replay.geometry.arrays import Booleans
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.byte_ranges import plan_reads
-from spatial_replay.logs.mcap.chunks import (
-    ChunkPlace,
+from spatial_replay.logs.mcap.chunk_records import (
     DamageError,
     Declaration,
-    RawMessage,
-    iter_contents,
-    read_records,
+    RawMessages,
+    Records,
     split_records,
+)
+from spatial_replay.logs.mcap.chunks import (
+    ChunkPlace,
+    iter_records,
+    read_records,
 )
 from spatial_replay.logs.mcap.index import (
     Directory,
@@ -37,7 +40,16 @@ from spatial_replay.logs.mcap.index import (
     iter_metadata,
     read_directory,
 )
-from spatial_replay.logs.messages import BLOCK_SAMPLES, Attachment, Block, Channel, Messages, Schema, select
+from spatial_replay.logs.messages import (
+    BLOCK_SAMPLES,
+    Attachment,
+    Block,
+    Channel,
+    Messages,
+    Schema,
+    chosen_payloads,
+    select,
+)
 from spatial_replay.logs.objects.decode import decode_objects
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.logs.remote import LogFile, RemoteFile, open_file
@@ -52,9 +64,8 @@ BLOCK_BYTES = 64 * 2**20
 """A block of messages is closed when it holds this much, however few its samples are."""
 AFTER_ALL_NS = 2**64
 _SAMPLES = "spatial_replay.ObjectStates"
-_CHANNEL, _PAYLOAD = itemgetter(1), itemgetter(4)
-_ORDER = itemgetter(0, 1, 2)
-"""Log time, channel and sequence; messages that share all three, as in copies of bags, keep their order."""
+_CHANNELS = 2**16
+"""As many as a file can have."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +113,7 @@ class McapSource:
         """Yield the payloads of one topic in order, in lists of bounded size, each with what was lost."""
         with self.open_walk() as walk:
             for messages in _blocks(walk, (0, AFTER_ALL_NS), topic.__eq__):
-                yield [payload for *_, payload in messages], walk.faults.take()
+                yield list(messages.payloads), walk.faults.take()
             yield [], walk.faults.take(last=True)
 
     def attachments(self) -> tuple[Attachment, ...]:
@@ -208,6 +219,7 @@ class ChunkWalk:
         self.directory = directory
         self._schemas = dict(directory.schemas)
         self.channels: dict[int, Channel] = {}
+        self._is_declared = np.zeros(_CHANNELS, np.bool_)
         self.places = sorted(directory.chunks, key=lambda place: (place.start_ns, place.offset))
         for channel in directory.channels.values():
             self._declare(channel)
@@ -221,37 +233,36 @@ class ChunkWalk:
 
     def iter_messages(
         self, places: Sequence[ChunkPlace], is_wanted: Callable[[str], bool] = lambda topic: True
-    ) -> Iterator[tuple[ChunkPlace, list[RawMessage]]]:
+    ) -> Iterator[tuple[ChunkPlace, RawMessages]]:
         """Yield the messages in each place; what is lost of them goes to the faults.
 
         Args:
             is_wanted: which topics matter; messages of others may be left out.
         """
-        for place, content in iter_contents(self.stream, places):
-            passed_over = frozenset(n for n, each in self.channels.items() if not is_wanted(each.topic))
-            yield place, self._messages(place, content, passed_over)
+        passed_over = [n for n, each in self.channels.items() if not is_wanted(each.topic)]
+        for place, found in iter_records(self.stream, places, passed_over):
+            yield place, self._messages(place, found)
 
-    def _messages(
-        self, place: ChunkPlace, records_read: bytes | DamageError, passed_over: frozenset[int]
-    ) -> list[RawMessage]:
-        span = Sentence("messages between ", Instant(place.start_ns, 0), " and ", Instant(place.end_ns, 0))
-        if isinstance(records_read, DamageError):
-            self._fault(place, Sentence(f"{records_read}; the ", span, " are lost"))
-            return []
-        content = split_records(records_read, passed_over)
-        if content.damage:
-            self._fault(
-                place,
-                Sentence(f"{content.damage}; of the ", span, f", {len(content.messages)} could be read"),
-            )
-        self._take_in(content.declarations)
-        channels = self.channels
-        usable = [m for m in content.messages if m[1] in channels and m[0] <= LATEST_NS]
-        if lost := len(content.messages) - len(usable):
-            self._fault(
-                place, Sentence(f"{lost} of the ", span, " have no channel, or a time beyond 2**63 - 1 ns")
-            )
-        return usable
+    def numbers(self, is_chosen: Callable[[str], bool]) -> Booleans:
+        """Return by number, (65536,), whether the topic of a channel is chosen."""
+        chosen = np.zeros(_CHANNELS, np.bool_)
+        chosen[[number for number, each in self.channels.items() if is_chosen(each.topic)]] = True
+        return chosen
+
+    def _messages(self, place: ChunkPlace, found: Records | DamageError) -> RawMessages:
+        if isinstance(found, DamageError):
+            self._fault(place, f"{found}; the ", " are lost")
+            return RawMessages.join([])
+        messages = found.messages
+        if found.damage:
+            self._fault(place, f"{found.damage}; of the ", f", {len(messages)} could be read")
+        self._take_in(found.declarations)
+        is_usable = self._is_declared[messages.heads["channel"]] & (messages.heads["log_time"] <= LATEST_NS)
+        if is_usable.all():
+            return messages
+        lost = len(messages) - np.count_nonzero(is_usable)
+        self._fault(place, f"{lost} of the ", " have no channel, or a time beyond 2**63 - 1 ns")
+        return messages.take(np.flatnonzero(is_usable))
 
     def _find_channels(self) -> None:
         """Declare all channels of a log without a summary: chunks need not come in the order of time."""
@@ -271,6 +282,7 @@ class ChunkWalk:
         if channel.id in self.channels:
             return
         schema = self._schemas.get(channel.schema_id)
+        self._is_declared[channel.id] = True
         self.channels[channel.id] = Channel(
             channel.topic,
             channel.message_encoding,
@@ -278,16 +290,20 @@ class ChunkWalk:
             MappingProxyType(channel.metadata),
         )
 
-    def _fault(self, place: ChunkPlace, what: str) -> None:
-        self.faults.add(Sentence(f"{self._name}: at byte {place.offset}: ", what))
+    def _fault(self, place: ChunkPlace, before: str, after: str) -> None:
+        """Report what happened to messages in a place, in words before and after their times."""
+        span = "messages between ", Instant(place.start_ns, 0), " and ", Instant(place.end_ns, 0)
+        self.faults.add(Sentence(f"{self._name}: at byte {place.offset}: ", Sentence(before, *span, after)))
 
 
 def _blocks(
     walk: ChunkWalk, window: tuple[int, int], is_wanted: Callable[[str], bool]
-) -> Iterator[list[RawMessage]]:
-    """Yield the messages of the topics wanted, in order, in lists of bounded size."""
+) -> Iterator[RawMessages]:
+    """Yield the messages of the topics wanted, in order, in blocks of bounded size."""
     start_ns, end_ns = window
-    numbers = {number for number, channel in walk.channels.items() if is_wanted(channel.topic)}
+    declared = 0
+    wanted = objects = walk.numbers(is_wanted)
+    numbers = set(np.flatnonzero(wanted).tolist())
     places = [
         place
         for place in walk.places
@@ -295,35 +311,43 @@ def _blocks(
         and place.end_ns >= start_ns
         and (place.channels is None or not place.channels.isdisjoint(numbers))
     ]
-    waiting: list[RawMessage] = []
+    waiting: list[RawMessages] = []
     size = samples = 0
     for number, (place, messages) in enumerate(walk.iter_messages(places, is_wanted), 1):
-        wanted = {number for number, channel in walk.channels.items() if is_wanted(channel.topic)}
-        objects = {number for number, channel in walk.channels.items() if channel.topic == OBJECTS}
-        if not wanted.issuperset(walk.channels) or place.start_ns < start_ns or place.end_ns >= end_ns:
-            messages = [m for m in messages if m[1] in wanted and start_ns <= m[0] < end_ns]
-        waiting += messages
-        size += sum(map(len, map(_PAYLOAD, messages)))
-        samples += sum(map(objects.__contains__, map(_CHANNEL, messages)))
+        if declared < len(walk.channels):
+            declared = len(walk.channels)
+            wanted, objects = walk.numbers(is_wanted), walk.numbers(OBJECTS.__eq__)
+        heads = messages.heads
+        is_chosen = wanted[heads["channel"]]
+        if place.start_ns < start_ns or place.end_ns >= end_ns:
+            is_chosen &= (heads["log_time"] >= start_ns) & (heads["log_time"] < end_ns)
+        if not is_chosen.all():
+            messages = messages.take(np.flatnonzero(is_chosen))
+        waiting.append(messages)
+        size += messages.size
+        samples += int(np.count_nonzero(objects[messages.heads["channel"]]))
         if number < len(places) and (size >= BLOCK_BYTES or samples >= BLOCK_SAMPLES):
-            waiting.sort(key=_ORDER)
-            ready = _count_before(waiting, places[number].start_ns)
+            ordered = _in_order(waiting)
+            ready = int(np.searchsorted(ordered.heads["log_time"], places[number].start_ns))
+            waiting = [ordered]
             if ready:
-                yield waiting[:ready]
-                waiting = waiting[ready:]
-                size = sum(map(len, map(_PAYLOAD, waiting)))
-                samples = sum(map(objects.__contains__, map(_CHANNEL, waiting)))
-    if waiting:
-        waiting.sort(key=_ORDER)
-        yield waiting
+                yield ordered[:ready]
+                # not the whole buffer for the few that are left
+                rest = ordered[ready:].compact()
+                waiting, size = [rest], rest.size
+                samples = int(np.count_nonzero(objects[rest.heads["channel"]]))
+    rest = _in_order(waiting)
+    if len(rest):
+        yield rest
 
 
-def _count_before(messages: list[RawMessage], time_ns: int) -> int:
-    """Count the messages, which are in order, before a time."""
-    count = len(messages)
-    while count and messages[count - 1][0] >= time_ns:
-        count -= 1
-    return count
+def _in_order(several: Sequence[RawMessages]) -> RawMessages:
+    """Join messages by log time, channel and sequence; those that share all three keep their order."""
+    joined = RawMessages.join(several)
+    times = joined.heads["log_time"]
+    if (times[1:] > times[:-1]).all():
+        return joined
+    return joined.take(np.lexsort((joined.heads["sequence"], joined.heads["channel"], times)))
 
 
 class _BlockDecoder:
@@ -336,7 +360,7 @@ class _BlockDecoder:
         self.any_sample = False
         self.first_fault: str | None = None
 
-    def block(self, messages: list[RawMessage]) -> Block:
+    def block(self, messages: RawMessages) -> Block:
         """Decode the samples among some messages."""
         columns = self._columns(messages)
         samples = [number for number, channel in columns.channels.items() if self._is_objects(channel)]
@@ -347,7 +371,7 @@ class _BlockDecoder:
         for time_ns in times[times <= before[:-1]].tolist():
             self._fault(Sentence("sample at ", Instant(time_ns, 0), ": there is one at this time already"))
         own, self._latest_ns = own[times > before[:-1]], int(before[-1])
-        payloads = [columns.payloads[index] for index in own.tolist()]
+        payloads = chosen_payloads(columns.payloads, own)
         trace, faults = decode_objects(payloads, columns.log_time_ns[own], concave=self._source.concave)
         for fault in faults:
             self._fault(fault)
@@ -369,20 +393,17 @@ class _BlockDecoder:
             f" {channel.encoding!r}; give {_SAMPLES} in protobuf"
         )
 
-    def _columns(self, messages: list[RawMessage]) -> Messages:
+    def _columns(self, messages: RawMessages) -> Messages:
         declared = self._walk.channels.items()
         is_wanted = self._source.is_wanted
-        copied = MappingProxyType({n: each for n, each in declared if is_wanted(each.topic)})
-        if not messages:
-            return Messages(copied)
-        log_time_ns, channel, sequence, publish_time_ns, payloads = zip(*messages, strict=True)
+        heads = messages.heads
         return Messages(
-            channels=copied,
-            channel=np.array(channel, np.int64),
-            sequence=np.array(sequence, np.int64),
-            log_time_ns=np.array(log_time_ns, np.int64),
-            publish_time_ns=np.array(publish_time_ns, np.uint64).view(np.int64),
-            payloads=payloads,
+            channels=MappingProxyType({n: each for n, each in declared if is_wanted(each.topic)}),
+            channel=heads["channel"].astype(np.int64),
+            sequence=heads["sequence"].astype(np.int64),
+            log_time_ns=heads["log_time"].astype(np.int64),
+            publish_time_ns=heads["publish_time"].astype(np.int64),
+            payloads=messages.payloads,
         )
 
     def _fault(self, what: str) -> None:

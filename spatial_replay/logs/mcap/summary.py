@@ -101,7 +101,7 @@ def _counts(walk: ChunkWalk) -> tuple[Counter[int], int | None, int | None]:
     else:
         counts, times = Counter(), []
         for _, messages in walk.iter_messages(walk.places):
-            counts.update(channel for _, channel, *_ in messages)
-            times += [time_ns for time_ns, *_ in messages]
+            counts.update(messages.heads["channel"].tolist())
+            times += messages.heads["log_time"].tolist()
             times = [min(times), max(times)] if times else []
     return counts, (times[0] if times else None), (times[-1] if times else None)

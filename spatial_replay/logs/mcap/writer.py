@@ -23,7 +23,7 @@ from mcap import records
 
 from spatial_replay.errors import OutputError
 from spatial_replay.geometry.arrays import Integers
-from spatial_replay.logs.mcap.chunks import encoded
+from spatial_replay.logs.mcap.chunk_records import encoded
 from spatial_replay.logs.mcap.packing import (
     Batch,
     McapSummary,
