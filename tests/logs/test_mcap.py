@@ -301,7 +301,7 @@ def test_all_messages_but_derived_ones_are_copied_as_they_are(log):
     (block,) = open_source(log(content)).iter_blocks()
     topics = [block.messages.channels[number].topic for number in block.messages.channel.tolist()]
     assert topics == [OBJECTS, "/camera"] * 3
-    assert block.messages.payloads[1::2] == (b"[]", b"{}", b"1")
+    assert list(block.messages.payloads[1::2]) == [b"[]", b"{}", b"1"]
     assert block.messages.log_time_ns.tolist() == sorted(times * 2)
     assert ROBUSTNESS not in {channel.topic for channel in block.messages.channels.values()}
     assert list(block.messages.payloads[::2]) == encode_objects(trace)
