@@ -304,6 +304,9 @@ class Skeleton:
 
     def _node(self, kind: Kind, first: int = 0, second: int = 0) -> int:
         node = Node(kind, first, second)
+        if kind in ("U", "R") and self.nodes[second][:2] == (kind, first):
+            # G G a is G a, and so on: `G a and G b` may well be read as G (a and G b)
+            return second
         if node not in self._numbers:
             if len(self.nodes) == MAX_NODES:
                 raise self._too_large()

@@ -7,7 +7,7 @@ function of inequalities between sums. Two relations about one quantity share it
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from fractions import Fraction
 from typing import Final, Literal, NamedTuple
 
@@ -84,6 +84,7 @@ class FactDiagrams:
         self._numbers: dict[object, int] = {}
         self._trees: dict[Expression, Tree | None] = {}
         self._known: dict[int, tuple[Formula, int]] = {}
+        self._written: dict[int, dict[str, None]] = {}
         # quantities that are compared with "==": modes and counts as a rule
         self._compared: set[Weights] = set()
         atoms = [each for one in formulas for each in iter_formulas(one) if isinstance(each, Atom)]
@@ -142,9 +143,20 @@ class FactDiagrams:
         is_whole = isinstance(self._trees[atom.expression], Linear)
         texts = _texts(atom, is_whole, is_least, weights, threshold)
         if weights in self._compared:
-            return self._fact(Fact(weights, threshold, ">=" if is_least else "<=", texts))
-        node = self._fact(Fact(weights, threshold, ">", texts if is_least else texts[::-1]))
+            side: Literal[">=", "<="] = ">=" if is_least else "<="
+            texts = _exact_texts(weights, threshold, side) or texts
+            return self._fact(Fact(weights, threshold, side, texts), atom.text)
+        node = self._fact(Fact(weights, threshold, ">", texts if is_least else texts[::-1]), atom.text)
         return node if is_least else self.diagrams.complement(node)
+
+    def equal_texts(self, number: int) -> Iterator[tuple[str, str]]:
+        """Yield pairs of comparisons of a fact, as "x > 1" and "x >= 1", whose robustness is the same."""
+        texts = dict.fromkeys((*self._written.get(number, ()), *self.facts[number].texts))
+        for strict in texts:
+            for sign in (" > ", " < "):
+                other = strict.replace(sign, f"{sign.rstrip()}= ")
+                if other != strict and other in texts and strict in self._written[number]:
+                    yield strict, other
 
     def _opaque(self, formula: Formula) -> int:
         text = format_formula(formula)
@@ -153,12 +165,13 @@ class FactDiagrams:
             alone = formula.quantifier == "forall" if formula.group.class_name != ANY_CLASS else None
         return self._fact(Fact((), Fraction(0), ">", (text, f"not ({text})"), alone))
 
-    def _fact(self, fact: Fact) -> int:
+    def _fact(self, fact: Fact, written: str = "") -> int:
         key = (fact[:3]) if fact.weights else fact.texts
         if key not in self._numbers:
             self._numbers[key] = len(self.facts)
             self.facts.append(fact)
         number = self._numbers[key]
+        self._written.setdefault(number, {})[written] = None
         known = self.facts[number]
         # another relation may say without "not" what this one says with it
         first, second = (
@@ -198,14 +211,9 @@ def _texts(
     """Return the sentences of a fact of an atom: where it holds, and where it fails."""
     if is_whole:
         return atom.text, f"not ({atom.text})"
-    (quantity, _), *others = weights
-    limit = format_number(float(threshold))
-    signs = (">=", "<=") if is_least else ("<=", ">=")
-    if not others and isinstance(quantity, SignedDistance):
-        pair = f"{format_term(quantity.first)} dist {format_term(quantity.second)}"
-        return f"{pair} {signs[0]} {limit}", f"{pair} {signs[1]} {limit}"
-    if not others and isinstance(quantity, Signal):
-        return f"{quantity.name} {signs[0]} {limit}", f"{quantity.name} {signs[1]} {limit}"
+    compared = _compared_texts(weights, threshold, (">=", "<=") if is_least else ("<=", ">="))
+    if compared is not None:
+        return compared
     text = _relation_text(weights) if not threshold else None
     if text is None:
         return f"a part of {atom.text}", f"not a part of {atom.text}"
@@ -213,6 +221,24 @@ def _texts(
     relation, holds_above = text
     texts = relation, f"not ({relation})"
     return texts if holds_above == is_least else texts[::-1]
+
+
+def _exact_texts(weights: Weights, threshold: Fraction, side: Literal[">=", "<="]) -> tuple[str, str] | None:
+    """Return the sentences of a comparison that is meant to the letter; None for a sum of several numbers."""
+    return _compared_texts(weights, threshold, (side, "<" if side == ">=" else ">"))
+
+
+def _compared_texts(weights: Weights, threshold: Fraction, signs: tuple[str, str]) -> tuple[str, str] | None:
+    (quantity, _), *others = weights
+    if others or not isinstance(quantity, SignedDistance | Signal):
+        return None
+    name = (
+        quantity.name
+        if isinstance(quantity, Signal)
+        else f"{format_term(quantity.first)} dist {format_term(quantity.second)}"
+    )
+    limit = format_number(float(threshold))
+    return f"{name} {signs[0]} {limit}", f"{name} {signs[1]} {limit}"
 
 
 def _relation_text(weights: Weights) -> tuple[str, bool] | None:

@@ -242,26 +242,41 @@ class _Examiner:
         implications = {
             node.span: node for node in nodes if isinstance(node, Boolean) and node.operator == "->"
         }
+        possible: dict[Boolean, Side] = {}
         for node in list(implications.values())[:MAX_ANTECEDENTS]:
-            antecedent = node.operands[0]
-            wanted = loosened(Temporal("F", (antecedent,)))
-            text = shortened_formula(format_formula(antecedent))
-            try:
-                ever = Side(automaton_of(self._specification, part.name, wanted))
-            except NoAutomatonError:
+            if (ever := self._sometime(part, node.operands[0])) is None:
                 continue
+            text = shortened_formula(format_formula(node.operands[0]))
             alone = self._asked(part.name, f"whether `{text}` ever holds", ever)
-            if alone is None:
-                continue
-            found, where = alone, ""
-            if found.word is not None and satisfying is not None:
-                within = self._asked(
-                    part.name, f"whether `{text}` holds in a run that satisfies it", satisfying, ever
-                )
-                found, where = within or found, f" in a run that satisfies {part.name}"
-            if found.word is None:
-                message = f"`{text}` never holds{where}, so this implication checks nothing"
-                self._add("idle antecedent", (part.name,), node.span, found, message, _IDLE)
+            if alone is not None and alone.word is None:
+                self._add_idle(part, node, alone, "")
+            elif alone is not None and satisfying is not None:
+                possible[node] = ever
+        if satisfying is None or not possible:
+            return
+        # one run in which all of them hold at once answers for each
+        once = self._sometime(part, Boolean("and", tuple(node.operands[0] for node in possible)))
+        if len(possible) > 1 and once is not None and self._search.is_found(satisfying, once):
+            return
+        for node, ever in possible.items():
+            text = shortened_formula(format_formula(node.operands[0]))
+            what = f"whether `{text}` holds in a run that satisfies it"
+            within = self._asked(part.name, what, satisfying, ever)
+            if within is not None and within.word is None:
+                self._add_idle(part, node, within, f" in a run that satisfies {part.name}")
+
+    def _add_idle(self, part: _Part, node: Boolean, found: Answer, where: str) -> None:
+        text = shortened_formula(format_formula(node.operands[0]))
+        message = f"`{text}` never holds{where}, so this implication checks nothing"
+        self._add("idle antecedent", (part.name,), node.span, found, message, _IDLE)
+
+    def _sometime(self, part: _Part, formula: Formula) -> Side | None:
+        """Return the runs in which a part of a spec holds in some sample; None without an automaton."""
+        wanted = loosened(Temporal("F", (formula,)))
+        try:
+            return Side(automaton_of(self._specification, part.name, wanted))
+        except NoAutomatonError:
+            return None
 
     def _pairs(self, parts: Sequence[_Part], results: Sequence[NamedSpec]) -> None:
         """Compare specs that are about the same things, and are no trouble on their own."""
@@ -344,7 +359,9 @@ def _joint(one: Answer | None, other: Answer | None) -> Answer:
     found = [each for each in (one, other) if each is not None]
     exclusions = dict.fromkeys(exclusion for each in found for exclusion in each.exclusions)
     opposites = dict.fromkeys(opposite for each in found for opposite in each.opposites)
-    return Answer(None, all(each.by_logic for each in found), tuple(exclusions), tuple(opposites))
+    equals = dict.fromkeys(equal for each in found for equal in each.equals)
+    by_logic = all(each.by_logic for each in found)
+    return Answer(None, by_logic, tuple(exclusions), tuple(opposites), tuple(equals))
 
 
 def _reason(found: Answer) -> str:
@@ -353,7 +370,8 @@ def _reason(found: Answer) -> str:
         opposites = "".join(
             f"; `{one}` and `{other}` are opposites" for one, other in found.opposites[:_SHOWN]
         )
-        return f"by logic alone, whatever is measured{opposites}"
+        equals = "".join(f"; `{one}` has the robustness of `{other}`" for one, other in found.equals[:_SHOWN])
+        return f"by logic alone, whatever is measured{opposites}{equals}"
     texts = [_exclusion_text(each) for each in found.exclusions[:_SHOWN]]
     more = len(found.exclusions) - len(texts)
     return "; ".join(texts) + (f"; and {more} more" if more else "")

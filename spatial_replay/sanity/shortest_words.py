@@ -28,6 +28,9 @@ MAX_STEPS: Final = 200_000
 MAX_ALL_STEPS: Final = 800_000
 """How many steps all questions about one specification take together."""
 
+_STEPS_AT_ONCE: Final = 60_000
+"""How many steps a question takes whose answer would spare others."""
+
 _STEPS_OF_GEOMETRY: Final = 50
 """How many steps asking geometry counts as."""
 
@@ -55,12 +58,14 @@ class Answer:
         by_logic: whether there is none whatever the facts are about.
         exclusions: facts that exclude each other, without which there would be one.
         opposites: if it is by logic, relations that are each other's opposites, so that logic knows.
+        equals: if it is by logic, comparisons whose robustness is the same, as "x > 1" and "x >= 1".
     """
 
     word: Word | None
     by_logic: bool = False
     exclusions: tuple[tuple[str, ...], ...] = ()
     opposites: tuple[tuple[str, str], ...] = ()
+    equals: tuple[tuple[str, str], ...] = ()
 
 
 class WordSearch:
@@ -90,24 +95,30 @@ class WordSearch:
             if word is not None:
                 return Answer(word)
             if self._search(sides, geometry=False) is None:
-                facts = (self.fact(number) for number in sorted(self._read(sides)))
-                opposites = [each.texts for each in facts if not any(map(is_negated, each.texts))]
-                return Answer(None, by_logic=True, opposites=tuple(opposites))
+                numbers = sorted(self._read(sides))
+                facts = [self.fact(number) for number in numbers]
+                # what is compared by "==" and not has no opposites that need to be named
+                opposites = [
+                    each.texts for each in facts if each.side == ">" and not any(map(is_negated, each.texts))
+                ]
+                equals = [pair for number in numbers for pair in self._conditions.equal_texts(number)]
+                return Answer(None, True, opposites=tuple(opposites), equals=tuple(equals))
         except (NoAutomatonError, RecursionError) as error:
             raise UndecidedError from error
         return Answer(None, exclusions=tuple(self._texts_of(each) for each in self._about(sides)))
 
-    def is_possible(self, condition: int) -> bool:
-        """Return whether a condition holds in some sample.
-
-        Raises:
-            UndecidedError: it takes too many steps.
-        """
-        return self._cube(condition) is not None
-
-    def excluded(self, cube: Cube) -> bool:
-        """Return whether geometry excludes that facts have such values in one sample."""
-        return self._conflict(cube) is not None
+    def is_found(self, *sides: Side) -> bool:
+        """Return whether a run that all sides agree with is found at once; if not, there may be one."""
+        self._steps = MAX_STEPS - _STEPS_AT_ONCE
+        exclusions, allowed, all_steps = len(self._exclusions), self._allowed, self._all_steps
+        try:
+            return self._search(sides, geometry=True) is not None
+        except (NoAutomatonError, RecursionError, UndecidedError):
+            return False
+        finally:
+            # answers name the exclusions that they need, not those of other questions
+            del self._exclusions[exclusions:]
+            self._allowed, self._all_steps = allowed, all_steps
 
     def _search(self, sides: Sequence[Side], *, geometry: bool) -> Word | None:
         """Return the shortest run by A*: automata say how many samples it takes at least from here on."""

@@ -60,6 +60,10 @@ FAMILIES: dict[str, Callable[[int], str]] = {
         *(f"(G (not ({p(n + k)} and {p(n + j)})))" for k in range(n) for j in range(k)),
     ),
     "response": lambda n: both(*(f"(G ({p(2 * k)} -> F {p(2 * k + 1)}))" for k in range(n))),
+    # G binds to the end, so this is what `G (…) and G (…)` means
+    "response within response": lambda n: nested(
+        lambda one, two: f"(G ({one} and {two}))", [f"(G ({p(2 * k)} -> F {p(2 * k + 1)}))" for k in range(n)]
+    ),
     "alternate response": lambda n: both(
         *(f"(G ({p(k)} -> X ((not {p(k)}) U {p(k + 1)})))" for k in range(n))
     ),

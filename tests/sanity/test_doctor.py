@@ -100,6 +100,28 @@ def test_relations_are_reported_as_they_are_written_and_opposites_are_named() ->
     assert never.violated.sentences == ("any sample",)
 
 
+def test_what_is_compared_by_equality_is_reported_to_the_letter() -> None:
+    specification = sr.parse_specification("spec on = F (mode > 1)\nspec one = G (mode == 1)")
+    examined = sr.doctor(specification)
+    (finding,) = examined.findings
+    assert (finding.kind, finding.specs) == ("implied", ("on", "one"))
+    assert finding.reason.endswith("whatever is measured; `mode > 1` has the robustness of `mode >= 1`")
+    runs = [run.sentences for spec in examined.specs for run in (spec.satisfied, spec.violated) if run]
+    assert runs == [("mode >= 1",), ("mode < 1",), ("mode >= 1 and mode <= 1",), ("mode < 1",)]
+    (alike,) = sr.doctor(sr.parse_specification("spec s = F (p >= 1)\nspec t = F (p > 1)")).findings
+    assert alike.reason.endswith("; `p > 1` has the robustness of `p >= 1`")
+
+
+def test_of_many_antecedents_the_one_that_never_holds_is_found() -> None:
+    antecedents = [f"a{n} leftof b{n}" for n in range(12)]
+    antecedents[7] += " and b7 leftof a7"
+    text = " and ".join(f"(G ({each} -> F c dist d >= 0.{n + 1}))" for n, each in enumerate(antecedents))
+    (finding,) = sr.doctor(sr.parse_specification(text), examples=False).findings
+    assert finding.kind == "idle antecedent"
+    assert "(a7 leftof b7) and (b7 leftof a7)" in finding.diagnostic.message
+    assert finding.exclusions == (("a7 leftof b7", "b7 leftof a7"),)
+
+
 def test_specs_are_compared_with_each_other() -> None:
     found = findings(
         "spec far = G (cup dist mug >= 0.2)\n"

@@ -64,12 +64,12 @@ def bench_many_responses(measure: Any) -> None:
 
 def bench_doctor(measure: Any) -> None:
     """What is wrong with a specification, and the shortest runs of its results, placed and evaluated."""
-    spatial = " and ".join(f"(G (a{n} leftof b{n} -> F a{n} ovlp b{n}))" for n in range(8))
+    spatial = " and ".join(f"(G (a{n} leftof b{n} -> F a{n} ovlp b{n}))" for n in range(12))
     several = "\n".join(
         f"spec s{n} = G (a dist b >= 0.{n + 10}) and F (a leftof c{n} and b ovlp c{n})" for n in range(12)
     )
     deadline = "G (a leftof b -> F[0, 1000] a ovlp b)"
-    tasks = {"pick-place": PICK_PLACE, "8 responses": spatial, "12 specs": several, "1000 samples": deadline}
+    tasks = {"pick-place": PICK_PLACE, "12 responses": spatial, "12 specs": several, "1000 samples": deadline}
     for name, text in tasks.items():
         specification = sr.parse_specification(text)
         measure(f"doctor, {name}", lambda _, it=specification: sr.doctor(it), limit_s=1.0)
