@@ -24,7 +24,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from types import FunctionType
 from typing import Any, Final, Generic, Literal, ParamSpec, TypeVar, cast
@@ -352,7 +352,7 @@ def cache_folder() -> Path | None:
 
     Code in it is loaded as it is, so it lies where only the user, or who installed the package, writes.
     """
-    name = f"kernels-{_digest()}"
+    name = f"kernels-{source_digest()}"
     shipped: Path | None = None
     for parent in _cache_parents():
         folder = parent / name
@@ -399,7 +399,8 @@ def _remove_stale(parent: Path, keep: str) -> None:
                 shutil.rmtree(folder, ignore_errors=True)
 
 
-def _digest() -> str:
+@cache
+def source_digest() -> str:
     """Return a digest of the sources of the package: kernels take constants from anywhere in it."""
     digest = hashlib.sha256()
     for path in sorted(_PACKAGE.rglob("*.py")):

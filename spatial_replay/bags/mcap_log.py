@@ -20,9 +20,10 @@ from spatial_replay.bags.reader import MessageReader
 from spatial_replay.bags.topic import Topic
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.mcap.chunk_records import DamageError, walk_records
+from spatial_replay.logs.mcap.chunk_walk import ChunkWalk
 from spatial_replay.logs.mcap.chunks import ChunkPlace, plan_places, read_records
 from spatial_replay.logs.mcap.index import Directory, iter_attachments, iter_metadata, read_directory
-from spatial_replay.logs.mcap.reader import ChunkWalk, recovery_remarks
+from spatial_replay.logs.mcap.reader import recovery_remarks
 from spatial_replay.logs.messages import Attachment, Channel
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.logs.remote import LogFile, open_file

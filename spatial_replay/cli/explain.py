@@ -75,6 +75,7 @@ def explain(
             inputs.options(keep=(MAPPED,)),
             keep_series=True,
             keep_leaves=True,
+            certify=False,
             advance=advance,
         )
     warn_of_input(replayed)

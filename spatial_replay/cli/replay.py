@@ -140,6 +140,7 @@ def replay(
             output=output,
             inputs=request.inputs,
             layer=layer,
+            certify=json_file is not None,
             advance=advance,
         )
     warn_of_input(replayed)

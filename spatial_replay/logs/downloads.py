@@ -80,9 +80,9 @@ def downloaded_folder(files: Sequence[RemoteFile], name: str, shown: str, reason
 
 def _copied(files: Sequence[RemoteFile], shown: str, reason: str, below: str = "") -> Path:
     """Return the folder that holds copies of files."""
-    versions, limit = [file.version for file in files], _limit()
+    versions, limit = [file.version for file in files], gigabytes(_LIMIT, _DEFAULT_GIGABYTES)
     size = sum(version.size for version in versions)
-    parent = _folder()
+    parent = user_cache_folder("downloads")
     known = [f"{os.fspath(file)}\n{file.version.tag}\n{file.version.size}" for file in files]
     folder = parent / hashlib.sha256("\n".join(known).encode()).hexdigest()[:32]
     # what has no tag may have changed
@@ -155,17 +155,29 @@ def _make_room(parent: Path, room: int) -> None:
         total -= size
 
 
-def _folder() -> Path:
-    chosen = os.environ.get("SPATIAL_REPLAY_CACHE")
-    if chosen:
-        return Path(chosen) / "downloads"
+def user_cache_folder(name: str) -> Path:
+    """Return the folder of this name among what the user's programs may keep.
+
+    Raises:
+        RuntimeError: the user has no home folder.
+    """
+    if chosen := os.environ.get("SPATIAL_REPLAY_CACHE"):
+        return Path(chosen) / name
     parent = os.environ.get("XDG_CACHE_HOME")
-    return (Path(parent) if parent else Path.home() / ".cache") / "spatial-replay" / "downloads"
+    return (Path(parent) if parent else Path.home() / ".cache") / "spatial-replay" / name
 
 
-def _limit() -> int:
-    text = os.environ.get(_LIMIT, str(_DEFAULT_GIGABYTES))
+def gigabytes(variable: str, otherwise: float) -> int:
+    """Return the bytes that a variable of the environment names in gigabytes.
+
+    Raises:
+        UsageError: it is not a number from 0 on.
+    """
+    text = os.environ.get(variable, str(otherwise))
     try:
-        return int(float(text) * _GIGABYTE)
+        size = int(float(text) * _GIGABYTE)
     except (ValueError, OverflowError):
-        raise UsageError(f"{_LIMIT} is {text!r}; give a number of gigabytes") from None
+        size = -1
+    if size < 0:
+        raise UsageError(f"{variable} is {text!r}; give a number of gigabytes")
+    return size

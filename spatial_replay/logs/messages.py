@@ -101,6 +101,11 @@ class Payloads(Sequence[bytes]):
         return map(self.data.__getitem__, map(slice, self.begin.tolist(), self.end.tolist()))
 
     @property
+    def nbytes(self) -> int:
+        """The size of all messages in bytes."""
+        return int(self.lengths.sum())
+
+    @property
     def lengths(self) -> Integers:
         """(M,) int64, in bytes."""
         return np.asarray(self.end - self.begin)

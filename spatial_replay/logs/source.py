@@ -16,8 +16,8 @@ from spatial_replay.logs.messages import BLOCK_SAMPLES, Attachment, Block
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.trace.axes import OUR_AXES, Axes
 from spatial_replay.trace.declared_units import signal_units_metadata
-from spatial_replay.trace.sample import FOREVER, Sample
-from spatial_replay.trace.trace import Trace, window_of
+from spatial_replay.trace.sample import Sample
+from spatial_replay.trace.trace import Trace, within
 
 
 class Source(Protocol):
@@ -135,12 +135,6 @@ class TrackSource(_Bare):
             yield Block(replace(Trace.from_samples(()), faults=rest))
 
 
-def within(trace: Trace, start_ns: int | None, end_ns: int | None) -> Trace:
-    """Return the samples of a trace from `start_ns` up to, not including, `end_ns`."""
-    begin, end = window_of(trace.times_ns, start_ns or 0, FOREVER if end_ns is None else end_ns)
-    return trace if (begin, end) == (0, len(trace)) else trace.slice(begin, end)
-
-
 def read_blocks(
     source: Source, start_ns: int | None = None, end_ns: int | None = None
 ) -> Generator[Block, None, None]:
@@ -181,6 +175,13 @@ def reading_only(source: Source, keep: tuple[str, ...] = ()) -> Source:
         keep: as `is_kept` takes them.
     """
     return cast(Source, replace(cast(Any, source), keep=keep)) if hasattr(source, "keep") else source
+
+
+def samples_only(source: Source) -> Source:
+    """Return a source whose blocks hold its samples and no messages, which may come from a cache."""
+    if hasattr(source, "without_messages"):
+        return cast(Source, replace(cast(Any, source), keep=(), without_messages=True))
+    return reading_only(source)
 
 
 def axes_of(source: Source) -> Axes:

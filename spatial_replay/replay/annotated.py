@@ -45,6 +45,7 @@ def run_replay(
     output: Path | None = None,
     inputs: Sequence[Path] = (),
     layer: bool = False,
+    certify: bool = True,
     advance: Callable[[int], None] = lambda samples: None,
 ) -> Replayed:
     """Evaluate specifications over a source and, if asked to, write the annotated log.
@@ -58,6 +59,7 @@ def run_replay(
         output: the annotated log; it replaces a file of that name only when it is complete.
         inputs: files that the output must not be.
         layer: leave the source's own messages, metadata and attachments out of the output.
+        certify: hash what is read and what comes out, as for every output; for that, messages are read, too.
         advance: called with the number of samples of each block that is done.
 
     Raises:
@@ -68,7 +70,14 @@ def run_replay(
     """
     if options.keep is None and output is not None and not layer:
         options = replace(options, keep=KEEP_ALL)
-    replay = Replay(source, files, options, keep_series=keep_series, keep_leaves=keep_leaves)
+    replay = Replay(
+        source,
+        files,
+        options,
+        keep_series=keep_series,
+        keep_leaves=keep_leaves,
+        certify=certify or output is not None,
+    )
     if output is None:
         return replay.run(advance=advance)
     # imported here since a replay without an annotated log needs no writer

@@ -160,12 +160,13 @@ class Replay:
             UsageError: no sample in the window.
             SpecificationError: names that the log never has, if names are strict.
         """
-        for block, trace in self._selection.iter_blocks():
+        needs_messages = write is not None or self._hashes is not None
+        for block, trace in self._selection.iter_blocks(messages=needs_messages):
             stretches = self._evaluation.extend(trace)
             self._traces.add(trace)
             inside = self._selection.inside(trace)
             own = Messages()
-            if write is not None or self._hashes is not None:
+            if needs_messages:
                 own = self._selection.own_messages(block, self._encoded)
             self._encoded += len(self._selection.inside(block.trace))
             self._remarks += block.remarks

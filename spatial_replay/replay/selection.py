@@ -13,7 +13,14 @@ from spatial_replay.errors import LogError, SpecificationError, UsageError
 from spatial_replay.logs.messages import Block, Channel, Messages, merge, messages_of, select
 from spatial_replay.logs.objects.encode import encode_objects
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
-from spatial_replay.logs.source import MemorySource, Source, read_ahead, read_blocks, reading_only, within
+from spatial_replay.logs.source import (
+    MemorySource,
+    Source,
+    read_ahead,
+    read_blocks,
+    reading_only,
+    samples_only,
+)
 from spatial_replay.logs.topics import OBJECTS, protobuf_channel
 from spatial_replay.monitor.atoms.delays import look_back
 from spatial_replay.monitor.instances import Instance, find_instances
@@ -24,7 +31,7 @@ from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.formula import Specification
 from spatial_replay.text import time_text
 from spatial_replay.trace.sample import FOREVER
-from spatial_replay.trace.trace import Trace, window_of
+from spatial_replay.trace.trace import Trace, window_of, within
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,13 +160,18 @@ class Selection:
     def window(self) -> Window:
         return self.options.window
 
-    def iter_blocks(self) -> Iterator[tuple[Block, Trace]]:
-        """Read each block, with its samples in the window, and before it if a specification looks back."""
+    def iter_blocks(self, *, messages: bool = True) -> Iterator[tuple[Block, Trace]]:
+        """Read each block, with its samples in the window, and before it if a specification looks back.
+
+        Args:
+            messages: whether the blocks have to hold messages.
+        """
         window = self.window
         # every Nth sample is counted from the log's first, wherever the window starts
         from_start = look_before(self.files) or window.every > 1
         read = 0
-        blocks = read_blocks(self.source, None if from_start else window.start_ns, window.end_ns)
+        source = self.source if messages else samples_only(self.source)
+        blocks = read_blocks(source, None if from_start else window.start_ns, window.end_ns)
         for block in read_ahead(blocks):
             trace = block.trace
             if window.every > 1:
@@ -170,7 +182,7 @@ class Selection:
 
     def iter_traces(self) -> Iterator[Trace]:
         """Read the samples of `iter_blocks`."""
-        for _, trace in self.iter_blocks():
+        for _, trace in self.iter_blocks(messages=False):
             yield trace
 
     def trace(self, advance: Callable[[int], None] = lambda samples: None) -> Trace:
@@ -233,7 +245,7 @@ class Selection:
         if missing and not self.window.is_whole:
             # an object that appears outside the window is no mistake in the specification
             whole = LogNames()
-            for block in read_blocks(self.source):
+            for block in read_blocks(samples_only(self.source)):
                 whole.add(block.trace)
             missing = self._missing_names(whole)
         if missing and self.options.strict_names:
@@ -249,7 +261,7 @@ class Selection:
         name = self.source.name
         spans = [
             (int(block.trace.times_ns[0]), int(block.trace.times_ns[-1]))
-            for block in read_blocks(self.source)
+            for block in read_blocks(samples_only(self.source))
             if len(block.trace)
         ]
         if not spans:

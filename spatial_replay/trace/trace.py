@@ -17,7 +17,7 @@ from spatial_replay.lazy import Displayed
 from spatial_replay.text import times_apart
 from spatial_replay.trace.declared_units import checked_units
 from spatial_replay.trace.measurement_cache import MeasurementCache
-from spatial_replay.trace.sample import Sample
+from spatial_replay.trace.sample import FOREVER, Sample
 
 ABSENT = -1
 """The row number of an object that is not in the sample."""
@@ -286,6 +286,12 @@ def window_of(times_ns: Integers, start_ns: int, end_ns: int) -> tuple[int, int]
     """
     # numpy's own search would round to doubles for an end that no int64 holds
     return bisect_left(times_ns, start_ns), bisect_left(times_ns, end_ns)
+
+
+def within(trace: Trace, start_ns: int | None, end_ns: int | None) -> Trace:
+    """Return the samples of a trace from `start_ns` up to, not including, `end_ns`."""
+    begin, end = window_of(trace.times_ns, start_ns or 0, FOREVER if end_ns is None else end_ns)
+    return trace if (begin, end) == (0, len(trace)) else trace.slice(begin, end)
 
 
 def _check_shapes(trace: Trace) -> None:

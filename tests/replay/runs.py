@@ -12,8 +12,8 @@ from mcap.reader import make_reader
 
 from spatial_replay import ConvexPart, Footprint, Sample, Trace, TrackedObject
 from spatial_replay.logs import Attachment, Block
-from spatial_replay.logs.source import within
 from spatial_replay.recording import record_source
+from spatial_replay.trace.trace import within
 
 STEP_NS = 250_000_000
 SPECIFICATION = """\

@@ -16,7 +16,7 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from spatial_replay.compiled import elementwise, kernel
-from spatial_replay.geometry.arrays import Integers, starts_from_counts
+from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.messages import Payloads
 
 RECORD_HEAD = struct.Struct("<BQ")
@@ -59,6 +59,8 @@ _MESSAGE_FIELDS = np.dtype(
     [("channel", "<u2"), ("sequence", "<u4"), ("log_time", "<u8"), ("publish_time", "<u8")]
 )
 _MESSAGE_BYTES = _MESSAGE_FIELDS.itemsize
+_LAST_OF_LOG_TIME = 13
+"""Where the highest byte of its log time is in a message."""
 _SCHEMA, _CHANNEL, _MESSAGE = 3, 4, 5
 
 
@@ -85,7 +87,7 @@ def walk_records(content: bytes) -> tuple[RecordHeads, bool]:
     walk = _Walk(copies=False)
     end = walk.over(content, np.empty(0, np.uint8))
     fields = (walk.heads[name].astype(np.uint64) for name in _MESSAGE_FIELDS.names or ())
-    return RecordHeads(*walk.places.copy(), *fields), end < len(content)
+    return RecordHeads(*walk.places[:3].copy(), *fields), end < len(content)
 
 
 class _Walk:
@@ -93,16 +95,19 @@ class _Walk:
 
     Attributes:
         count, declarations: how many records the last one has, and how many of them are not messages.
-        payloads: theirs, one after the other, if they are copied.
+        channel: the one of all its messages; -1 without any, -2 if they differ or have times beyond int64.
+        payloads: theirs, one after the other in the first `used` bytes, if they are copied.
     """
 
     def __init__(self, *, copies: bool) -> None:
         """Begin; `copies` says whether payloads are copied."""
         self._copies = copies
-        self._places = np.empty((3, 0), np.int64)
+        self._places = np.empty((5, 0), np.int64)
         self._heads = np.empty(0, np.uint8)
+        self._state = np.zeros(5, np.int64)
         self.payloads = np.empty(0, np.uint8)
-        self.count = self.declarations = 0
+        self.count = self.used = self.declarations = 0
+        self.channel = -1
 
     def over(self, content: bytes, passed_over: Bytes) -> int:
         """Walk over the records in some bytes; return where the last whole one ends.
@@ -115,10 +120,10 @@ class _Walk:
             self.payloads = np.empty(len(content), np.uint8)
         # room for as many records as there could be would be many times the bytes
         self._make_room(len(content) // 128 + 32)
-        state = np.zeros(4, np.int64)
+        self._state[:4], self._state[4] = 0, -1
         while True:
-            _walk_on(view, passed_over, state, self._places, self._heads, self.payloads)
-            position, self.count, _, self.declarations = state.tolist()
+            _walk_on(view, passed_over, self._state, self._places, self._heads, self.payloads)
+            position, self.count, self.used, self.declarations, self.channel = self._state.tolist()
             if self.count < self._places.shape[1]:
                 return int(position)
             self._make_room(2 * self.count)
@@ -126,12 +131,12 @@ class _Walk:
     def _make_room(self, count: int) -> None:
         more = count - self._places.shape[1]
         if more > 0:
-            self._places = np.concatenate([self._places, np.empty((3, more), np.int64)], axis=1)
+            self._places = np.concatenate([self._places, np.empty((5, more), np.int64)], axis=1)
             self._heads = np.concatenate([self._heads, np.empty(_MESSAGE_BYTES * more, np.uint8)])
 
     @property
     def places(self) -> Integers:
-        """(3, N) int64: opcode, begin and end of each record."""
+        """(5, N) int64: opcode, begin and end of each record; begin and end of its payload in `payloads`."""
         return self._places[:, : self.count]
 
     @property
@@ -139,7 +144,7 @@ class _Walk:
         """(N,) the heads of the records that are messages; those of others are 0."""
         heads = self._heads[: _MESSAGE_BYTES * self.count].copy().view(_MESSAGE_FIELDS)
         if self.declarations:
-            heads[self.places[0] != _MESSAGE] = 0
+            heads[self._places[0, : self.count] != _MESSAGE] = 0
         return heads
 
 
@@ -151,10 +156,10 @@ def _walk_on(
     """Fill in the records from a position on that there is room for: where they are, heads and payloads.
 
     Args:
-        state: position, records, bytes of payloads and declarations so far.
+        state: position, records, bytes of payloads, declarations and the channel so far; see `_Walk`.
     """
     size = content.shape[0]
-    position, count, used, declarations = state[0], state[1], state[2], state[3]
+    position, count, used, declarations, only = state[0], state[1], state[2], state[3], state[4]
     while position + _RECORD_HEAD <= size and count < places.shape[1]:
         begin = position + _RECORD_HEAD
         # from the highest byte on, so that no length, however large, overflows
@@ -166,22 +171,28 @@ def _walk_on(
         end = begin + length
         opcode = content[position]
         is_taken = _SCHEMA <= opcode <= _CHANNEL
+        before = used
         if is_taken:
             declarations += 1
         elif opcode == _MESSAGE and length >= _MESSAGE_BYTES:
             channel = content[begin] + 256 * content[begin + 1]
             is_taken = channel >= passed_over.shape[0] or passed_over[channel] == 0
             if is_taken:
+                if only == -1:
+                    only = channel
+                if only != channel or content[begin + _LAST_OF_LOG_TIME] >= 128:
+                    only = -2
                 payload = begin + _MESSAGE_BYTES
                 heads[_MESSAGE_BYTES * count : _MESSAGE_BYTES * (count + 1)] = content[begin:payload]
                 if payloads.shape[0] > 0:
-                    payloads[used : used + end - payload] = content[payload:end]
                     used += end - payload
+                    payloads[before:used] = content[payload:end]
         if is_taken:
             places[0, count], places[1, count], places[2, count] = opcode, begin, end
+            places[3, count], places[4, count] = before, used
             count += 1
         position = end
-    state[0], state[1], state[2], state[3] = position, count, used, declarations
+    state[0], state[1], state[2], state[3], state[4] = position, count, used, declarations, only
 
 
 Declaration: TypeAlias = records.Schema | records.Channel
@@ -194,10 +205,12 @@ class RawMessages:
     Attributes:
         heads: (M,) channel, sequence, log_time and publish_time.
         payloads: M encoded messages.
+        channel: the one of all, if they are known to have one, and times below 2**63; else negative.
     """
 
     heads: MessageHeads
     payloads: Payloads
+    channel: int = -2
 
     @classmethod
     def join(cls, several: Sequence[RawMessages]) -> RawMessages:
@@ -207,11 +220,6 @@ class RawMessages:
 
     def __len__(self) -> int:
         return len(self.heads)
-
-    @property
-    def size(self) -> int:
-        """Bytes of all payloads."""
-        return int(self.payloads.lengths.sum())
 
     def take(self, chosen: Integers) -> RawMessages:
         """Return the messages with the given indices, in that order."""
@@ -258,13 +266,14 @@ class Splitter:
 
     def split(self, content: bytes) -> Records:
         """See `split_records`."""
-        end = self._walk.over(content, self._passed_over)
+        walk = self._walk
+        end = walk.over(content, self._passed_over)
         damage = "a record breaks off" if end < len(content) else None
-        heads, (opcode, begin, stop) = self._walk.heads, self._walk.places
-        lengths = stop - begin - _MESSAGE_BYTES
+        heads, bounds = walk.heads, walk.places[3:].copy()
         declarations: list[Declaration] = []
-        if self._walk.declarations:
-            is_message = opcode == _MESSAGE
+        if walk.declarations:
+            opcode, begin, stop = walk.places[:3].tolist()
+            is_message = walk.places[0] == _MESSAGE
             for index in np.flatnonzero(~is_message).tolist():
                 read = records.Schema.read if opcode[index] == Opcode.SCHEMA else records.Channel.read
                 try:
@@ -273,7 +282,6 @@ class Splitter:
                     damage = str(error)
                     is_message[index:] = False
                     break
-            heads, lengths = heads[is_message], lengths[is_message]
-        starts = starts_from_counts(lengths)
-        data = self._walk.payloads[: int(starts[-1])].tobytes()
-        return Records(RawMessages(heads, Payloads(data, starts[:-1], starts[1:])), declarations, damage)
+            heads, bounds = heads[is_message], bounds[:, is_message]
+        payloads = Payloads(walk.payloads[: walk.used].tobytes(), bounds[0], bounds[1])
+        return Records(RawMessages(heads, payloads, walk.channel), declarations, damage)

@@ -10,7 +10,7 @@ import os
 import struct
 import zlib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from heapq import merge
 from types import MappingProxyType
 from typing import BinaryIO
@@ -28,7 +28,8 @@ from spatial_replay.text import Instant, Sentence
 _FOOTER_BYTES = RECORD_HEAD.size + 20
 _CHUNK_HEAD_BYTES = 64
 _CHUNK_INDEX = struct.Struct("<QQQQI")
-_MESSAGE_INDEX = struct.Struct("<HQ")
+_MESSAGE_INDEX = struct.Struct("<H8x")
+"""Of which only the channel matters here."""
 _LOOSE_BYTES = 2**22
 _LARGEST_RECORD = 2**30
 _STRIDE = 2**20
@@ -72,7 +73,7 @@ def read_directory(stream: BinaryIO, faults: FaultList, name: str) -> Directory:
         if len(faults) == known:
             faults.add(f"{name}: {damage}; the log was read without its index")
     if _is_own(directory.header):
-        directory.chunks = [replace(place, has_checksum=True) for place in directory.chunks]
+        directory.chunks = [place._replace(has_checksum=True) for place in directory.chunks]
     return directory
 
 
@@ -179,7 +180,7 @@ def _indexed_channels(body: bytes, length: int) -> frozenset[int] | None:
     entries = body[_CHUNK_INDEX.size : _CHUNK_INDEX.size + length]
     if not entries or len(entries) != length or length % _MESSAGE_INDEX.size:
         return None
-    return frozenset(channel for channel, _ in _MESSAGE_INDEX.iter_unpack(entries))
+    return frozenset([channel for (channel,) in _MESSAGE_INDEX.iter_unpack(entries)])
 
 
 def _check_complete(directory: Directory, end: int) -> None:

@@ -6,33 +6,21 @@ out only when no later chunk can hold an earlier one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
-from typing import BinaryIO
 
 import numpy as np
-from mcap import records
 
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Booleans
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.byte_ranges import plan_reads
-from spatial_replay.logs.mcap.chunk_records import (
-    DamageError,
-    Declaration,
-    RawMessages,
-    Records,
-    split_records,
-)
-from spatial_replay.logs.mcap.chunks import (
-    ChunkPlace,
-    iter_records,
-    read_records,
-)
+from spatial_replay.logs.mcap.chunk_records import RawMessages
+from spatial_replay.logs.mcap.chunk_walk import ChunkWalk
 from spatial_replay.logs.mcap.index import (
     Directory,
     check_attachments,
@@ -46,26 +34,24 @@ from spatial_replay.logs.messages import (
     Block,
     Channel,
     Messages,
-    Schema,
     chosen_payloads,
     select,
 )
 from spatial_replay.logs.objects.decode import decode_objects
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.logs.remote import LogFile, RemoteFile, open_file
+from spatial_replay.logs.sample_cache import DamagedEntryError, cached_samples
 from spatial_replay.logs.topics import ALL, DERIVED, METADATA, OBJECTS, RECOVERY, is_kept
 from spatial_replay.text import Instant, Sentence
 from spatial_replay.trace.axes import Axes
 from spatial_replay.trace.declared_units import signal_units_from_metadata
 from spatial_replay.trace.sample import LATEST_NS
-from spatial_replay.trace.trace import Trace
+from spatial_replay.trace.trace import Trace, within
 
 BLOCK_BYTES = 64 * 2**20
 """A block of messages is closed when it holds this much, however few its samples are."""
 AFTER_ALL_NS = 2**64
 _SAMPLES = "spatial_replay.ObjectStates"
-_CHANNELS = 2**16
-"""As many as a file can have."""
 
 
 @dataclass(frozen=True)
@@ -75,12 +61,14 @@ class McapSource:
     Attributes:
         keep: which of its other messages its blocks hold, as `is_kept` takes them. What they do not hold is
             not read, where chunks say what they hold.
+        without_messages: whether the blocks hold no messages, so that samples may come from a cache.
     """
 
     path: LogFile
     kind: str = "MCAP"
     concave: Concave = "decompose"
     keep: tuple[str, ...] = (ALL,)
+    without_messages: bool = False
 
     @property
     def name(self) -> str:
@@ -91,6 +79,32 @@ class McapSource:
 
         Only chunks that reach into the window are read, if the log has an index.
         """
+        if not self.without_messages:
+            yield from self._blocks(start_ns, end_ns)
+            return
+        cached = None if isinstance(self.path, RemoteFile) else cached_samples(self.path, self.concave)
+        if cached is not None and (entry := cached.open()) is not None:
+            with entry, suppress(DamagedEntryError):
+                for trace in cached.iter_traces(entry):
+                    if len(window := within(trace, start_ns, end_ns)):
+                        yield Block(window)
+                    # from where the log itself is read, if the entry turns out to be damaged
+                    start_ns = max(start_ns or 0, int(trace.times_ns[-1]) + 1)
+                return
+        is_whole = not start_ns and (end_ns is None or end_ns > LATEST_NS)
+        writer = cached.writer() if cached is not None and is_whole else None
+        try:
+            for block in self._blocks(start_ns, end_ns):
+                if writer is not None:
+                    writer.add(replace(block.trace, remarks=block.remarks))
+                yield replace(block, messages=Messages())
+            if writer is not None:
+                writer.finish()
+        finally:
+            if writer is not None:
+                writer.give_up()
+
+    def _blocks(self, start_ns: int | None, end_ns: int | None) -> Iterator[Block]:
         with self.open_walk() as walk:
             window = (0 if start_ns is None else start_ns, AFTER_ALL_NS if end_ns is None else end_ns)
             decoder = _BlockDecoder(self, walk)
@@ -209,93 +223,6 @@ def recovery_remarks(name: str, metadata: Sequence[tuple[str, Mapping[str, str]]
     )
 
 
-class ChunkWalk:
-    """The messages of a log by chunk, with the channels that have been declared so far."""
-
-    def __init__(self, stream: BinaryIO, directory: Directory, faults: FaultList, name: str) -> None:
-        self.stream = stream
-        self.faults = faults
-        self._name = name
-        self.directory = directory
-        self._schemas = dict(directory.schemas)
-        self.channels: dict[int, Channel] = {}
-        self._is_declared = np.zeros(_CHANNELS, np.bool_)
-        self.places = sorted(directory.chunks, key=lambda place: (place.start_ns, place.offset))
-        for channel in directory.channels.values():
-            self._declare(channel)
-        if directory.statistics is None:
-            self._find_channels()
-
-    @property
-    def sees_objects(self) -> bool:
-        """Whether a channel with samples has been declared."""
-        return any(channel.topic == OBJECTS for channel in self.channels.values())
-
-    def iter_messages(
-        self, places: Sequence[ChunkPlace], is_wanted: Callable[[str], bool] = lambda topic: True
-    ) -> Iterator[tuple[ChunkPlace, RawMessages]]:
-        """Yield the messages in each place; what is lost of them goes to the faults.
-
-        Args:
-            is_wanted: which topics matter; messages of others may be left out.
-        """
-        passed_over = [n for n, each in self.channels.items() if not is_wanted(each.topic)]
-        for place, found in iter_records(self.stream, places, passed_over):
-            yield place, self._messages(place, found)
-
-    def numbers(self, is_chosen: Callable[[str], bool]) -> Booleans:
-        """Return by number, (65536,), whether the topic of a channel is chosen."""
-        chosen = np.zeros(_CHANNELS, np.bool_)
-        chosen[[number for number, each in self.channels.items() if is_chosen(each.topic)]] = True
-        return chosen
-
-    def _messages(self, place: ChunkPlace, found: Records | DamageError) -> RawMessages:
-        if isinstance(found, DamageError):
-            self._fault(place, f"{found}; the ", " are lost")
-            return RawMessages.join([])
-        messages = found.messages
-        if found.damage:
-            self._fault(place, f"{found.damage}; of the ", f", {len(messages)} could be read")
-        self._take_in(found.declarations)
-        is_usable = self._is_declared[messages.heads["channel"]] & (messages.heads["log_time"] <= LATEST_NS)
-        if is_usable.all():
-            return messages
-        lost = len(messages) - np.count_nonzero(is_usable)
-        self._fault(place, f"{lost} of the ", " have no channel, or a time beyond 2**63 - 1 ns")
-        return messages.take(np.flatnonzero(is_usable))
-
-    def _find_channels(self) -> None:
-        """Declare all channels of a log without a summary: chunks need not come in the order of time."""
-        for place in sorted(self.places, key=lambda each: each.offset):
-            # the chunk is read again for its messages, and its damage reported then
-            with suppress(DamageError):
-                self._take_in(split_records(read_records(self.stream, place)).declarations)
-
-    def _take_in(self, declarations: Iterable[Declaration]) -> None:
-        for record in declarations:
-            if isinstance(record, records.Schema):
-                self._schemas.setdefault(record.id, record)
-            else:
-                self._declare(record)
-
-    def _declare(self, channel: records.Channel) -> None:
-        if channel.id in self.channels:
-            return
-        schema = self._schemas.get(channel.schema_id)
-        self._is_declared[channel.id] = True
-        self.channels[channel.id] = Channel(
-            channel.topic,
-            channel.message_encoding,
-            Schema(schema.name, schema.encoding, schema.data) if schema else None,
-            MappingProxyType(channel.metadata),
-        )
-
-    def _fault(self, place: ChunkPlace, before: str, after: str) -> None:
-        """Report what happened to messages in a place, in words before and after their times."""
-        span = "messages between ", Instant(place.start_ns, 0), " and ", Instant(place.end_ns, 0)
-        self.faults.add(Sentence(f"{self._name}: at byte {place.offset}: ", Sentence(before, *span, after)))
-
-
 def _blocks(
     walk: ChunkWalk, window: tuple[int, int], is_wanted: Callable[[str], bool]
 ) -> Iterator[RawMessages]:
@@ -317,15 +244,17 @@ def _blocks(
         if declared < len(walk.channels):
             declared = len(walk.channels)
             wanted, objects = walk.numbers(is_wanted), walk.numbers(OBJECTS.__eq__)
-        heads = messages.heads
-        is_chosen = wanted[heads["channel"]]
-        if place.start_ns < start_ns or place.end_ns >= end_ns:
-            is_chosen &= (heads["log_time"] >= start_ns) & (heads["log_time"] < end_ns)
-        if not is_chosen.all():
-            messages = messages.take(np.flatnonzero(is_chosen))
+        is_inside = place.start_ns >= start_ns and place.end_ns < end_ns
+        if not is_inside or messages.channel < 0 or not wanted[messages.channel]:
+            heads = messages.heads
+            is_chosen = wanted[heads["channel"]]
+            if not is_inside:
+                is_chosen &= (heads["log_time"] >= start_ns) & (heads["log_time"] < end_ns)
+            if not is_chosen.all():
+                messages = messages.take(np.flatnonzero(is_chosen))
         waiting.append(messages)
-        size += messages.size
-        samples += int(np.count_nonzero(objects[messages.heads["channel"]]))
+        size += messages.payloads.nbytes
+        samples += _count(messages, objects)
         if number < len(places) and (size >= BLOCK_BYTES or samples >= BLOCK_SAMPLES):
             ordered = _in_order(waiting)
             ready = int(np.searchsorted(ordered.heads["log_time"], places[number].start_ns))
@@ -334,11 +263,17 @@ def _blocks(
                 yield ordered[:ready]
                 # not the whole buffer for the few that are left
                 rest = ordered[ready:].compact()
-                waiting, size = [rest], rest.size
-                samples = int(np.count_nonzero(objects[rest.heads["channel"]]))
+                waiting, size, samples = [rest], rest.payloads.nbytes, _count(rest, objects)
     rest = _in_order(waiting)
     if len(rest):
         yield rest
+
+
+def _count(messages: RawMessages, chosen: Booleans) -> int:
+    """Count the messages of chosen channels."""
+    if messages.channel >= 0:
+        return len(messages) if chosen[messages.channel] else 0
+    return int(np.count_nonzero(chosen[messages.heads["channel"]]))
 
 
 def _in_order(several: Sequence[RawMessages]) -> RawMessages:
