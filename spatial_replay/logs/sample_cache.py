@@ -11,6 +11,7 @@ import json
 import os
 import shutil
 import tempfile
+import time
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -36,6 +37,7 @@ _MOST_TIMES_LARGER: Final = 4
 """An entry that outgrows its log by more would be read as slowly: objects that stand still shrink well."""
 _SPARE_BYTES: Final = 2**30
 """What stays free on the disk."""
+_LATELY_S: Final = 3600.0
 _ENDS_BYTES: Final = 2**16
 """At its beginning and its end, a log's own index and checksums among them."""
 _ENDING: Final = ".samples"
@@ -117,8 +119,7 @@ class CachedSamples:
         with suppress(OSError):
             folder = self._file.parent
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            if shutil.disk_usage(folder).free >= most + _SPARE_BYTES:
-                _make_room(folder, self.limit - most)
+            if shutil.disk_usage(folder).free >= most + _SPARE_BYTES and _has_room(folder, self.limit - most):
                 return EntryWriter(self._file, most, lambda: _key(self.log, self.concave) == self.key)
         return None
 
@@ -304,17 +305,24 @@ def _trace(head: Mapping[str, Any], stream: BinaryIO, shared: _SharedColumns) ->
     )
 
 
-def _make_room(folder: Path, room: int) -> None:
-    """Remove the entries that were not used for longest, and what writers left, until the others fit."""
+def _has_room(folder: Path, room: int) -> bool:
+    """Remove the entries, and what writers left, that were not used for longest, until the others fit.
+
+    Returns:
+        whether they do. What was used lately stays: many logs that are read in turn would only push out each
+        other, each written for nothing.
+    """
     entries = []
     for file in folder.iterdir():
         with suppress(OSError):
             state = file.stat()
             entries.append((state.st_mtime, file, state.st_size))
     total = sum(size for *_, size in entries)
-    for _, file, size in sorted(entries):
-        if total <= room:
-            return
+    latest = time.time() - _LATELY_S
+    for used_s, file, size in sorted(entries):
+        if total <= room or used_s > latest:
+            break
         with suppress(OSError):
             file.unlink()
         total -= size
+    return total <= room

@@ -157,19 +157,24 @@ def test_a_replay_prints_the_same_with_the_cache_and_without(log, kept, tmp_path
     assert "SPATIAL_REPLAY_SAMPLES" not in os.environ
 
 
-def test_what_was_not_used_for_longest_makes_room(log, kept, tmp_path, monkeypatch):
-    monkeypatch.setenv("SPATIAL_REPLAY_SAMPLES", "0.03")
+def test_what_was_not_used_for_longest_makes_room_unless_it_was_used_lately(log, kept, tmp_path, monkeypatch):
+    monkeypatch.setenv("SPATIAL_REPLAY_SAMPLES", "0.04")
     logs = [shutil.copy(log, tmp_path / f"{n}.mcap") for n in range(3)]
-    for number, each in enumerate(logs):
-        read_trace(each)
-        newest = max(kept(), key=lambda entry: entry.stat().st_mtime_ns)
-        os.utime(newest, (number + 1, number + 1))
-    sizes = [entry.stat().st_size for entry in kept()]
-    assert 0 < sum(sizes) <= 30_000_000
-    assert len(sizes) < 3
-    read_trace(logs[-1])
-    assert max(entry.stat().st_mtime for entry in kept()) > 10, "the newest one went"
-    monkeypatch.setenv("SPATIAL_REPLAY_SAMPLES", "0")
-    before = kept()
     read_trace(logs[0])
-    assert kept() == before
+    (first,) = kept()
+    os.utime(first, (1, 1))
+    read_trace(logs[1])
+    (second,) = set(kept()) - {first}
+    os.utime(second, (2, 2))
+    read_trace(logs[2])
+    (third,) = set(kept()) - {first, second}
+    assert first not in kept(), "the oldest one is still there"
+    assert sum(entry.stat().st_size for entry in kept()) <= 40_000_000
+    for entry in kept():
+        os.utime(entry)
+    read_trace(logs[0])
+    assert set(kept()) == {second, third}
+    monkeypatch.setenv("SPATIAL_REPLAY_SAMPLES", "0")
+    os.utime(third, (3, 3))
+    read_trace(logs[2])
+    assert third.stat().st_mtime == 3, "there was to be no cache"

@@ -7,15 +7,19 @@ import resource
 import subprocess
 import sys
 import tempfile
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import zstandard
+from mcap.reader import make_reader
 
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.logs.messages import Block
+from spatial_replay.logs.source import samples_only
 from spatial_replay.recording import record_source
 from spatial_replay.sources.open_log import open_source
 from spatial_replay.trace.trace import Trace
@@ -91,19 +95,54 @@ def _peak_bytes(*arguments: str) -> int:
 
 
 def bench_reading(measure: Any) -> None:
-    """Reading our own log, all samples into columns."""
+    """Reading our own log, all samples into columns: anew, again, and with one core."""
     count = 200_000
+    kept = {name: os.environ.get(name) for name in ("SPATIAL_REPLAY_CACHE", "SPATIAL_REPLAY_SAMPLES")}
     with tempfile.TemporaryDirectory() as folder:
         log = Path(folder) / "run.mcap"
         record_source(Moving(count), log)
-        measure(
-            "reading",
-            lambda _: sum(len(block.trace) for block in open_source(log).iter_blocks()),
-            per=count,
-            unit="sample",
-            runs=5,
-            limit_s=1 / 100_000,
-        )
+        os.environ["SPATIAL_REPLAY_CACHE"] = folder
+        per_sample: Any = {"per": count, "unit": "sample", "runs": 5}
+        records = _chunk_records(log)
+        bare = measure("decompressed, checked, no more", lambda _: _decompressed(records), **per_sample)
+
+        def read(room: str) -> int:
+            os.environ["SPATIAL_REPLAY_SAMPLES"] = room
+            return sum(len(block.trace) for block in samples_only(open_source(log)).iter_blocks())
+
+        try:
+            anew = measure("reading", lambda _: read("0"), limit_s=5e-6, **per_sample)
+            measure("reading and keeping", lambda _: read("4"), **(per_sample | {"runs": 1, "warmups": 0}))
+            measure("reading again", lambda _: read("4"), limit_s=0.5e-6, **per_sample)
+            cores = os.sched_getaffinity(0)
+            if len(cores) > 1:
+                os.sched_setaffinity(0, {min(cores)})
+                one = measure("reading with one core", lambda _: read("0"), **per_sample)
+                os.sched_setaffinity(0, cores)
+                measure.ratio(f"{len(cores)} cores, time of one", anew.median_s / one.median_s, 1 / 1.7)
+        finally:
+            for name, value in kept.items():
+                if value is None:
+                    os.environ.pop(name, None)
+                else:
+                    os.environ[name] = value
+        measure.ratio("reading, times the bare pass", anew.median_s / bare.median_s, 2.0)
+
+
+def _chunk_records(log: Path) -> list[tuple[bytes, int]]:
+    """The compressed bytes of each chunk, with how many they are decompressed."""
+    with log.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+        found = []
+        for chunk in summary.chunk_indexes if summary else ():
+            stream.seek(chunk.chunk_start_offset + chunk.chunk_length - chunk.compressed_size)
+            found.append((stream.read(chunk.compressed_size), chunk.uncompressed_size))
+    return found
+
+
+def _decompressed(records: list[tuple[bytes, int]]) -> int:
+    decompressor = zstandard.ZstdDecompressor()
+    return sum(zlib.crc32(decompressor.decompress(data, max_output_size=size)) for data, size in records)
 
 
 def bench_replay_large(measure: Any) -> None:
