@@ -146,7 +146,9 @@ def leaf_values(scene: TraceScene, leaves: Sequence[Formula], bindings: Bindings
     ).reshape(len(code.signals), len(scene))
     members = np.array([_flags(scene, each) for each in code.members], np.int8)
     members = members.reshape(len(code.members), len(scene))
-    closest = np.array([_closest(scene, each) for each in code.closest]).reshape(-1, 4, len(scene))
+    closest = np.array([_closest(scene, each) for each in code.closest]).reshape(
+        len(code.closest), 4, len(scene)
+    )
     is_known = np.isfinite(values).all() and np.isfinite(signals).all() and not (members < 0).any()
     is_known = is_known and (closest[:, 0] == closest[:, 1]).all()
     is_sure = not spreads.any() and (closest[:, :2] == closest[:, 2:]).all()
