@@ -47,15 +47,21 @@ export class Results {
     return Math.max(this.order.indexOf(chosen), 0);
   }
 
-  /** Finds the order of results, by the events so far: those violated, by time, those unknown, the others. */
+  /**
+   * Finds the order of results, by the events so far: those violated, by time, those unknown, the others. Of equal
+   * times the order of events counts: what only the end of a log decided comes last in it.
+   */
   findWorst(): void {
-    const keys = this.all.map((each) => {
+    const keys = this.all.map((each, place) => {
       const newest = this.newest(each, Infinity);
-      const rank = ["violated", "unknown"].indexOf(newest?.verdict ?? "");
-      return rank === 0 ? [0, newest!.known] as const : [rank < 0 ? 2 : rank, 0] as const;
+      if (newest?.verdict === "violated") return [0, newest.known, this.events.indexOf(newest), place];
+      return [newest?.verdict === "unknown" ? 1 : 2, 0, 0, place];
     });
-    this.order = this.all.map((_, place) => place)
-      .sort((one, other) => keys[one]![0] - keys[other]![0] || keys[one]![1] - keys[other]![1] || one - other);
+    const differing = (one: number[], other: number[]) => one.findIndex((key, index) => key !== other[index]);
+    this.order = this.all.map((_, place) => place).sort((one, other) => {
+      const at = differing(keys[one]!, keys[other]!);
+      return at < 0 ? 0 : keys[one]![at]! - keys[other]![at]!;
+    });
   }
 
   get shown(): ResultMessage | undefined {

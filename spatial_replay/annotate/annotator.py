@@ -16,6 +16,7 @@ from spatial_replay.annotate.automaton_state import (
     AutomatonRun,
     SpecAutomaton,
 )
+from spatial_replay.annotate.deciding_leaf import NewestSamples
 from spatial_replay.annotate.events import EncodedEvent, EventReporter, encoded_occurrence
 from spatial_replay.annotate.requirements import requirements_of
 from spatial_replay.annotate.robustness import encode_robustness
@@ -96,8 +97,9 @@ class Annotator:
             else None
             for tree, instance, requirements in zip(trees, instances, self._requirements, strict=True)
         ]
+        self._samples = NewestSamples()
         self._reporters = [
-            EventReporter(tree, instance, files[tree.file], semantics, units)
+            EventReporter(tree, instance, files[tree.file], semantics, units, self._samples)
             for tree, instance in zip(trees, instances, strict=True)
         ]
         self._runs = [
@@ -152,7 +154,7 @@ class Annotator:
             messages.append(self._messages(_SPECIFICATION, trace.times_ns[:1], [self.specification()]))
         messages.append(self._robustness(blocks))
         messages.append(self._automaton_states(blocks))
-        changes = self._changes(blocks)
+        changes = self._changes(trace, blocks)
         if self._trees:
             standing = self._standing.encode(trace.times_ns, blocks, self._over)
             messages.append(self._messages(_STANDING, *standing))
@@ -174,7 +176,7 @@ class Annotator:
                 run.pass_over(block)
         self._standing.pass_over(blocks)
         self._remember(trace, blocks)
-        return self._events(self._changes(blocks))
+        return self._events(self._changes(trace, blocks))
 
     def end(
         self, time_ns: int, finals: Sequence[Floats], vacuous: Sequence[Sequence[Vacuous]] = ()
@@ -245,8 +247,9 @@ class Annotator:
         ]
         return self._in_order(_ROBUSTNESS, blocks, encoded)
 
-    def _changes(self, blocks: Sequence[SeriesBlock]) -> list[EncodedEvent]:
+    def _changes(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> list[EncodedEvent]:
         """Return the events, by time, then in the order of results and of their nodes."""
+        self._samples.extend(trace)
         self._since_ns = [
             violated_since(own, block, since_ns)
             for own, block, since_ns in zip(self._requirements, blocks, self._since_ns, strict=True)
@@ -275,7 +278,16 @@ class Annotator:
         self, trace: Trace, blocks: Sequence[SeriesBlock], *, is_final: bool = False
     ) -> Messages:
         results = [
-            EvaluatedResult(requirements, block, pairs, since_ns, reporter.settled, tree.title, is_final)
+            EvaluatedResult(
+                requirements,
+                block,
+                pairs,
+                since_ns,
+                reporter.settled,
+                reporter.violated_ns,
+                tree.title,
+                is_final,
+            )
             for requirements, block, pairs, since_ns, reporter, tree in zip(
                 self._requirements,
                 blocks,

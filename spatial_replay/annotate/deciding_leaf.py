@@ -10,16 +10,22 @@ the leaf that decides. Where no number is equal, no leaf is reported.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from typing import NamedTuple
+from collections import deque
+from collections.abc import Collection, Mapping, Sequence
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.monitor.atoms.delays import look_back
+from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.monitor.online.codes import low_and_high
 from spatial_replay.monitor.stream import SeriesBlock
-from spatial_replay.spec.formula import Atom, Boolean, Formula, Quantified, iter_nodes
+from spatial_replay.monitor.witness.atom import deciding_atom
+from spatial_replay.monitor.witness.path import End
+from spatial_replay.spec.formula import Atom, Boolean, Formula, Outline, Quantified, iter_nodes
 from spatial_replay.spec.walks import operand_signs
+from spatial_replay.trace.trace import Trace
 
 
 class LeavesBelow(NamedTuple):
@@ -40,10 +46,14 @@ class LeafValue(NamedTuple):
     Attributes:
         leaf: index among the program's leaves.
         number: its own number there, its sign not turned.
+        end: which end of its interval that is.
+        time_ns: of the sample; None where only the number is known.
     """
 
     leaf: int
     number: float
+    end: End
+    time_ns: int | None = None
 
 
 def leaves_below(formula: Formula, leaves: Sequence[Formula]) -> list[LeavesBelow]:
@@ -85,7 +95,8 @@ def find_leaf(
     hits = np.flatnonzero(own * below.signs == number)
     if not len(hits):
         return None
-    return LeafValue(int(below.indices[hits[0]]), float(own[hits[0]]) + 0.0)
+    end = End.LOW if (below.signs[hits[0]] > 0.0) == low else End.HIGH
+    return LeafValue(int(below.indices[hits[0]]), float(own[hits[0]]) + 0.0, end)
 
 
 def _columns(entries: Sequence[tuple[int, int]]) -> LeavesBelow:
@@ -170,3 +181,59 @@ class DecidingLeaves:
 
 def _end(ends: Floats, node: int, low: bool) -> float:
     return float(ends[node, 0 if low else 1])
+
+
+_RECENT: Final = 1024
+"""Samples before a change in which the object that decides a quantifier is looked for."""
+
+
+class NewestSamples:
+    """The newest samples, in which quantifiers are traced to the objects that decide them.
+
+    Cutting the samples into blocks changes nothing.
+    """
+
+    def __init__(self) -> None:
+        """Start before the first sample."""
+        self._blocks: deque[Trace] = deque()
+        self._older = 0
+
+    def extend(self, trace: Trace) -> None:
+        """Take in the next samples."""
+        while self._blocks and self._older - len(self._blocks[0]) >= _RECENT:
+            self._older -= len(self._blocks.popleft())
+        self._blocks.append(trace)
+        self._older += len(trace)
+
+    def deciding_atom(
+        self, leaf: Formula, found: LeafValue, now_ns: int, regions: Mapping[str, Outline]
+    ) -> tuple[Atom, float] | None:
+        """Return the atom of the objects that give a quantifier its number, with the atom's own number.
+
+        None if the sample is not recent or unknown, if earlier samples would be needed, or if no atom has
+        that number.
+
+        Args:
+            leaf: with the object of a template.
+            now_ns: the time of the sample from which the number is looked back at.
+        """
+        sample = None if found.time_ns is None else self._sample(found.time_ns, now_ns)
+        if sample is None or look_back([leaf]) != (0, 0):
+            return None
+        decided = deciding_atom(TraceScene(sample, regions), leaf, found.end)
+        if decided is None:
+            return None
+        is_turned = decided.end is not found.end
+        number = -found.number if is_turned else found.number
+        ends = decided.value, decided.lower if decided.end is End.LOW else decided.upper
+        return (decided.atom, number) if number in ends else None
+
+    def _sample(self, time_ns: int, now_ns: int) -> Trace | None:
+        between = 0
+        for trace in reversed(self._blocks):
+            at, now = np.searchsorted(trace.times_ns, [time_ns, now_ns], side="right").tolist()
+            between += now - at
+            if at:
+                is_there = trace.times_ns[at - 1] == time_ns and between < _RECENT
+                return trace.slice(at - 1, at) if is_there else None
+        return None

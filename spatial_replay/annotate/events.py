@@ -15,6 +15,7 @@ from spatial_replay.annotate.deciding_leaf import (
     DecidingLeaves,
     LeafValue,
     LeavesBelow,
+    NewestSamples,
     find_leaf,
     leaves_below,
 )
@@ -44,11 +45,12 @@ from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.monitor.vacuity import Vacuous
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.spec.format import format_formula
-from spatial_replay.spec.formula import Specification, iter_nodes, operator_of
+from spatial_replay.spec.formula import Formula, Quantified, Specification, iter_nodes, operator_of
 from spatial_replay.spec.relations import RELATION_NAMES
 from spatial_replay.spec.units import declared_unit
 from spatial_replay.spec.walks import substitute
 from spatial_replay.text import requirement_text, time_text
+from spatial_replay.trace.sample import LATEST_NS
 
 
 class ReportedNode(NamedTuple):
@@ -117,6 +119,7 @@ class EventReporter:
 
     Attributes:
         settled: what settled the violation of the root before the end of the log, once it has happened.
+        violated_ns: since when the root is violated for certain, or `LATEST_NS`.
         over: what decided the root's verdict, an atom or a missing response, once there is one; "" if that
             is not known.
     """
@@ -128,9 +131,16 @@ class EventReporter:
         file: Specification,
         semantics: Semantics = "ltlf",
         units: Mapping[str, str] = MappingProxyType({}),
+        samples: NewestSamples | None = None,
     ) -> None:
-        """Before the first sample; `units` are those that are declared, see `unit_of`."""
-        self._units = units
+        """Start before the first sample.
+
+        Args:
+            units: those that are declared, see `unit_of`.
+            samples: take in each sample before this does; without them quantifiers are named as a whole.
+        """
+        self._units, self._regions = units, file.regions
+        self._samples = samples or NewestSamples()
         self._settles = semantics == "ltlf"  # the paper's semantics has no verdict over all continuations
         self._tree, self._filename = tree, "" if file.filename == "<text>" else file.filename
         self._leaves = instance.program.leaves
@@ -146,6 +156,7 @@ class EventReporter:
         self._carried: dict[tuple[int, int], LeafValue | None] = {}
         self._last_ns: int | None = None
         self.settled: SettledViolation | None = None
+        self.violated_ns = LATEST_NS
         self.over = ""
 
     def extend(self, block: SeriesBlock) -> list[EncodedEvent]:
@@ -210,31 +221,33 @@ class EventReporter:
         leaves = block.leaves[:, :, period.place]
         low, high = low_and_high(len(leaves), wide=period.code in (SATISFIED, VIOLATED))
         ends = leaves[low], leaves[high]
-        return find_leaf(self._reported[node].below, ends, period.worst, low=period.code != VIOLATED)
+        found = find_leaf(self._reported[node].below, ends, period.worst, low=period.code != VIOLATED)
+        return found and found._replace(time_ns=int(block.times_ns[period.place]))
 
     def _event(self, change: Change, block: SeriesBlock) -> EncodedEvent:
         reported, after, before = self._reported[change.node], change.after, change.before
         time_ns, settled = int(block.times_ns[change.sample]), None
+        if self._settles and change.node == 0 and after.code == VIOLATED:
+            self.violated_ns = time_ns
         if self._history is not None and self._history.is_complete and after.code in _VERDICTS:
             series, verdict = block.series[:, :, change.sample], _VERDICTS[after.code]
             settled = self._history.settled(reported.node, series, time_ns, verdict)
-            witness, because = self._settled(settled, time_ns)
+            witness, because = self._settled(settled, time_ns, time_ns)
             if change.node == 0 and verdict is Verdict.VIOLATED:
                 self.settled = SettledViolation(time_ns, settled)
-            self._remember(change.node, settled)
+            self._remember(change.node, settled, time_ns)
         else:
             found = self._deciding_leaf(change.node, after, block)
-            witness = because = self._words(found)
+            witness = because = self._words(found, time_ns)
             if after.code in _VERDICTS:
-                self._remember(change.node, found)
+                self._remember(change.node, found, time_ns)
         now = PeriodText(
             after, witness, change_sentence(reported.title, after, because, reported.unit), settled
         )
         past = None
         if before is not None:
-            past = self._past(
-                reported, before, after.start_ns, self._deciding_leaf(change.node, before, block)
-            )
+            worst = self._words(self._deciding_leaf(change.node, before, block), time_ns, past=True)
+            past = self._past(reported, before, after.start_ns, worst)
         return self._encoded(reported, time_ns, now, past)
 
     def _final_event(self, node: int, time_ns: int, last_ns: int, final: Floats) -> EncodedEvent:
@@ -244,25 +257,23 @@ class EventReporter:
         low, witness, because, decided = verdict is not Verdict.VIOLATED, "", "", None
         if self._history is not None and self._history.is_complete:
             decided = self._history.finished(reported.node, self._values, final)
-            witness, because = self._settled(decided, last_ns)
-            self._remember(node, decided)
+            witness, because = self._settled(decided, last_ns, time_ns)
+            self._remember(node, decided, time_ns)
         elif verdict is not Verdict.UNKNOWN:
             found = self._leaf_finder.find_leaf(reported.node, final, low=low, wide=self._settles)
-            witness = because = self._words(found)
-            self._remember(node, found)
+            witness = because = self._words(found, time_ns)
+            self._remember(node, found, time_ns)
         after = Period(_ENDED[verdict], last_ns, last_ns, lower if low else upper, OF_CURRENT)
         sentence = end_sentence(reported.title, verdict, (lower, upper), because, reported.unit)
         now = PeriodText(after, witness, sentence, decided)
         past = None
         if before.code != START and before.start_ns < last_ns:
-            past = self._past(reported, before, last_ns, self._carried[node, OF_CURRENT])
+            worst = self._words(self._carried[node, OF_CURRENT], time_ns, past=True)
+            past = self._past(reported, before, last_ns, worst)
         return self._encoded(reported, time_ns, now, past)
 
-    def _past(
-        self, reported: ReportedNode, period: Period, until_ns: int, worst: LeafValue | None
-    ) -> PeriodText:
+    def _past(self, reported: ReportedNode, period: Period, until_ns: int, witness: str) -> PeriodText:
         """Put a period that has ended into words."""
-        witness = self._words(worst, past=True)
         return PeriodText(period, witness, past_sentence(period, until_ns, witness, reported.unit))
 
     def _encoded(
@@ -303,34 +314,45 @@ class EventReporter:
         )
         return EncodedEvent(time_ns, *(each.SerializeToString(deterministic=True) for each in (event, log)))
 
-    def _remember(self, node: int, found: DecidingLeaf | LeafValue | None) -> None:
+    def _remember(self, node: int, found: DecidingLeaf | LeafValue | None, now_ns: int) -> None:
         """Keep what decided the root's verdict, if it is one over all continuations."""
         if self._reported[node].node or found is None or not self._settles:
             return
-        missed = found.missed if isinstance(found, DecidingLeaf) else None
-        is_response = missed is not None and missed.is_condition
-        self.over = f"missed {missed.response}" if missed and is_response else self._leaf_text(found.leaf)
+        if isinstance(found, DecidingLeaf) and found.missed and found.missed.is_condition:
+            self.over = f"missed {found.missed.response}"
+            return
+        leaf, _ = self._leaf(found.value if isinstance(found, DecidingLeaf) else found, now_ns)
+        self.over = self._leaf_text(leaf)
 
-    def _leaf_text(self, leaf: int) -> str:
-        return format_formula(substitute(self._leaves[leaf], self._bindings), relations=self._relations)
+    def _leaf(self, found: LeafValue, now_ns: int) -> tuple[Formula, float]:
+        """Return a leaf with its number, in place of a quantifier that of the objects that decide it."""
+        leaf = substitute(self._leaves[found.leaf], self._bindings)
+        decided = None
+        if isinstance(leaf, Quantified):
+            decided = self._samples.deciding_atom(leaf, found, now_ns, self._regions)
+        return decided or (leaf, found.number)
 
-    def _settled(self, found: DecidingLeaf | None, now_ns: int) -> tuple[str, str]:
-        """Return what decided in words, and the same with how long ago; nothing for None."""
+    def _leaf_text(self, leaf: Formula) -> str:
+        return format_formula(leaf, relations=self._relations)
+
+    def _settled(self, found: DecidingLeaf | None, since_ns: int, now_ns: int) -> tuple[str, str]:
+        """Return what decided in words, and the same with how long before a time; nothing for None."""
         if found is None:
             return "", ""
         missed, shown = found.missed, found.shown
-        before_ns = now_ns - shown.time_ns
-        words = self._words(LeafValue(shown.leaf, shown.number), past=before_ns > 0)
+        before_ns = since_ns - shown.time_ns
+        words = self._words(shown.value, now_ns, past=before_ns > 0)
         ago = f" ({time_text(before_ns)} earlier)" if before_ns else ""
         response = f"`{missed.condition}` held, but `{missed.response}` did not: " if missed else ""
         return words, f"{response}{words}{ago}"
 
-    def _words(self, found: LeafValue | None, *, past: bool = False) -> str:
+    def _words(self, found: LeafValue | None, now_ns: int, *, past: bool = False) -> str:
         """Return a leaf and its number in words; "" for none."""
         if found is None:
             return ""
-        amount = amount_text(abs(found.number), self._leaves[found.leaf], self._units)
-        return leaf_words(self._leaf_text(found.leaf), found.number, amount, past=past)
+        leaf, number = self._leaf(found, now_ns)
+        amount = amount_text(abs(number), leaf, self._units)
+        return leaf_words(self._leaf_text(leaf), number, amount, past=past)
 
     def _facts(self, reported: ReportedNode) -> dict[str, str]:
         of = {} if self._tree.object is None else {"object": self._tree.object}

@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from spatial_replay.annotate.deciding_leaf import leaf_key
+from spatial_replay.annotate.deciding_leaf import LeafValue, leaf_key
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.monitor.atoms.terms import Bindings
 from spatial_replay.monitor.causes import conjuncts_of, find_causes
@@ -44,6 +44,7 @@ class DecidingLeaf(NamedTuple):
         leaf: index among the program's leaves.
         number: its own number there, its sign not turned.
         time_ns: of the sample.
+        end: which end of its interval the number is.
         missed: the implication above it that failed, if a violation is due to one.
         response: where it is the condition's, the leaf by which the response came closest, if one did.
     """
@@ -52,6 +53,7 @@ class DecidingLeaf(NamedTuple):
     leaf: int
     number: float
     time_ns: int
+    end: End
     missed: MissedResponse | None = None
     response: DecidingLeaf | None = None
 
@@ -59,6 +61,11 @@ class DecidingLeaf(NamedTuple):
     def shown(self) -> DecidingLeaf:
         """The leaf to point at: that of a response that was missed, not of the condition that held."""
         return self if self.response is None else self.response
+
+    @property
+    def value(self) -> LeafValue:
+        """The leaf without its node and what was missed."""
+        return LeafValue(self.leaf, self.number, self.end, self.time_ns)
 
 
 class SettledViolation(NamedTuple):
@@ -197,4 +204,4 @@ class LeafHistory:
         number = float(samples.leaves[high if path.end is End.HIGH else low, index, sample])
         if not math.isfinite(number):
             return None
-        return DecidingLeaf(node, index, number + 0.0, int(samples.times_ns[sample]))
+        return DecidingLeaf(node, index, number + 0.0, int(samples.times_ns[sample]), path.end)

@@ -74,6 +74,7 @@ class EvaluatedResult(NamedTuple):
         since_ns: (R,), since when each requirement's conjunct is violated for certain (see
             `violated_since`); None for an equal time.
         settled: what settled the violation of the formula, if it is.
+        violated_ns: since when the formula is violated for certain, or `LATEST_NS`.
         title: what the result is known by; "" leaves it out of the banner.
         is_final: whether the block is about the finished log.
     """
@@ -83,6 +84,7 @@ class EvaluatedResult(NamedTuple):
     leaf_pairs: LeafPairs | None = None
     since_ns: Integers | None = None
     settled: SettledViolation | None = None
+    violated_ns: int = LATEST_NS
     title: str = ""
     is_final: bool = False
 

@@ -175,6 +175,31 @@ def test_negated_and_implied_atoms_are_witnesses_in_their_own_sign(tmp_path):
     assert facts(event)["witness"] == "`battery >= 2` holds by 1"
 
 
+def test_a_quantifier_is_named_by_the_objects_that_decide_it(tmp_path):
+    def at(sample: int, a: float, c: float) -> sr.Sample:
+        cars = {"a": sr.Footprint.disc(a, 0, 0.5), "c": sr.Footprint.disc(c, 0, 0.5)}
+        objects = {name: sr.TrackedObject(each, class_name="car") for name, each in cars.items()}
+        return sr.Sample(10**9 + sample * STEP_NS, objects | {"b": sr.Footprint.disc(0, 0, 0.5)})
+
+    samples = [at(0, 9, 5), at(1, 8, 6), at(2, 7, 7), at(3, 3, 8), at(4, 4, 9), at(5, 5, 9)]
+    text = """
+        group cars = class "car"
+        spec safe = G forall o in cars: (o dist b >= 3)
+        spec apart = G forall o in cars: !(o dist b < 3)
+        spec near = F forall o in cars: (o dist b <= 3)
+        spec each(ego) = F[0s, 0.2s] exists o in cars: (o dist ego <= -1)
+    """
+    events = written(tmp_path, text, samples, each={"ego": "b"})
+    found = {facts(event)["specification"]: event for _, event, _ in events}
+    assert {name: facts(event)["witness"] for name, event in found.items()} == {
+        "safe": "`a dist b >= 3` fails by 1",
+        "apart": "`a dist b < 3` holds by 1",
+        "near": "`a dist b <= 3` failed by 3",  # three samples before the last one
+        "each": "`c dist b <= -1` failed by 5",
+    }
+    assert facts(found["safe"])["witness_before"] == "`c dist b >= 3` held by 1"
+
+
 def test_the_paper_semantics_knows_signs_only(tmp_path):
     found = events_of(tmp_path, "spec kept = G battery >= 0", 2.0, -1.0, -1.0, -1.0, semantics="paper")
     [(number, event, _)] = found

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.message import Message
 from hypothesis import given
 from hypothesis import strategies as st
@@ -127,6 +128,38 @@ def test_a_set_of_states_is_described_by_all_that_it_may_be(tmp_path: Path) -> N
         "satisfied, whatever comes",
         "not satisfied yet",
     }
+
+
+def test_banner_and_standing_have_the_worst_result_first(tmp_path: Path) -> None:
+    text = """
+        spec never = F (a dist b <= 0.5)
+        spec goes_on = F G (a dist b >= 1.5)
+        spec unseen = G (a dist c >= 1)
+        spec last = G (a dist b >= 2)
+        spec early = G (a dist b >= 3.5)
+        spec met = F (a dist b <= 2)
+        spec later = F (a dist b <= 0.25)
+    """
+    log = annotated(tmp_path, text, moving([5.0, 4.5, 4.0, 2.0]))
+    banners = [
+        each.texts[0].text
+        for _, message in messages(log, SceneUpdate, "/spatial/scene")
+        for each in message.entities
+        if each.id == "verdict"
+    ]
+    assert banners == [
+        *["3 failing so far: never, met, later; 1 unknown: unseen; 3 holding so far: goes_on, last, early"]
+        * 2,
+        "1 violated: early; 3 failing so far: never, met, later; 1 unknown: unseen; "
+        "2 holding so far: goes_on, last",
+        "2 violated: early, last; 3 failing so far: never, goes_on, later; 1 unknown: unseen; "
+        "1 satisfied: met",
+        # what only the end decided comes last
+        "5 violated: early, last, never, …; 1 unknown: unseen; 1 satisfied: met",
+    ]
+    found = [message for _, message in messages(log, StandingUpdate, "/spatial/standing")]
+    assert [each.worst for each in found] == ["never", "never", "early", "early", "early"]
+    assert [each.name for each in found[-1].violated] == ["early", "last", "never", "goes_on", "later"]
 
 
 def test_rows_of_a_quantifier_name_their_objects(tmp_path: Path) -> None:

@@ -315,6 +315,26 @@ def test_the_result_violated_first_is_shown_unless_the_reader_chose(
         assert page.evaluate("viewer.ranges.length") < 10
 
 
+def test_the_list_of_results_has_the_worst_first(
+    open_panel: Open, logs: Mapping[str, Path], tmp_path: Path
+) -> None:
+    log = tmp_path / "ordered.mcap"
+    text = """
+        spec met = F (a dist b <= 4)
+        spec late = F (a dist b <= 0.5)
+        spec unseen = G (a dist c >= 1)
+        spec last = G (a dist b >= 3.5)
+        spec early = G (a dist b >= 5)
+    """
+    with sr.Recorder(log, specifications=[sr.parse_specification(text)]) as recorder:
+        for t in range(5):
+            objects = {"a": sr.Footprint.disc(9 - t, 0, 1), "b": sr.Footprint.disc(0, 0, 1)}
+            recorder.write(sr.Sample(t * 10**8, objects))
+    write_viewer_page(log, log.with_suffix(".html"))
+    page = open_panel("ordered", "specification", logs={"ordered": log})
+    expect(page.locator("select option")).to_have_text(["early", "last", "late", "unseen", "met"])
+
+
 LONG = """async (count) => {
     const {message: specification} = MESSAGES.find((each) => each.topic === "/spatial/specification");
     const [{name, object, nodes}] = specification.results;

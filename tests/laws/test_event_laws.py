@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from laws.strategies_monitor import Recording, cuts, recordings, specifications
 from spatial_replay import Specification, UsageError, evaluate, parse_specification
+from spatial_replay.annotate.deciding_leaf import NewestSamples
 from spatial_replay.annotate.events import EncodedEvent, EventReporter
 from spatial_replay.annotate.specification import reported_trees
 from spatial_replay.annotate.verdict_changes import LASTING, SATISFIED, START, NodeStates, track
@@ -91,15 +92,16 @@ def _all_events(
     instances = find_instances(spec, _choices(spec), [trace], 0, 2**63 - 1)
     evaluation = EvaluationStream(instances, spec.regions, semantics)
     trees = reported_trees([spec], [instances])
+    samples = NewestSamples()
     reporters = [
-        EventReporter(tree, stream.instance, spec, semantics)
+        EventReporter(tree, stream.instance, spec, semantics, samples=samples)
         for tree, stream in zip(trees, evaluation.streams, strict=True)
     ]
     events: list[list[EncodedEvent]] = [[] for _ in reporters]
     for begin, end in pairwise(ends):
-        for own, reporter, stretch in zip(
-            events, reporters, evaluation.extend(trace.slice(begin, end)), strict=True
-        ):
+        piece = trace.slice(begin, end)
+        samples.extend(piece)
+        for own, reporter, stretch in zip(events, reporters, evaluation.extend(piece), strict=True):
             own += reporter.extend(stretch)
     last_ns = int(trace.times_ns[-1])
     for own, reporter, stream in zip(events, reporters, evaluation.streams, strict=True):

@@ -97,6 +97,23 @@ def test_each_violated_result_has_an_arrow_of_its_own(tmp_path: Path) -> None:
     assert labels[5, 1] == "a dist b >= 4: -2"
 
 
+def test_of_equal_times_what_was_certain_comes_before_what_only_the_end_decided(tmp_path: Path) -> None:
+    text = "spec late = F (a dist b <= 1)\nspec seen = G (c dist b >= 1)\nspec last = G (a dist b >= 2.5)\n"
+    page = report_of_samples(tmp_path / "run.html", NEARING, text + "spec soon = F[0s, 1s] (a dist b <= 3)")
+    assert [each["title"] for each in page.facts["results"]] == ["soon", "last", "late", "seen"]
+    said = page.within("section#verdicts")
+    rows = [
+        said.index(f"{verdict}{name}robustness")
+        for verdict, name in [
+            ("violated", "soon"),
+            ("violated", "last"),
+            ("violated", "late"),
+            ("unknown", "seen"),
+        ]
+    ]
+    assert rows == sorted(rows)
+
+
 def test_verdicts_and_explanations_can_be_read_without_scripts(violated: Page) -> None:
     said = violated.within("section#verdicts")
     assert "violatedtable_setrobustness -0.1552," in said

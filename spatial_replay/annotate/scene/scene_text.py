@@ -22,7 +22,6 @@ from spatial_replay.logs.schemas.Robustness_pb2 import (
 )
 from spatial_replay.palette import FAILING, HOLDING, NEGATIVE, NEUTRAL, POSITIVE
 from spatial_replay.text import Instant
-from spatial_replay.trace.sample import LATEST_NS
 
 
 def labelled_objects(
@@ -67,12 +66,14 @@ def banners_of(
     Args:
         first: the first message that has any.
     """
-    titled = [each for each in results if each.title and len(each.block.times_ns)]
+    titled = [each for each in results if each.title]
     if not titled:
         return np.zeros(len(times_ns), np.int64), (None,)
     codes = np.zeros((len(times_ns), len(titled)), np.uint8)
     for column, result in enumerate(titled):
         own_ns = result.block.times_ns
+        if not len(own_ns):
+            continue
         at = np.minimum(np.searchsorted(own_ns, times_ns), len(own_ns) - 1)
         now = standing_codes(result.block.series[:1], final=result.is_final)[0, at]
         codes[:, column] = np.where((own_ns[at] == times_ns) | result.is_final, now, 0)
@@ -88,7 +89,7 @@ def _banner(
     for code, (words, hue) in _STANDING_WORDS.items():
         of_code = [result for result, each in zip(results, codes.tolist(), strict=True) if each == code]
         if code == VIOLATED:  # the one that was so first comes first
-            of_code.sort(key=lambda each: LATEST_NS if each.settled is None else each.settled.time_ns)
+            of_code.sort(key=lambda each: each.violated_ns)
         own = [each.title for each in of_code]
         if own:
             few = own if len(own) <= _MOST_TITLES else [*own[:_MOST_TITLES], "…"]
