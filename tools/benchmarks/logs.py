@@ -95,7 +95,7 @@ def _peak_bytes(*arguments: str) -> int:
 
 
 def bench_reading(measure: Any) -> None:
-    """Reading our own log, all samples into columns: anew, again, and with one core."""
+    """Reading our own log, all samples into columns: once, again, and with one core."""
     count = 200_000
     kept = {name: os.environ.get(name) for name in ("SPATIAL_REPLAY_CACHE", "SPATIAL_REPLAY_SAMPLES")}
     with tempfile.TemporaryDirectory() as folder:
@@ -111,7 +111,7 @@ def bench_reading(measure: Any) -> None:
             return sum(len(block.trace) for block in samples_only(open_source(log)).iter_blocks())
 
         try:
-            anew = measure("reading", lambda _: read("0"), limit_s=5e-6, **per_sample)
+            first = measure("reading", lambda _: read("0"), limit_s=5e-6, **per_sample)
             measure("reading and keeping", lambda _: read("4"), **(per_sample | {"runs": 1, "warmups": 0}))
             measure("reading again", lambda _: read("4"), limit_s=0.5e-6, **per_sample)
             cores = os.sched_getaffinity(0)
@@ -119,14 +119,14 @@ def bench_reading(measure: Any) -> None:
                 os.sched_setaffinity(0, {min(cores)})
                 one = measure("reading with one core", lambda _: read("0"), **per_sample)
                 os.sched_setaffinity(0, cores)
-                measure.ratio(f"{len(cores)} cores, time of one", anew.median_s / one.median_s, 1 / 1.7)
+                measure.ratio(f"{len(cores)} cores, time of one", first.median_s / one.median_s, 1 / 1.7)
         finally:
             for name, value in kept.items():
                 if value is None:
                     os.environ.pop(name, None)
                 else:
                     os.environ[name] = value
-        measure.ratio("reading, times the bare pass", anew.median_s / bare.median_s, 2.0)
+        measure.ratio("reading, times the bare pass", first.median_s / bare.median_s, 2.0)
 
 
 def _chunk_records(log: Path) -> list[tuple[bytes, int]]:
