@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import random
 import re
 from contextlib import suppress
@@ -288,6 +289,26 @@ def test_an_index_lets_a_window_skip_the_rest(log):
     part = Trace.concatenate([b.trace for b in source.iter_blocks(4 * 10**9, 8 * 10**9)])
     assert part == trace.slice(10, 20)
     assert not part.faults
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="the system does not say how many cores")
+def test_what_is_read_and_written_does_not_depend_on_the_number_of_cores(log, tmp_path):
+    joints = messages(JOINTS, list(range(0, 10**11, 10**8)), [b"{}" * n for n in range(1000)])
+    path = log(log_of(moving_cup(250), joints))
+    spec = tmp_path / "right.spatial"
+    spec.write_text("region goal = box(3, 0, 400, 1)\nspec right = F (cup enclosedin goal)")
+    cores = os.sched_getaffinity(0)
+    outputs, traces = [], []
+    for chosen in (cores, {min(cores)}):
+        try:
+            os.sched_setaffinity(0, chosen)
+            assert run(["replay", str(path), "--spec", str(spec), "-o", str(tmp_path / "out.mcap")]) == 0
+            traces.append(read_trace(path))
+        finally:
+            os.sched_setaffinity(0, cores)
+        outputs.append((tmp_path / "out.mcap").read_bytes())
+    assert outputs[0] == outputs[1]
+    assert traces[0] == traces[1] == moving_cup(250)
 
 
 def test_all_messages_but_derived_ones_are_copied_as_they_are(log):

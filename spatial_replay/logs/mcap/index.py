@@ -73,7 +73,9 @@ def read_directory(stream: BinaryIO, faults: FaultList, name: str) -> Directory:
         if len(faults) == known:
             faults.add(f"{name}: {damage}; the log was read without its index")
     if _is_own(directory.header):
-        directory.chunks = [place._replace(has_checksum=True) for place in directory.chunks]
+        directory.chunks = [
+            place if place.has_checksum else place._replace(has_checksum=True) for place in directory.chunks
+        ]
     return directory
 
 
@@ -166,7 +168,8 @@ def _take_in(directory: Directory, opcode: int, body: bytes) -> None:
             raise DamageError("the index breaks off")
         start_ns, end_ns, offset, length, indexed = _CHUNK_INDEX.unpack_from(body)
         channels = _indexed_channels(body, indexed)
-        directory.chunks.append(ChunkPlace(offset, length, start_ns, end_ns, channels=channels))
+        is_own = _is_own(directory.header)
+        directory.chunks.append(ChunkPlace(offset, length, start_ns, end_ns, True, channels, is_own))
     elif opcode == Opcode.ATTACHMENT_INDEX:
         attachment = decoded(records.AttachmentIndex.read, body)
         directory.attachments.append((attachment.offset, attachment.length))

@@ -253,7 +253,7 @@ def _blocks(
             if not is_chosen.all():
                 messages = messages.take(np.flatnonzero(is_chosen))
         waiting.append(messages)
-        size += messages.payloads.nbytes
+        size += len(messages.payloads.data) if messages.channel >= 0 else messages.payloads.nbytes
         samples += _count(messages, objects)
         if number < len(places) and (size >= BLOCK_BYTES or samples >= BLOCK_SAMPLES):
             ordered = _in_order(waiting)
