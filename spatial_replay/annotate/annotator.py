@@ -28,6 +28,7 @@ from spatial_replay.annotate.standing import FinalStanding, StandingEncoder
 from spatial_replay.annotate.violations import EvaluatedResult, leaf_pairs, violated_since
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.messages import Channel, Messages, messages_of
+from spatial_replay.logs.payloads import joined, taken
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.schemas.Robustness_pb2 import Robustness, StandingUpdate
 from spatial_replay.logs.schemas.Specification_pb2 import Specification as SpecificationMessage
@@ -309,9 +310,8 @@ class Annotator:
     ) -> Messages:
         """Order the messages of results by time; among equal times the order of results stays."""
         times_ns = np.concatenate([np.empty(0, np.int64), *(block.times_ns for block in blocks)])
-        payloads = [payload for own in encoded for payload in own]
         order = np.argsort(times_ns, kind="stable")
-        return self._messages(channel, times_ns[order], [payloads[index] for index in order.tolist()])
+        return self._messages(channel, times_ns[order], taken(joined(encoded), order))
 
     def _messages(self, channel: Channel, times_ns: Integers, payloads: Sequence[bytes]) -> Messages:
         first = self._written[channel.topic]

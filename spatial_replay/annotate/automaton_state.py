@@ -16,7 +16,8 @@ from spatial_replay.automata.guards import Transition
 from spatial_replay.errors import NoAutomatonError
 from spatial_replay.geometry.arrays import Flags, Integers
 from spatial_replay.logs.messages import Attachment
-from spatial_replay.logs.objects.wire import WireTemplate, payloads_of
+from spatial_replay.logs.objects.wire import WireTemplate
+from spatial_replay.logs.payloads import Filled, filled_in
 from spatial_replay.logs.schemas import AutomatonState_pb2
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.topics import AUTOMATA_PREFIX
@@ -78,14 +79,14 @@ class AutomatonRun:
         self._after: NDArray[np.bool_] | Integers = np.empty(0, np.int64)
         self._texts: dict[bytes, str] = {}
 
-    def encode(self, block: SeriesBlock) -> list[bytes]:
+    def encode(self, block: SeriesBlock) -> Sequence[bytes]:
         """Take in the next samples; return one message for each."""
         if not len(block.times_ns):
             return []
         values = self._values(block)
         before, after = self._steps(values)
         keys, groups = _distinct(before, after)
-        payloads = [b""] * len(block.times_ns)
+        filled = []
         for number, key in enumerate(keys):
             members = np.flatnonzero(groups == number)
             template = self._template(key, before[members[0]], after[members[0]])
@@ -93,11 +94,8 @@ class AutomatonRun:
             marks[:, :-3] = _TRUTHS[values[:, members]].T
             marks[:, -3:] = self._summary(after[members[0]])
             words = block.times_ns[members].astype(np.uint64)[:, None]
-            for index, payload in zip(
-                members.tolist(), payloads_of(template.fill(words, marks)), strict=True
-            ):
-                payloads[index] = payload
-        return payloads
+            filled.append((members, Filled(template, words, marks)))
+        return filled_in(len(block.times_ns), filled)
 
     def pass_over(self, block: SeriesBlock) -> None:
         """Take in the next samples without a message."""
@@ -108,12 +106,11 @@ class AutomatonRun:
         """Take in the next samples, at least one; return the states after each, (T,) or as sets (T, S)."""
         return self._steps(self._values(block))[1]
 
-    def words(self) -> list[str]:
-        """Return the states after each of the samples last taken in, in words."""
+    def words(self) -> tuple[list[str], Integers]:
+        """Return states in words, and which of them is after each of the samples last taken in."""
         kinds, groups = _distinct(self._after, self._after)
         firsts = [int(np.argmax(groups == number)) for number in range(len(kinds))]
-        texts = [self._text(kind, first) for kind, first in zip(kinds, firsts, strict=True)]
-        return [texts[number] for number in groups.tolist()]
+        return [self._text(kind, first) for kind, first in zip(kinds, firsts, strict=True)], groups
 
     @property
     def latest_words(self) -> str:

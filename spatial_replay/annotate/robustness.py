@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from spatial_replay.errors import LogError
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.logs.objects.wire import LayoutError, WireTemplate, payloads_of, rows_of
+from spatial_replay.logs.objects.wire import LayoutError, WireTemplate, rows_of
+from spatial_replay.logs.payloads import Filled, filled_in
 from spatial_replay.logs.schemas.Robustness_pb2 import (
     FAILS_SO_FAR,
     HOLDS_SO_FAR,
@@ -58,7 +59,7 @@ def encode_robustness(
     series: Floats,
     *,
     final: bool = False,
-) -> list[bytes]:
+) -> Sequence[bytes]:
     """Return one message for each sample.
 
     Args:
@@ -84,7 +85,8 @@ def encode_robustness(
     words[:, 0] = times_ns
     words[:, 1:] = series.reshape(4 * len(names), len(times_ns)).T.view(np.uint64)
     codes = standing_codes(series, final=final)
-    return payloads_of(WireTemplate.of(message).fill(words, np.ascontiguousarray(codes.T)))
+    filled = Filled(WireTemplate.of(message), words, np.ascontiguousarray(codes.T))
+    return filled_in(len(words), [(np.arange(len(words)), filled)])
 
 
 def standing_codes(series: Floats, *, final: bool = False) -> Codes:

@@ -15,8 +15,9 @@ from spatial_replay.annotate.automaton_state import AutomatonRun
 from spatial_replay.annotate.robustness import Codes, standing_codes
 from spatial_replay.annotate.scene.scene_update import spaced
 from spatial_replay.annotate.specification import ReportedTree, unit_of
-from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.logs.objects.wire import WireTemplate, payloads_of
+from spatial_replay.geometry.arrays import Floats, Integers, combined, equal_places
+from spatial_replay.logs.objects.wire import WireTemplate
+from spatial_replay.logs.payloads import Filled, filled_in
 from spatial_replay.logs.schemas.Robustness_pb2 import (
     FAILS_SO_FAR,
     HOLDS_SO_FAR,
@@ -137,7 +138,7 @@ class StandingEncoder:
 
     def encode(
         self, times_ns: Integers, blocks: Sequence[SeriesBlock], over: Sequence[str]
-    ) -> tuple[Integers, list[bytes]]:
+    ) -> tuple[Integers, Sequence[bytes]]:
         """Take in the next samples; return the times and contents of their messages.
 
         Args:
@@ -157,8 +158,7 @@ class StandingEncoder:
         if not len(chosen):
             return shown_ns, []
         self._written_ns = int(shown_ns[-1])
-        said = np.array(words, object).reshape(len(words), -1)
-        return shown_ns, self._messages(shown_ns, series, said, np.array(since), over)
+        return shown_ns, self._messages(shown_ns, series, words, np.array(since), over)
 
     def pass_over(self, blocks: Sequence[SeriesBlock]) -> None:
         """Take in the next samples without a message."""
@@ -204,29 +204,28 @@ class StandingEncoder:
             unit = unit_of(tree.formula, self._units)
             outcomes.append(FinalStanding(code, since_s, by, unit, said, violated_ns == LATEST_NS))
         self.outcomes = tuple(outcomes)
-        words, times_ns = np.array(self._words, object)[:, None], np.array([time_ns], np.int64)
+        words, times_ns = [([each], np.zeros(1, np.int64)) for each in self._words], np.array([time_ns])
         [payload] = self._messages(times_ns, series, words, np.array(since_ns)[:, None], over, final=True)
         return payload
 
-    def _described(self, index: int, block: SeriesBlock, at: Integers) -> list[str]:
-        """Return (S,) the state of a result's automaton in words, `at` samples into a block."""
+    def _described(self, index: int, block: SeriesBlock, at: Integers) -> tuple[list[str], Integers]:
+        """Return states of an automaton in words, and which of them (S,) is `at` samples into a block."""
         run = self._runs[index]
-        if run is None:
-            return [""] * len(at)
-        of_block = run.words() if len(block.times_ns) else []
-        every = [self._words[index], *of_block]
-        return [every[place] for place in at.tolist()]
+        if run is None or not len(block.times_ns):
+            return [self._words[index]], np.zeros(len(at), np.int64)
+        texts, which = run.words()
+        return [self._words[index], *texts], np.append(0, which + 1)[at]
 
     def _messages(
         self,
         times_ns: Integers,
         series: Sequence[Floats],
-        words: np.ndarray,
+        words: Sequence[tuple[list[str], Integers]],
         since_ns: Integers,
         over: Sequence[str],
         *,
         final: bool = False,
-    ) -> list[bytes]:
+    ) -> Sequence[bytes]:
         codes = [standing_codes(each, final=final) for each in series]
         of_results = np.array([each[0] for each in codes])
         worst = worst_results(of_results, since_ns)
@@ -238,13 +237,14 @@ class StandingEncoder:
         )
         counts = (of_results == VIOLATED).sum(axis=0)
         marks, numbers = self._rows(series, codes)
-        payloads = [b""] * len(times_ns)
-        groups: dict[_Layout, list[int]] = {}
-        for sample, count in enumerate(counts.tolist()):
-            violated = tuple((each, over[each]) for each in order[:count, sample].tolist())
-            key = _Layout(int(worst[sample]), tuple(words[:, sample]), violated, final)
-            groups.setdefault(key, []).append(sample)
-        for layout, members in groups.items():
+        filled_groups = []
+        is_listed = np.arange(len(order))[:, None] < counts
+        keys = [worst, *(which for _, which in words), *np.where(is_listed, order, -1)]
+        for members in equal_places(combined(keys, len(times_ns))):
+            first = int(members[0])
+            violated = tuple((each, over[each]) for each in order[: counts[first], first].tolist())
+            said = tuple(texts[which[first]] for texts, which in words)
+            layout = _Layout(int(worst[first]), said, violated, final)
             rows = series[layout.worst][:_MOST_ROWS, :, members]
             own = [rounded(rows[:, [1, 0]]).reshape(-1, len(members))]
             for each, _ in layout.violated:
@@ -255,10 +255,9 @@ class StandingEncoder:
             stamps = times_ns[members].astype(np.uint64)[:, None]
             bits = np.concatenate([stamps, np.ascontiguousarray(filled).view(np.uint64)], axis=1)
             own_marks = codes[layout.worst][:_MOST_ROWS, members]
-            encoded = self._template(layout).fill(bits, np.concatenate([marks[:, members], own_marks]).T)
-            for sample, payload in zip(members, payloads_of(encoded), strict=True):
-                payloads[sample] = payload
-        return payloads
+            both = np.ascontiguousarray(np.concatenate([marks[:, members], own_marks]).T)
+            filled_groups.append((members, Filled(self._template(layout), bits, both)))
+        return filled_in(len(times_ns), filled_groups)
 
     def _rows(self, series: Sequence[Floats], codes: Sequence[Codes]) -> tuple[Codes, Floats]:
         """Return the standing (E, S) and the robustness (E, S) of each entry of `results`."""

@@ -5,8 +5,8 @@ Ragged rows keep rows of unequal length in one flat array: row r is `values[star
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TypeAlias
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -55,3 +55,37 @@ def count_in_rows(flags: Booleans, start: Integers) -> Integers:
         return np.zeros(len(start) - 1, np.int64)
     total = starts_from_counts(flags.astype(np.int64))
     return np.asarray(total[start[1:]] - total[start[:-1]])
+
+
+_MOST: Final = 2**62
+
+
+def combined(columns: Iterable[NDArray[Any]], length: int) -> Integers:
+    """Return (length,) a number that is equal exactly where all columns of whole numbers are."""
+    code, most = np.zeros(length, np.int64), 1
+    for column in columns:
+        if not length or (column == column[0]).all():
+            continue
+        least = int(column.min())
+        width = int(column.max()) - least + 1
+        places = column.astype(np.int64) - least
+        if most * width > _MOST:
+            (code, most), (places, width) = _ranked(code), _ranked(places)
+        code, most = code * width + places, most * width
+    return code
+
+
+def _ranked(column: Integers) -> tuple[Integers, int]:
+    """Return the rank of each number among those that there are, and how many there are."""
+    kinds, ranks = np.unique(column, return_inverse=True)
+    return ranks.astype(np.int64), len(kinds)
+
+
+def equal_places(code: Integers) -> Iterator[Integers]:
+    """Yield the places (K,) of each value, in their order."""
+    if len(code) and (code == code[0]).all():
+        yield np.arange(len(code))
+        return
+    order = np.argsort(code, kind="stable")
+    edges = np.flatnonzero(np.diff(code[order])) + 1
+    yield from (places for places in np.split(order, edges) if len(places))

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spatial_replay.geometry.arrays import Integers, starts_from_counts
+from spatial_replay.logs.payloads import MixedPayloads, joined
 from spatial_replay.trace.trace import Trace
 
 BLOCK_SAMPLES = 8_192
@@ -209,7 +210,7 @@ def join(streams: Sequence[Messages]) -> Messages:
         sequence=_joined([stream.sequence for stream in streams]),
         log_time_ns=_joined([stream.log_time_ns for stream in streams]),
         publish_time_ns=_joined([stream.publish_time_ns for stream in streams]),
-        payloads=[payload for stream in streams for payload in stream.payloads],
+        payloads=joined([stream.payloads for stream in streams]),
     )
 
 
@@ -227,7 +228,9 @@ def select(messages: Messages, chosen: Integers) -> Messages:
 
 def chosen_payloads(payloads: Sequence[bytes], chosen: Integers) -> Sequence[bytes]:
     """Return the payloads with the given indices, in that order."""
-    return payloads.take(chosen) if isinstance(payloads, Payloads) else [payloads[i] for i in chosen.tolist()]
+    if isinstance(payloads, Payloads | MixedPayloads):
+        return payloads.take(chosen)
+    return [payloads[index] for index in chosen.tolist()]
 
 
 def _rank(channel: Channel) -> tuple[str, str, str, str, bytes, tuple[tuple[str, str], ...]]:

@@ -26,7 +26,8 @@ from spatial_replay.annotate.scene.scene_entities import (
     point_at,
 )
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.logs.objects.wire import Bytes, WireTemplate
+from spatial_replay.logs.objects.wire import WireTemplate, Words
+from spatial_replay.logs.payloads import Filled
 from spatial_replay.spec.formula import Outline
 
 OBJECT_OPACITY: Final = 0.55
@@ -133,20 +134,20 @@ class SceneTemplate:
     """Messages of one layout, but for their times, coordinates and colours.
 
     Attributes:
-        template: its words are to be filled in.
-        stamps: offsets of the timestamps' contents.
+        template: its words are to be filled in: numbers, and after them two for each timestamp.
+        stamps: how many timestamps there are.
     """
 
     template: WireTemplate
-    stamps: tuple[int, ...]
+    stamps: int
 
-    def fill(self, times_ns: Integers, words: Floats) -> Bytes:
-        """Encode messages (S, L) from times (S,) and numbers (S, W)."""
-        rows = self.template.fill(words.view(np.uint64))
-        stamps = _encoded_stamps(times_ns)
-        for begin in self.stamps:
-            rows[:, begin : begin + _STAMP] = stamps
-        return rows
+    def filled(self, times_ns: Integers, numbers: Floats) -> Filled:
+        """Return messages with times (S,) and numbers (S, W)."""
+        count = numbers.shape[1]
+        words = np.empty((len(times_ns), count + 2 * self.stamps), np.uint64)
+        words[:, :count] = numbers.view(np.uint64)
+        words[:, count:] = np.tile(_encoded_stamps(times_ns), self.stamps)
+        return Filled(self.template, words, np.empty((len(words), 0), np.uint8))
 
 
 def make_template(layout: SceneLayout, regions: tuple[Region, ...], lift: float) -> SceneTemplate:
@@ -181,8 +182,10 @@ def make_template(layout: SceneLayout, regions: tuple[Region, ...], lift: float)
         begin = payload.tobytes().rindex(number.encode())
         slots = np.append(slots, np.arange(begin, begin + len(number), 8))
     payload[slots[:, None] + np.arange(8)] = 0
+    stamps = _stamp_offsets(payload.tobytes())
+    both = (np.array(stamps, np.int64)[:, None] + _STAMP_WORDS).ravel()
     return SceneTemplate(
-        WireTemplate(payload, slots, np.empty(0, np.int64)), _stamp_offsets(payload.tobytes())
+        WireTemplate(payload, np.concatenate([slots, both]), np.empty(0, np.int64)), len(stamps)
     )
 
 
@@ -328,6 +331,7 @@ _A_STAMP: Final = Timestamp(seconds=_SECONDS, nanos=_NANOS)
 # its bytes of all ones are in no text, and every other number is a slot or an ordinary constant
 _STAMP_BYTES: Final = _A_STAMP.SerializeToString()
 _STAMP: Final = len(_STAMP_BYTES)
+_STAMP_WORDS: Final = (0, _STAMP - 8)
 _NS: Final = 1_000_000_000
 
 
@@ -340,11 +344,11 @@ def _stamp_offsets(payload: bytes) -> tuple[int, ...]:
     return tuple(offsets)
 
 
-def _encoded_stamps(times_ns: Integers) -> Bytes:
-    """Encode nanoseconds (S,) as the contents (S, 12) of timestamps."""
+def _encoded_stamps(times_ns: Integers) -> Words:
+    """Encode nanoseconds (S,) as the contents of timestamps: (S, 2) words that overlap, at `_STAMP_WORDS`."""
     rows = np.tile(np.frombuffer(_STAMP_BYTES, np.uint8), (len(times_ns), 1))
     shifts = np.arange(0, 35, 7)
     more = np.array([0x80, 0x80, 0x80, 0x80, 0x00])
     for begin, number in ((1, times_ns // _NS), (7, times_ns % _NS)):
         rows[:, begin : begin + 5] = number[:, None] >> shifts & 0x7F | more
-    return rows
+    return np.concatenate([rows[:, at : at + 8].copy().view("<u8") for at in _STAMP_WORDS], axis=1)

@@ -46,8 +46,8 @@ from spatial_replay.annotate.violations import (
     first_violations,
     worst_robustness,
 )
-from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.logs.objects.wire import payloads_of
+from spatial_replay.geometry.arrays import Floats, Integers, combined, equal_places
+from spatial_replay.logs.payloads import filled_in
 from spatial_replay.monitor.atoms.terms import footprint_from_outline
 from spatial_replay.spec.formula import Outline
 from spatial_replay.trace.trace import Trace
@@ -107,7 +107,7 @@ class SceneMessages(NamedTuple):
     """Encoded messages, their times (S,) int64, the state to go on from, and what they show if any."""
 
     times_ns: Integers
-    payloads: list[bytes]
+    payloads: Sequence[bytes]
     state: SceneState
     frames: SceneFrames | None
 
@@ -164,14 +164,12 @@ class SceneEncoder:
         content = _content(trace, names, rows, state, scale, violations, causes, has_label, banners)
         shades = colours(objects, scales), colours(regions, scales)
         templates = dict(state.templates)
-        payloads = [b""] * len(written)
+        filled = []
         for layout, samples in _by_layout(content):
             if layout not in templates:
                 templates[layout] = make_template(layout, self._drawn, _LIFT * scale)
             words = self._words(layout, samples, content, *shades, scale)
-            encoded = templates[layout].fill(times_ns[samples], words)
-            for sample, payload in zip(samples.tolist(), payloads_of(encoded), strict=True):
-                payloads[sample] = payload
+            filled.append((samples, templates[layout].filled(times_ns[samples], words)))
         last = content.forms[-1] >= FIRST_FORM
         after = SceneState(
             first_ns=state.first_ns,
@@ -188,7 +186,7 @@ class SceneEncoder:
         frames = SceneFrames(
             times_ns, objects, regions, *shades, scale, presence, content, self._drawn, find_arrows, self.unit
         )
-        return SceneMessages(times_ns, payloads, after, frames)
+        return SceneMessages(times_ns, filled_in(len(written), filled), after, frames)
 
     def scaled(self, state: SceneState, trace: Trace, rows: Integers) -> tuple[SceneState, Floats, int]:
         """Return the state with its scale and place, once an object is shown, the scale (S, 1) of each
@@ -338,12 +336,8 @@ def _class_codes(trace: Trace, rows: Integers) -> Integers:
 def _by_layout(content: SceneContent) -> Iterator[tuple[SceneLayout, Integers]]:
     """Yield the layouts, each with its samples (S,)."""
     keys = np.column_stack([content.forms, content.styles, content.arrow, content.banner])
-    if (keys == keys[0]).all():
-        yield _layout(content, keys[0]), np.arange(len(keys))
-        return
-    rows, which = np.unique(keys, axis=0, return_inverse=True)
-    for number, row in enumerate(rows):
-        yield _layout(content, row), np.flatnonzero(which.reshape(-1) == number)
+    for samples in equal_places(combined(keys.T, len(keys))):
+        yield _layout(content, keys[samples[0]]), samples
 
 
 def _layout(content: SceneContent, key: NDArray[np.int64]) -> SceneLayout:

@@ -8,18 +8,24 @@ as fast.
 from __future__ import annotations
 
 import struct
+import threading
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Final, NamedTuple, cast
 
 import numpy as np
 import zstandard
 from mcap import records
 from mcap.opcode import Opcode
+from numpy.typing import NDArray
 
-from spatial_replay.geometry.arrays import Integers
+from spatial_replay.geometry.arrays import Integers, equal_places, starts_from_counts
 from spatial_replay.logs.mcap.chunk_records import RECORD_HEAD, encoded
 from spatial_replay.logs.messages import Messages
+from spatial_replay.logs.payloads import Filled, MixedPayloads, columns_of
+from spatial_replay.trace.sample import FOREVER
 
 _MESSAGE = np.dtype(
     [
@@ -31,15 +37,29 @@ _MESSAGE = np.dtype(
         ("publish_time", "<u8"),
     ]
 )
+_HEAD: Final = _MESSAGE.itemsize
+_HEAD_BYTES: Final = np.dtype(f"V{_HEAD}")
+_NO_HEAD: Final = bytes(_HEAD)
 _INDEX_ENTRY = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
+_ZSTD: Final = b"zstd"
+_CHUNK: Final = struct.Struct("<BQQQQII4sQ")
+_INDEX: Final = struct.Struct("<BQHI")
+COMPRESSION_LEVEL: Final = 1
+"""Coordinates hardly shrink further at higher levels, which take several times as long."""
 
 
 @dataclass(frozen=True, slots=True)
 class PackedChunk:
-    """A chunk ready to be written, with its entry of the summary."""
+    """A chunk ready to be written, with what the summary says of it.
 
-    record: bytes
-    index: bytes
+    Attributes:
+        data: the chunk's record, followed by its index of messages.
+        index_bytes: how long that index is.
+        index_offsets: for each channel, where its entries begin in the index.
+    """
+
+    data: bytes
+    index_bytes: int
     index_offsets: Mapping[int, int]
     compressed_size: int
     uncompressed_size: int
@@ -50,25 +70,26 @@ class PackedChunk:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Batch:
-    """Messages as records: heads (M,), payloads, and (M,) sizes of both."""
+    """Messages as records: heads (M,), payloads, (M,) sizes of both, and the numbers of their channels."""
 
     heads: np.ndarray[tuple[int], np.dtype[np.void]]
-    payloads: list[bytes]
+    payloads: MixedPayloads
     sizes: Integers
+    channels: list[int]
 
     @classmethod
     def of(cls, messages: Messages, numbers: Integers) -> Batch:
         """Return messages as records, with channel numbers (M,)."""
-        payloads = list(messages.payloads)
-        sizes = np.fromiter(map(len, payloads), np.int64, len(payloads))
+        payloads = columns_of(messages.payloads)
+        sizes = payloads.sizes
         heads = np.zeros(len(payloads), _MESSAGE)
         heads["opcode"] = Opcode.MESSAGE
-        heads["length"] = sizes + (_MESSAGE.itemsize - RECORD_HEAD.size)
+        heads["length"] = sizes + (_HEAD - RECORD_HEAD.size)
         heads["channel"] = numbers
         heads["sequence"] = messages.sequence
         heads["log_time"] = messages.log_time_ns
         heads["publish_time"] = messages.publish_time_ns
-        return cls(heads, payloads, sizes + _MESSAGE.itemsize)
+        return cls(heads, payloads, sizes + _HEAD, numbers.tolist())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,52 +105,151 @@ class MessageRange:
         return self.batch.heads[self.begin : self.stop]
 
     @property
-    def channels(self) -> list[int]:
+    def sizes(self) -> Integers:
+        return self.batch.sizes[self.begin : self.stop]
+
+    @property
+    def channels(self) -> set[int]:
         """The numbers of the channels with messages in it."""
-        numbers: list[int] = np.unique(self.heads["channel"]).tolist()
-        return numbers
+        return set(self.batch.channels[self.begin : self.stop])
 
     @property
     def start_ns(self) -> int:
         """Log time of its first message."""
-        return int(self.heads["log_time"][0])
+        return int(self.batch.heads["log_time"][self.begin])
 
-    def parts(self) -> list[bytes]:
-        """Return heads and payloads in turn."""
-        heads = self.heads.tobytes()
-        width = _MESSAGE.itemsize
-        parts = [b""] * (2 * (self.stop - self.begin))
-        parts[::2] = [heads[place : place + width] for place in range(0, len(heads), width)]
-        parts[1::2] = self.batch.payloads[self.begin : self.stop]
-        return parts
+    def contents(self) -> list[bytes]:
+        """Return room for each head, and each payload; those of a template are to be filled in."""
+        payloads = self.batch.payloads
+        patterns = [part.template.pattern if isinstance(part, Filled) else None for part in payloads.parts]
+        own = slice(self.begin, self.stop)
+        places = zip(payloads.part[own].tolist(), payloads.row[own].tolist(), strict=True)
+        contents = [_NO_HEAD] * (2 * (self.stop - self.begin))
+        contents[1::2] = [patterns[part] or payloads.parts[part][row] for part, row in places]
+        return contents
+
+    def fill(self, content: bytearray, starts: Integers) -> None:
+        """Fill in heads and templates.
+
+        Args:
+            content: with `contents` in it.
+            starts: (m,) where each message's record begins.
+        """
+        heads: NDArray[np.void] = np.ndarray((len(content) - _HEAD + 1,), _HEAD_BYTES, content, 0, (1,))
+        heads[starts] = self.heads.view(_HEAD_BYTES)
+        payloads, own = self.batch.payloads, slice(self.begin, self.stop)
+        part, row = payloads.part[own], payloads.row[own]
+        for places in equal_places(part):
+            filled = payloads.parts[part[places[0]]]
+            if isinstance(filled, Filled):
+                filled.write(content, starts[places] + _HEAD, row[places])
 
 
-def pack(ranges: list[MessageRange], declaring: bytes, compressor: zstandard.ZstdCompressor) -> PackedChunk:
-    """Pack messages into a compressed chunk with its index, after the declarations that it begins with."""
+class OpenChunk(NamedTuple):
+    """A chunk to be packed: its messages, at least one, and the declarations that it begins with."""
+
+    ranges: Sequence[MessageRange]
+    declaring: bytes
+
+
+def pack(chunks: Sequence[OpenChunk]) -> list[PackedChunk]:
+    """Pack messages into compressed chunks, each with its index.
+
+    Several chunks are laid out in one buffer, where the messages of a template are encoded together.
+    """
+    content, starts = _laid_out(chunks)
+    ranges = [each for chunk in chunks for each in chunk.ranges]
+    counts = np.array([sum(each.stop - each.begin for each in chunk.ranges) for chunk in chunks], np.int64)
     heads = np.concatenate([each.heads for each in ranges])
-    sizes = np.concatenate([each.batch.sizes[each.begin : each.stop] for each in ranges])
-    content = declaring + b"".join([part for each in ranges for part in each.parts()])
+    begins = np.cumsum([0, *(len(chunk.declaring) + _size_of(chunk) for chunk in chunks)])
+    first = starts_from_counts(counts)
+    low_ns = np.minimum.reduceat(heads["log_time"], first[:-1]).tolist()
+    high_ns = np.maximum.reduceat(heads["log_time"], first[:-1]).tolist()
+    chunk_of = np.repeat(np.arange(len(chunks)), counts)
     entries = np.zeros(len(heads), _INDEX_ENTRY)
     entries["log_time"] = heads["log_time"]
-    entries["offset"] = len(declaring) + np.cumsum(sizes) - sizes
-    index, offsets, counts = bytearray(), dict[int, int](), dict[int, int]()
-    for channel in np.unique(heads["channel"]).tolist():
-        listed = entries[heads["channel"] == channel].tobytes()
-        offsets[channel] = len(index)
-        counts[channel] = len(listed) // _INDEX_ENTRY.itemsize
-        index += struct.pack("<BQHI", Opcode.MESSAGE_INDEX, len(listed) + 6, channel, len(listed)) + listed
-    compressed = compressor.compress(content)
-    start_ns, end_ns = int(heads["log_time"].min()), int(heads["log_time"].max())
-    chunk = records.Chunk(
-        compression="zstd",
-        data=compressed,
-        message_start_time=start_ns,
-        message_end_time=end_ns,
-        uncompressed_crc=zlib.crc32(content),
-        uncompressed_size=len(content),
-    )
-    sizes_of = len(compressed), len(content)
-    return PackedChunk(encoded(chunk), bytes(index), offsets, *sizes_of, counts, start_ns, end_ns)
+    entries["offset"] = starts - begins[chunk_of]
+    key = chunk_of * 2**16 + heads["channel"]
+    order = np.argsort(key, kind="stable")
+    key, listed = key[order], entries[order]
+    edges = np.flatnonzero(np.diff(key, prepend=-1, append=-1)).tolist()
+    indices: list[list[tuple[int, bytes]]] = [[] for _ in chunks]
+    for begin, end in pairwise(edges):
+        chunk, channel = divmod(int(key[begin]), 2**16)
+        indices[chunk].append((channel, listed[begin:end].tobytes()))
+    whole, bounds = memoryview(content), begins.tolist()
+    return [
+        _packed(whole[bounds[at] : bounds[at + 1]], indices[at], low_ns[at], high_ns[at])
+        for at in range(len(chunks))
+    ]
+
+
+def _size_of(chunk: OpenChunk) -> int:
+    return sum(int(each.sizes.sum()) for each in chunk.ranges)
+
+
+def _laid_out(chunks: Sequence[OpenChunk]) -> tuple[bytearray, Integers]:
+    """Return the content of chunks, one after the other, and where each message's record begins in it."""
+    parts, offset, starts = list[bytes](), 0, list[Integers]()
+    for chunk in chunks:
+        parts.append(chunk.declaring)
+        offset += len(chunk.declaring)
+        for each in chunk.ranges:
+            ends = offset + np.cumsum(each.sizes)
+            starts.append(ends - each.sizes)
+            parts += each.contents()
+            offset = int(ends[-1])
+    content = bytearray().join(parts)
+    for each, own in _joined(chunks, starts):
+        each.fill(content, own)
+    return content, np.concatenate(starts)
+
+
+def _joined(
+    chunks: Sequence[OpenChunk], starts: Sequence[Integers]
+) -> Iterator[tuple[MessageRange, Integers]]:
+    """Yield the ranges of one batch that follow each other as one, with the places of their records."""
+    waiting: list[Integers] = []
+    ranges = [each for chunk in chunks for each in chunk.ranges]
+    for at, (each, own) in enumerate(zip(ranges, starts, strict=True)):
+        waiting.append(own)
+        after = ranges[at + 1] if at + 1 < len(ranges) else None
+        if after is None or after.batch is not each.batch or after.begin != each.stop:
+            count = sum(map(len, waiting))
+            yield MessageRange(each.batch, each.stop - count, each.stop), np.concatenate(waiting)
+            waiting = []
+
+
+def _packed(
+    content: memoryview, index: Sequence[tuple[int, bytes]], start_ns: int, end_ns: int
+) -> PackedChunk:
+    """Compress a chunk.
+
+    Args:
+        index: of each channel, the entries of its messages.
+    """
+    compressed = _compressor().compress(content)
+    about = start_ns, end_ns, len(content), zlib.crc32(content)
+    length = _CHUNK.size - RECORD_HEAD.size + len(compressed)
+    parts = [_CHUNK.pack(Opcode.CHUNK, length, *about, len(_ZSTD), _ZSTD, len(compressed)), compressed]
+    offsets, size = dict[int, int](), 0
+    for channel, entries in index:
+        offsets[channel] = size
+        parts += [_INDEX.pack(Opcode.MESSAGE_INDEX, len(entries) + 6, channel, len(entries)), entries]
+        size += _INDEX.size + len(entries)
+    counts = {channel: len(entries) // _INDEX_ENTRY.itemsize for channel, entries in index}
+    sizes = len(compressed), len(content)
+    return PackedChunk(b"".join(parts), size, offsets, *sizes, counts, start_ns, end_ns)
+
+
+_local = threading.local()
+
+
+def _compressor() -> zstandard.ZstdCompressor:
+    """Return the compressor of this thread: one serves one thread at a time."""
+    if not hasattr(_local, "compressor"):
+        _local.compressor = zstandard.ZstdCompressor(level=COMPRESSION_LEVEL)
+    return cast(zstandard.ZstdCompressor, _local.compressor)
 
 
 @dataclass(slots=True)
@@ -138,32 +258,33 @@ class McapSummary:
 
     schemas: list[records.Schema] = field(default_factory=list)
     channels: list[records.Channel] = field(default_factory=list)
-    chunks: list[records.ChunkIndex] = field(default_factory=list)
+    chunks: list[bytes] = field(default_factory=list)
     attachments: list[records.AttachmentIndex] = field(default_factory=list)
     metadata: list[records.MetadataIndex] = field(default_factory=list)
     counts: dict[int, int] = field(default_factory=dict)
+    start_ns: int = FOREVER
+    end_ns: int = 0
 
-    def add_chunk(self, chunk: records.ChunkIndex, counts: Mapping[int, int]) -> None:
-        """Take in a chunk with its number of messages by channel."""
-        self.chunks.append(chunk)
-        for channel, count in counts.items():
+    def add_chunk(self, chunk: PackedChunk, offset: int) -> None:
+        """Take in a chunk that is written at a place in the file."""
+        self.chunks.append(_chunk_index(chunk, offset))
+        self.start_ns, self.end_ns = min(self.start_ns, chunk.start_ns), max(self.end_ns, chunk.end_ns)
+        for channel, count in chunk.counts.items():
             self.counts[channel] = self.counts.get(channel, 0) + count
 
     def section(self, offset: int) -> bytes:
         """Encode the section and the footer for a place in the file."""
-        groups: tuple[tuple[Opcode, Sequence[records.McapRecord]], ...] = (
-            (Opcode.SCHEMA, self.schemas),
-            (Opcode.CHANNEL, self.channels),
-            (Opcode.STATISTICS, [self._statistics()]),
-            (Opcode.CHUNK_INDEX, self.chunks),
-            (Opcode.ATTACHMENT_INDEX, self.attachments),
-            (Opcode.METADATA_INDEX, self.metadata),
+        groups = (
+            (Opcode.SCHEMA, encoded(*self.schemas)),
+            (Opcode.CHANNEL, encoded(*self.channels)),
+            (Opcode.STATISTICS, encoded(self._statistics())),
+            (Opcode.CHUNK_INDEX, b"".join(self.chunks)),
+            (Opcode.ATTACHMENT_INDEX, encoded(*self.attachments)),
+            (Opcode.METADATA_INDEX, encoded(*self.metadata)),
         )
         section, offsets = b"", []
-        for opcode, group in groups:
-            if group:
-                is_index = opcode == Opcode.CHUNK_INDEX
-                content = b"".join(map(_chunk_index, self.chunks)) if is_index else encoded(*group)
+        for opcode, content in groups:
+            if content:
                 offsets.append(records.SummaryOffset(opcode, offset + len(section), len(content)))
                 section += content
         footer = struct.pack("<BQQQ", Opcode.FOOTER, 20, offset, offset + len(section))
@@ -177,25 +298,25 @@ class McapSummary:
             channel_message_counts=self.counts,
             chunk_count=len(self.chunks),
             message_count=sum(self.counts.values()),
-            message_end_time=max((chunk.message_end_time for chunk in self.chunks), default=0),
-            message_start_time=min((chunk.message_start_time for chunk in self.chunks), default=0),
+            message_end_time=self.end_ns,
+            message_start_time=self.start_ns if self.chunks else 0,
             metadata_count=len(self.metadata),
             schema_count=len(self.schemas),
         )
 
 
-_CHUNK_INDEX = struct.Struct("<BQQQQQI")
-_INDEX_OFFSET = struct.Struct("<HQ")
+_CHUNK_INDEX: Final = struct.Struct("<BQQQQQI")
+_INDEX_OFFSET: Final = struct.Struct("<HQ")
+_CHUNK_SIZES: Final = struct.Struct("<QI4sQQ")
 
 
-def _chunk_index(index: records.ChunkIndex) -> bytes:
-    """Encode a chunk index as `encoded` does, in a tenth of the time: long logs have very many."""
-    offsets = b"".join(_INDEX_OFFSET.pack(*each) for each in index.message_index_offsets.items())
-    compression = index.compression.encode()
-    rest = struct.pack("<QI", index.message_index_length, len(compression)) + compression
-    rest += struct.pack("<QQ", index.compressed_size, index.uncompressed_size)
-    times = index.message_start_time, index.message_end_time
-    places = index.chunk_start_offset, index.chunk_length
-    length = _CHUNK_INDEX.size - 9 + len(offsets) + len(rest)
-    head = _CHUNK_INDEX.pack(Opcode.CHUNK_INDEX, length, *times, *places, len(offsets))
-    return head + offsets + rest
+def _chunk_index(chunk: PackedChunk, offset: int) -> bytes:
+    """Encode the index of a chunk as `encoded` does, in a tenth of the time: long logs have very many."""
+    record_bytes = len(chunk.data) - chunk.index_bytes
+    following = offset + record_bytes
+    offsets = b"".join(_INDEX_OFFSET.pack(n, following + at) for n, at in chunk.index_offsets.items())
+    sizes = chunk.index_bytes, len(_ZSTD), _ZSTD, chunk.compressed_size, chunk.uncompressed_size
+    length = _CHUNK_INDEX.size - RECORD_HEAD.size + len(offsets) + _CHUNK_SIZES.size
+    about = chunk.start_ns, chunk.end_ns, offset, record_bytes
+    head = _CHUNK_INDEX.pack(Opcode.CHUNK_INDEX, length, *about, len(offsets))
+    return head + offsets + _CHUNK_SIZES.pack(*sizes)

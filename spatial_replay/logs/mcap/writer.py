@@ -8,6 +8,7 @@ broken, and the others can be read without it.
 
 from __future__ import annotations
 
+import os
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -15,10 +16,9 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO, Self
+from typing import Any, BinaryIO, Self, TypeAlias
 
 import numpy as np
-import zstandard
 from mcap import records
 
 from spatial_replay.errors import OutputError
@@ -28,6 +28,7 @@ from spatial_replay.logs.mcap.packing import (
     Batch,
     McapSummary,
     MessageRange,
+    OpenChunk,
     PackedChunk,
     pack,
 )
@@ -42,12 +43,16 @@ CHUNK_NS = 10**9
 REPEAT_NS = 5 * 10**9
 """A channel is declared again in the second chunk with its messages, and in one this much after the last that
 declares it. In every chunk, schemas would add 15 % to an annotated log; so they add up to 5 %."""
-COMPRESSION_LEVEL = 1
-"""Coordinates hardly shrink further at higher levels, which take several times as long."""
-WAITING_CHUNKS = 1024
-"""Chunks that may wait for their compression."""
+TOGETHER_BYTES = 8 * CHUNK_BYTES
+"""So much is packed at once: messages are encoded together, and stay in the cache of the processor."""
 WAITING_BYTES = 256 * 2**20
 """Bytes of chunks that may wait for their compression: pictures and clouds of points make large ones."""
+THREADS = 4
+"""The most threads that pack chunks, if there are so many processors."""
+
+
+_Closing: TypeAlias = tuple[int, int, list[MessageRange], int]
+"""A chunk that ends: at which message of a call, 0 for before or 1 for after it; its messages, their bytes."""
 
 
 @dataclass(slots=True)
@@ -107,10 +112,9 @@ class LogWriter:
         self._schemas: dict[Schema, int] = {}
         self._declarations: dict[int, _Declaration] = {}
         self._lanes = (_Lane(), _Lane())
-        self._worker = ThreadPoolExecutor(1, "chunk-compression")
-        self._compressor = zstandard.ZstdCompressor(level=COMPRESSION_LEVEL)
-        self._packing: deque[Future[PackedChunk]] = deque()
-        self._packing_bytes: deque[int] = deque()
+        self._workers = ThreadPoolExecutor(min(THREADS, _processors()), "chunk-packing")
+        self._packing: deque[tuple[int, Future[list[PackedChunk]]]] = deque()
+        self._packing_bytes = 0
         self._closed = False
         self._write(MAGIC)
         self._write_record(records.Header(profile, library))
@@ -122,7 +126,7 @@ class LogWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if isinstance(error, OutputError):
-            self._worker.shutdown(cancel_futures=True)
+            self._workers.shutdown(cancel_futures=True)
         else:
             self.close()
 
@@ -135,7 +139,7 @@ class LogWriter:
         if not len(messages):
             return
         numbers, lanes = self._numbers(messages)
-        closings: list[tuple[int, int, list[MessageRange], int]] = []
+        closings: list[_Closing] = []
         for number, lane in enumerate(self._lanes):
             places = np.flatnonzero(lanes == number)
             if not len(places):
@@ -145,8 +149,8 @@ class LogWriter:
             batch = Batch.of(own, numbers[places])
             closings += self._divide(lane, batch, places, messages.log_time_ns)
         # in the order of the messages at which they close, however these were divided among calls
-        for _, _, ranges, size in sorted(closings, key=lambda closing: closing[:2]):
-            self._pack(ranges, size)
+        closings.sort(key=lambda closing: closing[:2])
+        self._pack([closed for _, _, *closed in closings])
 
     def add_metadata(self, name: str, data: Mapping[str, str]) -> None:
         """Add a metadata record, its keys in the order given, after closing the chunk."""
@@ -171,9 +175,7 @@ class LogWriter:
 
     def flush(self) -> None:
         """Close the chunks and hand everything written so far to the operating system."""
-        for lane in self._lanes:
-            if lane.open:
-                self._pack(*_closed(lane))
+        self._pack([_closed(lane) for lane in self._lanes if lane.open])
         self._write_packed(0)
 
     def close(self) -> None:
@@ -187,7 +189,7 @@ class LogWriter:
             self._write(self._summary.section(self._offset) + MAGIC)
             self._flush_stream()
         finally:
-            self._worker.shutdown(cancel_futures=True)
+            self._workers.shutdown(cancel_futures=True)
 
     def _numbers(self, messages: Messages) -> tuple[Integers, Integers]:
         """Return (M,) channel numbers and (M,) lanes; channels that are new are numbered as they come."""
@@ -223,9 +225,7 @@ class LogWriter:
         self._summary.channels.append(declared)
         self._declarations[declared.id] = _Declaration(described, encoded(declared))
 
-    def _divide(
-        self, lane: _Lane, batch: Batch, places: Integers, times_ns: Integers
-    ) -> Iterator[tuple[int, int, list[MessageRange], int]]:
+    def _divide(self, lane: _Lane, batch: Batch, places: Integers, times_ns: Integers) -> Iterator[_Closing]:
         """Cut the messages of a lane where chunks end.
 
         A late message of the other lane closes a chunk, too, so that none waits for long.
@@ -235,8 +235,7 @@ class LogWriter:
             times_ns: (M,) of all of them.
 
         Yields:
-            For each chunk that ends: at which message of the call, 0 for before it or 1 for after it; its
-            messages, and their bytes.
+            Each chunk that ends.
         """
         ends = np.cumsum(batch.sizes)
         latest = np.maximum.accumulate(times_ns)
@@ -264,9 +263,7 @@ class LogWriter:
             else:
                 return
 
-    def _overtaken(
-        self, lane: _Lane, times_ns: Integers
-    ) -> Iterator[tuple[int, int, list[MessageRange], int]]:
+    def _overtaken(self, lane: _Lane, times_ns: Integers) -> Iterator[_Closing]:
         """Yield what `_divide` does if all messages of a call are of the other lane."""
         if lane.open:
             late = (times_ns >= lane.began_ns + CHUNK_NS) | self._is_over(lane)
@@ -277,46 +274,35 @@ class LogWriter:
         """Return whether a second of the clock has passed since a chunk began."""
         return self._clock is not None and (self._clock() - lane.began_s) * 1e9 >= CHUNK_NS
 
-    def _pack(self, ranges: list[MessageRange], size: int) -> None:
-        """Compress a chunk on the other thread, and write those that are ready."""
-        declaring = self._declaring(ranges)
-        self._packing.append(self._worker.submit(pack, ranges, declaring, self._compressor))
-        self._packing_bytes.append(size)
-        self._write_packed(WAITING_CHUNKS)
+    def _pack(self, closed: Sequence[tuple[list[MessageRange], int]]) -> None:
+        """Pack chunks on other threads, some together, and write those that are ready."""
+        together, size = list[OpenChunk](), 0
+        for number, (ranges, own_size) in enumerate(closed, start=1):
+            together.append(OpenChunk(ranges, self._declaring(ranges)))
+            size += own_size
+            if size >= TOGETHER_BYTES or number == len(closed):
+                self._packing.append((size, self._workers.submit(pack, together)))
+                self._packing_bytes += size
+                self._write_packed(WAITING_BYTES)
+                together, size = [], 0
 
     def _declaring(self, ranges: Sequence[MessageRange]) -> bytes:
         """Return the declarations that a chunk begins with; each schema is in it once."""
         start_ns = ranges[0].start_ns
-        numbers = sorted(set().union(*(each.channels for each in ranges)))
+        numbers = sorted(set[int]().union(*(each.channels for each in ranges)))
         due = [each for number in numbers if (each := self._declarations[number]).is_due(start_ns)]
         for each in due:
             each.count, each.last_ns = each.count + 1, start_ns
         return b"".join([*dict.fromkeys(each.schema for each in due), *(each.channel for each in due)])
 
-    def _write_packed(self, waiting: int) -> None:
-        """Write chunks in their order until no more than `waiting` are left, and those that are ready."""
-        while self._packing and (
-            len(self._packing) > waiting
-            or sum(self._packing_bytes) > WAITING_BYTES
-            or self._packing[0].done()
-        ):
-            chunk = self._packing.popleft().result()
-            self._packing_bytes.popleft()
-            following = self._offset + len(chunk.record)
-            index = records.ChunkIndex(
-                chunk_length=len(chunk.record),
-                chunk_start_offset=self._offset,
-                compression="zstd",
-                compressed_size=chunk.compressed_size,
-                message_end_time=chunk.end_ns,
-                message_index_length=len(chunk.index),
-                message_index_offsets={n: following + place for n, place in chunk.index_offsets.items()},
-                message_start_time=chunk.start_ns,
-                uncompressed_size=chunk.uncompressed_size,
-            )
-            self._summary.add_chunk(index, chunk.counts)
-            self._write(chunk.record)
-            self._write(chunk.index)
+    def _write_packed(self, waiting_bytes: int) -> None:
+        """Write chunks in their order until no more bytes are waiting, and those that are ready."""
+        while self._packing and (self._packing_bytes > waiting_bytes or self._packing[0][1].done()):
+            size, packing = self._packing.popleft()
+            for chunk in packing.result():
+                self._summary.add_chunk(chunk, self._offset)
+                self._write(chunk.data)
+            self._packing_bytes -= size
             self._flush_stream()
 
     def _write_record(self, record: records.McapRecord) -> tuple[int, int]:
@@ -337,6 +323,11 @@ class LogWriter:
             self._stream.flush()
         except OSError as error:
             raise output_error(self._path, error) from error
+
+
+def _processors() -> int:
+    """Return how many processors this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _first_from(times_ns: Integers, latest: Integers, limit_ns: int, begin: int) -> int:

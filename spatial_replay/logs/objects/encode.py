@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-
 import numpy as np
 from google.protobuf.message import Message
-from numpy.typing import NDArray
 
-from spatial_replay.geometry.arrays import Floats, Integers, starts_from_counts
+from spatial_replay.geometry.arrays import Floats, Integers, combined, equal_places, starts_from_counts
 from spatial_replay.logs.objects.wire import WireTemplate, payloads_of
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.trace.trace import ABSENT, Trace
@@ -38,7 +35,7 @@ def _object_pieces(trace: Trace) -> list[bytes]:
     rows = np.where(marked < 0, -2 - marked, marked)
     name = np.nonzero(present)[1]
     pieces = [b""] * len(rows)
-    for places in _equal(_combined([name, marked < 0, _row_layout(trace)[rows]], len(rows))):
+    for places in equal_places(combined([name, marked < 0, _row_layout(trace)[rows]], len(rows))):
         first = int(places[0])
         message = _message(trace, int(name[first]), int(rows[first]), unreadable=bool(marked[first] < 0))
         encoded = _pieces(message, _numbers(trace, message, rows[places]))
@@ -73,24 +70,7 @@ def _row_layout(trace: Trace) -> Integers:
         column = np.zeros(len(counts), np.int64)
         column[has_part] = vertex_counts[shapes.part_start[:-1][has_part] + place]
         columns.append(column)
-    return _combined(columns, len(counts))
-
-
-def _combined(columns: Iterable[NDArray[np.generic]], length: int) -> Integers:
-    """Return (length,) a number that is equal exactly where all columns are."""
-    code = np.zeros(length, np.int64)
-    for column in columns:
-        if length and (column != column[0]).any():
-            _, ranks = np.unique(column, return_inverse=True)
-            _, code = np.unique(code * (int(ranks.max()) + 1) + ranks, return_inverse=True)
-    return code.astype(np.int64)
-
-
-def _equal(code: Integers) -> Iterator[Integers]:
-    """Yield the places (K,) of each value."""
-    order = np.argsort(code, kind="stable")
-    edges = np.flatnonzero(np.diff(code[order])) + 1
-    return (places for places in np.split(order, edges) if len(places))
+    return combined(columns, len(counts))
 
 
 def _message(trace: Trace, name: int, row: int, *, unreadable: bool) -> ObjectStates:

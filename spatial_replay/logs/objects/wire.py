@@ -10,6 +10,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from google.protobuf.descriptor import FieldDescriptor
@@ -78,6 +79,11 @@ class WireTemplate:
 
     def __len__(self) -> int:
         return len(self.payload)
+
+    @cached_property
+    def pattern(self) -> bytes:
+        """The payload as bytes."""
+        return self.payload.tobytes()
 
     def fill(self, words: Words, marks: Bytes | None = None) -> Bytes:
         """Encode n messages: words (n, W) and marks (n, M) → (n, L) uint8."""

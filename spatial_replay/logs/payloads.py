@@ -1,0 +1,154 @@
+"""Contents of many messages as columns: encoded only where somebody wants bytes.
+
+Messages of one template differ in a few numbers. Until a log is written, only these are kept, and messages
+are put in order by their places; the writer encodes them straight into a chunk.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Final, TypeAlias, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from spatial_replay.geometry.arrays import Integers
+
+if TYPE_CHECKING:
+    # loads protobuf, which messages that are only copied need not
+    from spatial_replay.logs.objects.wire import Bytes, WireTemplate, Words
+
+_FEW: Final = 16
+"""So many messages are encoded at once: columns would cost more than they save."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Filled:
+    """Messages of one template: their words (n, W) and marks (n, K)."""
+
+    template: WireTemplate
+    words: Words
+    marks: Bytes
+
+    def __len__(self) -> int:
+        return len(self.words)
+
+    def encoded(self, rows: Integers | slice) -> Bytes:
+        """Encode some of the messages, (k, L) uint8."""
+        return self.template.fill(self.words[rows], self.marks[rows])
+
+    def write(self, content: bytearray, begins: Integers, rows: Integers) -> None:
+        """Fill in some of the messages (k,) at `begins` (k,), where content holds the pattern."""
+        if self.words.size:
+            # any 8 bytes of the content, as a word
+            anywhere: NDArray[np.void] = np.ndarray((len(content) - 7,), "V8", content, 0, (1,))
+            anywhere[begins[:, None] + self.template.word_offsets] = self.words.view("V8")[rows]
+        if self.marks.size:
+            everywhere = np.frombuffer(content, np.uint8)
+            everywhere[begins[:, None] + self.template.mark_offsets] = self.marks[rows]
+
+
+Part: TypeAlias = "Filled | Sequence[bytes]"
+
+
+@dataclass(frozen=True, eq=False)
+class MixedPayloads(Sequence[bytes]):
+    """M encoded messages, made when they are asked for.
+
+    Attributes:
+        parts: the messages, those of one template together.
+        part: (M,) int64, in which part each message is.
+        row: (M,) int64, and where in it.
+    """
+
+    parts: tuple[Part, ...]
+    part: Integers
+    row: Integers
+
+    def __len__(self) -> int:
+        return len(self.part)
+
+    @overload
+    def __getitem__(self, index: int) -> bytes: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> MixedPayloads: ...
+
+    def __getitem__(self, index: int | slice) -> bytes | MixedPayloads:
+        if isinstance(index, slice):
+            return MixedPayloads(self.parts, self.part[index], self.row[index])
+        part, row = self.parts[self.part[index]], int(self.row[index])
+        return part.encoded(slice(row, row + 1)).tobytes() if isinstance(part, Filled) else part[row]
+
+    def __iter__(self) -> Iterator[bytes]:
+        every = [_listed(part) if isinstance(part, Filled) else part for part in self.parts]
+        return (every[part][row] for part, row in zip(self.part.tolist(), self.row.tolist(), strict=True))
+
+    @cached_property
+    def sizes(self) -> Integers:
+        """(M,) how many bytes each message has."""
+        sizes = np.empty(len(self), np.int64)
+        for number, part in enumerate(self.parts):
+            own = self.part == number
+            if isinstance(part, Filled):
+                sizes[own] = len(part.template)
+            else:
+                sizes[own] = np.fromiter(map(len, part), np.int64, len(part))[self.row[own]]
+        return sizes
+
+    def take(self, chosen: Integers) -> MixedPayloads:
+        """Return the messages with the given indices, in that order."""
+        return MixedPayloads(self.parts, self.part[chosen], self.row[chosen])
+
+
+def filled_in(count: int, groups: Sequence[tuple[Integers, Filled]]) -> Sequence[bytes]:
+    """Return messages by their places among `count`, each group with its own."""
+    if count <= _FEW:
+        payloads = [b""] * count
+        for places, filled in groups:
+            for place, payload in zip(places.tolist(), _listed(filled), strict=True):
+                payloads[place] = payload
+        return payloads
+    part, row = np.empty(count, np.int64), np.empty(count, np.int64)
+    for number, (places, filled) in enumerate(groups):
+        part[places], row[places] = number, np.arange(len(filled))
+    return MixedPayloads(tuple(filled for _, filled in groups), part, row)
+
+
+def columns_of(payloads: Sequence[bytes]) -> MixedPayloads:
+    """Return messages as columns."""
+    if isinstance(payloads, MixedPayloads):
+        return payloads
+    return MixedPayloads((payloads,), np.zeros(len(payloads), np.int64), np.arange(len(payloads)))
+
+
+def joined(several: Sequence[Sequence[bytes]]) -> Sequence[bytes]:
+    """Join messages, one sequence after the other."""
+    if not any(isinstance(each, MixedPayloads) for each in several):
+        return [payload for each in several for payload in each]
+    every = [columns_of(each) for each in several]
+    begins = np.cumsum([0, *(len(each.parts) for each in every)]).tolist()
+    return MixedPayloads(
+        tuple(part for each in every for part in each.parts),
+        np.concatenate([each.part + begin for each, begin in zip(every, begins, strict=False)]),
+        np.concatenate([each.row for each in every]),
+    )
+
+
+def taken(payloads: Sequence[bytes], chosen: Integers) -> Sequence[bytes]:
+    """Return the messages with the given indices, in that order."""
+    if isinstance(payloads, MixedPayloads):
+        return payloads.take(chosen)
+    return [payloads[index] for index in chosen.tolist()]
+
+
+def _listed(part: Filled) -> list[bytes]:
+    encoded = part.encoded(slice(None))
+    length, whole = len(part.template), encoded.tobytes()
+    return (
+        [whole[begin : begin + length] for begin in range(0, encoded.size, length)]
+        if length
+        else [b""] * len(part)
+    )
