@@ -73,13 +73,12 @@ def outlines_of(footprint: Footprint) -> list[Floats]:
 
 def extents(footprints: FootprintBatch) -> Floats:
     """Return (R,) the longer side of each footprint's bounding box."""
-    owner = np.repeat(np.arange(len(footprints)), np.diff(footprints.part_start))
-    vertex_part = np.repeat(np.arange(len(owner)), np.diff(footprints.vertex_start))
-    radius = footprints.radius[vertex_part][:, None]
-    low = np.full((len(footprints), 2), np.inf)
-    high = np.full((len(footprints), 2), -np.inf)
-    np.minimum.at(low, owner[vertex_part], footprints.vertices - radius)
-    np.maximum.at(high, owner[vertex_part], footprints.vertices + radius)
+    if not len(footprints):
+        return np.empty(0)
+    radius = np.repeat(footprints.radius, np.diff(footprints.vertex_start))[:, None]
+    begins = footprints.vertex_start[footprints.part_start[:-1]]
+    low = np.minimum.reduceat(footprints.vertices - radius, begins)
+    high = np.maximum.reduceat(footprints.vertices + radius, begins)
     return np.asarray((high - low).max(axis=1))
 
 

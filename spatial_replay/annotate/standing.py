@@ -151,7 +151,9 @@ class StandingEncoder:
         series, words, since = [], [], []
         for index, block in enumerate(blocks):
             at = np.searchsorted(block.times_ns, shown_ns, side="right")
-            series.append(np.concatenate([self._last[index], block.series], axis=2)[:, :, at])
+            is_whole = len(at) == block.series.shape[2] and bool((at == np.arange(1, len(at) + 1)).all())
+            with_last = [] if is_whole else [self._last[index], block.series]
+            series.append(np.concatenate(with_last, axis=2)[:, :, at] if with_last else block.series)
             words.append(self._described(index, block, at))
             since.append(np.append(self._violated_ns[index], self._violated(index, block))[at])
         self.pass_over(blocks)

@@ -1,11 +1,12 @@
 """How the entities of the scene are drawn: outlines, faces, sides, labels and arrows.
 
 Every part of a footprint is drawn as one ring of points (`rings`). Numbers that differ between messages are
-NaN here and filled in later (`scene_template`).
+`SLOT` here and filled in later (`scene_template`).
 """
 
 from __future__ import annotations
 
+import struct
 from typing import Final, NamedTuple
 
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
@@ -26,7 +27,9 @@ ARROW_HEAD: Final = 0.15
 
 _LINE_PIXELS: Final = 2.0
 _LABEL_PIXELS: Final = 14.0
-_NAN: Final = float("nan")
+SLOT_BYTES: Final = b"\xfe" + b"\xff" * 7
+SLOT: Final[float] = struct.unpack("<d", SLOT_BYTES)[0]
+"""A number that is to be filled in: a NaN whose bytes are in no text, and in no message but where it is."""
 
 
 def encode_frame(time_ns: int) -> bytes:
@@ -38,7 +41,7 @@ def encode_frame(time_ns: int) -> bytes:
 
 
 class Elevation(NamedTuple):
-    """The heights of an entity, in footprint units; NaN to be filled in.
+    """The heights of an entity, in footprint units; `SLOT` where it is to be filled in.
 
     Attributes:
         fill: of its filled face, the upper one of a prism.
@@ -99,13 +102,13 @@ def point_at(entity: SceneEntity, label: str, lift: float) -> None:
         lift: height of flat objects above the plane, and a fifth of an arrow's width.
     """
     arrow = entity.arrows.add(
-        shaft_length=_NAN, shaft_diameter=5.0 * lift, head_length=_NAN, head_diameter=12.0 * lift
+        shaft_length=SLOT, shaft_diameter=5.0 * lift, head_length=SLOT, head_diameter=12.0 * lift
     )
-    arrow.pose.position.x = arrow.pose.position.y = arrow.pose.position.z = _NAN
-    arrow.pose.orientation.z = arrow.pose.orientation.w = _NAN
+    arrow.pose.position.x = arrow.pose.position.y = arrow.pose.position.z = SLOT
+    arrow.pose.orientation.z = arrow.pose.orientation.w = SLOT
     arrow.color.r, arrow.color.g, arrow.color.b, arrow.color.a = *NEGATIVE, 1.0
     text = entity.texts.add(billboard=True, font_size=_LABEL_PIXELS, scale_invariant=True, text=label)
-    text.pose.position.x = text.pose.position.y = text.pose.position.z = _NAN
+    text.pose.position.x = text.pose.position.y = text.pose.position.z = SLOT
     text.pose.orientation.w = 1.0
     text.color.r, text.color.g, text.color.b, text.color.a = *LABEL, 1.0
 
@@ -116,7 +119,7 @@ def _add_outline(entity: SceneEntity, ring: Floats, z: float) -> None:
     )
     for x, y in ring.tolist():
         line.points.add(x=x, y=y)
-    line.color.r, line.color.g, line.color.b, line.color.a = _NAN, _NAN, _NAN, 1.0
+    line.color.r, line.color.g, line.color.b, line.color.a = SLOT, SLOT, SLOT, 1.0
 
 
 def _add_face(entity: SceneEntity, ring: Floats, z: float, opacity: float) -> None:
@@ -125,7 +128,7 @@ def _add_face(entity: SceneEntity, ring: Floats, z: float, opacity: float) -> No
         face.points.add(x=x, y=y)
     for corner in range(1, len(ring) - 1):
         face.indices.extend((0, corner, corner + 1))
-    face.color.r, face.color.g, face.color.b, face.color.a = _NAN, _NAN, _NAN, opacity
+    face.color.r, face.color.g, face.color.b, face.color.a = SLOT, SLOT, SLOT, opacity
 
 
 def _add_sides(entity: SceneEntity, ring: Floats, bottom: float, height: float, opacity: float) -> None:
@@ -138,7 +141,7 @@ def _add_sides(entity: SceneEntity, ring: Floats, bottom: float, height: float, 
     for low in range(count):
         following = (low + 1) % count
         sides.indices.extend((low, following, count + low, following, count + following, count + low))
-    sides.color.r, sides.color.g, sides.color.b, sides.color.a = _NAN, _NAN, _NAN, opacity
+    sides.color.r, sides.color.g, sides.color.b, sides.color.a = SLOT, SLOT, SLOT, opacity
 
 
 def lying_at(z: float) -> Pose:

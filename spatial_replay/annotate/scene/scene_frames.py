@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from spatial_replay.annotate.rings import Rings
 from spatial_replay.annotate.scene.scene_template import OBJECT, REGION, Banner, CauseText, Region, border_of
-from spatial_replay.annotate.scene.scene_text import violation_text
+from spatial_replay.annotate.scene.scene_text import ArrowTexts
 from spatial_replay.annotate.violations import Presence, Violations
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.geometry.batch import FootprintBatch
@@ -96,20 +96,20 @@ class Arrows(NamedTuple):
     Attributes:
         result: which of the results it is.
         violations: of the S samples.
-        causes: (S,), what decides each, in words.
+        texts: what decides each, and its number.
     """
 
     result: int
     violations: Violations
-    causes: Sequence[str]
+    texts: ArrowTexts
 
-    def at(self, index: int, unit: str) -> DrawnViolation | None:
-        """Return the arrow in one message, if there is one; `unit` is that of lengths."""
+    def at(self, index: int) -> DrawnViolation | None:
+        """Return the arrow in one message, if there is one."""
         found = self.violations
         if not found.is_shown[index]:
             return None
         robustness, holds = float(found.robustness[index]), bool(found.holds[index])
-        label = f"{self.causes[index]}{violation_text(found, index, unit)}"
+        label = self.texts.label(index)
         moment_ns = int(found.moment_ns[index]) if found.moment_ns[index] >= 0 else None
         node, leaf = int(found.node[index]), int(found.leaf[index])
         return DrawnViolation(
@@ -157,7 +157,6 @@ class SceneFrames:
     _content: SceneContent
     _regions: tuple[Region, ...]
     _find_arrows: Callable[[], Sequence[Arrows]]
-    _unit: str = ""
 
     @cached_property
     def _arrows(self) -> Sequence[Arrows]:
@@ -177,7 +176,7 @@ class SceneFrames:
                 code = int(self._presence.class_code[index, column])
                 class_name = self._presence.classes[code] if code >= 0 else None
                 entities[OBJECT + name] = DrawnEntity(rings, colour, class_name)
-        arrows = (each.at(index, self._unit) for each in self._arrows)
+        arrows = (each.at(index) for each in self._arrows)
         is_violated = bool((self.objects[index] < 0.0).any() or (self.regions[index] < 0.0).any())
         violations = tuple(each for each in arrows if each is not None)
         return SceneFrame(entities, violations, is_violated)
@@ -195,6 +194,7 @@ class SceneContent(NamedTuple):
         violations: of the S samples.
         arrow: (S,), the same as `forms` for the arrow at the worst violation; its forms are `causes`.
         causes: what decides violations, in words.
+        numbers: of each violation that is shown, its number with its unit.
         banner: (S,), which of `banners`.
     """
 
@@ -208,6 +208,7 @@ class SceneContent(NamedTuple):
     violations: Violations
     arrow: Integers
     causes: tuple[CauseText, ...]
+    numbers: Sequence[bytes]
     banner: Integers
     banners: tuple[Banner | None, ...]
 

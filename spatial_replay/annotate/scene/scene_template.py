@@ -1,11 +1,12 @@
 """Templates of messages of /spatial/scene, and the numbers that are filled into them.
 
 Messages of one layout have the same entities with the same primitives. Their template is encoded once, with
-NaN where coordinates and colours belong; filling in those numbers makes many messages at once.
+`SLOT` where coordinates and colours belong; filling in those numbers makes many messages at once.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple
@@ -20,6 +21,8 @@ from spatial_replay.annotate.rings import Form
 from spatial_replay.annotate.scene.scene_entities import (
     ARROW_HEAD,
     FRAME,
+    SLOT,
+    SLOT_BYTES,
     Elevation,
     draw,
     lying_at,
@@ -72,11 +75,6 @@ class CauseText(NamedTuple):
 
     text: str
     words: int
-
-
-def words_in(text: str) -> int:
-    """Return how many words of 8 bytes a text takes."""
-    return -(-len(text.encode()) // 8)
 
 
 class DrawnObject(NamedTuple):
@@ -174,19 +172,17 @@ def make_template(layout: SceneLayout, regions: tuple[Region, ...], lift: float)
     if isinstance(layout.witness, CauseText):
         number = "#" * (8 * layout.witness.words)
         point_at(_add_entity(message, WITNESS), layout.witness.text + number, lift)
-    payload = np.frombuffer(message.SerializeToString(deterministic=True), np.uint8).copy()
-    words = WireTemplate.of(message).word_offsets
-    slots = words[np.isnan(payload[words[:, None] + np.arange(8)].view("<f8")[:, 0])]
+    encoded = message.SerializeToString(deterministic=True)
+    slots = _offsets(encoded, SLOT_BYTES)
     if number:
         # the end of the last text of all
-        begin = payload.tobytes().rindex(number.encode())
-        slots = np.append(slots, np.arange(begin, begin + len(number), 8))
-    payload[slots[:, None] + np.arange(8)] = 0
-    stamps = _stamp_offsets(payload.tobytes())
-    both = (np.array(stamps, np.int64)[:, None] + _STAMP_WORDS).ravel()
-    return SceneTemplate(
-        WireTemplate(payload, np.concatenate([slots, both]), np.empty(0, np.int64)), len(stamps)
-    )
+        begin = encoded.rindex(number.encode())
+        slots += range(begin, begin + len(number), 8)
+    stamps = _offsets(encoded, _STAMP_BYTES)
+    payload = np.frombuffer(encoded.replace(SLOT_BYTES, bytes(8)), np.uint8)
+    words = [*slots, *(begin + at for begin in stamps for at in _STAMP_WORDS)]
+    template = WireTemplate(payload, np.array(words, np.int64), np.empty(0, np.int64))
+    return SceneTemplate(template, len(stamps))
 
 
 def words_of_region(region: Region, colour: Floats) -> list[Floats]:
@@ -234,14 +230,17 @@ def words_of_object(
     return words + [height + lift for height in upper]
 
 
-def words_of_witness(points: Floats, z: Floats, scale: float, labels: Sequence[str]) -> list[Floats]:
+def words_of_witness(
+    points: Floats, z: Floats, scale: float, labels: Sequence[bytes], words: int
+) -> list[Floats]:
     """Return what to fill in for the arrow at the worst violation.
 
     Args:
         points: (S, 2, 2), its begin and its end.
         z: (S,), its height.
         scale: the size of objects in the scene.
-        labels: S texts, each of as many words of 8 bytes (see `words_in`).
+        labels: S texts.
+        words: how many words of 8 bytes each of them takes.
 
     Returns:
         columns (S, n).
@@ -252,7 +251,7 @@ def words_of_witness(points: Floats, z: Floats, scale: float, labels: Sequence[s
     head = np.minimum(0.5 * length, ARROW_HEAD * scale)
     arrow = [begin, z, np.sin(half), np.cos(half), length - head, head]
     middle = [(begin + end) / 2.0, z + ARROW_HEAD * scale]
-    text = b"".join([label.encode().ljust(8 * words_in(label)) for label in labels])
+    text = b"".join([label.ljust(8 * words) for label in labels])
     label = np.frombuffer(text, "<f8")
     return [column.reshape(len(points), -1) for column in (*arrow, *middle, label)]
 
@@ -292,12 +291,12 @@ def _region_entity(region: Region) -> SceneEntity:
 
 
 def _add_object(entity: SceneEntity, drawn: DrawnObject, lift: float) -> None:
-    rings = [np.full((length, 2), np.nan) for length in drawn.form.rings]
+    rings = [np.full((length, 2), SLOT) for length in drawn.form.rings]
     elevation = Elevation(lift * (1.0 + drawn.level / LEVELS), None, 2.5 * lift)
     if drawn.form.has_height:
-        elevation = Elevation(np.nan, (np.nan, np.nan), np.nan)
+        elevation = Elevation(SLOT, (SLOT, SLOT), SLOT)
     name = drawn.name if drawn.has_label else None
-    draw(entity, name, rings, rings, (np.nan, np.nan), elevation, OBJECT_OPACITY)
+    draw(entity, name, rings, rings, (SLOT, SLOT), elevation, OBJECT_OPACITY)
 
 
 def _add_banner(entity: SceneEntity, banner: Banner, lift: float) -> None:
@@ -335,13 +334,9 @@ _STAMP_WORDS: Final = (0, _STAMP - 8)
 _NS: Final = 1_000_000_000
 
 
-def _stamp_offsets(payload: bytes) -> tuple[int, ...]:
-    offsets = []
-    begin = payload.find(_STAMP_BYTES)
-    while begin >= 0:
-        offsets.append(begin)
-        begin = payload.find(_STAMP_BYTES, begin + _STAMP)
-    return tuple(offsets)
+def _offsets(payload: bytes, wanted: bytes) -> list[int]:
+    """Return where some bytes are in a payload."""
+    return [found.start() for found in re.finditer(re.escape(wanted), payload)]
 
 
 def _encoded_stamps(times_ns: Integers) -> Words:

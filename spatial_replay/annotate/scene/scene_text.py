@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from types import MappingProxyType
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spatial_replay.annotate.robustness import standing_codes
-from spatial_replay.annotate.scene.scene_template import Banner, CauseText, words_in
+from spatial_replay.annotate.scene.scene_template import Banner, CauseText
 from spatial_replay.annotate.violations import EvaluatedResult, Violations
-from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.geometry.arrays import Floats, Integers, combined, equal_places
 from spatial_replay.logs.schemas.Robustness_pb2 import (
     FAILS_SO_FAR,
     HOLDS_SO_FAR,
@@ -98,35 +98,54 @@ def _banner(
     return None if colour is None else Banner("; ".join(parts), colour, place)
 
 
-def causes_of(
+class ArrowTexts(NamedTuple):
+    """What the arrows of S messages say.
+
+    Attributes:
+        causes: what decides violations, in words.
+        cause: (S,), which of them decides each that is shown.
+        numbers: of each that is shown, the number with its unit; empty for the others.
+    """
+
+    causes: tuple[CauseText, ...]
+    cause: Integers
+    numbers: Sequence[bytes]
+
+    def label(self, index: int) -> str:
+        """Return all that an arrow that is shown says."""
+        return f"{self.causes[self.cause[index]].text}{self.numbers[index].decode()}"
+
+
+def arrow_texts(
     results: Sequence[EvaluatedResult], found: Violations, first_ns: int, unit: str
-) -> tuple[tuple[CauseText, ...], Integers]:
-    """Return what decides violations, in words, and which of them (S,) decides each.
+) -> ArrowTexts:
+    """Return what decides violations, and their numbers.
 
     Args:
         first_ns: the time of the log's first sample.
         unit: of lengths.
     """
-    words = np.array([words_in(violation_text(found, index, unit)) for index in range(len(found.result))])
-    columns = [found.result, found.leaf, found.holds, found.moment_ns, words]
-    kinds, which = np.unique(np.stack(columns, axis=1), axis=0, return_inverse=True)
-    causes = []
-    for result, leaf, holds, moment_ns, length in kinds.tolist():
+    shown = np.flatnonzero(found.is_shown)
+    robustness = np.where(found.holds, -found.robustness, found.robustness)[shown].tolist()
+    texts = [robustness_text(number, unit).encode() for number in robustness]
+    words = -(-np.fromiter(map(len, texts), np.int64, len(texts)) // 8)
+    columns = [each[shown] for each in (found.result, found.leaf, found.holds, found.moment_ns)]
+    causes, cause = [], np.zeros(len(found.result), np.int64)
+    for places in equal_places(combined([*columns, words], len(shown))):
+        cause[shown[places]] = len(causes)
+        result, leaf, holds, moment_ns = (int(each[places[0]]) for each in columns)
         known = results[result].leaf_pairs if result >= 0 and leaf >= 0 else None
         text = "" if known is None else known.texts[leaf]
         text = text if len(text) <= _LONGEST_CAUSE else f"{text[: _LONGEST_CAUSE - 1]}…"
         at = "" if moment_ns < 0 else f" at {Instant(moment_ns, first_ns)}"
-        causes.append(CauseText(f"{text}{at}: {'holds by ' if holds else ''}", length))
-    return tuple(causes), which.reshape(-1)
+        causes.append(CauseText(f"{text}{at}: {'holds by ' if holds else ''}", int(words[places[0]])))
+    numbers = [b""] * len(found.result)
+    for index, text in zip(shown.tolist(), texts, strict=True):
+        numbers[index] = text
+    return ArrowTexts(tuple(causes), cause, numbers)
 
 
 _LONGEST_CAUSE: Final = 60
-
-
-def violation_text(found: Violations, index: int, unit: str) -> str:
-    """Return the number of an arrow: by how much an atom holds that should not, else the robustness."""
-    number = float(found.robustness[index])
-    return robustness_text(-number if found.holds[index] else number, unit)
 
 
 def robustness_text(number: float, unit: str) -> str:

@@ -38,7 +38,7 @@ from spatial_replay.annotate.scene.scene_template import (
     words_of_region,
     words_of_witness,
 )
-from spatial_replay.annotate.scene.scene_text import banners_of, causes_of, labelled_objects, violation_text
+from spatial_replay.annotate.scene.scene_text import ArrowTexts, arrow_texts, banners_of, labelled_objects
 from spatial_replay.annotate.violations import (
     EvaluatedResult,
     Presence,
@@ -160,8 +160,8 @@ class SceneEncoder:
         objects, regions = worst_robustness(results, presence, [region.name for region in self._drawn])
         has_label = labelled_objects(results, names, rows >= 0, objects)
         banners = banners_of(results, times_ns, state.place or _NOWHERE, first)
-        causes = causes_of(results, violations, state.first_ns or 0, self.unit)
-        content = _content(trace, names, rows, state, scale, violations, causes, has_label, banners)
+        arrows = arrow_texts(results, violations, state.first_ns or 0, self.unit)
+        content = _content(trace, names, rows, state, scale, violations, arrows, has_label, banners)
         shades = colours(objects, scales), colours(regions, scales)
         templates = dict(state.templates)
         filled = []
@@ -184,7 +184,7 @@ class SceneEncoder:
         )
         find_arrows = partial(_arrows_of, results, trace, written, state.first_ns or 0, self.unit)
         frames = SceneFrames(
-            times_ns, objects, regions, *shades, scale, presence, content, self._drawn, find_arrows, self.unit
+            times_ns, objects, regions, *shades, scale, presence, content, self._drawn, find_arrows
         )
         return SceneMessages(times_ns, filled_in(len(written), filled), after, frames)
 
@@ -234,7 +234,8 @@ class SceneEncoder:
             colour = objects[samples, column]
             columns += words_of_object(drawn, points, bottom, top, colour, _LIFT * scale)
         if isinstance(layout.witness, CauseText):
-            columns += _words_of_arrow(content.violations, samples, scale, self.unit)
+            numbers = [content.numbers[index] for index in samples.tolist()]
+            columns += _words_of_arrow(content.violations, samples, scale, numbers, layout.witness.words)
         return np.concatenate([np.empty((len(samples), 0)), *columns], axis=1)
 
 
@@ -245,15 +246,15 @@ def _arrows_of(
     arrows = []
     for number, result in enumerate(results):
         found = first_violations([result], trace, written)
-        causes, which = causes_of([result], found, first_ns, unit)
-        arrows.append(Arrows(number, found, [causes[cause].text for cause in which.tolist()]))
+        arrows.append(Arrows(number, found, arrow_texts([result], found, first_ns, unit)))
     return arrows
 
 
-def _words_of_arrow(found: Violations, samples: Integers, scale: float, unit: str) -> list[Floats]:
+def _words_of_arrow(
+    found: Violations, samples: Integers, scale: float, numbers: Sequence[bytes], words: int
+) -> list[Floats]:
     z = np.fmax(found.top[samples], 0.0) + 3.0 * _LIFT * scale
-    labels = [violation_text(found, index, unit) for index in samples.tolist()]
-    return words_of_witness(found.points[samples], z, scale, labels)
+    return words_of_witness(found.points[samples], z, scale, numbers, words)
 
 
 def _region(name: str, outline: Outline) -> Region:
@@ -298,7 +299,7 @@ def _content(
     before: SceneState,
     scale: float,
     found: Violations,
-    decided: tuple[tuple[CauseText, ...], Integers],
+    arrows: ArrowTexts,
     has_label: NDArray[np.bool_],
     banners: tuple[Integers, tuple[Banner | None, ...]],
 ) -> SceneContent:
@@ -313,11 +314,9 @@ def _content(
     styles = np.full(rows.shape, -1, np.int64)
     styles[is_present] = 2 * _levels(extents(footprints), scale) + has_label[is_present]
     was_pointing = np.append(before.is_pointing, found.is_shown[:-1])
-    causes, cause = decided
-    witness = np.where(found.is_shown, FIRST_FORM + cause, np.where(was_pointing, DELETED, ABSENT))
-    return SceneContent(
-        names, rows, forms, styles, observations, footprints, rings, found, witness, causes, *banners
-    )
+    witness = np.where(found.is_shown, FIRST_FORM + arrows.cause, np.where(was_pointing, DELETED, ABSENT))
+    said = witness, arrows.causes, arrows.numbers
+    return SceneContent(names, rows, forms, styles, observations, footprints, rings, found, *said, *banners)
 
 
 def _levels(sizes: Floats, scale: float) -> Integers:

@@ -52,7 +52,7 @@ THREADS = 4
 
 
 _Closing: TypeAlias = tuple[int, int, list[MessageRange], int]
-"""A chunk that ends: at which message of a call, 0 for before or 1 for after it; its messages, their bytes."""
+"""A chunk that ends: at which message of a call, 0 for before or 1 for after it, its messages and their bytes."""
 
 
 @dataclass(slots=True)
