@@ -39,7 +39,7 @@ class Filled:
         """Encode some of the messages, (k, L) uint8."""
         return self.template.fill(self.words[rows], self.marks[rows])
 
-    def write(self, content: bytearray, begins: Integers, rows: Integers) -> None:
+    def write(self, content: memoryview, begins: Integers, rows: Integers) -> None:
         """Fill in some of the messages (k,) at `begins` (k,), where content holds the pattern."""
         if self.words.size:
             # any 8 bytes of the content, as a word

@@ -39,11 +39,12 @@ _MESSAGE = np.dtype(
 )
 _HEAD: Final = _MESSAGE.itemsize
 _HEAD_BYTES: Final = np.dtype(f"V{_HEAD}")
-_NO_HEAD: Final = bytes(_HEAD)
-_INDEX_ENTRY = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
+_INDEX_ENTRY: Final = 16
 _ZSTD: Final = b"zstd"
 _CHUNK: Final = struct.Struct("<BQQQQII4sQ")
 _INDEX: Final = struct.Struct("<BQHI")
+_MOST_KEPT: Final = 2**22
+"""A thread keeps room for so many bytes of chunks."""
 COMPRESSION_LEVEL: Final = 1
 """Coordinates hardly shrink further at higher levels, which take several times as long."""
 
@@ -53,12 +54,13 @@ class PackedChunk:
     """A chunk ready to be written, with what the summary says of it.
 
     Attributes:
-        data: the chunk's record, followed by its index of messages.
-        index_bytes: how long that index is.
+        parts: the chunk's record, followed by its index of messages.
+        record_bytes, index_bytes: how long both are.
         index_offsets: for each channel, where its entries begin in the index.
     """
 
-    data: bytes
+    parts: Sequence[bytes]
+    record_bytes: int
     index_bytes: int
     index_offsets: Mapping[int, int]
     compressed_size: int
@@ -70,11 +72,21 @@ class PackedChunk:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Batch:
-    """Messages as records: heads (M,), payloads, (M,) sizes of both, and the numbers of their channels."""
+    """Messages as records.
 
-    heads: np.ndarray[tuple[int], np.dtype[np.void]]
+    Attributes:
+        heads: (M,), the encoded heads.
+        payloads: what follows them.
+        start: (M + 1,) int64, where each begins and the last one ends, side by side.
+        times_ns: (M,) int64, their log times.
+        numbers: (M,) int64, the numbers of their channels; and as a list `channels`.
+    """
+
+    heads: NDArray[np.void]
     payloads: MixedPayloads
-    sizes: Integers
+    start: Integers
+    times_ns: Integers
+    numbers: Integers
     channels: list[int]
 
     @classmethod
@@ -89,7 +101,9 @@ class Batch:
         heads["sequence"] = messages.sequence
         heads["log_time"] = messages.log_time_ns
         heads["publish_time"] = messages.publish_time_ns
-        return cls(heads, payloads, sizes + _HEAD, numbers.tolist())
+        encoded_heads: NDArray[np.void] = heads.view(_HEAD_BYTES)
+        start = starts_from_counts(sizes + _HEAD)
+        return cls(encoded_heads, payloads, start, messages.log_time_ns, numbers, numbers.tolist())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,12 +115,18 @@ class MessageRange:
     stop: int
 
     @property
-    def heads(self) -> np.ndarray[tuple[int], np.dtype[np.void]]:
-        return self.batch.heads[self.begin : self.stop]
+    def times_ns(self) -> Integers:
+        return self.batch.times_ns[self.begin : self.stop]
 
     @property
-    def sizes(self) -> Integers:
-        return self.batch.sizes[self.begin : self.stop]
+    def numbers(self) -> Integers:
+        return self.batch.numbers[self.begin : self.stop]
+
+    @property
+    def start(self) -> Integers:
+        """(m + 1,) where its records begin and the last one ends, side by side."""
+        start = self.batch.start[self.begin : self.stop + 1]
+        return np.asarray(start - start[0])
 
     @property
     def channels(self) -> set[int]:
@@ -116,27 +136,28 @@ class MessageRange:
     @property
     def start_ns(self) -> int:
         """Log time of its first message."""
-        return int(self.batch.heads["log_time"][self.begin])
+        return int(self.batch.times_ns[self.begin])
 
-    def contents(self) -> list[bytes]:
-        """Return room for each head, and each payload; those of a template are to be filled in."""
+    def write(self, content: memoryview, start: Integers) -> None:
+        """Write payloads into records (m + 1,); those of a template without what is to be filled in."""
         payloads = self.batch.payloads
         patterns = [part.template.pattern if isinstance(part, Filled) else None for part in payloads.parts]
         own = slice(self.begin, self.stop)
         places = zip(payloads.part[own].tolist(), payloads.row[own].tolist(), strict=True)
-        contents = [_NO_HEAD] * (2 * (self.stop - self.begin))
-        contents[1::2] = [patterns[part] or payloads.parts[part][row] for part, row in places]
-        return contents
+        for (part, row), start, end in zip(
+            places, (start[:-1] + _HEAD).tolist(), start[1:].tolist(), strict=True
+        ):
+            content[start:end] = patterns[part] or payloads.parts[part][row]
 
-    def fill(self, content: bytearray, starts: Integers) -> None:
+    def fill(self, content: memoryview, starts: Integers) -> None:
         """Fill in heads and templates.
 
         Args:
-            content: with `contents` in it.
+            content: after `write`.
             starts: (m,) where each message's record begins.
         """
         heads: NDArray[np.void] = np.ndarray((len(content) - _HEAD + 1,), _HEAD_BYTES, content, 0, (1,))
-        heads[starts] = self.heads.view(_HEAD_BYTES)
+        heads[starts] = self.batch.heads[self.begin : self.stop]
         payloads, own = self.batch.payloads, slice(self.begin, self.stop)
         part, row = payloads.part[own], payloads.row[own]
         for places in equal_places(part):
@@ -151,6 +172,12 @@ class OpenChunk(NamedTuple):
     ranges: Sequence[MessageRange]
     declaring: bytes
 
+    @property
+    def size(self) -> int:
+        """How many bytes its content has."""
+        starts = [(each.batch.start, each) for each in self.ranges]
+        return len(self.declaring) + sum(int(start[own.stop] - start[own.begin]) for start, own in starts)
+
 
 def pack(chunks: Sequence[OpenChunk]) -> list[PackedChunk]:
     """Pack messages into compressed chunks, each with its index.
@@ -160,16 +187,15 @@ def pack(chunks: Sequence[OpenChunk]) -> list[PackedChunk]:
     content, starts = _laid_out(chunks)
     ranges = [each for chunk in chunks for each in chunk.ranges]
     counts = np.array([sum(each.stop - each.begin for each in chunk.ranges) for chunk in chunks], np.int64)
-    heads = np.concatenate([each.heads for each in ranges])
-    begins = np.cumsum([0, *(len(chunk.declaring) + _size_of(chunk) for chunk in chunks)])
+    times_ns = np.concatenate([each.times_ns for each in ranges])
+    numbers = np.concatenate([each.numbers for each in ranges])
+    begins = starts_from_counts([chunk.size for chunk in chunks])
     first = starts_from_counts(counts)
-    low_ns = np.minimum.reduceat(heads["log_time"], first[:-1]).tolist()
-    high_ns = np.maximum.reduceat(heads["log_time"], first[:-1]).tolist()
+    low_ns = np.minimum.reduceat(times_ns, first[:-1]).tolist()
+    high_ns = np.maximum.reduceat(times_ns, first[:-1]).tolist()
     chunk_of = np.repeat(np.arange(len(chunks)), counts)
-    entries = np.zeros(len(heads), _INDEX_ENTRY)
-    entries["log_time"] = heads["log_time"]
-    entries["offset"] = starts - begins[chunk_of]
-    key = chunk_of * 2**16 + heads["channel"]
+    entries = np.stack([times_ns, starts - begins[chunk_of]], axis=1).astype("<i8", copy=False)
+    key = chunk_of * 2**16 + numbers
     order = np.argsort(key, kind="stable")
     key, listed = key[order], entries[order]
     edges = np.flatnonzero(np.diff(key, prepend=-1, append=-1)).tolist()
@@ -177,29 +203,25 @@ def pack(chunks: Sequence[OpenChunk]) -> list[PackedChunk]:
     for begin, end in pairwise(edges):
         chunk, channel = divmod(int(key[begin]), 2**16)
         indices[chunk].append((channel, listed[begin:end].tobytes()))
-    whole, bounds = memoryview(content), begins.tolist()
+    bounds = begins.tolist()
     return [
-        _packed(whole[bounds[at] : bounds[at + 1]], indices[at], low_ns[at], high_ns[at])
+        _packed(content[bounds[at] : bounds[at + 1]], indices[at], low_ns[at], high_ns[at])
         for at in range(len(chunks))
     ]
 
 
-def _size_of(chunk: OpenChunk) -> int:
-    return sum(int(each.sizes.sum()) for each in chunk.ranges)
-
-
-def _laid_out(chunks: Sequence[OpenChunk]) -> tuple[bytearray, Integers]:
+def _laid_out(chunks: Sequence[OpenChunk]) -> tuple[memoryview, Integers]:
     """Return the content of chunks, one after the other, and where each message's record begins in it."""
-    parts, offset, starts = list[bytes](), 0, list[Integers]()
+    content = _room(sum(chunk.size for chunk in chunks))
+    offset, starts = 0, list[Integers]()
     for chunk in chunks:
-        parts.append(chunk.declaring)
+        content[offset : offset + len(chunk.declaring)] = chunk.declaring
         offset += len(chunk.declaring)
         for each in chunk.ranges:
-            ends = offset + np.cumsum(each.sizes)
-            starts.append(ends - each.sizes)
-            parts += each.contents()
-            offset = int(ends[-1])
-    content = bytearray().join(parts)
+            start = offset + each.start
+            each.write(content, start)
+            starts.append(start[:-1])
+            offset = int(start[-1])
     for each, own in _joined(chunks, starts):
         each.fill(content, own)
     return content, np.concatenate(starts)
@@ -237,12 +259,22 @@ def _packed(
         offsets[channel] = size
         parts += [_INDEX.pack(Opcode.MESSAGE_INDEX, len(entries) + 6, channel, len(entries)), entries]
         size += _INDEX.size + len(entries)
-    counts = {channel: len(entries) // _INDEX_ENTRY.itemsize for channel, entries in index}
+    counts = {channel: len(entries) // _INDEX_ENTRY for channel, entries in index}
     sizes = len(compressed), len(content)
-    return PackedChunk(b"".join(parts), size, offsets, *sizes, counts, start_ns, end_ns)
+    record_bytes = RECORD_HEAD.size + length
+    return PackedChunk(parts, record_bytes, size, offsets, *sizes, counts, start_ns, end_ns)
 
 
 _local = threading.local()
+
+
+def _room(size: int) -> memoryview:
+    """Return room for a content, until this thread asks again: new memory costs as much as filling it."""
+    if size > _MOST_KEPT:
+        return memoryview(bytearray(size))
+    if len(getattr(_local, "room", b"")) < size:
+        _local.room = bytearray(size)
+    return memoryview(_local.room)[:size]
 
 
 def _compressor() -> zstandard.ZstdCompressor:
@@ -312,11 +344,10 @@ _CHUNK_SIZES: Final = struct.Struct("<QI4sQQ")
 
 def _chunk_index(chunk: PackedChunk, offset: int) -> bytes:
     """Encode the index of a chunk as `encoded` does, in a tenth of the time: long logs have very many."""
-    record_bytes = len(chunk.data) - chunk.index_bytes
-    following = offset + record_bytes
+    following = offset + chunk.record_bytes
     offsets = b"".join(_INDEX_OFFSET.pack(n, following + at) for n, at in chunk.index_offsets.items())
     sizes = chunk.index_bytes, len(_ZSTD), _ZSTD, chunk.compressed_size, chunk.uncompressed_size
     length = _CHUNK_INDEX.size - RECORD_HEAD.size + len(offsets) + _CHUNK_SIZES.size
-    about = chunk.start_ns, chunk.end_ns, offset, record_bytes
+    about = chunk.start_ns, chunk.end_ns, offset, chunk.record_bytes
     head = _CHUNK_INDEX.pack(Opcode.CHUNK_INDEX, length, *about, len(offsets))
     return head + offsets + _CHUNK_SIZES.pack(*sizes)

@@ -52,7 +52,7 @@ THREADS = 4
 
 
 _Closing: TypeAlias = tuple[int, int, list[MessageRange], int]
-"""A chunk that ends: at which message of a call, 0 for before or 1 for after it, its messages and their bytes."""
+"""A chunk that ends: at which message of a call, 0 for before it or 1 for after it; its messages; their bytes."""
 
 
 @dataclass(slots=True)
@@ -237,7 +237,7 @@ class LogWriter:
         Yields:
             Each chunk that ends.
         """
-        ends = np.cumsum(batch.sizes)
+        ends = batch.start[1:]
         latest = np.maximum.accumulate(times_ns)
         begin = at = 0
         if lane.open and self._is_over(lane):
@@ -299,9 +299,11 @@ class LogWriter:
         """Write chunks in their order until no more bytes are waiting, and those that are ready."""
         while self._packing and (self._packing_bytes > waiting_bytes or self._packing[0][1].done()):
             size, packing = self._packing.popleft()
-            for chunk in packing.result():
-                self._summary.add_chunk(chunk, self._offset)
-                self._write(chunk.data)
+            chunks, place = packing.result(), self._offset
+            for chunk in chunks:
+                self._summary.add_chunk(chunk, place)
+                place += chunk.record_bytes + chunk.index_bytes
+            self._write(b"".join([part for chunk in chunks for part in chunk.parts]))
             self._packing_bytes -= size
             self._flush_stream()
 
