@@ -79,7 +79,8 @@ def extents(footprints: FootprintBatch) -> Floats:
     begins = footprints.vertex_start[footprints.part_start[:-1]]
     low = np.minimum.reduceat(footprints.vertices - radius, begins)
     high = np.maximum.reduceat(footprints.vertices + radius, begins)
-    return np.asarray((high - low).max(axis=1))
+    sides = high - low
+    return np.asarray(np.maximum(sides[:, 0], sides[:, 1]))
 
 
 _ANGLES = np.arange(ROUND) * (2.0 * np.pi / ROUND)

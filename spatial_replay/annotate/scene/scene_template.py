@@ -139,12 +139,10 @@ class SceneTemplate:
     template: WireTemplate
     stamps: int
 
-    def filled(self, times_ns: Integers, numbers: Floats) -> Filled:
-        """Return messages with times (S,) and numbers (S, W)."""
-        count = numbers.shape[1]
-        words = np.empty((len(times_ns), count + 2 * self.stamps), np.uint64)
-        words[:, :count] = numbers.view(np.uint64)
-        words[:, count:] = np.tile(_encoded_stamps(times_ns), self.stamps)
+    def filled(self, times_ns: Integers, columns: Sequence[Floats]) -> Filled:
+        """Return messages with times (S,) and numbers: columns (S, n), one after the other."""
+        stamps = np.tile(_encoded_stamps(times_ns).view(np.float64), self.stamps)
+        words = np.concatenate([*columns, stamps], axis=1).view(np.uint64)
         return Filled(self.template, words, np.empty((len(words), 0), np.uint8))
 
 
@@ -226,7 +224,8 @@ def words_of_object(
     if not drawn.has_label:
         return words
     # half the sum of the ends does not depend on the order in which points are added up
-    words.append((points.min(axis=1) + points.max(axis=1)) / 2.0)
+    corners = np.ascontiguousarray(points.transpose(1, 0, 2))
+    words.append((corners.min(axis=0) + corners.max(axis=0)) / 2.0)
     return words + [height + lift for height in upper]
 
 

@@ -220,8 +220,8 @@ class SceneEncoder:
         objects: Floats,
         regions: Floats,
         scale: float,
-    ) -> Floats:
-        """Return (S, W) what to fill in the layout's template."""
+    ) -> list[Floats]:
+        """Return what to fill in the layout's template, as columns (S, n)."""
         columns = []
         for index, region in enumerate(self._drawn):
             columns += words_of_region(region, regions[samples, index])
@@ -236,7 +236,7 @@ class SceneEncoder:
         if isinstance(layout.witness, CauseText):
             numbers = [content.numbers[index] for index in samples.tolist()]
             columns += _words_of_arrow(content.violations, samples, scale, numbers, layout.witness.words)
-        return np.concatenate([np.empty((len(samples), 0)), *columns], axis=1)
+        return columns
 
 
 def _arrows_of(

@@ -35,6 +35,7 @@ from spatial_replay.logs.mcap.packing import (
 from spatial_replay.logs.messages import Channel, Messages, Schema, messages_of, select
 from spatial_replay.logs.output_file import output_error
 from spatial_replay.logs.topics import LIBRARY, MAGIC, OWN_PREFIX
+from spatial_replay.trace.sample import FOREVER
 
 CHUNK_BYTES = 128 * 2**10
 """A chunk is closed when it holds this much, uncompressed."""
@@ -52,7 +53,7 @@ THREADS = 4
 
 
 _Closing: TypeAlias = tuple[int, int, list[MessageRange], int]
-"""A chunk that ends: at which message of a call, 0 for before it or 1 for after it; its messages; their bytes."""
+"""A chunk that ends: at which message of a call, 0 for before it or 1 for after it; its messages and size."""
 
 
 @dataclass(slots=True)
@@ -67,16 +68,13 @@ class _Lane:
 
 @dataclass(slots=True)
 class _Declaration:
-    """A channel and its schema as records, and in how many chunks, and when last, they were declared."""
+    """A channel and its schema as records, in how many chunks they were declared, and from when on the next
+    one does."""
 
     schema: bytes
     channel: bytes
     count: int = 0
-    last_ns: int = 0
-
-    def is_due(self, time_ns: int) -> bool:
-        """Return whether a chunk that begins at a time declares it."""
-        return self.count < 2 or time_ns >= self.last_ns + REPEAT_NS
+    due_ns: int = -FOREVER
 
 
 class LogWriter:
@@ -237,24 +235,25 @@ class LogWriter:
         Yields:
             Each chunk that ends.
         """
-        ends = batch.start[1:]
-        latest = np.maximum.accumulate(times_ns)
+        # lists, in which a place is found in a tenth of the time
+        ends, listed = batch.start[1:].tolist(), places.tolist()
+        latest: list[int] = np.maximum.accumulate(times_ns).tolist()
         begin = at = 0
         if lane.open and self._is_over(lane):
             yield 0, 0, *_closed(lane)
-        while lane.open or begin < len(places):
+        while lane.open or begin < len(listed):
             if not lane.open:
-                at = int(places[begin])
+                at = listed[begin]
                 lane.began_ns = int(times_ns[at])
                 lane.began_s = self._clock() if self._clock else 0.0
             late = _first_from(times_ns, latest, lane.began_ns + CHUNK_NS, at if lane.open else at + 1)
-            written = int(ends[begin - 1]) if begin else 0
-            full = int(np.searchsorted(ends, written + CHUNK_BYTES - lane.open_bytes)) + 1
-            stop = min(full, int(np.searchsorted(places, late)), len(places))
+            written = ends[begin - 1] if begin else 0
+            full = bisect_left(ends, written + CHUNK_BYTES - lane.open_bytes) + 1
+            stop = min(full, bisect_left(listed, late), len(listed))
             if stop > begin:
                 lane.open.append(MessageRange(batch, begin, stop))
-                lane.open_bytes += int(ends[stop - 1]) - written
-                begin, at = stop, int(places[stop - 1]) + 1
+                lane.open_bytes += ends[stop - 1] - written
+                begin, at = stop, listed[stop - 1] + 1
             if lane.open_bytes >= CHUNK_BYTES:
                 yield at - 1, 1, *_closed(lane)
             elif late < len(times_ns):
@@ -289,10 +288,12 @@ class LogWriter:
     def _declaring(self, ranges: Sequence[MessageRange]) -> bytes:
         """Return the declarations that a chunk begins with; each schema is in it once."""
         start_ns = ranges[0].start_ns
-        numbers = sorted(set[int]().union(*(each.channels for each in ranges)))
-        due = [each for number in numbers if (each := self._declarations[number]).is_due(start_ns)]
+        declarations = self._declarations
+        numbers = {each for own in ranges for each in own.channels if start_ns >= declarations[each].due_ns}
+        due = [declarations[number] for number in sorted(numbers)]
         for each in due:
-            each.count, each.last_ns = each.count + 1, start_ns
+            each.count += 1
+            each.due_ns = -FOREVER if each.count < 2 else start_ns + REPEAT_NS
         return b"".join([*dict.fromkeys(each.schema for each in due), *(each.channel for each in due)])
 
     def _write_packed(self, waiting_bytes: int) -> None:
@@ -332,11 +333,11 @@ def _processors() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _first_from(times_ns: Integers, latest: Integers, limit_ns: int, begin: int) -> int:
+def _first_from(times_ns: Integers, latest: list[int], limit_ns: int, begin: int) -> int:
     """Return the first message from `begin` on that is not before a time; their number if there is none.
 
     Args:
-        latest: (M,) the latest time so far, by which it is found at once where times do not go back.
+        latest: M times, the latest so far, by which it is found at once where times do not go back.
     """
     first = bisect_left(latest, limit_ns, begin)
     if first < len(times_ns) and times_ns[first] < limit_ns:
