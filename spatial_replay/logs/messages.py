@@ -6,16 +6,15 @@ numbers, so that equal logs give equal files.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Protocol, overload
+from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from spatial_replay.geometry.arrays import Integers, starts_from_counts
-from spatial_replay.logs.payloads import MixedPayloads, joined
+from spatial_replay.geometry.arrays import Integers
+from spatial_replay.logs.payloads import chosen_payloads, joined_payloads
 from spatial_replay.trace.trace import Trace
 
 BLOCK_SAMPLES = 8_192
@@ -50,81 +49,6 @@ class Channel:
 
 def _none() -> Integers:
     return np.zeros(0, np.int64)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Payloads(Sequence[bytes]):
-    """M encoded messages in one buffer; each becomes an object of its own when it is asked for.
-
-    Attributes:
-        data: the buffer.
-        begin, end: (M,) int64, where each lies in it.
-    """
-
-    data: bytes
-    begin: Integers
-    end: Integers
-
-    @classmethod
-    def of(cls, payloads: Sequence[bytes]) -> Payloads:
-        """Return some messages in one buffer."""
-        if isinstance(payloads, cls):
-            return payloads
-        starts = starts_from_counts(np.fromiter(map(len, payloads), np.int64, len(payloads)))
-        return cls(b"".join(payloads), starts[:-1], starts[1:])
-
-    @classmethod
-    def join(cls, several: Sequence[Payloads]) -> Payloads:
-        """Join messages, one after the other."""
-        sizes = starts_from_counts(list(map(len, [each.data for each in several])))[:-1]
-        shifts = np.repeat(sizes, list(map(len, several)))
-        return cls(
-            b"".join([each.data for each in several]),
-            _joined([each.begin for each in several]) + shifts,
-            _joined([each.end for each in several]) + shifts,
-        )
-
-    def __len__(self) -> int:
-        return len(self.begin)
-
-    @overload
-    def __getitem__(self, index: int) -> bytes: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> Payloads: ...
-
-    def __getitem__(self, index: int | slice) -> bytes | Payloads:
-        if isinstance(index, slice):
-            return Payloads(self.data, self.begin[index], self.end[index])
-        return self.data[self.begin[index] : self.end[index]]
-
-    def __iter__(self) -> Iterator[bytes]:
-        return map(self.data.__getitem__, map(slice, self.begin.tolist(), self.end.tolist()))
-
-    @property
-    def nbytes(self) -> int:
-        """The size of all messages in bytes."""
-        return int(self.lengths.sum())
-
-    @property
-    def lengths(self) -> Integers:
-        """(M,) int64, in bytes."""
-        return np.asarray(self.end - self.begin)
-
-    def take(self, chosen: Integers) -> Payloads:
-        """Return the messages with the given indices, in that order."""
-        return Payloads(self.data, self.begin[chosen], self.end[chosen])
-
-    def rows(self) -> NDArray[np.uint8]:
-        """Return messages of one length L as (M, L) uint8."""
-        first, length = (int(self.begin[0]), int(self.lengths[0])) if len(self) else (0, 0)
-        if not length:
-            return np.empty((len(self), 0), np.uint8)
-        if (self.begin[1:] - self.begin[:-1] == length).all():
-            # they follow each other, as where samples are all that was read
-            return np.ndarray((len(self), length), np.uint8, self.data, first)
-        anywhere = np.ndarray((len(self.data) - length + 1, length), np.uint8, self.data, 0, (1, 1))
-        return anywhere[self.begin]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -210,7 +134,7 @@ def join(streams: Sequence[Messages]) -> Messages:
         sequence=_joined([stream.sequence for stream in streams]),
         log_time_ns=_joined([stream.log_time_ns for stream in streams]),
         publish_time_ns=_joined([stream.publish_time_ns for stream in streams]),
-        payloads=joined([stream.payloads for stream in streams]),
+        payloads=joined_payloads([stream.payloads for stream in streams]),
     )
 
 
@@ -224,13 +148,6 @@ def select(messages: Messages, chosen: Integers) -> Messages:
         publish_time_ns=messages.publish_time_ns[chosen],
         payloads=chosen_payloads(messages.payloads, chosen),
     )
-
-
-def chosen_payloads(payloads: Sequence[bytes], chosen: Integers) -> Sequence[bytes]:
-    """Return the payloads with the given indices, in that order."""
-    if isinstance(payloads, Payloads | MixedPayloads):
-        return payloads.take(chosen)
-    return [payloads[index] for index in chosen.tolist()]
 
 
 def _rank(channel: Channel) -> tuple[str, str, str, str, bytes, tuple[tuple[str, str], ...]]:

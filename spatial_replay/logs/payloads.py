@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final, TypeAlias, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from spatial_replay.geometry.arrays import Integers
+from spatial_replay.geometry.arrays import Integers, starts_from_counts
 
 if TYPE_CHECKING:
     # loads protobuf, which messages that are only copied need not
@@ -22,6 +22,81 @@ if TYPE_CHECKING:
 
 _FEW: Final = 16
 """So many messages are encoded at once: columns would cost more than they save."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Payloads(Sequence[bytes]):
+    """M encoded messages in one buffer; each becomes an object of its own when it is asked for.
+
+    Attributes:
+        data: the buffer.
+        begin, end: (M,) int64, where each lies in it.
+    """
+
+    data: bytes
+    begin: Integers
+    end: Integers
+
+    @classmethod
+    def of(cls, payloads: Sequence[bytes]) -> Payloads:
+        """Return some messages in one buffer."""
+        if isinstance(payloads, cls):
+            return payloads
+        starts = starts_from_counts(np.fromiter(map(len, payloads), np.int64, len(payloads)))
+        return cls(b"".join(payloads), starts[:-1], starts[1:])
+
+    @classmethod
+    def join(cls, several: Sequence[Payloads]) -> Payloads:
+        """Join messages, one after the other."""
+        sizes = starts_from_counts(list(map(len, [each.data for each in several])))[:-1]
+        shifts = np.repeat(sizes, list(map(len, several)))
+        return cls(
+            b"".join([each.data for each in several]),
+            np.concatenate([sizes[:0], *(each.begin for each in several)]) + shifts,
+            np.concatenate([sizes[:0], *(each.end for each in several)]) + shifts,
+        )
+
+    def __len__(self) -> int:
+        return len(self.begin)
+
+    @overload
+    def __getitem__(self, index: int) -> bytes: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> Payloads: ...
+
+    def __getitem__(self, index: int | slice) -> bytes | Payloads:
+        if isinstance(index, slice):
+            return Payloads(self.data, self.begin[index], self.end[index])
+        return self.data[self.begin[index] : self.end[index]]
+
+    def __iter__(self) -> Iterator[bytes]:
+        return map(self.data.__getitem__, map(slice, self.begin.tolist(), self.end.tolist()))
+
+    @property
+    def nbytes(self) -> int:
+        """The size of all messages in bytes."""
+        return int(self.lengths.sum())
+
+    @property
+    def lengths(self) -> Integers:
+        """(M,) int64, in bytes."""
+        return np.asarray(self.end - self.begin)
+
+    def take(self, chosen: Integers) -> Payloads:
+        """Return the messages with the given indices, in that order."""
+        return Payloads(self.data, self.begin[chosen], self.end[chosen])
+
+    def rows(self) -> NDArray[np.uint8]:
+        """Return messages of one length L as (M, L) uint8."""
+        first, length = (int(self.begin[0]), int(self.lengths[0])) if len(self) else (0, 0)
+        if not length:
+            return np.empty((len(self), 0), np.uint8)
+        if (self.begin[1:] - self.begin[:-1] == length).all():
+            # they follow each other, as where samples are all that was read
+            return np.ndarray((len(self), length), np.uint8, self.data, first)
+        anywhere = np.ndarray((len(self.data) - length + 1, length), np.uint8, self.data, 0, (1, 1))
+        return anywhere[self.begin]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,6 +169,8 @@ class MixedPayloads(Sequence[bytes]):
             own = self.part == number
             if isinstance(part, Filled):
                 sizes[own] = len(part.template)
+            elif isinstance(part, Payloads):
+                sizes[own] = part.lengths[self.row[own]]
             else:
                 sizes[own] = np.fromiter(map(len, part), np.int64, len(part))[self.row[own]]
         return sizes
@@ -124,11 +201,13 @@ def columns_of(payloads: Sequence[bytes]) -> MixedPayloads:
     return MixedPayloads((payloads,), np.zeros(len(payloads), np.int64), np.arange(len(payloads)))
 
 
-def joined(several: Sequence[Sequence[bytes]]) -> Sequence[bytes]:
+def joined_payloads(several: Sequence[Sequence[bytes]]) -> Sequence[bytes]:
     """Join messages, one sequence after the other."""
-    if not any(isinstance(each, MixedPayloads) for each in several):
+    if not any(isinstance(each, Payloads | MixedPayloads) for each in several):
         return [payload for each in several for payload in each]
-    every = [columns_of(each) for each in several]
+    every = [columns_of(each) for each in several if len(each)]
+    if not every:
+        return []
     begins = np.cumsum([0, *(len(each.parts) for each in every)]).tolist()
     return MixedPayloads(
         tuple(part for each in every for part in each.parts),
@@ -137,9 +216,9 @@ def joined(several: Sequence[Sequence[bytes]]) -> Sequence[bytes]:
     )
 
 
-def taken(payloads: Sequence[bytes], chosen: Integers) -> Sequence[bytes]:
-    """Return the messages with the given indices, in that order."""
-    if isinstance(payloads, MixedPayloads):
+def chosen_payloads(payloads: Sequence[bytes], chosen: Integers) -> Sequence[bytes]:
+    """Return the payloads with the given indices, in that order."""
+    if isinstance(payloads, Payloads | MixedPayloads):
         return payloads.take(chosen)
     return [payloads[index] for index in chosen.tolist()]
 

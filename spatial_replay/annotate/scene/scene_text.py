@@ -130,7 +130,7 @@ def arrow_texts(
     texts = [robustness_text(number, unit).encode() for number in robustness]
     words = -(-np.fromiter(map(len, texts), np.int64, len(texts)) // 8)
     columns = [each[shown] for each in (found.result, found.leaf, found.holds, found.moment_ns)]
-    causes, cause = [], np.zeros(len(found.result), np.int64)
+    causes, cause = list[CauseText](), np.zeros(len(found.result), np.int64)
     for places in equal_places(combined([*columns, words], len(shown))):
         cause[shown[places]] = len(causes)
         result, leaf, holds, moment_ns = (int(each[places[0]]) for each in columns)
@@ -140,8 +140,8 @@ def arrow_texts(
         at = "" if moment_ns < 0 else f" at {Instant(moment_ns, first_ns)}"
         causes.append(CauseText(f"{text}{at}: {'holds by ' if holds else ''}", int(words[places[0]])))
     numbers = [b""] * len(found.result)
-    for index, text in zip(shown.tolist(), texts, strict=True):
-        numbers[index] = text
+    for index, number in zip(shown.tolist(), texts, strict=True):
+        numbers[index] = number
     return ArrowTexts(tuple(causes), cause, numbers)
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from spatial_replay.compiled import elementwise, kernel
 from spatial_replay.geometry.arrays import Integers
-from spatial_replay.logs.messages import Payloads
+from spatial_replay.logs.payloads import Payloads
 
 RECORD_HEAD = struct.Struct("<BQ")
 """Opcode and length of the body that follows."""

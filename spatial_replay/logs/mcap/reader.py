@@ -34,10 +34,10 @@ from spatial_replay.logs.messages import (
     Block,
     Channel,
     Messages,
-    chosen_payloads,
     select,
 )
 from spatial_replay.logs.objects.decode import decode_objects
+from spatial_replay.logs.payloads import chosen_payloads
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.logs.remote import LogFile, RemoteFile, open_file
 from spatial_replay.logs.sample_cache import DamagedEntryError, cached_samples

@@ -148,7 +148,7 @@ class LogWriter:
             closings += self._divide(lane, batch, places, messages.log_time_ns)
         # in the order of the messages at which they close, however these were divided among calls
         closings.sort(key=lambda closing: closing[:2])
-        self._pack([closed for _, _, *closed in closings])
+        self._pack([(ranges, size) for _, _, ranges, size in closings])
 
     def add_metadata(self, name: str, data: Mapping[str, str]) -> None:
         """Add a metadata record, its keys in the order given, after closing the chunk."""
