@@ -9,16 +9,15 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Final, TypeAlias, overload
+from typing import Final, Protocol, TypeAlias, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spatial_replay.geometry.arrays import Integers, starts_from_counts
 
-if TYPE_CHECKING:
-    # loads protobuf, which messages that are only copied need not
-    from spatial_replay.logs.objects.wire import Bytes, WireTemplate, Words
+Bytes: TypeAlias = NDArray[np.uint8]
+Words: TypeAlias = NDArray[np.uint64]
 
 _FEW: Final = 16
 """So many messages are encoded at once: columns would cost more than they save."""
@@ -99,11 +98,28 @@ class Payloads(Sequence[bytes]):
         return anywhere[self.begin]
 
 
+class Template(Protocol):
+    """The layout of some messages, as `WireTemplate` has it."""
+
+    @property
+    def pattern(self) -> bytes: ...
+
+    @property
+    def word_offsets(self) -> Integers: ...
+
+    @property
+    def mark_offsets(self) -> Integers: ...
+
+    def __len__(self) -> int: ...
+
+    def fill(self, words: Words, marks: Bytes | None = None) -> Bytes: ...
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Filled:
     """Messages of one template: their words (n, W) and marks (n, K)."""
 
-    template: WireTemplate
+    template: Template
     words: Words
     marks: Bytes
 

@@ -29,8 +29,8 @@ from spatial_replay.annotate.scene.scene_entities import (
     point_at,
 )
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.logs.objects.wire import WireTemplate, Words
-from spatial_replay.logs.payloads import Filled
+from spatial_replay.logs.objects.wire import WireTemplate
+from spatial_replay.logs.payloads import Filled, Words
 from spatial_replay.spec.formula import Outline
 
 OBJECT_OPACITY: Final = 0.55

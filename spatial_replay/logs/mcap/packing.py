@@ -145,7 +145,8 @@ class MessageRange:
         own = slice(self.begin, self.stop)
         columns = payloads.part[own], payloads.row[own], start[:-1] + _HEAD, start[1:]
         for part, row, begin, end in zip(*(column.tolist() for column in columns), strict=True):
-            content[begin:end] = patterns[part] or payloads.parts[part][row]
+            pattern = patterns[part]
+            content[begin:end] = payloads.parts[part][row] if pattern is None else pattern
 
     def fill(self, content: memoryview, starts: Integers) -> None:
         """Fill in heads and templates.

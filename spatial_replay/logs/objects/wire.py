@@ -18,9 +18,7 @@ from google.protobuf.message import Message
 from numpy.typing import NDArray
 
 from spatial_replay.geometry.arrays import Integers
-
-Bytes = NDArray[np.uint8]
-Words = NDArray[np.uint64]
+from spatial_replay.logs.payloads import Bytes, Words
 
 _WIDE = (FieldDescriptor.TYPE_DOUBLE, FieldDescriptor.TYPE_FIXED64)
 _NARROW = FieldDescriptor.TYPE_ENUM
