@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -124,6 +125,12 @@ def falsify(
 
 def _lines(found: Falsification) -> Iterator[str]:
     yield f"run 1, with nothing varied: {_judged(found.first)}"
+    for each in found.parameters:
+        if each.unit == "s" and found.first.seconds < each.high < math.inf:
+            yield (
+                f"{each.name}@{each.low:g}s:{each.high:g}s goes on after the end of that run, at"
+                f" {found.first.seconds:g} s: from there on nothing happens"
+            )
     if found.first.is_violated:
         yield "  the search ended with it: what fails without any variation needs no search"
     unknown = sum(run.verdict == "unknown" for run in found.runs)

@@ -113,8 +113,8 @@ def _lines(learned: Learned) -> Iterator[str]:
     if learned.checked:
         yield checked_text(learned.checked).rstrip(".")
     for name in learned.missed[:_MOST_LISTED] if learned.lines else ():
-        yield f"no line is violated by {name}"
+        yield f"{name} violates none of these lines"
     if learned.lines and len(learned.missed) > _MOST_LISTED:
-        yield f"… nor by {counted(len(learned.missed) - _MOST_LISTED, 'more bad run')}"
+        yield f"… nor do {counted(len(learned.missed) - _MOST_LISTED, 'more bad run')}"
     for each in learned.left_out:
         yield f"not compared: {each}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -26,6 +27,10 @@ _LESS: Final = 0.5
 """The bad runs that a further line has to distinguish; by how much less a run counts after that."""
 _NEVER: Final = 0.3
 """How surely an event that never comes distinguishes a bad run; how the run ends says more."""
+_DISTANCES: Final = 2
+"""How many distances from landmarks say where one object is put: two leave two places in the plane."""
+_LEAST_BITS_PLACED: Final = 2.0
+"""What the distance of an object from the nearest landmark is worth at least."""
 _SHARE_OF_ALWAYS: Final = 1 / 3
 """The most of all lines without bad runs that say what always holds, and that say orders."""
 _PLAIN_BEFORE: Final = 0.8
@@ -122,23 +127,30 @@ def _goals(fit: FittedLimits) -> list[Line]:
     """Return how good runs end: a distance for each object, and relations that began otherwise."""
     bits = fit.bits
     scored: list[tuple[float, int, Line]] = []
-    joined = _Groups()
+    joined, placed = _Groups(), Counter[Party]()
     pairs = set()
     of_class: set[int] = set()
     for _, index in sorted(_distances(fit), key=lambda each: (-each[0], each[1])):
         quantity = fit.quantities[index]
-        if index not in of_class and joined.join(*quantity.parties):
+        if index not in of_class and (
+            _places(fit, quantity, placed) if fit.landmarks else joined.join(*quantity.parties)
+        ):
             of_class.update(fit.members[index])
             fact = near = fit.fact(FINALLY, 1, index)
             if fit.limits[FINALLY, 0, index] > 0.0:
                 fact = replace(fit.fact(FINALLY, 0, index), other_limit=near.limit)
-            scored.append((fit.bits_between(index), index, Line("finally", fact)))
+            bit = fit.bits_between(index)
+            if any(placed[each] == 1 for each in quantity.parties):
+                # the nearest landmark says most, whatever the way there was
+                bit = max(bit, _LEAST_BITS_PLACED)
+            scored.append((bit, index, Line("finally", fact)))
             pairs |= {quantity.pair, *(fit.quantities[each].pair for each in fit.members[index])}
     before: dict[tuple[str, Party], set[Party]] = {}
     relations = [
         (float(bits[FINALLY, 0, index]), index)
         for index, quantity in enumerate(fit.quantities)
         if quantity.relation not in ("dist", "signal")
+        and (not fit.landmarks or fit.landmarks.intersection(quantity.parties))
         and bits[FINALLY, 0, index] >= _LEAST_BITS
         and fit.moves[index]
         and _agrees(fit, FINALLY, 0, index)
@@ -160,7 +172,17 @@ def _goals(fit: FittedLimits) -> list[Line]:
         scored.append((bit, index, Line("finally", fit.fact(FINALLY, 0, index))))
         pairs |= {quantity.pair, *(fit.quantities[each].pair for each in fit.members[index])}
     scored += _visits(fit, pairs)
-    return _spread([(bit, line) for bit, _, line in sorted(scored, key=lambda each: (-each[0], each[1]))])
+    ordered = sorted(scored, key=lambda each: (-each[0], each[1]))
+    return _spread([(bit, line) for bit, _, line in ordered], fit.landmarks)
+
+
+def _places(fit: FittedLimits, quantity: Quantity, placed: Counter[Party]) -> bool:
+    """Return whether a distance says where something is put by what stays, as no two others do yet."""
+    moved = [each for each in quantity.parties if each not in fit.landmarks]
+    if len(moved) != 1 or placed[moved[0]] == _DISTANCES:
+        return False
+    placed.update(moved)
+    return True
 
 
 def _by_worth(fit: FittedLimits, bits: float, index: int) -> tuple[bool, float, bool, int]:
@@ -168,20 +190,18 @@ def _by_worth(fit: FittedLimits, bits: float, index: int) -> tuple[bool, float, 
     return fit.quantities[index].relation == "ovlp", -round(bits, 1), not fit.members[index], index
 
 
-def _spread(scored: list[tuple[float, Line]]) -> list[Line]:
-    """Return lines by their bits, each counting for less the more lines there are about its objects."""
-    counts: dict[Party, int] = {}
+def _spread(scored: list[tuple[float, Line]], landmarks: frozenset[Party]) -> list[Line]:
+    """Return lines by their bits, each counting for less the more lines there are about what it moves."""
+    counts = Counter[Party]()
     result = []
-    left = list(scored)
+    left = [(bit, line, set(line.fact.quantity.parties) - landmarks) for bit, line in scored]
     while left:
         worth = [
-            bit * _NEXT_LINE ** min((counts.get(each, 0) for each in line.fact.quantity.parties), default=0)
-            for bit, line in left
+            bit * _NEXT_LINE ** min((counts[each] for each in moved), default=0) for bit, _, moved in left
         ]
-        _, line = left.pop(worth.index(max(worth)))
+        _, line, moved = left.pop(worth.index(max(worth)))
         result.append(line)
-        for each in line.fact.quantity.parties:
-            counts[each] = counts.get(each, 0) + 1
+        counts.update(moved)
     return result
 
 
@@ -200,14 +220,17 @@ def _agrees(fit: FittedLimits, pattern: int, direction: int, index: int) -> bool
 
 
 def _distances(fit: FittedLimits) -> Iterator[tuple[float, int]]:
-    """Yield the distances at the end by how well they say where something was put."""
+    """Yield the distances at the end by how well they place something; with landmarks, the least first."""
     for index, quantity in enumerate(fit.quantities):
         far, near = fit.limits[FINALLY, :, index]
         if quantity.relation != "dist" or not near < 0.0 or not fit.moves[index]:
             continue
         bits = fit.bits_between(index)
         is_apart = len(quantity.pair) == 2 and fit.lowest[FINALLY, 0, index] >= 0.0
-        if is_apart and bits >= _LEAST_BITS and _agrees(fit, FINALLY, 1, index):
+        if fit.landmarks:
+            if is_apart and not fit.members[index]:
+                yield near, index
+        elif is_apart and bits >= _LEAST_BITS and _agrees(fit, FINALLY, 1, index):
             spread = -near - (far if np.isfinite(far) else 0.0)
             travel = max(float(each.travel[index]) for each in fit.good)
             exact = np.log2(travel / max(spread, 1e-3 * travel))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from decimal import ROUND_FLOOR, Decimal
+from decimal import ROUND_CEILING, ROUND_FLOOR, Decimal
 from functools import cached_property
 from itertools import product
 from math import floor, log10
@@ -28,6 +28,8 @@ _SURE: Final = 4.0
 _MOST_EVENTS: Final = 40
 _STILL: Final = 1e-3
 """What varies by less than this part of the greatest distance does not move."""
+_STAYS: Final = 0.05
+"""What ends by less than this part of the farthest way from where it began is a landmark."""
 _SCORED_RUNS: Final = 10
 _MOST_BITS: Final = 6.0
 
@@ -110,6 +112,8 @@ class FittedLimits:
             return LimitedRelation(found, direction, 0.0)
         where = pattern, direction, quantity
         limit, lowest = float(self.limits[where]), float(self.lowest[where])
+        if not self.bad and (plain := _one_digit(limit, lowest)) is not None:
+            return LimitedRelation(found, direction, plain)
         return LimitedRelation(
             found, direction, _short(limit, max(lowest - limit, _FINEST * abs(lowest)), lowest)
         )
@@ -153,6 +157,19 @@ class FittedLimits:
         travel = np.max([each.travel for each in self.good], axis=0)
         is_length = np.array([each.relation not in ("oriented", "signal") for each in self.quantities])
         return np.asarray(travel > np.where(is_length, _STILL * self.scale, 0.0))
+
+    @cached_property
+    def landmarks(self) -> frozenset[Party]:
+        """The objects, and whole classes, that stay where they are in all good runs."""
+        shifts = {
+            name: max(each.shifts[name] for each in self.good)
+            for name in set.intersection(*(set(each.shifts) for each in self.good))
+        }
+        farthest = max((each for each in shifts.values() if np.isfinite(each)), default=0.0)
+        still = {name for name, shift in shifts.items() if shift < _STAYS * farthest}
+        classes = [members_of(each.trace) for each in self.good]
+        whole = {name for name in classes[0] if all(name in each and each[name] <= still for each in classes)}
+        return frozenset([*map(Party, still), *(Party(name, True) for name in whole)])
 
     def bits_between(self, quantity: int) -> float:
         """Return how much it says that a distance is between both its limits at the end."""
@@ -264,3 +281,14 @@ def _short(limit: float, margin: float, lowest: float) -> float:
     rounded = Decimal(limit).scaleb(-exponent).to_integral_value(ROUND_FLOOR).scaleb(exponent)
     found = float(rounded)
     return found if found <= lowest else lowest
+
+
+def _one_digit(limit: float, lowest: float) -> float | None:
+    """Return the number of one digit from a limit up to the lowest value; None if there is none, or several.
+
+    People write 0.05 rather than 0.0487, and good runs that come near a limit say no more.
+    """
+    step = Decimal(1).scaleb(floor(log10(max(abs(limit), abs(lowest)) or 1.0)))
+    first = (Decimal(limit) / step).to_integral_value(ROUND_CEILING)
+    last = (Decimal(lowest) / step).to_integral_value(ROUND_FLOOR)
+    return float(first * step) if first == last != 0 else None

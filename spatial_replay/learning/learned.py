@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
@@ -152,6 +153,7 @@ def learn_runs(
     scope = scope_of([run.trace for run in good], profile)
     if not scope.quantities:
         raise UsageError(_nothing_in_common(good))
+    left_out = (*_missing(good), *scope.left_out)
     observed: dict[int, Observed] = {}
     for run in runs:
         observed[id(run)] = Observed.of(run.trace, scope.quantities)
@@ -164,13 +166,15 @@ def learn_runs(
         return writer.written(found, some)
 
     written = learn(runs)
+    if written is not None and bad:
+        written = writer.ordered(written, bad)
     learned = [_evidence(*each, good, bad) for each in written.pairs] if written is not None else []
     violating = {name for line in learned for name in line.violated_by}
     checked = tuple(_checked(good, bad, learn))
     missed = tuple(run.name for run in bad if run.name not in violating)
     text = ""
     if written is not None:
-        head = list(_head(good, bad, missed, checked, scope.left_out))
+        head = list(_head(good, bad, missed, checked, left_out))
         text = writer.text(written, head, learned, len(good), len(bad))
     return Learned(
         text,
@@ -179,7 +183,7 @@ def learn_runs(
         tuple((run.name, run.is_good) for run in runs),
         missed,
         checked,
-        scope.left_out,
+        left_out,
     )
 
 
@@ -213,6 +217,16 @@ def _check(runs: Sequence[LabelledRun]) -> None:
                     f"the {kind} run {other.name} holds the same samples as the good run {one.name}; "
                     "leave one of them out"
                 )
+
+
+def _missing(good: Sequence[LabelledRun]) -> Iterator[str]:
+    """Yield the objects that most good runs have, but not all."""
+    counts = Counter(name for run in good for name in run.trace.names)
+    some = [name for name in sorted(counts) if len(good) / 2 <= counts[name] < len(good)]
+    for name in some[:_MOST_NAMED]:
+        yield f"{name}, which is missing in {len(good) - counts[name]} of {counted(len(good), 'good run')}"
+    if len(some) > _MOST_NAMED:
+        yield f"{counted(len(some) - _MOST_NAMED, 'more object')} that some good runs lack"
 
 
 def _nothing_in_common(good: Sequence[LabelledRun]) -> str:
@@ -255,6 +269,18 @@ class _Writer:
             line for line, spec in zip(lines, self._parse(lines).specs, strict=True) if _is_kept(spec, runs)
         ]
         return _Written(tuple(kept), self._parse(kept)) if kept else None
+
+    def ordered(self, written: _Written, bad: Sequence[LabelledRun]) -> _Written:
+        """Return the same lines: of those that the same bad runs violate, the shorter ones first."""
+        alike: dict[tuple[bool, ...], list[Line]] = {}
+        keys = []
+        for line, spec in written.pairs:
+            keys.append(tuple(robustness_of(spec.formula, run.trace)[1] < 0.0 for run in bad))
+            alike.setdefault(keys[-1], []).append(line)
+        for lines in alike.values():
+            lines.sort(key=lambda line: len(line.formula(self.taken).split()))
+        lines = [alike[key].pop(0) for key in keys]
+        return _Written(tuple(lines), self._parse(lines))
 
     def _parse(self, lines: Sequence[Line]) -> Specification:
         names: set[str] = set()
@@ -352,7 +378,8 @@ def _head(
     runs = counted(len(good), "good run") + (f" and {counted(len(bad), 'bad run')}" if bad else "")
     yield f"Learned from {runs}."
     if missed:
-        yield f"No line is violated by {counted(len(missed), 'bad run')}{_listed(missed)}."
+        verb = "violates" if len(missed) == 1 else "violate"
+        yield f"{counted(len(missed), 'bad run')} {verb} none of these lines{_listed(missed)}."
     if checked:
         yield checked_text(checked)
     else:

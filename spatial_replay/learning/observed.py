@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -33,6 +33,8 @@ class Observed:
             its negative, and by end.
         sampled: (2, Q, S), the lower ends in some samples, by direction.
         travel: (Q,), by how much each quantity varies.
+        shifts: how far the corners of each object come from where they begin until the end; infinite if it is
+            not there.
     """
 
     trace: Trace
@@ -42,6 +44,7 @@ class Observed:
     last: Floats
     sampled: Floats
     travel: Floats
+    shifts: Mapping[str, float]
 
     @classmethod
     def of(cls, trace: Trace, quantities: Sequence[Quantity]) -> Observed:
@@ -76,6 +79,7 @@ class Observed:
             np.concatenate(last, axis=2),
             np.concatenate(sampled, axis=1),
             np.concatenate(travel),
+            {name: _shift(trace, column) for column, name in enumerate(trace.names)},
         )
 
     def first_time(self, quantity: Quantity, direction: int, limit: float, *, surely: bool) -> int:
@@ -88,6 +92,23 @@ class Observed:
         values = directed(TraceScene(self.trace, {}), [quantity])[direction, 0 if surely else 1, 0]
         holds = values >= limit if surely else values > limit
         return int(holds.argmax()) if holds.any() else len(holds)
+
+
+def _shift(trace: Trace, column: int) -> float:
+    """Return how far an object's corners are, in the mean, from where they were in the first sample."""
+    rows = trace.rows[[0, -1], column]
+    if (rows < 0).any():
+        return np.inf
+    shapes = trace.footprints
+    first, last = (
+        shapes.vertices[
+            shapes.vertex_start[shapes.part_start[row]] : shapes.vertex_start[shapes.part_start[row + 1]]
+        ]
+        for row in rows.tolist()
+    )
+    if first.shape != last.shape:
+        return np.inf
+    return float(np.hypot(*(last - first).mean(axis=0)))
 
 
 def directed(scene: TraceScene, quantities: Sequence[Quantity]) -> Floats:

@@ -75,6 +75,16 @@ def test_a_mishap_after_the_end_of_the_run_is_refused(
     assert "begin before that, in another folder" in said
 
 
+def test_times_after_the_end_of_the_run_are_pointed_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["falsify", "push", "-o", str(tmp_path / "found"), "--vary", "slip@5s:200s", "--budget", "1"]
+    assert run(command) == 0
+    said = capsys.readouterr().out
+    assert "slip@5s:200s goes on after the end of that run, at " in said
+    assert " s: from there on nothing happens" in said
+
+
 def test_a_planner_is_searched_as_a_script_is(tmp_path: Path) -> None:
     # so much noise that it sees nothing to do
     vary = ["noise=0.2:0.3"]
