@@ -123,7 +123,7 @@ class Arranger:
             domains = self._domains(chosen)
             if domains is not None and all(each.any() for each in domains.values()):
                 self._visits = 0
-                stencils = self._stencils(chosen)
+                stencils = self._stencils(chosen, domains)
                 found = 0
                 for cells in self._placed({}, domains, stencils):
                     if self.meets(self.sample_with(cells)):
@@ -221,15 +221,23 @@ class Arranger:
 
     # ------------------------------------------------------------------------------------ two objects
 
-    def _stencils(self, chosen: tuple[str, ...]) -> dict[tuple[str, str], Booleans]:
+    def _stencils(
+        self, chosen: tuple[str, ...], domains: Mapping[str, Booleans]
+    ) -> dict[tuple[str, str], Booleans]:
         """Return for each pair the conflicts by the way from one to the other: (A, B, rows, columns)."""
         stencils = {}
+        # turns without any cell need not be measured
+        used = {name: cells.any(axis=(1, 2)) for name, cells in domains.items()}
+        if self._settings.rules < 3:
+            used = {name: np.ones_like(each) for name, each in used.items()}
         for first, second in product(chosen, chosen):
-            if first != second and (found := self._stencil(first, second, chosen)) is not None:
+            if first != second and (found := self._stencil(first, second, chosen, used)) is not None:
                 stencils[first, second] = found
         return stencils
 
-    def _stencil(self, first: str, second: str, chosen: tuple[str, ...]) -> Booleans | None:
+    def _stencil(
+        self, first: str, second: str, chosen: tuple[str, ...], used: Mapping[str, Booleans]
+    ) -> Booleans | None:
         demands = [
             each
             for each in self._demands
@@ -242,15 +250,16 @@ class Arranger:
         apart = first not in supports and second not in supports
         reach = (_radius(one) + _radius(two) + self._settings.workspace.clearance) / size + 1.0
         half = max(grid.shape) - 1 if demands else min(math.ceil(reach), max(grid.shape) - 1)
-        turns = self._fields[first].turns
-        side = 2 * half + 1
-        if not (demands or apart) or side * side * len(turns) * len(self._fields[second].turns) > _WIDEST:
+        turns, side = self._fields[first].turns, 2 * half + 1
+        cells = side * side * int(used[first].sum()) * int(used[second].sum())
+        if not (demands or apart) or cells > _WIDEST:
             return None
         local = Grid(-(half + 0.5) * size, -(half + 0.5) * size, size, side, side)
         formulas = [each.formula for each in demands]
-        workspace = Workspace(local, self._settings.workspace.yaws)
-        conflicts = []
-        for turn in turns.tolist():
+        workspace, measured = self._turned_in(local, used[second])
+        conflicts = np.ones((len(turns), len(used[second]), side, side), np.bool_)
+        for number in np.flatnonzero(used[first]).tolist():
+            turn = float(turns[number])
             objects = {first: moved_object(one, 0.0, 0.0, turn), second: two}
             sample = Sample(self._sample.time_ns, objects, self._sample.signals)
             maps = proposition_maps(formulas, self._regions, sample, second, workspace)
@@ -259,8 +268,18 @@ class Arranger:
                 bad |= maps.clearance <= self._settings.workspace.clearance
             for each, low, high in zip(demands, maps.lower, maps.upper, strict=True):
                 bad |= ((low if each.wanted else -high) - each.least) < 0.0
-            conflicts.append(bad)
-        return np.stack(conflicts)
+            conflicts[number, measured] = bad
+        return conflicts
+
+    def _turned_in(self, grid: Grid, used: Booleans) -> tuple[Workspace, list[int]]:
+        """Return a workspace without obstacles for those turns that are used, and their numbers."""
+        yaws, keeps = self._settings.workspace.yaws, self._settings.workspace.keeps_yaw
+        if len(used) == 1:
+            return Workspace(grid, () if keeps else yaws), [0]
+        first = int(keeps)
+        numbers = [number for number in range(first, len(used)) if used[number]]
+        chosen = tuple(yaws[number - first] for number in numbers)
+        return Workspace(grid, chosen, keeps_yaw=keeps), [*range(first), *numbers]
 
     # ----------------------------------------------------------------------------------------- search
 
@@ -317,9 +336,11 @@ class Arranger:
         own = [field.surplus[each] for each in field.surplus if self._about[each] == (name,)]
         if own:
             score: Floats = np.minimum.reduce(own)
-            # cells with too little room come after all others
+            # cells with too little room come after all others, and so do turns of what is pushed
+            is_last = room < settings.room
+            is_last[1:] |= settings.workspace.keeps_yaw
             behind = 2.0 * float(abs(score[np.isfinite(score)]).max(initial=1.0))
-            return score - np.where(room >= settings.room, 0.0, behind)
+            return score - np.where(is_last, behind, 0.0)
         if settings.skill == "place":
             return np.asarray(np.minimum(room, 1e9))
         here = np.array(centre_of(self._movable[name].footprint))

@@ -10,11 +10,12 @@ import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
+from typing import Final
 
 import numpy as np
 
 from spatial_replay.errors import TraceError
-from spatial_replay.geometry.arrays import Floats
+from spatial_replay.geometry.arrays import Booleans, Floats
 from spatial_replay.geometry.footprint import TrackedObject
 from spatial_replay.planning.decisions import Candidate, Consideration, Guards, Reason, Target
 from spatial_replay.planning.demands import Pose, with_moved
@@ -41,6 +42,9 @@ from spatial_replay.planning.settings import Settings
 from spatial_replay.planning.workspace import Grid, Workspace
 from spatial_replay.spec.formula import Formula, Outline
 from spatial_replay.trace.sample import Sample
+
+_SWEPT: Final = math.radians(10.0)
+"""The widest angle between orientations that are looked at while an object turns on the spot."""
 
 
 def find_target(
@@ -122,14 +126,53 @@ def _nearest_cell(
     if entry is None:
         return "no free path leads into reach"
     row, column = entry.cells[-1].tolist()
-    path = shortest_path(gradient.blocked[0] == FREE, (row, column), good[0])
+    free = gradient.blocked[0] == FREE
+    path, turned = shortest_path(free, (row, column), good[0]), 0
+    if path is None:
+        # it is turned at the end of its path, and only if that is needed
+        for layer in range(1, len(gradient.turns)):
+            goals = _turnable(gradient, layer, good[layer] & free, settings)
+            other = shortest_path(free, (row, column), goals)
+            if other is not None and (path is None or other.length < path.length):
+                path, turned = other, layer
     if path is None:
         return "no free path leads to a good place"
     cells = [(row, column) for row, column in (*entry.cells.tolist(), *path.cells[1:].tolist())]
     # an object off the middle of its cell need not visit that middle first
     first = 1 if cells[0] == cell and len(cells) > 1 else 0
     turns = [gradient.grid.centre(*each) for each in cells[first:]]
-    return _target(gradient, tracked, (0, *cells[-1]), (here, *turns))
+    return _target(gradient, tracked, (turned, *cells[-1]), (here, *turns))
+
+
+def _turnable(gradient: GradientMap, layer: int, goals: Booleans, settings: Settings) -> Booleans:
+    """Return in which of some cells (rows, columns) an object can be turned to the orientation of a layer."""
+    able = np.zeros(goals.shape, np.bool_)
+    if goals.any():
+        low, left = np.argwhere(goals).min(axis=0).tolist()
+        high, right = (np.argwhere(goals).max(axis=0) + 1).tolist()
+        grid, size = gradient.grid, gradient.grid.cell_size
+        corner = grid.xmin + left * size, grid.ymin + low * size
+        around, turn = Grid(*corner, size, right - left, high - low), float(gradient.turns[layer])
+        able[low:high, left:right] = can_turn_in(around, gradient, turn, settings)
+    return able & goals
+
+
+def can_turn_in(grid: Grid, gradient: GradientMap, turn: float, settings: Settings) -> Booleans:
+    """Return (rows, columns): whether a map's object can turn on the spot in each cell of a grid.
+
+    Nothing stands in its way there, and no constraint holds, in orientations every few degrees in between.
+    """
+    count = math.ceil(abs(turn) / _SWEPT)
+    about = gradient.made_of.now.about
+    tracked = about.sample.objects[gradient.name]
+    here = (tracked.yaw or 0.0) if isinstance(tracked, TrackedObject) else 0.0
+    yaws = tuple(here + turn * number / count for number in range(1, count))
+    if not yaws:
+        return np.ones(grid.shape, np.bool_)
+    workspace = replace(settings.workspace, yaws=yaws, keeps_yaw=False)
+    maps = proposition_maps(*about, gradient.name, workspace, grid)
+    is_kept = danger_of(maps, gradient.made_of.constraints) < -settings.constraint_margin
+    return np.asarray(((maps.clearance > workspace.clearance) & is_kept).all(axis=0))
 
 
 def _path_into_reach(gradient: GradientMap, cell: tuple[int, int], settings: Settings) -> Path | None:
@@ -262,13 +305,13 @@ class Movables:
             then: where other objects are moved to later, for the robustness, and as obstacles.
         """
         settings, name = self._settings, target.name
-        if settings.skill == "push" or not settings.refine:
+        if not settings.refine or (settings.skill == "push" and settings.rules < 3):
             return target
         progress, constraints = consideration.progress.cubes, consideration.constraints.cubes
         later = self._sample if then is None else with_moved(self._sample, then)
 
         def measured(grid: Grid, yaws: tuple[float, ...]) -> tuple[GradientMap, Floats]:
-            workspace = replace(settings.workspace, yaws=yaws)
+            workspace = replace(settings.workspace, yaws=yaws, keeps_yaw=False)
             about = self._propositions, self._regions
             now = proposition_maps(*about, self._sample, name, workspace, grid)
             after = now if then is None else proposition_maps(*about, later, name, workspace, grid)
@@ -278,7 +321,22 @@ class Movables:
             gradient.blocked[after.clearance <= settings.workspace.clearance] = OCCUPIED
             return gradient, np.minimum(now.room(room_from), after.room(room_from))
 
-        return refined(target, self._tracked(name), settings, measured)
+        found = refined(target, self._tracked(name), settings, measured)
+        return found if settings.skill == "place" or self._is_pushed_to(found, constraints) else target
+
+    def _is_pushed_to(self, target: Target, constraints: Cubes) -> bool:
+        """Return whether nothing is in the way on the last stretch of a path, and while turning there."""
+        settings, maps = self._settings, self.maps_of(target.name)
+        gradient = gradient_map(maps, ((),), constraints, settings.workspace, settings.constraint_margin)
+        last = (
+            gradient.grid.cell(*each)
+            for each in points_along(target.waypoints[-2:], gradient.grid.cell_size / 2)
+        )
+        if any(gradient.blocked[0][cell] != FREE for cell in last):
+            return False
+        size = gradient.grid.cell_size
+        spot = Grid(target.x - size / 2, target.y - size / 2, size, 1, 1)
+        return bool(can_turn_in(spot, gradient, target.turn, settings).all())
 
     def _tracked(self, name: str) -> TrackedObject:
         tracked = self._sample.objects[name]

@@ -341,8 +341,9 @@ class Foresight:
         rest: tuple[Target, ...],
     ) -> Target:
         """Return the first of several motions with a refined target, if the others lead on as before."""
-        here, *_, there = target.waypoints
-        found = movables.refined(replace(target, waypoints=(here, there)), consideration, None, poses)
+        here, *way, there = target.waypoints
+        way = way if self._settings.skill == "push" else []
+        found = movables.refined(replace(target, waypoints=(here, *way, there)), consideration, None, poses)
         ways = movables.with_way(found, consideration.constraints.cubes)
         if isinstance(ways, str) or found.robustness <= target.robustness:
             return target

@@ -221,7 +221,7 @@ def proposition_maps(
         present = ", ".join(sample.objects) or "none"
         raise UsageError(f"there is no object {name!r} to move; the sample has: {present}")
     cells = workspace.grid if grid is None else grid
-    turns = np.array(workspace.yaws) - (tracked.yaw or 0.0) if workspace.yaws else np.zeros(1)
+    turns = workspace.turns(tracked.yaw)
     here = Trace.from_samples([sample])
     everywhere = _trace_over_cells(here, tracked, name, cells, turns)
     moves = np.array([concerns(each, name) for each in propositions], np.bool_)

@@ -223,6 +223,7 @@ class MotionOrder:
             for x, y in points_along(target.waypoints, step)
             for part in moved_object(tracked, x, y).footprint.parts
         ]
+        parts += moved_object(tracked, target.x, target.y, target.turn).footprint.parts
         return replace(tracked, footprint=Footprint(tuple(parts)))
 
     def _clearance(self, scene: Foreseen, covered: Mapping[str, TrackedObject], other: str) -> float:

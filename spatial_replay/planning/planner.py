@@ -152,8 +152,8 @@ class Planner:
         """Why a motion has to stop now; empty while it may go on.
 
         A motion has to stop when one more sample like the newest two, with its object farther by as much as
-        between these, would lose acceptance. A robot that asks after each sample can end the motion with
-        `Outcome(False, planner.stop_reason)`.
+        between these, and turned by as much if it is to be turned, would lose acceptance. A robot that asks
+        after each sample can end the motion with `Outcome(False, planner.stop_reason)`.
         """
         return self._stop_reason
 
@@ -205,9 +205,12 @@ class Planner:
         if not (isinstance(was, TrackedObject) and isinstance(now, TrackedObject)):
             return ""
         (u, v), (x, y) = centre_of(was.footprint), centre_of(now.footprint)
+        turned = math.remainder((now.yaw or 0.0) - (was.yaw or 0.0), math.tau) if target.turn else 0.0
         if math.hypot(x - u, y - v) <= was.uncertainty + now.uncertainty:
-            return ""
-        there = moved_object(now, 2.0 * x - u, 2.0 * y - v)
+            if not turned:
+                return ""
+            u, v = x, y
+        there = moved_object(now, 2.0 * x - u, 2.0 * y - v, turned)
         objects = {**sample.objects, target.name: there}
         symbol = self._observer.symbol(Sample(sample.time_ns, objects, sample.signals, sample.unknown))
         if not self.automaton.step_set(self._states, symbol).isdisjoint(self.automaton.can_accept):

@@ -42,7 +42,7 @@ def refined(target: Target, tracked: TrackedObject, settings: Settings, measured
         measured: measures maps around the target.
     """
     size = settings.workspace.grid.cell_size
-    spacing, turning, halved = _COARSEST * size, _widest_turn(settings, tracked) / 2.0, 0
+    spacing, turning, halved = _COARSEST * size, _widest_turn(target, tracked, settings) / 2.0, 0
     pose, best, least = (target.x, target.y, target.turn), target.robustness, -math.inf
     for number in range(_MOST_GRIDS):
         x, y, turn = pose
@@ -72,13 +72,16 @@ def _near(gradient: GradientMap, target: Target, tracked: TrackedObject, setting
     """Return (A, rows, columns): whether poses are as near to a target as they may be."""
     offsets = np.abs(gradient.grid.centres() - np.array([target.x, target.y])).max(axis=1)
     near = offsets <= _FARTHEST * settings.workspace.grid.cell_size * (1.0 + 1e-9)
-    turned = np.abs(gradient.turns - target.turn) <= _widest_turn(settings, tracked) * (1.0 + 1e-9)
+    turned = np.abs(gradient.turns - target.turn) <= _widest_turn(target, tracked, settings) * (1.0 + 1e-9)
     return np.asarray(turned[:, None, None] & near.reshape(gradient.grid.shape))
 
 
-def _widest_turn(settings: Settings, tracked: TrackedObject) -> float:
-    """Return how far an object may be turned from an orientation: half the way to the next one; or 0."""
+def _widest_turn(target: Target, tracked: TrackedObject, settings: Settings) -> float:
+    """Return how far an object may be turned from an orientation: half the way to the next one; or 0.
+
+    A pushed object that keeps its orientation is not turned at all.
+    """
     yaws = sorted(settings.workspace.yaws)
-    if len(yaws) < 2 or tracked.yaw is None:
+    if len(yaws) < 2 or tracked.yaw is None or (settings.skill == "push" and target.turn == 0.0):
         return 0.0
     return min(after - before for before, after in pairwise(yaws)) / 2.0

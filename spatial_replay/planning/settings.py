@@ -72,10 +72,11 @@ class Settings:
         lift: how high above where it stood an object is carried, in footprint units, at least 0. Its way then
             keeps what must not hold at a distance, over other things where heights allow. None leaves the way
             to the robot.
-        refine: whether targets of placed objects are refined within their cell, and, between several
-            orientations, to turns in between; without it, they are middles of cells.
-        rules: 2, or 1 for the rules of earlier versions, so that their logs can be recomputed: no motions
-            that only make room, and an object is never brought near a place where that failed before.
+        refine: whether targets are refined near their cell, and, between several orientations, to turns in
+            between; without it, they are middles of cells.
+        rules: 3, or those of earlier versions, so that their logs can be recomputed. 2: targets of pushes are
+            not refined. 1: also no motions that only make room, and an object is never brought near a place
+            where that failed before.
 
     Raises:
         UsageError: invalid values, all of them reported.
@@ -92,18 +93,17 @@ class Settings:
     motions: int = 6
     lift: float | None = 0.0
     refine: bool = True
-    rules: int = 2
+    rules: int = 3
 
     def __post_init__(self) -> None:
         refuse_faults(self._faults())
+        if self.skill == "push" and self.workspace.yaws and not self.workspace.keeps_yaw:
+            object.__setattr__(self, "workspace", replace(self.workspace, keeps_yaw=True))
 
     def _faults(self) -> Iterator[str]:
         if self.skill not in _SKILLS:
             yield f"skill is {self.skill!r}; the skills are {', '.join(_SKILLS)}"
-        faults = kind_faults("workspace", self.workspace, Workspace, "a Workspace")
-        yield from faults
-        if not faults and self.skill == "push" and self.workspace.yaws:
-            yield "the orientation of a pushed object cannot be chosen; leave `yaws` of the workspace out"
+        yield from kind_faults("workspace", self.workspace, Workspace, "a Workspace")
         if self.movable is not None:
             yield from member_faults("movable", self.movable, tuple, str, "a tuple of names")
         distances = {name: getattr(self, name) for name in ("margin", "constraint_margin", "room")}
@@ -114,8 +114,8 @@ class Settings:
         if self.room_from not in _ROOM_FROM:
             yield f"room_from is {self.room_from!r}; give {' or '.join(_ROOM_FROM)}"
         yield from kind_faults("refine", self.refine, bool, "True or False")
-        if self.rules not in (1, 2):
-            yield f"rules is {self.rules!r}; give 2, or 1 for the rules of earlier versions"
+        if self.rules not in (1, 2, 3):
+            yield f"rules is {self.rules!r}; give 3, or 1 or 2 for the rules of earlier versions"
 
 
 def text_from_settings(settings: Settings) -> str:

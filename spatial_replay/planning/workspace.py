@@ -128,6 +128,8 @@ class Workspace:
         grid: the positions considered for the centre of an object.
         yaws: orientations in radians that an object may be given; empty to keep orientations. An object of
             unknown orientation is turned by these angles.
+        keeps_yaw: whether an object may also keep the orientation that it has, and one of unknown
+            orientation has to; settings that push say so.
         base: position (x, y) of the robot.
         nearest, farthest: the range of distances from the base that the robot reaches, in footprint units.
         obstacles: static obstacles, besides the objects of a sample.
@@ -146,6 +148,7 @@ class Workspace:
     obstacles: tuple[Footprint, ...] = ()
     supports: frozenset[str] = field(default_factory=frozenset)
     clearance: float = 0.0
+    keeps_yaw: bool = False
 
     def __post_init__(self) -> None:
         refuse_faults(self._faults())
@@ -192,6 +195,14 @@ class Workspace:
         longer = float((high - low).max()) or 1.0
         (xmin, ymin), (xmax, ymax) = (low - longer / 2).tolist(), (high + longer / 2).tolist()
         return cls(Grid.over(xmin, ymin, xmax, ymax, 2.0 * longer / CELLS_AROUND))
+
+    def turns(self, yaw: float | None) -> Floats:
+        """Return (A,): the angles in radians by which an object of an orientation may be turned."""
+        if not self.keeps_yaw:
+            return np.array(self.yaws) - (yaw or 0.0) if self.yaws else np.zeros(1)
+        # the shorter way round
+        turned = () if yaw is None else (math.remainder(each - yaw, math.tau) for each in self.yaws)
+        return np.array([0.0, *turned])
 
     def within_reach(self, grid: Grid) -> Booleans:
         """Return (rows, columns): whether the robot reaches the middle of each cell of a grid.

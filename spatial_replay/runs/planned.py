@@ -108,9 +108,9 @@ def _settings(world: World, changes: Mapping[str, Any]) -> Settings:
 class WorldExecutor:
     """The robot of a simulated world as an `Executor`."""
 
-    def __init__(self, world: World, skill: Skill) -> None:
+    def __init__(self, world: World, settings: Settings) -> None:
         self._world = world
-        self._skill = skill
+        self._settings = settings
 
     def execute(self, step: Step) -> Outcome:
         """See `Executor`.
@@ -121,8 +121,10 @@ class WorldExecutor:
         target = step.target
         if target is None:
             raise UsageError(f"step {step.number} ({step.kind}) moves nothing")
-        if self._skill == "push":
-            done = self._world.push(target.name, target.waypoints[1:] or target.waypoints)
+        if self._settings.skill == "push":
+            # strokes turn objects, which matters only where orientations are planned
+            yaw = target.yaw if self._settings.workspace.yaws else None
+            done = self._world.push(target.name, target.waypoints[1:] or target.waypoints, yaw)
         else:
             done = self._world.place(target.name, target.x, target.y, target.yaw, target.waypoints[1:-1])
         return Outcome(done.succeeded, done.reason)
@@ -288,7 +290,7 @@ def record_plan(
                 return planner.stop_reason
 
             world.attach(observe, lambda tick: loop.log_tick(tick, world.time_ns))
-            end = run_plan(loop, WorldExecutor(world, world.skill).execute, world.step)
+            end = run_plan(loop, WorldExecutor(world, planner.settings).execute, world.step)
         last = end.last
         return PlannedRun(
             samples=log.samples,

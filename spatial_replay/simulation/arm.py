@@ -33,6 +33,8 @@ _TURNING = 2.0
 _REACHED = 0.003
 _SETTLING_TICKS = 30
 _GRIP_FORCE = 25.0
+_PINCHED = 0.004
+"""How much wider than commanded the fingers are, in metres, if they hold something."""
 _MIDDLE, _FURTHEST = 0.78, 2.75
 """The centre of the tool's yaw range relative to the direction from the base, and its half width."""
 _NEAREST, _FARTHEST = 0.27, 0.77
@@ -63,6 +65,11 @@ class Arm:
     def width(self) -> float:
         """The actual distance of the fingers."""
         return self._engine.finger_width()
+
+    @property
+    def holds(self) -> bool:
+        """Whether something between the fingers keeps them from their distance."""
+        return self.width > self._width + _PINCHED
 
     def drive(self) -> None:
         """Send the latest command to the motors; it holds for one tick."""

@@ -50,8 +50,13 @@ class Grasp:
     opening: float
 
 
-def best_grasp(scene: Scene, name: str, goal: Point, yaw: float | None) -> Grasp | str:
-    """Return the grasp with the most clearance, preferring thin sides; or the reason why there is none."""
+def best_grasp(
+    scene: Scene, name: str, goal: Point, yaw: float | None, *, is_lifted: bool = True
+) -> Grasp | str:
+    """Return the grasp with the most clearance, preferring thin sides; or the reason why there is none.
+
+    A body that is not lifted is turned the shorter way round.
+    """
     start = scene.place_of(name)
     if not in_reach(*start):
         return f"{name} lies out of the robot's reach"
@@ -65,7 +70,7 @@ def best_grasp(scene: Scene, name: str, goal: Point, yaw: float | None) -> Grasp
     best, best_room, can_turn_hand, can_pick, can_place = None, _ROOM, False, False, False
     for thickness, angle in sorted(across):
         opening = min(WIDEST, thickness + _OPENING)
-        for grasp_yaw, turn in _turns(scene, name, angle, goal, yaw):
+        for grasp_yaw, turn in _turns(scene, name, angle, goal, yaw, is_lifted):
             grasp = Grasp(grasp_yaw, turn, above_bottom, opening)
             here = _room(scene, name, start, grasp.yaw, grasp, bottom)
             there = _room(scene, name, goal, grasp.turn, grasp, surface(scene, name, goal))
@@ -113,7 +118,7 @@ def _angles(scene: Scene, name: str) -> list[tuple[float, float]]:
 
 
 def _turns(
-    scene: Scene, name: str, angle: float, goal: Point, yaw: float | None
+    scene: Scene, name: str, angle: float, goal: Point, yaw: float | None, is_lifted: bool
 ) -> Iterator[tuple[float, float]]:
     """Iterate over the yaws of the tool for picking up and setting down that the arm can reach."""
     pose, start = scene.pose(name), scene.place_of(name)
@@ -124,7 +129,9 @@ def _turns(
         further = 0.0 if yaw is None or not pose.is_level else yaw - pose.yaw
         if is_round:
             further = math.atan2(goal[1], goal[0]) - math.atan2(start[1], start[0])
-        turn = turn_towards(grasp_yaw + further, *goal, 2 * math.pi)
+        turn = grasp_yaw + math.remainder(further, math.tau)
+        if is_lifted:
+            turn = turn_towards(grasp_yaw + further, *goal, 2 * math.pi)
         if can_turn(grasp_yaw, *start) and can_turn(turn, *goal):
             yield grasp_yaw, turn
 

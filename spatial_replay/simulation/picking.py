@@ -42,6 +42,15 @@ def picking(
 
 def pick_up(scene: Scene, name: str, grasp: Grasp) -> Generator[None, None, str]:
     """Grasp a body and lift it; return the reason of a failure, or ""."""
+    (x, y), trouble = scene.place_of(name), (yield from take_hold(scene, name, grasp))
+    if trouble:
+        return trouble
+    lifted = yield from _holding(scene, name, scene.arm.move(x, y, ABOVE, speed=2 * _SLOW))
+    return "" if lifted else f"{name} slipped out of the fingers as it was lifted"
+
+
+def take_hold(scene: Scene, name: str, grasp: Grasp) -> Generator[None, None, str]:
+    """Close the fingers on a body where it stands; return the reason of a failure, or ""."""
     arm, (x, y) = scene.arm, scene.place_of(name)
     z = scene.height(name)[0] + grasp.above_bottom
     yield from arm.travel(x, y, grasp.yaw)
@@ -51,8 +60,7 @@ def pick_up(scene: Scene, name: str, grasp: Grasp) -> Generator[None, None, str]
     yield from arm.grip(0.0)
     if scene.engine.fingers_touching(name) < 2:
         return f"the fingers closed beside {name}"
-    lifted = yield from _holding(scene, name, arm.move(x, y, ABOVE, speed=2 * _SLOW))
-    return "" if lifted else f"{name} slipped out of the fingers as it was lifted"
+    return ""
 
 
 def carry(
@@ -65,6 +73,19 @@ def carry(
         if not carried:
             return f"{name} slipped out of the fingers on the way"
     return ""
+
+
+def turn_on_the_spot(scene: Scene, name: str, yaw: float) -> Generator[None, None, str]:
+    """Turn a body on its support between the fingers; return the reason of a failure, or ""."""
+    grasp = best_grasp(scene, name, scene.place_of(name), yaw, is_lifted=False)
+    if isinstance(grasp, str):
+        return grasp
+    trouble = yield from take_hold(scene, name, grasp)
+    if not trouble:
+        turned = yield from _holding(scene, name, scene.arm.move(*scene.arm.commanded, grasp.turn))
+        trouble = "" if turned else f"{name} slipped out of the fingers as it was turned"
+    yield from let_go(scene, grasp.opening)
+    return trouble
 
 
 def put_back(scene: Scene, name: str) -> Motion:

@@ -1,4 +1,4 @@
-"""Pushing bodies over the table with two fingers side by side, so that they do not turn away."""
+"""Pushing bodies over the table with two fingers side by side, and turning them between the fingers."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from spatial_replay.simulation.arm import (
     in_reach,
     turn_towards,
 )
+from spatial_replay.simulation.picking import turn_on_the_spot
 from spatial_replay.simulation.scene import Scene, extent, rectangle
 from spatial_replay.simulation.world import Execution
 
@@ -31,21 +32,32 @@ _CLOSE = 0.004
 _FAR = 0.015
 """The tolerance of a body's position after all strokes, in metres."""
 _STRAIGHT = 0.0025
+_TURNED = 0.05
+"""The tolerance of a body's yaw that is given, in radians."""
+_TURNS = 2
+"""The maximum number of turns on the spot."""
 _STROKES = 4
 """The maximum number of strokes to one goal."""
 
 
-def pushing(scene: Scene, name: str, path: Sequence[Point]) -> Generator[None, None, Execution]:
-    """Push a body along a path, one stroke for each straight stretch, with corrections at the end."""
+def pushing(
+    scene: Scene, name: str, path: Sequence[Point], yaw: float | None = None
+) -> Generator[None, None, Execution]:
+    """Push a body along a path, one stroke for each straight stretch, with corrections at the end.
+
+    With `yaw`, turn it there: a stroke also turns a body a little, as its side comes to lie at the fingers.
+    """
     corners = straightened([scene.place_of(name), *path])[1:]
     for corner in corners[:-1]:
         trouble = yield from _push_to(scene, name, corner, strokes=1, allowed=3 * _FAR)
         if trouble:
             return Execution(False, trouble)
     trouble = yield from _push_to(scene, name, corners[-1], strokes=_STROKES, allowed=_FAR)
+    trouble = trouble or (yield from _turn_to(scene, name, corners[-1], yaw))
     is_straight = len(corners) == 1
     way = "straight to its place" if is_straight else f"along {len(corners)} straight stretches"
-    return Execution(not trouble, trouble or f"pushed {name} {way}")
+    turned = "" if yaw is None else ", and turned it there"
+    return Execution(not trouble, trouble or f"pushed {name} {way}{turned}")
 
 
 def _push_to(
@@ -61,6 +73,23 @@ def _push_to(
         if missed <= _CLOSE:
             break
     return "" if missed <= allowed else f"{name} ended {missed * 100:.1f} cm from where it was pushed to"
+
+
+def _turn_to(scene: Scene, name: str, goal: Point, yaw: float | None) -> Generator[None, None, str]:
+    """Turn a body to a yaw near its goal; return the reason of a failure, or ""."""
+    if yaw is None:
+        return ""
+    for _ in range(_TURNS):
+        if abs(scene.pose(name).turned_from(yaw)) <= _TURNED:
+            break
+        trouble = yield from turn_on_the_spot(scene, name, yaw)
+        if trouble:
+            return trouble
+    left = abs(scene.pose(name).turned_from(yaw))
+    if left > _TURNED:
+        return f"{name} is {math.degrees(left):.0f} degrees from how it was turned"
+    missed = math.dist(scene.place_of(name), goal)
+    return "" if missed <= _FAR else f"{name} ended {missed * 100:.1f} cm from where it was pushed to"
 
 
 def straightened(path: Sequence[Point]) -> list[Point]:

@@ -12,10 +12,10 @@ import numpy as np
 
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
-from spatial_replay.simulation.arm import STEPS_PER_TICK, TICKS_PER_S, Arm
+from spatial_replay.simulation.arm import STEPS_PER_TICK, TICKS_PER_S, WIDEST, Arm
 from spatial_replay.simulation.bullet import Engine
 from spatial_replay.simulation.injection import Injection, Start
-from spatial_replay.simulation.picking import put_back
+from spatial_replay.simulation.picking import let_go, put_back
 from spatial_replay.simulation.pushing import pushing
 from spatial_replay.simulation.scenario import Scenario
 from spatial_replay.simulation.scene import Scene
@@ -159,9 +159,10 @@ class Tabletop:
     def step(self) -> None:
         self.run(self._scene.arm.wait(1 / SAMPLES_PER_S))
 
-    def push(self, name: str, path: Sequence[tuple[float, float]]) -> Execution:
-        self._refuse_unless("push", name, [number for point in path for number in point])
-        return self._move(name, pushing(self._scene, name, path))
+    def push(self, name: str, path: Sequence[tuple[float, float]], yaw: float | None = None) -> Execution:
+        numbers = [number for point in path for number in point]
+        self._refuse_unless("push", name, numbers and [*numbers, 0.0 if yaw is None else yaw])
+        return self._move(name, pushing(self._scene, name, path, yaw))
 
     def place(
         self,
@@ -206,6 +207,8 @@ class Tabletop:
         motion.close()
         if self._scenario.skill == "place":
             self.run(put_back(self._scene, name))
+        elif self._scene.arm.holds:
+            self.run(let_go(self._scene, WIDEST))
         return Execution(False, reason)
 
     def follow(self, motion: Generator[None, None, _Result], duration_ns: int | None) -> _Result | None:

@@ -144,8 +144,8 @@ class World(Protocol):
     def step(self) -> None:
         """Advance to the time of the next sample; the robot holds still."""
 
-    def push(self, name: str, path: Sequence[tuple[float, float]]) -> Execution:
-        """Push an object along a path of points (x, y) of its centre.
+    def push(self, name: str, path: Sequence[tuple[float, float]], yaw: float | None = None) -> Execution:
+        """Push an object along a path of points (x, y) of its centre, and turn it there to `yaw` if given.
 
         Raises:
             UsageError: no such object, or the robot does not push.

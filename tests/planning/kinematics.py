@@ -50,6 +50,12 @@ class Table:
             self.look()
             if share < 1.0:
                 return Outcome(False, "it slipped")
+        if target.turn and not carried:
+            for number in range(1, 7):
+                self.objects[target.name] = moved_object(start, *ends[-1], number / 6 * target.turn)
+                self.look()
+                if reason := getattr(self.planner, "stop_reason", ""):
+                    return Outcome(False, reason)
         return Outcome(True, "it is there")
 
 

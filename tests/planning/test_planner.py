@@ -294,11 +294,6 @@ def test_default_settings_plan_around_the_first_sample():
     assert max(one.settings.workspace.grid.shape) == 80
 
 
-def test_a_pushed_object_cannot_be_turned():
-    with pytest.raises(UsageError, match="yaws"):
-        Settings(Workspace(TABLE.workspace.grid, yaws=(0.0,)), "push")
-
-
 def test_successful_motions_do_not_use_up_attempts():
     one = planner("G F (cup dist plate <= 1)", replace(TABLE, movable=("cup",)))
     table = Table(dict(THINGS), one)

@@ -159,3 +159,17 @@ def test_a_goal_out_of_reach_fails_with_a_reason() -> None:
         done = made.push("green", [(0.9, 0.0)])
         assert done.reason == "the robot does not reach (0.90, 0.00), where green should go"
         assert made.time_ns == 0
+
+
+def test_a_pushed_block_is_turned_to_the_yaw_that_is_asked_for() -> None:
+    with world("push", seed=2) as (made, _):
+        before = tracked(made.sample(), "blue").yaw or 0.0
+        done = made.push("blue", [(0.5, 0.12)], yaw=before + 0.7)
+        assert done.succeeded and "turned" in done.reason
+        yaw = tracked(made.sample(), "blue").yaw or 0.0
+        assert abs(math.remainder(yaw - before - 0.7, math.tau)) < 0.05
+        assert math.dist(centre(made, "blue"), (0.5, 0.12)) < 0.015
+        # stopped with the fingers closed around it, the hand lets go
+        made.attach(lambda sample: "enough" if sample.signals["finger_width"] < 0.045 else None)
+        assert made.push("blue", [(0.5, 0.12)], yaw=before).reason == "enough"
+        assert made.sample().signals["finger_width"] > 0.06
