@@ -6,9 +6,9 @@ it is asked for: an automaton may have far more transitions, and these more cube
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias, overload
+from typing import NamedTuple, TypeAlias, overload
 
 from spatial_replay.automata.diagrams import LEAF, NO, YES, Diagrams
 from spatial_replay.automata.propositions import Proposition
@@ -39,7 +39,7 @@ class Covers:
 
     def __init__(self, diagrams: Diagrams) -> None:
         self._diagrams = diagrams
-        self._known: dict[tuple[int, int], tuple[tuple[Cube, ...], int]] = {}
+        self._known: dict[tuple[int, int], _Cover] = {}
 
     def guard(self, node: int) -> Guard:
         """Return the cubes of a function.
@@ -47,7 +47,11 @@ class Covers:
         Raises:
             NoAutomatonError: they are more than `MAX_CUBES`.
         """
-        return tuple(sorted(self._between(node, node)[0]))
+        cover = self._between(node, node)
+        # counted before they are written out
+        if cover.count > MAX_CUBES:
+            raise NoAutomatonError(f"a guard takes more than {MAX_CUBES} cubes")
+        return tuple(sorted(_cubes_of(cover)))
 
     def some(self, node: int) -> Guard:
         """Return some cubes of a function, `FEW_CUBES` at most, of which no two hold at once."""
@@ -62,35 +66,58 @@ class Covers:
                 stack += ((high, (*cube, (variable, True))), (low, (*cube, (variable, False))))
         return tuple(found)
 
-    def _between(self, lower: int, upper: int) -> tuple[tuple[Cube, ...], int]:
-        """Return cubes that hold where `lower` does and at most where `upper` does, and their function."""
+    def _between(self, lower: int, upper: int) -> _Cover:
+        """Return cubes that hold where `lower` does and at most where `upper` does."""
         if lower == NO:
-            return (), NO
+            return _Cover(0, NO)
         if upper == YES:
-            return ((),), YES
+            return _Cover(1, YES)
         key = (lower, upper)
         if key not in self._known:
             self._known[key] = self._split(lower, upper)
         return self._known[key]
 
-    def _split(self, lower: int, upper: int) -> tuple[tuple[Cube, ...], int]:
+    def _split(self, lower: int, upper: int) -> _Cover:
         diagrams = self._diagrams
         variable = min(diagrams[lower].variable, diagrams[upper].variable)
         low_0, low_1 = diagrams.branches(lower, variable)
         high_0, high_1 = diagrams.branches(upper, variable)
-        cubes_0, covered_0 = self._between(diagrams.both(low_0, diagrams.complement(high_1)), high_0)
-        cubes_1, covered_1 = self._between(diagrams.both(low_1, diagrams.complement(high_0)), high_1)
+        low = self._between(diagrams.both(low_0, diagrams.complement(high_1)), high_0)
+        high = self._between(diagrams.both(low_1, diagrams.complement(high_0)), high_1)
         # what the cubes with this variable leave open is left to cubes without it
-        open_0 = diagrams.both(low_0, diagrams.complement(covered_0))
-        open_1 = diagrams.both(low_1, diagrams.complement(covered_1))
-        cubes, covered = self._between(diagrams.either(open_0, open_1), diagrams.both(high_0, high_1))
-        with_0 = (((variable, False), *cube) for cube in cubes_0)
-        with_1 = (((variable, True), *cube) for cube in cubes_1)
-        all_cubes = (*with_0, *with_1, *cubes)
-        if len(all_cubes) > MAX_CUBES:
-            raise NoAutomatonError(f"a guard takes more than {MAX_CUBES} cubes")
-        decided = diagrams.decide(variable, covered_0, covered_1)
-        return all_cubes, diagrams.either(decided, covered)
+        open_0 = diagrams.both(low_0, diagrams.complement(low.covered))
+        open_1 = diagrams.both(low_1, diagrams.complement(high.covered))
+        rest = self._between(diagrams.either(open_0, open_1), diagrams.both(high_0, high_1))
+        decided = diagrams.decide(variable, low.covered, high.covered)
+        count = low.count + high.count + rest.count
+        return _Cover(count, diagrams.either(decided, rest.covered), (variable, low, high, rest))
+
+
+class _Cover(NamedTuple):
+    """Cubes that are not written out.
+
+    Attributes:
+        count: how many there are.
+        covered: the function that they are together.
+        split: a variable, the cubes in which it is false and true, without it, and those that leave it out;
+            None for no cube, or the empty one alone.
+    """
+
+    count: int
+    covered: int
+    split: tuple[int, _Cover, _Cover, _Cover] | None = None
+
+
+def _cubes_of(cover: _Cover) -> Iterator[Cube]:
+    """Yield the cubes of a cover."""
+    waiting: list[tuple[_Cover, Cube]] = [(cover, ())]
+    while waiting:
+        (count, _, split), cube = waiting.pop()
+        if split is not None:
+            variable, low, high, rest = split
+            waiting += ((low, (*cube, (variable, False))), (high, (*cube, (variable, True))), (rest, cube))
+        elif count:
+            yield cube
 
 
 @dataclass(frozen=True)

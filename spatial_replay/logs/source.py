@@ -135,6 +135,37 @@ class TrackSource(_Bare):
             yield Block(replace(Trace.from_samples(()), faults=rest))
 
 
+@dataclass(frozen=True)
+class SourceOf:
+    """What a source that is made of another one has from it: everything but its blocks."""
+
+    source: Source
+
+    @property
+    def name(self) -> str:
+        return self.source.name
+
+    @property
+    def kind(self) -> str:
+        return self.source.kind
+
+    @property
+    def axes(self) -> Axes:
+        return axes_of(self.source)
+
+    @property
+    def signal_units(self) -> Mapping[str, str]:
+        return {name: unit for name, unit in units_of(self.source).items() if name}
+
+    def attachments(self) -> tuple[Attachment, ...]:
+        """See `Source.attachments`."""
+        return self.source.attachments()
+
+    def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
+        """See `Source.metadata`."""
+        return self.source.metadata()
+
+
 def read_blocks(
     source: Source, start_ns: int | None = None, end_ns: int | None = None
 ) -> Generator[Block, None, None]:

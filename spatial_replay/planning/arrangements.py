@@ -227,7 +227,7 @@ class Arranger:
         """Return for each pair the conflicts by the way from one to the other: (A, B, rows, columns)."""
         stencils = {}
         # turns without any cell need not be measured
-        used = {name: cells.any(axis=(1, 2)) for name, cells in domains.items()}
+        used = {name: np.asarray(cells.any(axis=(1, 2))) for name, cells in domains.items()}
         if self._settings.rules < 3:
             used = {name: np.ones_like(each) for name, each in used.items()}
         for first, second in product(chosen, chosen):

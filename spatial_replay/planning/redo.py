@@ -11,9 +11,9 @@ import numpy as np
 
 from spatial_replay.errors import LogError
 from spatial_replay.lazy import Displayed
-from spatial_replay.logs.messages import Attachment, Block, Messages, merge, select
+from spatial_replay.logs.messages import Block, Messages, merge, select
 from spatial_replay.logs.schemas.PlanDecision_pb2 import PlanDecision
-from spatial_replay.logs.source import Source, axes_of, read_blocks
+from spatial_replay.logs.source import Source, SourceOf, read_blocks
 from spatial_replay.logs.topics import (
     GRADIENT_MAP,
     PLAN_DECISION,
@@ -37,7 +37,6 @@ from spatial_replay.planning.read import (
 from spatial_replay.planning.settings import changed_settings, changes_text
 from spatial_replay.spec.format import format_specification
 from spatial_replay.spec.formula import Specification
-from spatial_replay.trace.axes import Axes
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import window_of
 
@@ -260,23 +259,10 @@ def _on_redone_topics(messages: Messages) -> Messages:
 
 
 @dataclass(frozen=True)
-class RedoneSource:
+class RedoneSource(SourceOf):
     """A planned log with what would have been decided beside what was."""
 
-    source: Source
     beside: Messages
-
-    @property
-    def name(self) -> str:
-        return self.source.name
-
-    @property
-    def kind(self) -> str:
-        return self.source.kind
-
-    @property
-    def axes(self) -> Axes:
-        return axes_of(self.source)
 
     def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
         """See `Source.iter_blocks`."""
@@ -289,11 +275,3 @@ class RedoneSource:
             own = select(self.beside, np.arange(done, max(done, end)))
             done = max(done, end)
             yield replace(block, messages=merge([block.messages, own]))
-
-    def attachments(self) -> tuple[Attachment, ...]:
-        """See `Source.attachments`."""
-        return self.source.attachments()
-
-    def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
-        """See `Source.metadata`."""
-        return self.source.metadata()

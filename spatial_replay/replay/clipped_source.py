@@ -15,13 +15,12 @@ from spatial_replay.bags.ros_definitions import full_type_name
 from spatial_replay.bags.topic import Topic
 from spatial_replay.errors import LogError
 from spatial_replay.logs.mcap.reader import McapSource
-from spatial_replay.logs.messages import Attachment, Block, Channel, Messages, merge, select
-from spatial_replay.logs.source import Source, axes_of, read_blocks, units_of
+from spatial_replay.logs.messages import Block, Channel, Messages, merge, select
+from spatial_replay.logs.source import Source, SourceOf, read_blocks
 from spatial_replay.logs.topics import OBJECTS
 from spatial_replay.mapping.field_paths import get_field
 from spatial_replay.mapping.message_types import TRANSFORM_TYPES, short_type
 from spatial_replay.replay.kept_messages import KEEP_ALL, source_keeping
-from spatial_replay.trace.axes import Axes
 from spatial_replay.trace.sample import FOREVER
 from spatial_replay.trace.trace import Trace, window_of
 
@@ -30,30 +29,13 @@ CLIP_METADATA: Final = "spatial_replay_clip"
 
 
 @dataclass(frozen=True)
-class _ClippedSource:
+class _ClippedSource(SourceOf):
     """A log from one time to before another, after the messages that are still valid then."""
 
-    source: Source
     start_ns: int
     end_ns: int
     latched: Messages
     about: Mapping[str, str]
-
-    @property
-    def name(self) -> str:
-        return self.source.name
-
-    @property
-    def kind(self) -> str:
-        return self.source.kind
-
-    @property
-    def axes(self) -> Axes:
-        return axes_of(self.source)
-
-    @property
-    def signal_units(self) -> Mapping[str, str]:
-        return {name: unit for name, unit in units_of(self.source).items() if name}
 
     def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
         """See `Source.iter_blocks`."""
@@ -64,10 +46,6 @@ class _ClippedSource:
         for block in self.source.iter_blocks(first, last):
             # an external log is read from before the window, for what is valid in it
             yield replace(block, messages=_between(block.messages, first, last))
-
-    def attachments(self) -> tuple[Attachment, ...]:
-        """See `Source.attachments`."""
-        return self.source.attachments()
 
     def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
         """See `Source.metadata`."""

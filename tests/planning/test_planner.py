@@ -9,7 +9,7 @@ import pytest
 
 import spatial_replay as sr
 from planning.kinematics import BLOCKS, PUSHING, Table, block, run
-from spatial_replay import Planner, Settings, TraceError, UsageError
+from spatial_replay import NoAutomatonError, Planner, Settings, TraceError, UsageError
 from spatial_replay.planning import MOST_MOTIONS, Grid, Outcome, Reason, Workspace, moved_object
 
 PUSH = Settings(
@@ -292,6 +292,15 @@ def test_default_settings_plan_around_the_first_sample():
     steps, _ = run(one, {**THINGS, "cup": block(9, 1, size=1)})
     assert [step.kind for step in steps] == ["execute", "hold"]
     assert max(one.settings.workspace.grid.shape) == 80
+
+
+def test_a_guard_of_too_many_cubes_is_refused_at_the_first_decision():
+    # 2 ** 27 cubes: they are counted, not written out
+    text = " xor ".join(f"(X t{number} leftof plate)" for number in range(28))
+    one = planner(f"spec s = {text}", replace(TABLE, movable=("t0",)))
+    one.observe(sr.Sample(0, {"plate": THINGS["plate"], **{f"t{n}": THINGS["cup"] for n in range(28)}}))
+    with pytest.raises(NoAutomatonError, match="takes more than 100000 cubes, too many to plan around"):
+        one.next_step()
 
 
 def test_successful_motions_do_not_use_up_attempts():

@@ -126,6 +126,16 @@ def test_the_log_and_the_page_of_it_have_both_decisions(tidied, tmp_path):
     assert "Redone" in page.read_text()
 
 
+def test_a_copy_with_both_decisions_keeps_the_units_of_lengths_and_signals(tmp_path):
+    run_, both = tmp_path / "run.mcap", tmp_path / "both.mcap"
+    planner = sr.Planner(sr.parse_specification(SPEC), TIDYING)
+    with sr.Recorder(run_, planner=planner, units={"": "m", "battery": "V"}) as recorder:
+        recorder.write(sr.Sample(0, OBJECTS, {"battery": 24.0}))
+        assert recorder.next_step().kind == "execute"
+    assert run("plan", "--redo", run_, "-o", both).exit_code == 0
+    assert sr.read_trace(both).units == sr.read_trace(run_).units == {"": "m", "battery": "V"}
+
+
 def test_settings_come_from_a_file_and_options_have_precedence(tidied, tmp_path):
     (tmp_path / "careful.yaml").write_text("room: 0.2\nattempts: 1\nyaws: [0, 45deg]\n")
     found = run("plan", "--redo", tidied, "--settings", tmp_path / "careful.yaml", "--room", "0.1")
@@ -159,6 +169,8 @@ def test_every_setting_is_in_the_schema_in_the_help_and_on_the_page():
     packaged = files("spatial_replay.planning").joinpath("settings.schema.json").read_text()
     assert json.loads(packaged) == schema
     own = {each.name for each in (*fields(Settings), *fields(Workspace))} - {"workspace", "grid"}
+    # it follows from the skill
+    own -= {"keeps_yaw"}
     assert schema["properties"].keys() == own | {"area", "cell_size"}
     helped = run("plan", "push", "--help").output
     page = (ROOT / "docs/planning.md").read_text()
