@@ -49,7 +49,7 @@ class Covers:
         """
         cover = self._between(node, node)
         # counted before they are written out
-        if cover.count > MAX_CUBES:
+        if cover.size > MAX_CUBES:
             raise NoAutomatonError(f"a guard takes more than {MAX_CUBES} cubes")
         return tuple(sorted(_cubes_of(cover)))
 
@@ -89,21 +89,21 @@ class Covers:
         open_1 = diagrams.both(low_1, diagrams.complement(high.covered))
         rest = self._between(diagrams.either(open_0, open_1), diagrams.both(high_0, high_1))
         decided = diagrams.decide(variable, low.covered, high.covered)
-        count = low.count + high.count + rest.count
-        return _Cover(count, diagrams.either(decided, rest.covered), (variable, low, high, rest))
+        size = low.size + high.size + rest.size
+        return _Cover(size, diagrams.either(decided, rest.covered), (variable, low, high, rest))
 
 
 class _Cover(NamedTuple):
     """Cubes that are not written out.
 
     Attributes:
-        count: how many there are.
+        size: how many there are.
         covered: the function that they are together.
         split: a variable, the cubes in which it is false and true, without it, and those that leave it out;
             None for no cube, or the empty one alone.
     """
 
-    count: int
+    size: int
     covered: int
     split: tuple[int, _Cover, _Cover, _Cover] | None = None
 
@@ -112,11 +112,11 @@ def _cubes_of(cover: _Cover) -> Iterator[Cube]:
     """Yield the cubes of a cover."""
     waiting: list[tuple[_Cover, Cube]] = [(cover, ())]
     while waiting:
-        (count, _, split), cube = waiting.pop()
+        (size, _, split), cube = waiting.pop()
         if split is not None:
             variable, low, high, rest = split
             waiting += ((low, (*cube, (variable, False))), (high, (*cube, (variable, True))), (rest, cube))
-        elif count:
+        elif size:
             yield cube
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from spatial_replay.falsification.parameters import TENTHS, Case, Parameter
+from spatial_replay.lazy import Displayed
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.text import json_number
 
@@ -122,7 +123,7 @@ class Coverage:
 
 
 @dataclass(frozen=True, eq=False)
-class Falsification:
+class Falsification(Displayed):
     """What a search for failures has found.
 
     Attributes:

@@ -19,18 +19,21 @@ _VIEWS: Mapping[str, str] = MappingProxyType(
         "spatial_replay.automata.automaton": "automaton_view",
         "spatial_replay.compare.runs": "diff_view",
         "spatial_replay.compare.specifications": "diff_view",
+        "spatial_replay.falsification.failures": ".falsification.failures_view",
         "spatial_replay.learning.learned": "learned_view",
         "spatial_replay.monitor.evaluate": "evaluation_view",
         "spatial_replay.monitor.result": "evaluation_view",
         "spatial_replay.planning.decisions": "planning_view",
         "spatial_replay.planning.maps": "planning_view",
         "spatial_replay.planning.read": "planning_view",
+        "spatial_replay.planning.redo": "planning_view",
+        "spatial_replay.sanity.examine": "examination_view",
         "spatial_replay.spec.formula": "specification_view",
         "spatial_replay.trace.trace": "trace_view",
         "spatial_replay.tuning.tuned": "tuning_view",
     }
 )
-"""The view that registers the types of a module."""
+"""The view that registers the types of a module, relative to this package; a room above has its own."""
 
 
 @singledispatch
@@ -64,7 +67,7 @@ def _after_loading_view(function: Any, value: object) -> Any:
     kind = type(value)
     generic = function.registry[object]
     if (view := _VIEWS.get(kind.__module__)) is not None:
-        import_module(f"spatial_replay.notebook.{view}")
+        import_module(f".{view}", __name__)
     if (view_function := function.dispatch(kind)) is generic:
         raise UsageError(f"there is no picture of a {kind.__name__}")
     return view_function

@@ -26,6 +26,7 @@ from spatial_replay.notebook.figures import (
 from spatial_replay.planning.decisions import Candidate, Consideration, Step
 from spatial_replay.planning.maps import FREE, REASONS, GradientMap, moved_object
 from spatial_replay.planning.read import LoggedStep
+from spatial_replay.planning.redo import Redone
 from spatial_replay.text import counted
 from spatial_replay.trace.sample import Sample
 
@@ -295,3 +296,27 @@ def logged_step_html(logged: LoggedStep) -> Html:
         ended = f" at {logged.end_ns / 1e9:.3f} s: {logged.outcome.reason}"
         parts.append(element("div", element("b", how), ended))
     return element("div", *parts)
+
+
+@html.register(Redone)
+def redone_html(redone: Redone) -> Html:
+    """Return what was changed, how many decisions are the same, and the first that differs, as both are."""
+    changes = ", ".join(redone.changes) or "nothing changed"
+    lines = [
+        element(
+            "div",
+            element("b", redone.name),
+            f": {counted(redone.decisions, 'decision')}, redone with {changes}",
+        ),
+        element("div", f"{redone.same} the same byte for byte, {redone.alike} do the same"),
+    ]
+    if redone.redone is not None and redone.sample is not None:
+        lines.append(element("div", f"the first that differs, at {redone.sample.time_ns / 1e9:.3f} s:"))
+        old = (
+            quiet("the log has no decision there")
+            if redone.recorded is None
+            else step_html(redone.recorded.step)
+        )
+        lines.append(table(["recorded", "redone"], [(old, step_html(redone.redone.step))]))
+    lines += [element("div", quiet(f"not read: {fault}")) for fault in redone.faults]
+    return element("div", *lines)

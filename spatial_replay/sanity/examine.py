@@ -9,6 +9,7 @@ from itertools import combinations
 from typing import Final, Literal, TypeAlias
 
 from spatial_replay.errors import NoAutomatonError, SpecificationError
+from spatial_replay.lazy import Displayed
 from spatial_replay.sanity.conditions import FactDiagrams
 from spatial_replay.sanity.examples import Example, shortest_example
 from spatial_replay.sanity.readings import SpecReading, automaton_of, loosened, reading_of
@@ -85,7 +86,7 @@ class SpecExamination:
 
 
 @dataclass(frozen=True)
-class Examination:
+class Examination(Displayed):
     """What is wrong with a specification, and what its specs mean by example.
 
     Attributes:

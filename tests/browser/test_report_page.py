@@ -13,6 +13,8 @@ from playwright.sync_api import Browser, ConsoleMessage, Error, Locator, Page, e
 
 import spatial_replay as sr
 from perception.filmed import write_approach
+from planning.plans import record_plan_of
+from planning.test_map_layers import OBJECTS, SPEC, TIDYING
 from report.report_pages import (
     RECORDINGS,
     report_of_recording,
@@ -44,6 +46,8 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Path]:
     report_of_recording(folder / "violated.html", "table.jsonl", "table_edited.spatial")
     report_of_recording(folder / "satisfied.html", "table.jsonl", "table.spatial")
     report_of_recording(folder / "planned.html", "push.mcap")
+    record_plan_of(folder / "layers.mcap", SPEC, OBJECTS, TIDYING)
+    write_report(open_source(folder / "layers.mcap"), [], folder / "layers.html")
     report_of_recording(folder / "edited.html", "push.mcap", "push_edited.spatial")
     broken = folder / "broken.mcap"
     broken.write_bytes((RECORDINGS / "push.mcap").read_bytes()[:300_000])
@@ -404,6 +408,31 @@ def test_decisions_show_what_was_tried_and_lead_to_their_time(open_page: Open) -
     with_map = page.evaluate("document.querySelector('.stage').toDataURL()")
     page.get_by_label("map", exact=True).uncheck()
     assert page.evaluate("document.querySelector('.stage').toDataURL()") != with_map
+
+
+def test_a_map_shows_each_relation_and_says_what_limits_or_blocks_a_cell(open_page: Open) -> None:
+    page = open_page("layers")
+    card = page.locator(".card").nth(0)
+    card.locator("summary").click()
+    candidate = card.locator(".candidate", has_text="chosen")
+    made, choice = candidate.locator("canvas").first, candidate.get_by_label("Layer of the map").first
+    titles = choice.locator("option").all_text_contents()
+    assert titles[0] == "all that has to hold" and len(titles) > 1
+    pictures = []
+    for title in titles:
+        choice.select_option(label=title)
+        expect(choice).to_have_attribute("title", title)
+        pictures.append(made.evaluate("each => each.toDataURL()"))
+    assert len(set(pictures)) == len(titles)
+    made.scroll_into_view_if_needed()
+    box = made.bounding_box()
+    assert box is not None
+    said = set()
+    for row in range(1, 8):
+        for column in range(1, 8):
+            page.mouse.move(box["x"] + box["width"] * column / 8, box["y"] + box["height"] * row / 8)
+            said.add((made.get_attribute("title") or "").split(" by ")[0])
+    assert {"blocked"} < said
 
 
 def test_each_object_of_a_template_can_be_looked_into(open_page: Open) -> None:

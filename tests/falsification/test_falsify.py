@@ -12,6 +12,7 @@ import pytest
 
 import spatial_replay as sr
 from falsification.crossings import APART, VARIED, crossing
+from pages import shown
 
 pytest.importorskip("cma", reason="the search needs cma")
 
@@ -49,6 +50,19 @@ def test_failures_are_logs_that_violate_with_the_worst_first(folder: Path) -> No
         for log, run in ((failure.log, failure.run), (failure.smaller_log, failure.smaller)):
             (result,) = sr.replay_log(log).results
             assert (result.verdict, result.robustness) == ("violated", run.robustness)
+
+
+def test_a_notebook_shows_failures_and_what_was_covered(folder: Path, tmp_path: Path) -> None:
+    found = search(folder)
+    text = shown(found)
+    assert f"{len(found.failures)} failures in 30 runs" in text
+    assert found.text_of(found.failures[0].smaller.case) in text
+    assert all(each.parameter in text for each in found.coverage)
+    kept = sr.falsify(
+        crossing, APART, output=tmp_path / "kept", vary={**VARIED, "start": (0.0, 0.1)}, budget=2
+    )
+    assert not kept.failures
+    assert f"lowest: {kept.lowest.robustness:.4g} of apart" in shown(kept)
 
 
 def test_a_run_is_that_of_its_case(folder: Path) -> None:

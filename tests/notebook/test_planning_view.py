@@ -8,7 +8,16 @@ from pages import shown
 from planning.kinematics import BLOCKS, PUSHING, block, run
 from planning.plans import PUSH, record_plan_of
 from spatial_replay import LogError, Planner, Settings, UsageError
-from spatial_replay.planning import FREE, Grid, Workspace, gradient_map, proposition_maps, read_steps
+from spatial_replay.planning import (
+    FREE,
+    Grid,
+    Workspace,
+    gradient_map,
+    proposition_maps,
+    read_steps,
+    redo_decisions,
+)
+from spatial_replay.sources import open_source
 
 SAMPLE = sr.Sample(
     0, {"cup": block(1, 1, size=1), "mat": block(6, 6, size=4), "<jug>": sr.Footprint.disc(1, 6, 1)}
@@ -123,6 +132,18 @@ def test_the_steps_of_a_log_have_outcomes(run_log):
 def test_a_logged_step_is_drawn_with_the_objects_as_they_were(run_log):
     first, *_ = read_steps(run_log[0])
     assert [text.get_text() for text in first.plot()[0].texts] == list(first.sample.objects)
+
+
+def test_what_would_have_been_decided_stands_beside_what_was(run_log):
+    same = shown(redo_decisions(open_source(run_log[0])))
+    count = len(run_log[1])
+    assert f"{count} decisions, redone with nothing changed" in same
+    assert f"{count} the same byte for byte" in same
+    other = redo_decisions(open_source(run_log[0]), changes={"margin": 0.02})
+    text = shown(other)
+    assert "margin 0.01 -> 0.02" in text
+    for step in (other.recorded.step, other.redone.step):
+        assert step.reason in text
 
 
 def test_a_log_without_a_plan_has_no_steps(tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 import spatial_replay as sr
+from pages import shown
 
 REGIONS = """
 region left_bin = box(0, 0, 1, 1)
@@ -229,3 +230,15 @@ def test_a_template_is_examined_about_any_object() -> None:
 def test_only_specifications_are_examined() -> None:
     with pytest.raises(sr.UsageError, match="give a Specification"):
         sr.doctor("F (a leftof b)")  # type: ignore[arg-type]
+
+
+def test_a_notebook_shows_findings_and_the_shortest_runs() -> None:
+    text = "spec never = F (a leftof b and b leftof a)\nspec near = F[0, 3] (a dist b <= 0.1)"
+    found = sr.doctor(sr.parse_specification(text))
+    page = shown(found)
+    assert "1 finding in 2 results" in page
+    assert found.findings[0].diagnostic.message in page
+    assert found.specs[1].satisfied is not None
+    assert found.specs[1].satisfied.sentences[0] in page
+    healthy = shown(sr.doctor(sr.parse_specification("spec near = F (a dist b <= 0.1)"), examples=False))
+    assert "0 findings in 1 result" in healthy and "none shown" in healthy

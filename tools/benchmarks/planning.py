@@ -16,10 +16,15 @@ from spatial_replay.planning import (
     Grid,
     Workspace,
     gradient_map,
+    map_layers,
     moved_object,
     proposition_maps,
+    redo_decisions,
     shortest_path,
 )
+from spatial_replay.sources import open_source
+
+RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
 
 PUSHING = """
 use spatial_spec
@@ -66,6 +71,42 @@ def bench_gradient_map(bench: Any) -> None:
             return gradient_map(maps, progress, constraints, workspace)
 
         bench.measure(f"moving {name}", run, unit="object", runs=21, limit_s=0.010, reference_s=2.1)
+
+
+def bench_map_layers(bench: Any) -> None:
+    """What a logged map says of each cell beside its robustness: layers, what limits and what blocks it."""
+    specification, sample = sr.parse_specification(PUSHING), _blocks()
+    machine = automaton(specification)
+    formulas = [each.formula for each in machine.propositions]
+    (first, *_) = next(machine.paths(0, {(0, 3)}))
+    workspace = Workspace(Grid.over(0.3, -0.225, 0.75, 0.225, 0.005))
+    settings = sr.Settings(workspace, "push")
+
+    def one_map(_: object = None) -> Any:
+        maps = proposition_maps(formulas, specification.regions, sample, "green", workspace)
+        return gradient_map(maps, first.guard, (), workspace)
+
+    made = one_map()
+    plain = bench.measure("a map", one_map, unit="map", runs=21)
+    layers = bench.measure(
+        "its layers", lambda _: map_layers(made, settings), unit="map", runs=21, limit_s=0.05
+    )
+    bench.ratio("layers, in maps", layers.median_s / plain.median_s, 4.0)
+
+
+def bench_redo(bench: Any) -> None:
+    """Deciding again on the samples of a recorded push; beside it, reading these samples."""
+    source = open_source(RECORDINGS / "push.mcap")
+
+    def read(_: object) -> object:
+        return sum(len(block.trace) for block in source.iter_blocks())
+
+    bench.measure("reading the samples", read, unit="run", runs=5)
+    bench.measure("nothing changed", lambda _: redo_decisions(source), unit="run", runs=5, limit_s=3.0)
+    changes = {"margin": 0.02}
+    bench.measure(
+        "a larger margin", lambda _: redo_decisions(source, changes=changes), unit="run", runs=5, limit_s=3.0
+    )
 
 
 def bench_decision(bench: Any) -> None:
