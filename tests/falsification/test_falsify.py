@@ -58,11 +58,9 @@ def test_a_notebook_shows_failures_and_what_was_covered(folder: Path, tmp_path: 
     assert f"{len(found.failures)} failures in 30 runs" in text
     assert found.text_of(found.failures[0].smaller.case) in text
     assert all(each.parameter in text for each in found.coverage)
-    kept = sr.falsify(
-        crossing, APART, output=tmp_path / "kept", vary={**VARIED, "start": (0.0, 0.1)}, budget=2
-    )
-    assert not kept.failures
-    assert f"lowest: {kept.lowest.robustness:.4g} of apart" in shown(kept)
+    calm = sr.parse_specification("spec calm = G (robot dist person >= -10)")
+    kept = sr.falsify(crossing, calm, output=tmp_path / "kept", vary=VARIED, budget=2)
+    assert f"lowest: {kept.lowest.robustness:.4g} of calm" in shown(kept)
 
 
 def test_a_run_is_that_of_its_case(folder: Path) -> None:
