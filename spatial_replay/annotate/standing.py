@@ -19,10 +19,13 @@ from spatial_replay.geometry.arrays import Floats, Integers, combined, equal_pla
 from spatial_replay.logs.objects.wire import WireTemplate
 from spatial_replay.logs.payloads import Filled, filled_in
 from spatial_replay.logs.schemas.Robustness_pb2 import (
+    FAILS_NOW,
     FAILS_SO_FAR,
+    HOLDS_NOW,
     HOLDS_SO_FAR,
     SATISFIED,
     UNKNOWN,
+    UNKNOWN_NOW,
     VIOLATED,
     StandingUpdate,
 )
@@ -253,12 +256,13 @@ class StandingEncoder:
                 certain_ns = np.minimum(since_ns[each, members], times_ns[members])
                 seconds = (certain_ns - (self._first_ns or 0)) / 1e9
                 own.append(np.stack([np.round(seconds, 3), rounded(-series[each][0, 3, members])]))
+            own.append(rounded(rows[:, 1]))
             filled = np.concatenate([numbers[:, members], *own]).T
             stamps = times_ns[members].astype(np.uint64)[:, None]
             bits = np.concatenate([stamps, np.ascontiguousarray(filled).view(np.uint64)], axis=1)
             own_marks = codes[layout.worst][:_MOST_ROWS, members]
-            both = np.ascontiguousarray(np.concatenate([marks[:, members], own_marks]).T)
-            filled_groups.append((members, Filled(self._template(layout), bits, both)))
+            every = np.concatenate([marks[:, members], own_marks, _present(rows[:, 1])])
+            filled_groups.append((members, Filled(self._template(layout), bits, np.ascontiguousarray(every.T))))
         return filled_in(len(times_ns), filled_groups)
 
     def _rows(self, series: Sequence[Floats], codes: Sequence[Codes]) -> tuple[Codes, Floats]:
@@ -293,6 +297,7 @@ class StandingEncoder:
             unit = unit_of(node, self._units)
             text = said if node.name is None else node.name
             message.nodes.add(text=text, now=1.0, value=1.0, unit=unit, standing=UNKNOWN)
+            message.present.add(text=text, state=UNKNOWN_NOW, now=1.0, unit=unit)
         for index, over in violated:
             tree = self._trees[index]
             unit = unit_of(tree.formula, self._units)
@@ -307,6 +312,11 @@ def named_parts(tree: ReportedTree) -> dict[str, tuple[int, Formula]]:
     return {
         name: (identifier, node) for name, identifier, node in named if identifier and names.count(name) == 1
     }
+
+
+def _present(now: Floats) -> Codes:
+    """Return the number of `Present` for each robustness in one sample."""
+    return np.where(now >= 0.0, HOLDS_NOW, np.where(now < 0.0, FAILS_NOW, UNKNOWN_NOW)).astype(np.uint8)
 
 
 def part_title(name: str, tree: ReportedTree) -> str:

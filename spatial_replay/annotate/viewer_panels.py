@@ -213,8 +213,8 @@ def state_strips(trees: Sequence[ReportedTree], has_states: Sequence[bool]) -> P
 
 
 def node_table() -> Panel:
-    """Return the table of the worst result's nodes, with their text, numbers and standing at the cursor."""
-    return _titled("Table!nodes", "Nodes of the worst result", {"topicPath": f"{STANDING}.nodes"})
+    """Return the table of the worst result's nodes at the cursor: whether they hold now, and by how much."""
+    return _titled("Table!nodes", "Nodes of the worst result, now", {"topicPath": f"{STANDING}.present"})
 
 
 def violation_table() -> Panel:

@@ -18,7 +18,9 @@ import spatial_replay as sr
 from spatial_replay.annotate.standing import rounded
 from spatial_replay.logs import MemorySource
 from spatial_replay.logs.schemas.Robustness_pb2 import (
+    FAILS_NOW,
     FAILS_SO_FAR,
+    HOLDS_NOW,
     HOLDS_SO_FAR,
     SATISFIED,
     UNKNOWN,
@@ -106,6 +108,9 @@ def test_every_message_says_how_all_results_stand_and_the_last_what_the_log_come
     root, atom = found[2].nodes
     assert (root.text, root.value) == ("apart", -0.5)
     assert (atom.text, atom.now) == ("a farfrom[1] b", -0.5)
+    last = found[-1].present[1]
+    assert [each.present[1].state for each in found[1:]] == [FAILS_NOW, FAILS_NOW, HOLDS_NOW, HOLDS_NOW]
+    assert (last.text, last.now) == ("a farfrom[1] b", 1.0)
     states = [message.results[1].automaton for message in found]
     assert states[1].endswith("satisfied if nothing more came")
     assert states[2].endswith("violated, whatever comes")

@@ -56,6 +56,26 @@ UNKNOWN: Standing.ValueType  # 47
 """The value is not determined, and nothing is decided. In a final message: what was not seen leaves it open."""
 global___Standing = Standing
 
+class _Present:
+    ValueType = typing.NewType("ValueType", builtins.int)
+    V: typing_extensions.TypeAlias = ValueType
+
+class _PresentEnumTypeWrapper(google.protobuf.internal.enum_type_wrapper._EnumTypeWrapper[_Present.ValueType], builtins.type):
+    DESCRIPTOR: google.protobuf.descriptor.EnumDescriptor
+    PRESENT_UNSPECIFIED: _Present.ValueType  # 0
+    HOLDS_NOW: _Present.ValueType  # 1
+    FAILS_NOW: _Present.ValueType  # 2
+    UNKNOWN_NOW: _Present.ValueType  # 3
+
+class Present(_Present, metaclass=_PresentEnumTypeWrapper):
+    """How a node stands in one sample, without the samples that follow."""
+
+PRESENT_UNSPECIFIED: Present.ValueType  # 0
+HOLDS_NOW: Present.ValueType  # 1
+FAILS_NOW: Present.ValueType  # 2
+UNKNOWN_NOW: Present.ValueType  # 3
+global___Present = Present
+
 @typing.final
 class Robustness(google.protobuf.message.Message):
     """The robustness of every node of one specification after one sample, on the topic /spatial/robustness."""
@@ -163,6 +183,7 @@ class StandingUpdate(google.protobuf.message.Message):
     NODES_FIELD_NUMBER: builtins.int
     FINAL_FIELD_NUMBER: builtins.int
     VIOLATED_FIELD_NUMBER: builtins.int
+    PRESENT_FIELD_NUMBER: builtins.int
     time_ns: builtins.int
     """Time of the sample in nanoseconds; equal to the log time of the message, unless that is final."""
     worst: builtins.str
@@ -181,6 +202,10 @@ class StandingUpdate(google.protobuf.message.Message):
     def violated(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___Violation]:
         """The results that are violated, whatever comes, the one that was so first before the others."""
 
+    @property
+    def present(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___PresentNode]:
+        """The same nodes as they are at the newest sample, for tables beside a cursor."""
+
     def __init__(
         self,
         *,
@@ -190,9 +215,10 @@ class StandingUpdate(google.protobuf.message.Message):
         nodes: collections.abc.Iterable[global___NodeStanding] | None = ...,
         final: builtins.bool = ...,
         violated: collections.abc.Iterable[global___Violation] | None = ...,
+        present: collections.abc.Iterable[global___PresentNode] | None = ...,
     ) -> None: ...
     def HasField(self, field_name: typing.Literal["_time_ns", b"_time_ns", "time_ns", b"time_ns"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["_time_ns", b"_time_ns", "final", b"final", "nodes", b"nodes", "results", b"results", "time_ns", b"time_ns", "violated", b"violated", "worst", b"worst"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["_time_ns", b"_time_ns", "final", b"final", "nodes", b"nodes", "present", b"present", "results", b"results", "time_ns", b"time_ns", "violated", b"violated", "worst", b"worst"]) -> None: ...
     def WhichOneof(self, oneof_group: typing.Literal["_time_ns", b"_time_ns"]) -> typing.Literal["time_ns"] | None: ...
 
 global___StandingUpdate = StandingUpdate
@@ -292,6 +318,7 @@ class NodeStanding(google.protobuf.message.Message):
     unit: builtins.str
     """Unit of both; empty for footprint units."""
     standing: global___Standing.ValueType
+    """Standing of `value`: whether the node holds at the first sample. See `PresentNode` for the newest one."""
     def __init__(
         self,
         *,
@@ -309,3 +336,34 @@ class NodeStanding(google.protobuf.message.Message):
     def WhichOneof(self, oneof_group: typing.Literal["_value", b"_value"]) -> typing.Literal["value"] | None: ...
 
 global___NodeStanding = NodeStanding
+
+@typing.final
+class PresentNode(google.protobuf.message.Message):
+    """One node at the newest sample, with its text, for tables: the number is rounded to four digits."""
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    TEXT_FIELD_NUMBER: builtins.int
+    STATE_FIELD_NUMBER: builtins.int
+    NOW_FIELD_NUMBER: builtins.int
+    UNIT_FIELD_NUMBER: builtins.int
+    text: builtins.str
+    state: global___Present.ValueType
+    """Whether it holds there."""
+    now: builtins.float
+    """Robustness there; NaN where it is not determined."""
+    unit: builtins.str
+    """Unit of `now`; empty for footprint units."""
+    def __init__(
+        self,
+        *,
+        text: builtins.str = ...,
+        state: global___Present.ValueType = ...,
+        now: builtins.float | None = ...,
+        unit: builtins.str = ...,
+    ) -> None: ...
+    def HasField(self, field_name: typing.Literal["_now", b"_now", "now", b"now"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["_now", b"_now", "now", b"now", "state", b"state", "text", b"text", "unit", b"unit"]) -> None: ...
+    def WhichOneof(self, oneof_group: typing.Literal["_now", b"_now"]) -> typing.Literal["now"] | None: ...
+
+global___PresentNode = PresentNode
