@@ -262,7 +262,9 @@ class StandingEncoder:
             bits = np.concatenate([stamps, np.ascontiguousarray(filled).view(np.uint64)], axis=1)
             own_marks = codes[layout.worst][:_MOST_ROWS, members]
             every = np.concatenate([marks[:, members], own_marks, _present(rows[:, 1])])
-            filled_groups.append((members, Filled(self._template(layout), bits, np.ascontiguousarray(every.T))))
+            filled_groups.append(
+                (members, Filled(self._template(layout), bits, np.ascontiguousarray(every.T)))
+            )
         return filled_in(len(times_ns), filled_groups)
 
     def _rows(self, series: Sequence[Floats], codes: Sequence[Codes]) -> tuple[Codes, Floats]:

@@ -160,7 +160,6 @@ def scene_value(
             _entity_value(identifier, shown, len(scene.frames), box, packing)
             for identifier, shown in sorted(entities.items(), key=_drawing_order)
         ],
-        "is_violated": packing.add(np.array([frame.is_violated for frame in scene.frames]), "u1"),
         "violations": {
             "frames": packing.add(np.array([number for number, _ in shown]), "i4"),
             "points": packing.add(box.steps(_joined([each.ends for each in arrows])), "u2"),

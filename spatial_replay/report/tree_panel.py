@@ -109,6 +109,8 @@ def requirement_values(
             "sign": requirement.sign,
             "is_condition": requirement.is_condition,
             "lasts": requirement.lasts,
+            "obligation": requirement.obligation
+            and {"node": place[requirement.obligation.node], "sign": requirement.obligation.sign},
             "outcome": json_number(float(requirement.outcome(ends, np.zeros(1, np.int64))[0])),
             "entities": entities_of(requirement),
             "standing": packing.add(requirement.standing(result.series, samples), "u1"),

@@ -85,6 +85,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Path]:
         for t in range(6)
     ]
     report_of_samples(folder / "reached.html", meeting, "spec meet = F (a ovlp b)")
+    report_of_samples(folder / "braking.html", _braking(), BRAKING)
     _film(folder)
     hostile = [
         sr.Sample(t * 10**8, {name: sr.Footprint.disc(3 * k, t, 1) for k, name in enumerate(HOSTILE)})
@@ -93,6 +94,21 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Path]:
     ovlp = " or ".join(f"({quoted(name)} ovlp {quoted(HOSTILE[0])})" for name in HOSTILE[1:])
     report_of_samples(folder / "hostile.html", hostile, f"spec {'s' * 200} = F ({ovlp})")
     return {page.stem: page for page in folder.glob("*.html")}
+
+
+BRAKING = "spec stops = G ((a dist b <= 2) -> F[0s, 0.3s] (speed <= 1))"
+
+
+def _braking() -> list[sr.Sample]:
+    """A run in which two discs come near at 0.5 s, and the one brakes too late."""
+    return [
+        sr.Sample(
+            t * 10**8,
+            {"a": sr.Footprint.disc(5 - t / 2, 0, 1), "b": sr.Footprint.disc(0, 0, 1)},
+            signals={"speed": 3 - t / 5 if t < 15 else 0.2},
+        )
+        for t in range(20)
+    ]
 
 
 def _film(folder: Path) -> None:
@@ -338,6 +354,25 @@ def test_the_scene_says_what_is_violated_now(open_page: Open) -> None:
     )
     caption = open_page("violated", at="#t=9.9").locator(".caption")
     expect(caption).to_have_text("nothing is violated now; table_set was before")
+
+
+def test_the_scene_calls_nothing_to_come_that_nothing_asks_for(open_page: Open) -> None:
+    """A response without its condition, a condition itself, and all after the end."""
+    for time, words in (
+        (0.1, "nothing is violated now"),
+        (0.4, "nothing is violated now; speed <= 1 of stops is still to come"),
+        (1.9, "nothing is violated now; stops was before"),
+    ):
+        expect(open_page("braking", at=f"#t={time}").locator(".caption")).to_have_text(words)
+
+
+def test_the_scene_names_what_decided_where_no_arrow_can_show_it(open_page: Open) -> None:
+    page = open_page("braking")
+    expect(page.locator(".caption")).to_have_text(
+        "what decided the verdict: speed <= 1 of stops fails by 0.8 now; no arrow shows it"
+    )
+    said = page.locator(".verdict").first
+    expect(said).to_contain_text("The nearest that it came to speed <= 1 was at 0.600 s: speed is 1.8.")
 
 
 def test_the_keys_step_through_the_kept_samples_of_a_thinned_run(open_page: Open) -> None:

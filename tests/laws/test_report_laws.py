@@ -104,7 +104,7 @@ def test_of_frames_with_many_corners_fewer_are_taken() -> None:
 
 
 def frame_with(corners: int) -> SceneFrame:
-    return SceneFrame({"object/a": DrawnEntity((np.zeros((corners, 2)),), (0, 0, 0))}, None, False)
+    return SceneFrame({"object/a": DrawnEntity((np.zeros((corners, 2)),), (0, 0, 0))}, ())
 
 
 @given(arrays.arrays(np.float64, st.integers(0, 50), elements=st.floats(width=64)))

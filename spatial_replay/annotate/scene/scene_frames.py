@@ -123,12 +123,10 @@ class SceneFrame(NamedTuple):
     Attributes:
         entities: by their ids.
         violations: of each result that an arrow can show it of.
-        is_violated: whether a requirement on an object or a region is violated.
     """
 
     entities: Mapping[str, DrawnEntity]
     violations: tuple[DrawnViolation, ...]
-    is_violated: bool
 
     @property
     def corners(self) -> int:
@@ -177,9 +175,8 @@ class SceneFrames:
                 class_name = self._presence.classes[code] if code >= 0 else None
                 entities[OBJECT + name] = DrawnEntity(rings, colour, class_name)
         arrows = (each.at(index) for each in self._arrows)
-        is_violated = bool((self.objects[index] < 0.0).any() or (self.regions[index] < 0.0).any())
         violations = tuple(each for each in arrows if each is not None)
-        return SceneFrame(entities, violations, is_violated)
+        return SceneFrame(entities, violations)
 
 
 class SceneContent(NamedTuple):

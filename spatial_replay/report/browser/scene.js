@@ -83,7 +83,6 @@ function readScene(run) {
     violations,
     stride: scene.stride,
     scale: scene.scale,
-    isViolated: numbers(scene.is_violated),
     entities: scene.entities.map((entity) => readEntity(entity, numbers, coordinates)),
   };
 }
@@ -359,15 +358,15 @@ function wordsOf(clock, scene, frame) {
   const isLost = chosen.some((result) =>
     statusOf(run, result, result.nodes[0], placeIn(result, clock.sample)) === "violated");
   const violated = inState(VIOLATED).filter((each) => !each.isCondition && (each.lasts || !isLost));
+  const decided = decidedAt(clock);
+  if (decided) return decided;
   if (violated.length) return [...failureWords(violated[0]), others(violated), "; no arrow shows it"];
-  if (scene.isViolated[frame] && run.results.length < 2) {
-    return ["something is violated now that no arrow shows"];
-  }
   const unknown = inState(UNKNOWN);
   if (unknown.length) {
     return ["no violation is known now; ", ...partWords(unknown[0]), " is unknown", others(unknown)];
   }
-  const pending = inState(PENDING);
+  // after the last sample nothing comes, and the condition of an implication need not
+  const pending = clock.isAtEnd ? [] : inState(PENDING).filter((each) => !each.isCondition && each.isDue);
   if (pending.length) {
     return [`nothing is violated now${lostBefore(clock)}; `, ...partWords(pending[0]), " is still to come",
       others(pending)];
@@ -375,6 +374,18 @@ function wordsOf(clock, scene, frame) {
   if (open.length) return [`nothing is violated now${lostBefore(clock)}`];
   const more = chosen.some((result) => result.requirements.length) ? "more " : "";
   return [`no ${more}requirements on the objects: they are grey${lostBefore(clock)}`];
+}
+
+// What decided the chosen result, in the sample that did, where no arrow shows it.
+function decidedAt({run, sample, result: chosen}) {
+  const result = run.results[chosen];
+  if (!result || result.fault === null || result.decided === null) return null;
+  const place = placeIn(result, sample), node = result.nodes[result.decided];
+  if (indexAt(run.times, result.fault) !== sample || place === null || place >= result.samples) return null;
+  const number = node.series[NOW][place] * node.divisor;
+  if (Number.isNaN(number)) return null;
+  return ["what decided the verdict: ", ...partWords({result, node}),
+    ` ${signWords(number, declaredUnit(node))} now; no arrow shows it`];
 }
 
 // Whether the chosen result is violated by what was before.
@@ -432,8 +443,11 @@ function requirementsAt(results, sample) {
     const place = placeIn(result, sample);
     if (place === null || place >= result.samples) return [];
     return result.requirements
-      .map(({node, standing, is_condition: isCondition, lasts}) =>
-        ({result, node: result.nodes[node], place, standing: standing[place], isCondition, lasts}))
+      .map(({node, standing, is_condition: isCondition, lasts, obligation}) => ({
+        result, node: result.nodes[node], place, standing: standing[place], isCondition, lasts,
+        // so far its obligation is not met: of a response, its condition held
+        isDue: obligation && obligation.sign * result.nodes[obligation.node].series[VALUE][place] < 0,
+      }))
       .filter(({standing}) => standing !== FULFILLED);
   });
 }
