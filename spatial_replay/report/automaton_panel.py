@@ -12,7 +12,6 @@ from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.dot_hoa import abbreviated, meanings
 from spatial_replay.automata.drawing import draw_automaton
 from spatial_replay.geometry.arrays import Integers
-from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,10 +37,10 @@ class StatePathCollector:
         self._codes: list[int] = []
         self._sets: dict[tuple[int, ...], int] = {}
 
-    def add(self, message: AutomatonState) -> None:
-        """Take in the next message."""
-        self._times_ns.append(message.time_ns)
-        self._codes.append(self._sets.setdefault(tuple(message.states), len(self._sets)))
+    def add(self, time_ns: int, states: tuple[int, ...]) -> None:
+        """Take in the states after the next sample."""
+        self._times_ns.append(time_ns)
+        self._codes.append(self._sets.setdefault(states, len(self._sets)))
 
     @property
     def path(self) -> StatePath:

@@ -10,6 +10,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 
@@ -37,6 +38,20 @@ from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.relations import RELATION_NAMES
 from spatial_replay.spec.units import units_of
 
+_COLLECTED: Final = frozenset(
+    (
+        log_topics.EVENTS,
+        log_topics.AUTOMATON,
+        log_topics.PLAN_DECISION,
+        log_topics.GRADIENT_MAP,
+        log_topics.REDONE_DECISION,
+        log_topics.REDONE_MAP,
+    )
+)
+_TIME_BYTES: Final = 9
+"""The first field of a state, a fixed64 with its tag."""
+_MOST_KEPT: Final = 4096
+
 
 class Collector:
     """Collects what a page shows from a run, as its messages come."""
@@ -46,18 +61,19 @@ class Collector:
         self.decisions = DecisionCollector()
         self.events: list[ReportedEvent] = []
         self._paths: defaultdict[tuple[str, str], StatePathCollector] = defaultdict(StatePathCollector)
+        self._states: dict[bytes, tuple[StatePathCollector, tuple[int, ...]]] = {}
 
     def add(self, messages: Messages) -> None:
         """Take in the next messages."""
         topics = {number: channel.topic for number, channel in messages.channels.items()}
-        numbered = zip(messages.channel.tolist(), messages.sequence.tolist(), messages.payloads, strict=True)
-        for channel, sequence, payload in numbered:
-            match topics[channel]:
+        collected = [number for number, topic in topics.items() if topic in _COLLECTED]
+        for index in np.flatnonzero(np.isin(messages.channel, collected)).tolist():
+            payload, sequence = messages.payloads[index], int(messages.sequence[index])
+            match topics[int(messages.channel[index])]:
                 case log_topics.EVENTS:
                     self.events.append(event_of(payload))
                 case log_topics.AUTOMATON:
-                    message = AutomatonState.FromString(payload)
-                    self._paths[message.specification, message.object].add(message)
+                    self._add_state(int(messages.log_time_ns[index]), payload)
                 case log_topics.PLAN_DECISION:
                     self.decisions.add_decision(payload)
                 case log_topics.GRADIENT_MAP:
@@ -66,6 +82,18 @@ class Collector:
                     self.decisions.redone.add_decision(payload)
                 case log_topics.REDONE_MAP:
                     self.decisions.redone.add_map(sequence, payload)
+
+    def _add_state(self, time_ns: int, payload: bytes) -> None:
+        # what follows the time is nearly always that of a message before
+        said = payload[_TIME_BYTES:]
+        if said not in self._states:
+            message = AutomatonState.FromString(payload)
+            if len(self._states) >= _MOST_KEPT:
+                self._states.clear()
+            path = self._paths[message.specification, message.object]
+            self._states[said] = path, tuple(message.states)
+        path, states = self._states[said]
+        path.add(time_ns, states)
 
     def path(self, name: str, object: str | None) -> StatePath:
         """Return where the automaton of a result was; an empty path if it has none."""
