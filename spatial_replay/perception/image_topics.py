@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from os import PathLike
 from types import MappingProxyType
@@ -18,9 +18,10 @@ from spatial_replay.logs.downloads import local_copy
 from spatial_replay.logs.remote import LogFile, log_file
 from spatial_replay.logs.topics import is_image_type
 from spatial_replay.mapping.message_types import short_type
+from spatial_replay.perception.decoder import H264Decoder, Shown, Untrue, has_key
 from spatial_replay.perception.frame import LARGEST_PICTURE, NO_IMAGE, Detection, Frame, Image
 from spatial_replay.perception.opencv import FAMILIES, corners_from_apriltag, decode_image
-from spatial_replay.perception.video import H264Decoder, VideoFile, has_key
+from spatial_replay.perception.video import VideoFile
 from spatial_replay.text import nearest_hint, time_text
 
 _CHANNELS: Final[Mapping[str, tuple[int, tuple[int, ...]]]] = MappingProxyType(
@@ -74,31 +75,48 @@ class ImageTopic:
         self.topic, self._type = chosen.name, short_type(chosen.type)
         self.channel = next(iter(self._reader.channels({self.topic}).values()), None)
         self._decode = self._reader.decoder(self.topic)
+        self._is_video = "CompressedVideo" in self._type
         self.faults: list[str] = []
 
     def __iter__(self) -> Iterator[Frame]:
-        decoder = H264Decoder() if "CompressedVideo" in self._type else None
         last_ns = first_ns = -1
-        for message in self._reader.iter_messages({self.topic}):
-            first_ns = message.log_time_ns if first_ns < 0 else first_ns
-            place = f"{self.name}: {self.topic} after {time_text(message.log_time_ns, first_ns)}"
-            try:
-                value: Any = self._decode(message.payload)
-                listed = _DETECTIONS.get(self._type)
-                found = None if listed is None else _detections(getattr(value, listed))
-                image = NO_IMAGE if found is not None else _image(value, self._type, decoder)
-            except LogError as error:
-                self.faults.append(f"{place}: {error}; left out")
-                continue
-            time_ns = _stamp_ns(value) or message.log_time_ns
-            if image is None:
-                continue
-            if time_ns <= last_ns:
-                self.faults.append(f"{place}: its stamp is not after that of the frame before; left out")
-                continue
-            last_ns = time_ns
-            yield Frame(time_ns, image, message.payload, detections=found)
+        untrue = Untrue()
+        for log_ns, frame, is_true in self._frames():
+            first_ns = log_ns if first_ns < 0 else first_ns
+            fault = f"{frame}; left out" if isinstance(frame, LogError) else None
+            if not isinstance(frame, LogError):
+                untrue.add(log_ns - first_ns, is_true)
+                if frame.time_ns > last_ns:
+                    last_ns = frame.time_ns
+                    yield frame
+                else:
+                    fault = "its stamp is not after that of the frame before; left out"
+            if fault is not None:
+                place = time_text(log_ns, first_ns)
+                self.faults.append(f"{self.name}: {self.topic} after {place}: {fault}")
+        self.faults += untrue.faults(f"{self.name}: {self.topic}")
         self.faults += self._reader.take_faults()
+
+    def _frames(self) -> Iterator[tuple[int, Frame | LogError, bool]]:
+        """Yield when each message was logged, its frame or what is wrong with it, and whether it is true."""
+        decoder = H264Decoder() if self._is_video else None
+        listed = _DETECTIONS.get(self._type)
+        for message in self._reader.iter_messages({self.topic}):
+            log_ns, payload = message.log_time_ns, message.payload
+            try:
+                value: Any = self._decode(payload)
+                time_ns = _stamp_ns(value) or log_ns
+                if decoder is not None:
+                    yield from map(_frame, decoder.decode(_h264(value), (log_ns, time_ns, payload)))
+                elif listed is not None:
+                    found = _detections(getattr(value, listed))
+                    yield log_ns, Frame(time_ns, NO_IMAGE, payload, detections=found), True
+                else:
+                    yield log_ns, Frame(time_ns, _image(value, self._type), payload), True
+            except LogError as error:
+                yield log_ns, error, False
+        if decoder is not None:
+            yield from map(_frame, decoder.rest())
 
     def frames_at(self, times_ns: Sequence[int]) -> Iterator[Frame]:
         """Yield what the camera showed at some times, increasing: of each the last frame stamped until then.
@@ -110,19 +128,27 @@ class ImageTopic:
         """
         shown = self._shown()
         found = np.searchsorted(shown.stamps_ns, np.asarray(times_ns, np.int64), side="right") - 1
-        decoder = H264Decoder() if "CompressedVideo" in self._type else None
-        done = 0
+        decoder, done = H264Decoder() if self._is_video else None, 0
         for place in np.unique(found[found >= 0]).tolist():
             stamp_ns, last_ns = int(shown.stamps_ns[place]), int(shown.log_times_ns[place])
             # from the key frame on, unless the decoder is already past it
-            first_ns = max(int(shown.key_times_ns[place]), done) if decoder is not None else last_ns
-            for message in self._reader.iter_messages({self.topic}, first_ns, last_ns + 1):
+            first_ns = last_ns if decoder is None else max(int(shown.key_times_ns[place]), done)
+            done = last_ns + 1
+            image = None
+            for message in self._reader.iter_messages({self.topic}, first_ns, done):
                 with suppress(LogError):
                     value: Any = self._decode(message.payload)
-                    image = _image(value, self._type, decoder)
-                    if image is not None and (_stamp_ns(value) or message.log_time_ns) == stamp_ns:
-                        yield Frame(stamp_ns, image)
-            done = last_ns + 1
+                    time_ns = _stamp_ns(value) or message.log_time_ns
+                    if decoder is None:
+                        image = _image(value, self._type) if time_ns == stamp_ns else image
+                    else:
+                        image = _image_of(stamp_ns, decoder.decode(_h264(value), time_ns), image)
+            if image is None and decoder is not None:
+                # held back, or not true: what follows is decoded from its key frame again
+                image = _image_of(stamp_ns, decoder.rest(), image)
+                decoder, done = H264Decoder(), 0
+            if image is not None:
+                yield Frame(stamp_ns, image)
 
     def _shown(self) -> _Shown:
         """Return when there are frames, without decoding them."""
@@ -133,7 +159,7 @@ class ImageTopic:
                 value: Any = self._decode(message.payload)
             except LogError:
                 continue
-            if "CompressedVideo" not in self._type or has_key(bytes(value.data)):
+            if not self._is_video or has_key(bytes(value.data)):
                 key_ns = message.log_time_ns
             stamp_ns = _stamp_ns(value) or message.log_time_ns
             if stamp_ns > last_ns and key_ns >= 0:
@@ -172,17 +198,38 @@ def _chosen(name: str, topics: tuple[Topic, ...], wanted: str | None) -> Topic:
     raise UsageError(f"{name} has no topic {wanted!r}; {hint}")
 
 
-def _image(value: Any, type_name: str, decoder: H264Decoder | None) -> Image | None:
-    """Return the image in a message; None for one that only later frames are decoded from.
+def _h264(value: Any) -> bytes:
+    """Return the content of a message of video.
+
+    Raises:
+        LogError: it is not H.264.
+    """
+    if str(value.format).lower() not in ("h264", ""):
+        raise LogError(f"the video is {value.format!r:.40}; H.264 is read")
+    return bytes(value.data)
+
+
+def _frame(shown: Shown) -> tuple[int, Frame, bool]:
+    """Return when a message of video was logged, its frame, and whether that is true."""
+    log_ns, time_ns, payload = shown.of
+    return log_ns, Frame(time_ns, shown.image, payload), shown.is_true
+
+
+def _image_of(stamp_ns: int, shown: Iterable[Shown], image: Image | None) -> Image | None:
+    """Return the image with a stamp, if it is true; else the one that was found before."""
+    for each in shown:
+        if each.of == stamp_ns and each.is_true:
+            image = each.image
+    return image
+
+
+def _image(value: Any, type_name: str) -> Image:
+    """Return the image in a message.
 
     Raises:
         LogError: it is damaged, or in an encoding that is not known.
     """
     data = bytes(value.data)
-    if decoder is not None:
-        if str(value.format).lower() not in ("h264", ""):
-            raise LogError(f"the video is {value.format!r:.40}; H.264 is read")
-        return decoder.decode(data)
     if "Compressed" in type_name:
         return decode_image(data)
     encoding, width, height = str(value.encoding).lower(), int(value.width), int(value.height)

@@ -1,4 +1,4 @@
-"""Video files and H.264 frames: the only module that knows PyAV.
+"""Video files and H.264 frames: with `decoder.py` the only modules that know PyAV.
 
 What a log keeps of a video is H.264 in Annex B form, one frame a message, with parameter sets before each key
 frame and without B frames: what `foxglove.CompressedVideo` demands.
@@ -8,28 +8,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from contextlib import suppress
 from fractions import Fraction
-from functools import cache
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Final, Self
 
 import numpy as np
 
-from spatial_replay.errors import LogError, MissingFileError, OutputError, UsageError, importing
-from spatial_replay.perception.frame import LARGEST_PICTURE, Frame, Image
-from spatial_replay.text import counted
+from spatial_replay.errors import LogError, MissingFileError, OutputError, UsageError
+from spatial_replay.perception.decoder import Decoded, Decoder, Untrue, has_key, load_av, picture, reason
+from spatial_replay.perception.frame import LARGEST_PICTURE, Frame
 
 _KEY_FRAMES: Final = 30
 """Frames from one key frame to the next in what we encode: a viewer seeks to the one before the cursor."""
 
 _NS: Final = Fraction(1, 10**9)
 _TICK: Final = Fraction(1, 90_000)
-_IDR, _SEQUENCE_PARAMETERS = 5, 7
-"""Kinds of units in H.264."""
-
-_DECODER: Final = MappingProxyType({"max_pixels": str(LARGEST_PICTURE)})
 _MOST_BOXES: Final = 1000
 """Boxes of an .mp4 that are looked at for its index."""
 
@@ -60,7 +53,7 @@ class VideoFile:
             raise UsageError(f"the rate is {rate!r}; give frames a second, above 0")
         self.name, self._path, self._rate = path.name, path, rate
         self.faults: list[str] = []
-        av = _load()
+        av = load_av()
         try:
             with path.open("rb"):
                 pass
@@ -75,7 +68,7 @@ class VideoFile:
                     " it breaks off; give the whole file, or record as .mkv or .ts, which need none"
                 ) from None
             raise LogError(
-                f"{self.name} is no video that can be read ({_reason(error)}); give a file of a camera, such"
+                f"{self.name} is no video that can be read ({reason(error)}); give a file of a camera, such"
                 " as .mp4, .mkv or .avi, or a log with --topic"
             ) from None
         streams = self._container.streams.video
@@ -93,10 +86,7 @@ class VideoFile:
         if context.width * context.height > LARGEST_PICTURE:
             self.close()
             raise LogError(f"{self.name}: its frames of {context.width} x {context.height} are too large")
-        # one thread, one frame out for one in
-        self._stream.thread_type = "NONE"
-        self._stream.thread_count = 1
-        context.options = dict(_DECODER)
+        self._decoder = Decoder(context)
 
     @property
     def copy_fault(self) -> str | None:
@@ -109,46 +99,60 @@ class VideoFile:
         return None
 
     def __iter__(self) -> Iterator[Frame]:
-        av = _load()
-        last_ns, first, count, widest_ns = -1, None, 0, 0
-        damaged, is_damaged = 0, False
+        av = load_av()
+        last_ns = before_ns = -1
+        first, count, widest_ns = None, 0, 0
+        untrue = Untrue()
+        # a frame that is not true, until there is another one
+        kept: Frame | None = None
         try:
             length_ns = self._length_ns()
-            for packet, frame in self._decoded():
-                stamp = self._stamp_ns(frame, count)
+            for found in self._decoded():
+                stamp = self._stamp_ns(found.frame, count)
                 count += 1
-                # what the decoder makes up of a frame in parts may show objects where they are not
-                is_damaged = bool(frame.is_corrupt)
-                damaged += is_damaged
-                if is_damaged:
+                first = stamp if first is None and found.is_true else first
+                time_ns = 0 if first is None else stamp - first
+                untrue.add(time_ns, found.is_true)
+                if kept is not None:
+                    yield kept
+                    kept = None
+                if first is None:
                     continue
-                first = stamp if first is None else first
-                time_ns = stamp - first
                 if time_ns <= last_ns:
                     self._add_fault(f"{self.name}: frame {count} is not after the one before it; left out")
                     continue
                 widest_ns = max(widest_ns, time_ns - last_ns) if last_ns >= 0 else 0
-                last_ns = time_ns
-                yield Frame(time_ns, frame.to_ndarray(format="bgr24"), packet, has_key(packet))
-            if damaged > is_damaged:
-                self._add_fault(f"{self.name}: {counted(damaged - is_damaged, 'damaged frame')}, left out")
-            if is_damaged:
-                at = "in its first frame" if last_ns < 0 else f"after {last_ns / 1e9:.3f} s, within a frame"
+                before_ns, last_ns = last_ns, time_ns
+                frame = Frame(time_ns, picture(found), found.of, has_key(found.of))
+                if found.is_true:
+                    yield frame
+                else:
+                    kept = frame
+            # a file that ends within a frame has damaged that one
+            if untrue.last == untrue.frames == 1:
+                at = (
+                    "in its first frame"
+                    if first is None
+                    else f"after {before_ns / 1e9:.3f} s, within a frame"
+                )
                 self._add_fault(f"{self.name} breaks off {at}")
+                return
+            if kept is not None:
+                yield kept
+            self.faults += untrue.faults(self.name)
             # the last frame is shown as long as any other, however uneven they are
-            elif widest_ns and last_ns + widest_ns * 3 // 2 < length_ns:
+            if widest_ns and last_ns + widest_ns * 3 // 2 < length_ns:
                 ends = f"{last_ns / 1e9:.3f} s, though its header says {length_ns / 1e9:.3f} s"
                 self._add_fault(f"{self.name} breaks off after {ends}")
         except (av.FFmpegError, EOFError) as error:
             at = "before its first frame" if last_ns < 0 else f"after {last_ns / 1e9:.3f} s"
-            self._add_fault(f"{self.name} breaks off {at} ({_reason(error)})")
+            self._add_fault(f"{self.name} breaks off {at} ({reason(error)})")
         finally:
             self.close()
 
-    def _decoded(self) -> Iterator[tuple[bytes, Any]]:
+    def _decoded(self) -> Iterator[Decoded]:
         """Yield frames, each with its bytes if it can be copied."""
-        av = _load()
-        packets: dict[int | None, bytes] = {}
+        av = load_av()
         convert = None
         if self.copy_fault is None:
             convert = av.bitstream.BitStreamFilterContext("h264_mp4toannexb", self._stream)
@@ -157,21 +161,19 @@ class VideoFile:
             # and what FFmpeg guesses is one frame late
             if self._container.format.name == "avi" and not self._stream.codec_context.has_b_frames:
                 packet.pts = packet.dts
-            # the filter takes the packet's content, and its time with it
-            pts = packet.pts
             if packet.is_corrupt:
                 self._add_fault(f"{self.name}: a packet is damaged")
-            frames = []
+            copies: list[bytes] = []
+            found = []
             try:
-                frames = packet.decode()
+                found = self._decoder.decode(packet, copies)
             except av.InvalidDataError as error:
-                self._add_fault(f"{self.name}: a frame cannot be decoded ({_reason(error)}); left out")
+                self._add_fault(f"{self.name}: a frame cannot be decoded ({reason(error)}); left out")
+            # the filter takes the packet's content
             if convert is not None and packet.size:
-                packets[pts] = b"".join(bytes(each) for each in convert.filter(packet))
-            for frame in frames:
-                if frame.width * frame.height > LARGEST_PICTURE:
-                    raise LogError(f"{self.name}: a frame of {frame.width} x {frame.height} is too large")
-                yield packets.pop(frame.pts, b""), frame
+                copies += [bytes(each) for each in convert.filter(packet)]
+            for each in found:
+                yield each._replace(of=b"".join(each.of))
 
     def _length_ns(self) -> int:
         """Return how long the file says that the video is; 0 if it does not."""
@@ -210,7 +212,7 @@ class H264Encoder:
         Raises:
             UsageError: PyAV is not installed.
         """
-        av = _load()
+        av = load_av()
         self._size = width - width % 2, height - height % 2
         context = av.CodecContext.create("libx264", "w")
         context.width, context.height = self._size
@@ -230,7 +232,7 @@ class H264Encoder:
 
     def encode(self, frame: Frame) -> bytes:
         """Return the next frame, times increasing."""
-        av = _load()
+        av = load_av()
         width, height = self._size
         image = frame.image[:height, :width]
         form = "gray" if image.ndim == 2 else "bgr24"
@@ -238,38 +240,6 @@ class H264Encoder:
         picture.pts = frame.time_ns // 1000
         picture.time_base = Fraction(1, 1_000_000)
         return b"".join(bytes(packet) for packet in self._context.encode(picture))
-
-
-class H264Decoder:
-    """H.264 messages to images, in their order; a process for one topic."""
-
-    def __init__(self) -> None:
-        """Open the decoder; frames before the first key frame are not decoded."""
-        self._context = _load().CodecContext.create("h264", "r")
-        self._context.options = dict(_DECODER)
-        self._context.thread_count = 1
-        self._is_ready = False
-
-    def decode(self, data: bytes) -> Image | None:
-        """Return the image of a message; None before the first key frame.
-
-        Raises:
-            LogError: it is damaged.
-        """
-        self._is_ready |= has_key(data)
-        if not self._is_ready:
-            return None
-        av = _load()
-        try:
-            frames = self._context.decode(av.Packet(data))
-        except av.FFmpegError as error:
-            raise LogError(f"a frame cannot be decoded ({_reason(error)})") from None
-        if not frames:
-            return None
-        width, height = frames[-1].width, frames[-1].height
-        if width * height > LARGEST_PICTURE:
-            raise LogError(f"a frame of {width} x {height} is too large")
-        return np.asarray(frames[-1].to_ndarray(format="bgr24"), np.uint8)
 
 
 class VideoWriter:
@@ -282,7 +252,7 @@ class VideoWriter:
             OutputError: the file cannot be written.
             UsageError: PyAV is not installed, or the name's ending is not that of a video.
         """
-        av = _load()
+        av = load_av()
         self._rate = rate
         self._stream: Any = None
         try:
@@ -290,7 +260,7 @@ class VideoWriter:
         except ValueError:
             raise UsageError(f"{path}: give the name of a video, such as {path.stem}.mp4") from None
         except OSError as error:
-            raise OutputError(f"{path}: {_reason(error)}") from None
+            raise OutputError(f"{path}: {reason(error)}") from None
 
     def __enter__(self) -> Self:
         return self
@@ -302,7 +272,7 @@ class VideoWriter:
 
     def write(self, frame: Frame) -> None:
         """Add a frame; an odd edge of the picture loses a row or column of pixels."""
-        av = _load()
+        av = load_av()
         height, width = (edge - edge % 2 for edge in frame.image.shape[:2])
         if self._stream is None:
             self._stream = self._opened(width, height)
@@ -323,16 +293,6 @@ class VideoWriter:
         return stream
 
 
-def has_key(data: bytes) -> bool:
-    """Return whether H.264 in Annex B form can be decoded from here on."""
-    at = data.find(b"\x00\x00\x01")
-    while 0 <= at < len(data) - 3:
-        if data[at + 3] & 31 in (_IDR, _SEQUENCE_PARAMETERS):
-            return True
-        at = data.find(b"\x00\x00\x01", at + 3)
-    return False
-
-
 def _lacks_index(path: Path) -> bool:
     """Return whether a file is an .mp4 or .mov without the box that says where its frames are."""
     with path.open("rb") as file:
@@ -347,24 +307,3 @@ def _lacks_index(path: Path) -> bool:
             kinds.append(kind)
             at += max(length, 8)
     return kinds[:1] == [b"ftyp"] and b"moov" not in kinds
-
-
-def _reason(error: BaseException) -> str:
-    reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
-    return f"{reason!s:.200}".lower()
-
-
-@cache
-def _load() -> Any:
-    """Import PyAV.
-
-    Raises:
-        UsageError: it is not installed.
-    """
-    with importing("videos need PyAV", extra="vision"):
-        import av
-        import av.bitstream
-    # its messages would go to the terminal; errors are raised
-    with suppress(AttributeError):
-        av.logging.set_level(None)
-    return av
