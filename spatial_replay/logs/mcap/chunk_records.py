@@ -117,9 +117,11 @@ class _Walk:
         """
         view = np.frombuffer(content, np.uint8)
         if self._copies and len(self.payloads) < len(content):
-            self.payloads = np.empty(len(content), np.uint8)
+            # the next chunk is about as large
+            self.payloads = np.empty(len(content) + len(content) // 8, np.uint8)
         # room for as many records as there could be would be many times the bytes
-        self._make_room(len(content) // 128 + 32)
+        if (enough := len(content) // 128 + 32) > self._places.shape[1]:
+            self._make_room(2 * enough)
         self._state[:4], self._state[4] = 0, -1
         while True:
             _walk_on(view, passed_over, self._state, self._places, self._heads, self.payloads)
@@ -130,9 +132,8 @@ class _Walk:
 
     def _make_room(self, count: int) -> None:
         more = count - self._places.shape[1]
-        if more > 0:
-            self._places = np.concatenate([self._places, np.empty((5, more), np.int64)], axis=1)
-            self._heads = np.concatenate([self._heads, np.empty(_MESSAGE_BYTES * more, np.uint8)])
+        self._places = np.concatenate([self._places, np.empty((5, more), np.int64)], axis=1)
+        self._heads = np.concatenate([self._heads, np.empty(_MESSAGE_BYTES * more, np.uint8)])
 
     @property
     def places(self) -> Integers:

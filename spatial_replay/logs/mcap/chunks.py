@@ -19,7 +19,7 @@ from typing import BinaryIO, NamedTuple
 import lz4.frame
 import zstandard
 
-from spatial_replay.logs.byte_ranges import plan_reads
+from spatial_replay.logs.byte_ranges import is_planned, plan_reads
 from spatial_replay.logs.mcap.chunk_records import RECORD_HEAD, DamageError, Records, Splitter
 
 LARGEST_CHUNK = 2**30
@@ -35,6 +35,8 @@ _TOGETHER, _TOGETHER_BYTES, _AHEAD = 8, 2**20, 24
 """Chunks, and their bytes, that a thread takes at once; and how many times as many are read ahead."""
 _MOST_THREADS = 4
 """More would wait for the one that takes what they have read."""
+_MOST_SPREAD = 1.5
+"""Times their own bytes that chunks and what lies between them may have, to be read at once."""
 
 
 class ChunkPlace(NamedTuple):
@@ -85,24 +87,35 @@ def read_records(stream: BinaryIO, place: ChunkPlace) -> bytes:
     Raises:
         DamageError: the chunk is cut off, does not decompress, or has another checksum than it says.
     """
-    return _content(place, _record(stream, place), zstandard.ZstdDecompressor())
+    (record,) = _read_places(stream, [place])
+    return _content(place, record, zstandard.ZstdDecompressor())
 
 
-def _record(stream: BinaryIO, place: ChunkPlace) -> bytes:
-    stream.seek(place.offset)
-    return stream.read(place.length)
+def _read_places(stream: BinaryIO, places: Sequence[ChunkPlace]) -> list[memoryview]:
+    """Read what is in some places, at once where they follow each other closely, as on this machine."""
+    begin, end = places[0].offset, max(place.offset + place.length for place in places)
+    is_near = end - begin <= _MOST_SPREAD * sum(place.length for place in places)
+    if len(places) == 1 or not is_near or begin > min(place.offset for place in places) or is_planned(stream):
+        return [_read(stream, place.offset, place.length) for place in places]
+    data = _read(stream, begin, end - begin)
+    return [data[place.offset - begin : place.offset - begin + place.length] for place in places]
 
 
-def _content(place: ChunkPlace, record: bytes, decompressor: zstandard.ZstdDecompressor) -> bytes:
+def _read(stream: BinaryIO, offset: int, length: int) -> memoryview:
+    stream.seek(offset)
+    return memoryview(stream.read(length))
+
+
+def _content(place: ChunkPlace, record: memoryview, decompressor: zstandard.ZstdDecompressor) -> bytes:
     """Return the records in what was read of a place; see `read_records`."""
     if len(record) < place.length:
         raise DamageError("the chunk breaks off")
     if not place.compressed:
-        return record
-    chunk_place(place.offset, record[:_LONGEST_HEAD], len(record))
+        return bytes(record)
+    chunk_place(place.offset, bytes(record[:_LONGEST_HEAD]), len(record))
     _, _, size, checksum, name_length = _CHUNK_HEAD.unpack_from(record, RECORD_HEAD.size)
     begin = _FIXED_HEAD + name_length
-    content = _decompressed(record[_FIXED_HEAD:begin], memoryview(record)[begin + 8 :], size, decompressor)
+    content = _decompressed(bytes(record[_FIXED_HEAD:begin]), record[begin + 8 :], size, decompressor)
     if len(content) != size:
         raise DamageError(f"the chunk holds {len(content)} bytes instead of {size}")
     if (checksum or place.has_checksum) and zlib.crc32(content) != checksum:
@@ -117,8 +130,8 @@ def iter_records(
 ) -> Iterator[tuple[ChunkPlace, Records | DamageError]]:
     """Yield each place with its records, or with the damage that `read_records` raised, in this order.
 
-    Other threads, one for each core, read, check, decompress and split the next places while the caller
-    processes one, so the caller must not use the stream in between.
+    Other threads read, check, decompress and split the next places while the caller processes one, on all
+    cores but one. So the caller must not use the stream in between.
 
     Args:
         passed_over: channels whose messages are not wanted.
@@ -126,7 +139,7 @@ def iter_records(
     plan_places(stream, places)
     reading = Lock()
     waiting: deque[tuple[Sequence[ChunkPlace], Future[list[Records | DamageError]]]] = deque()
-    with ThreadPoolExecutor(min(cores(), _MOST_THREADS), "chunk-reading") as readers:
+    with ThreadPoolExecutor(max(1, min(cores() - 1, _MOST_THREADS)), "chunk-reading") as readers:
         try:
             for group in _groups(places):
                 waiting.append((group, readers.submit(_read_group, stream, reading, group, passed_over)))
@@ -165,7 +178,7 @@ def _read_group(
     stream: BinaryIO, reading: Lock, places: Sequence[ChunkPlace], passed_over: Collection[int]
 ) -> list[Records | DamageError]:
     with reading:
-        read = [_record(stream, place) for place in places]
+        read = _read_places(stream, places)
     decompressor, splitter = zstandard.ZstdDecompressor(), Splitter(passed_over)
     found: list[Records | DamageError] = []
     for place, record in zip(places, read, strict=True):
