@@ -449,14 +449,17 @@ def test_a_map_shows_each_relation_and_says_what_limits_or_blocks_a_cell(open_pa
     page = open_page("layers")
     card = page.locator(".card").nth(0)
     card.locator("summary").click()
-    candidate = card.locator(".candidate", has_text="chosen")
-    made, choice = candidate.locator("canvas").first, candidate.get_by_label("Layer of the map").first
+    # of the orientations, the one of the target has them
+    figure = card.locator(".candidate figure", has=page.get_by_label("Layer of the map"))
+    made, choice = figure.locator("canvas"), figure.get_by_label("Layer of the map")
     titles = choice.locator("option").all_text_contents()
     assert titles[0] == "all that has to hold" and len(titles) > 1
     pictures = []
     for title in titles:
         choice.select_option(label=title)
         expect(choice).to_have_attribute("title", title)
+        # it is drawn with the next frame of the screen
+        page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
         pictures.append(made.evaluate("each => each.toDataURL()"))
     assert len(set(pictures)) == len(titles)
     made.scroll_into_view_if_needed()
