@@ -32,13 +32,17 @@ def labelled_objects(
 ) -> NDArray[np.bool_]:
     """Return (S, objects), which objects have their names beside them.
 
-    Where a sample has very many, these are the ones that a specification names and those that violate it.
+    Where a sample has very many, these are the ones that violate a specification there, the worst first, and
+    then those that it names.
     """
     named = {each for result in results for own in result.requirements for each in own.objects}
-    is_chosen = (robustness < 0.0) | np.array([name in named for name in names], np.bool_)
+    is_named = np.array([name in named for name in names], np.bool_)
+    urgency = np.where(robustness < 0.0, robustness, np.where(is_named, 0.0, np.inf))
+    urgency[~is_present] = np.inf
     is_crowded = is_present.sum(axis=1) >= _CROWD
-    is_first = np.cumsum(is_chosen, axis=1) <= _MOST_LABELS
-    return np.asarray(np.where(is_crowded[:, None], is_chosen & is_first, True))
+    rank = np.argsort(np.argsort(urgency, axis=1, kind="stable"), axis=1, kind="stable")
+    is_chosen = (urgency < np.inf) & (rank < _MOST_LABELS)
+    return np.asarray(np.where(is_crowded[:, None], is_chosen, True))
 
 
 _CROWD: Final = 40
