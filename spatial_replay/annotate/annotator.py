@@ -127,7 +127,10 @@ class Annotator:
     @property
     def outcomes(self) -> Sequence[FinalStanding]:
         """What each result came to, once the log has ended."""
-        return self._standing.outcomes
+        return [
+            outcome._replace(over_by=each.over_by)
+            for outcome, each in zip(self._standing.outcomes, self._reporters, strict=False)
+        ]
 
     @property
     def _over(self) -> list[str]:

@@ -65,14 +65,19 @@ def end_sentence(title: str, verdict: Verdict, ends: tuple[float, float], witnes
     return f"{title} is {verdict}{amount}, for the log has ended{because}."
 
 
-def past_sentence(before: Period, until_ns: int, witness: str, unit: str) -> str:
-    """Return a sentence on the period before, until another began."""
-    seconds = time_text(until_ns, before.start_ns)
+def past_sentence(before: Period, unknown_ns: int, until_ns: int, witness: str, unit: str) -> str:
+    """Return a sentence on the period before, until another began.
+
+    Args:
+        unknown_ns: from when on nothing was known, if that is before `until_ns`.
+    """
+    seconds = time_text(min(unknown_ns, until_ns), before.start_ns)
+    unknown = f", then unknown for {time_text(until_ns, unknown_ns)}" if unknown_ns < until_ns else ""
     if before.code == FAILING:
-        return f"Before, it was pending for {seconds}."
+        return f"Before, it was pending for {seconds}{unknown}."
     worst = ""
     if witness:
         worst = f"; its worst was that {witness}"
     elif math.isfinite(before.worst):
         worst = f", by {with_unit(abs(before.worst), unit)} or more"
-    return f"Before, it held for {seconds}{worst}."
+    return f"Before, it held for {seconds}{unknown}{worst}."

@@ -40,7 +40,7 @@ from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.online.codes import low_and_high
 from spatial_replay.monitor.online.operators import looks_ahead
 from spatial_replay.monitor.semantics import Semantics
-from spatial_replay.monitor.sentences import amount_text
+from spatial_replay.monitor.sentences import amount_text, uncertain_text
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.monitor.vacuity import Vacuous
 from spatial_replay.monitor.verdict import Verdict, final_verdict
@@ -122,6 +122,8 @@ class EventReporter:
         violated_ns: since when the root is violated for certain, or `LATEST_NS`.
         over: what decided the root's verdict, an atom or a missing response, once there is one; "" if that
             is not known.
+        over_by: the number of that atom, or of the one that came nearest to the response, with its unit and
+            without its sign; "" if that is not known.
     """
 
     def __init__(
@@ -155,9 +157,10 @@ class EventReporter:
         self._states = NodeStates.begin(len(self._reported))
         self._carried: dict[tuple[int, int], LeafValue | None] = {}
         self._last_ns: int | None = None
+        self._unknown_ns = np.full(len(self._reported), LATEST_NS)
         self.settled: SettledViolation | None = None
         self.violated_ns = LATEST_NS
-        self.over = ""
+        self.over = self.over_by = ""
 
     def extend(self, block: SeriesBlock) -> list[EncodedEvent]:
         """Take in the next samples; return the changes that they confirm, by node, then by time."""
@@ -165,7 +168,6 @@ class EventReporter:
             self._history = None
         if not len(block.times_ns) or self._states.are_final:
             return []
-        self._last_ns = int(block.times_ns[-1])
         self._values = block.series[:, 0, -1].copy()
         self._leaf_finder.extend(block)
         if self._history is not None:
@@ -180,6 +182,9 @@ class EventReporter:
                 period = Period(code, 0, 0, float(tracked.states.worst[node, slot]), place)
                 carried[node, (OF_CURRENT, OF_CANDIDATE)[slot]] = self._deciding_leaf(node, period, block)
         self._carried = carried
+        for node in range(len(self._reported)):
+            self._unknown_ns[node] = self._after(node, tracked.states.period(node).end_ns, block)
+        self._last_ns = int(block.times_ns[-1])
         return events
 
     def end(self, time_ns: int, final: Floats) -> list[EncodedEvent]:
@@ -224,6 +229,14 @@ class EventReporter:
         found = find_leaf(self._reported[node].below, ends, period.worst, low=period.code != VIOLATED)
         return found and found._replace(time_ns=int(block.times_ns[period.place]))
 
+    def _after(self, node: int, time_ns: int, block: SeriesBlock) -> int:
+        """Return the sample after the last of a node in its state; `LATEST_NS` if there is none yet."""
+        if self._last_ns is not None and time_ns < self._last_ns:
+            return int(self._unknown_ns[node])
+        return int(
+            np.append(block.times_ns, LATEST_NS)[np.searchsorted(block.times_ns, time_ns, side="right")]
+        )
+
     def _event(self, change: Change, block: SeriesBlock) -> EncodedEvent:
         reported, after, before = self._reported[change.node], change.after, change.before
         time_ns, settled = int(block.times_ns[change.sample]), None
@@ -247,7 +260,8 @@ class EventReporter:
         past = None
         if before is not None:
             worst = self._words(self._deciding_leaf(change.node, before, block), time_ns, past=True)
-            past = self._past(reported, before, after.start_ns, worst)
+            unknown_ns = self._after(change.node, before.end_ns, block)
+            past = self._past(reported, before, (unknown_ns, after.start_ns), worst)
         return self._encoded(reported, time_ns, now, past)
 
     def _final_event(self, node: int, time_ns: int, last_ns: int, final: Floats) -> EncodedEvent:
@@ -269,12 +283,14 @@ class EventReporter:
         past = None
         if before.code != START and before.start_ns < last_ns:
             worst = self._words(self._carried[node, OF_CURRENT], time_ns, past=True)
-            past = self._past(reported, before, last_ns, worst)
+            past = self._past(reported, before, (int(self._unknown_ns[node]), last_ns), worst)
         return self._encoded(reported, time_ns, now, past)
 
-    def _past(self, reported: ReportedNode, period: Period, until_ns: int, witness: str) -> PeriodText:
-        """Put a period that has ended into words."""
-        return PeriodText(period, witness, past_sentence(period, until_ns, witness, reported.unit))
+    def _past(
+        self, reported: ReportedNode, period: Period, until_ns: tuple[int, int], witness: str
+    ) -> PeriodText:
+        """Put a period that has ended into words, and from when until when nothing was known after it."""
+        return PeriodText(period, witness, past_sentence(period, *until_ns, witness, reported.unit))
 
     def _encoded(
         self, reported: ReportedNode, time_ns: int, now: PeriodText, past: PeriodText | None
@@ -318,11 +334,13 @@ class EventReporter:
         """Keep what decided the root's verdict, if it is one over all continuations."""
         if self._reported[node].node or found is None or not self._settles:
             return
-        if isinstance(found, DecidingLeaf) and found.missed and found.missed.is_condition:
-            self.over = f"missed {found.missed.response}"
-            return
-        leaf, _ = self._leaf(found.value if isinstance(found, DecidingLeaf) else found, now_ns)
-        self.over = self._leaf_text(leaf)
+        missed = found.missed if isinstance(found, DecidingLeaf) else None
+        leaf, number = self._leaf(found.shown.value if isinstance(found, DecidingLeaf) else found, now_ns)
+        self.over, self.over_by = self._leaf_text(leaf), amount_text(abs(number), leaf, self._units)
+        if missed and missed.is_condition:
+            self.over = f"missed {missed.response}"
+            if isinstance(found, DecidingLeaf) and found.response is None:
+                self.over_by = ""
 
     def _leaf(self, found: LeafValue, now_ns: int) -> tuple[Formula, float]:
         """Return a leaf with its number, in place of a quantifier that of the objects that decide it."""
@@ -342,6 +360,9 @@ class EventReporter:
         missed, shown = found.missed, found.shown
         before_ns = since_ns - shown.time_ns
         words = self._words(shown.value, now_ns, past=before_ns > 0)
+        if abs(shown.bound) < abs(shown.number):
+            leaf, _ = self._leaf(shown.value, now_ns)
+            words += uncertain_text(amount_text(abs(shown.bound), leaf, self._units))
         ago = f" ({time_text(before_ns)} earlier)" if before_ns else ""
         response = f"`{missed.condition}` held, but `{missed.response}` did not: " if missed else ""
         return words, f"{response}{words}{ago}"

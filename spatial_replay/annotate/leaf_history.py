@@ -42,7 +42,8 @@ class DecidingLeaf(NamedTuple):
     Attributes:
         node: its id in the formula's tree.
         leaf: index among the program's leaves.
-        number: its own number there, its sign not turned.
+        number: its own number there, its sign not turned, without what is uncertain.
+        bound: the same with what is uncertain: the end of its interval that decides.
         time_ns: of the sample.
         end: which end of its interval the number is.
         missed: the implication above it that failed, if a violation is due to one.
@@ -56,6 +57,7 @@ class DecidingLeaf(NamedTuple):
     end: End
     missed: MissedResponse | None = None
     response: DecidingLeaf | None = None
+    bound: float = math.nan
 
     @property
     def shown(self) -> DecidingLeaf:
@@ -201,7 +203,12 @@ class LeafHistory:
         if index is None:
             return None
         low, high = low_and_high(len(samples.leaves), wide=True)
-        number = float(samples.leaves[high if path.end is End.HIGH else low, index, sample])
-        if not math.isfinite(number):
+        bound = float(samples.leaves[high if path.end is End.HIGH else low, index, sample])
+        if not math.isfinite(bound):
             return None
-        return DecidingLeaf(node, index, number + 0.0, int(samples.times_ns[sample]), path.end)
+        low, high = low_and_high(len(samples.leaves), wide=False)
+        number = float(samples.leaves[high if path.end is End.HIGH else low, index, sample])
+        if not math.isfinite(number) or (number >= 0.0) != (bound >= 0.0):
+            number = bound
+        time_ns = int(samples.times_ns[sample])
+        return DecidingLeaf(node, index, number + 0.0, time_ns, path.end, bound=bound + 0.0)

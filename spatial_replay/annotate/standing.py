@@ -80,6 +80,7 @@ class FinalStanding(NamedTuple):
         by: its robustness without its sign: the end of its interval that decides; NaN where it is unknown.
         unit: of the robustness.
         over: what decided it; "" if that is not known.
+        over_by: the number of that, with its unit and without its sign; "" if that is not known.
         is_late: whether only the end of the log decided it.
     """
 
@@ -89,6 +90,7 @@ class FinalStanding(NamedTuple):
     unit: str
     over: str
     is_late: bool = False
+    over_by: str = ""
 
 
 def worst_first(outcomes: Sequence[FinalStanding]) -> list[int]:

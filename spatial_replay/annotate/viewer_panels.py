@@ -281,10 +281,14 @@ def summary() -> Panel:
 def _violation_text(outcome: FinalStanding) -> str:
     if outcome.standing != VIOLATED:
         return ""
+    since = f", violated since {outcome.since_s:.3f} s"
+    if outcome.over:
+        # the number of what is named: that of the result may be another atom's, in another unit
+        by = f" by {outcome.over_by}" if outcome.over_by else ""
+        return f"{since}: {shortened_formula(outcome.over)}{by}"
     unit = f" {outcome.unit}" if outcome.unit and outcome.unit != MIXED else ""
-    over = f": {shortened_formula(outcome.over)}" if outcome.over else ""
     by = f" by {number_text(outcome.by)}{unit}" if math.isfinite(outcome.by) else ""
-    return f", violated since {outcome.since_s:.3f} s{by}{over}"
+    return f"{since}{by}"
 
 
 def _titled(identifier: str, title: str, config: Config) -> Panel:

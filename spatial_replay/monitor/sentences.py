@@ -158,6 +158,11 @@ def amount_text(number: float, atom: Formula, units: Mapping[str, str] = Mapping
     return f"{amount} ({number_text(number)} on its scale of {format_number(divisor)})"
 
 
+def uncertain_text(least: str) -> str:
+    """Return what follows the number of an atom that is uncertain: how much it is at least."""
+    return f", at least {least} with what is uncertain"
+
+
 def without_residue(number: float, atom: Formula) -> float:
     """Return a number of an atom, but 0 where it is no more than a rounding error."""
     limits = [
@@ -214,9 +219,13 @@ def _closest(best: DecidingAtom, time_ns: int, first_ns: int, units: Mapping[str
 def _how_it_decides(
     witness: Witness, deciding: DecidingAtom, first_ns: int, *, is_open: bool = False
 ) -> Sentence:
-    amount = deciding.value if deciding.lower == deciding.upper else _end(deciding)
+    amount, least = deciding.value, _end(deciding)
+    if math.isnan(amount) or (amount >= 0.0) != (least >= 0.0):
+        amount = least
     size = amount_text(abs(amount), deciding.atom, witness.units)
     how = f"holds by {size}" if amount >= 0.0 else f"fails by {size}"
+    if abs(least) < abs(amount):
+        how += uncertain_text(amount_text(abs(least), deciding.atom, witness.units))
     if without_residue(amount, deciding.atom) == 0.0:
         how = "just holds" if amount >= 0.0 else "just fails"
     where = _in_time(witness)

@@ -355,3 +355,28 @@ def test_a_goal_that_is_still_to_come_is_neither_pointed_at_nor_red(tmp_path):
     assert colour.r > colour.b
     assert ended["witness"].texts[0].text.strip() == "robot enclosedin bin: -87"
     assert ended["verdict"].texts[0].text == "delivered violated"
+
+
+def test_time_in_which_nothing_was_known_is_not_called_held(tmp_path):
+    found = events_at_end(tmp_path, "spec kept = G battery >= 0", 2.0, 1.0, None, None, None)
+    assert "Before, it held for 0.200 s, then unknown for 0.200 s;" in found[-1][2].message
+    found = events_of(tmp_path, "spec kept = G battery >= 0", 2.0, 1.0, None, -1.0)
+    assert "Before, it held for 0.200 s, then unknown for 0.100 s;" in found[-1][2].message
+
+
+def test_an_uncertain_atom_has_one_number_everywhere(tmp_path):
+    discs = [
+        {
+            "a": sr.TrackedObject(sr.Footprint.disc(0, 0, 0), uncertainty=0.25),
+            "b": sr.TrackedObject(sr.Footprint.disc(x, 0, 0)),
+        }
+        for x in (3.0, 1.5)
+    ]
+    samples = [sr.Sample(index * STEP_NS, objects) for index, objects in enumerate(discs)]
+    number = "fails by 0.5, at least 0.25 with what is uncertain"
+    [(_, _, line)] = written(tmp_path, "spec far = G a dist b >= 2", samples)[:1]
+    assert line.message.startswith(f"`far` is violated, whatever comes: `a dist b >= 2` {number}.")
+    [result] = sr.evaluate(
+        sr.parse_specification("spec far = G a dist b >= 2"), sr.Trace.from_samples(samples)
+    )
+    assert f"`a dist b >= 2`, which {number} at 0.100 s" in result.explain()

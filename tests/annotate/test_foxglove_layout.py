@@ -163,6 +163,23 @@ def curves(layout: dict, panel: str = "Plot!robustness") -> dict[str, str]:
     return {path["label"]: path["value"] for path in own}
 
 
+def test_the_title_of_a_light_has_the_number_of_what_it_names(tmp_path):
+    """The number of the result is that of the condition here, and would be in another unit."""
+    samples = [
+        sr.Sample(
+            t * 10**8,
+            {"a": sr.Footprint.disc(0, 0, 1), "b": sr.Footprint.disc(3 - t / 4, 0, 1)},
+            {"speed": 9.0 - t},
+        )
+        for t in range(5)
+    ]
+    output = tmp_path / "annotated.mcap"
+    files = [sr.parse_specification("spec stops = G (a dist b <= 0.5 -> F[0s, 0.1s] (speed <= 1))")]
+    run_replay(MemorySource.from_samples(samples), files, output=output)
+    title = layout_of(output)["configById"]["Indicator!result0"]["foxglovePanelTitle"]
+    assert title == "stops, violated since 0.400 s: missed F[0s, 0.1s] (speed <= 1) by 4"
+
+
 def test_every_result_has_its_curve_its_light_and_its_strip_under_its_name(tmp_path):
     layout = layout_of(run(tmp_path, TEXT))
     panels = layout["configById"]
@@ -172,7 +189,7 @@ def test_every_result_has_its_curve_its_light_and_its_strip_under_its_name(tmp_p
     lights = [panel for name, panel in panels.items() if name.startswith("Indicator!")]
     for key in ("lichtblickPanelTitle", "foxglovePanelTitle"):
         first, second = (light[key] for light in lights)
-        assert first == "near, violated since 0.400 s by 2.099: a closeto[2] b"
+        assert first == "near, violated since 0.400 s: a closeto[2] b by 2.099"
         assert second == "apart"
     assert panels["Table!violated"]["topicPath"] == "/spatial/standing.violated"
     strips = panels["StateTransitions!verdicts"]["paths"]

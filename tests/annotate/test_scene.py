@@ -478,7 +478,9 @@ def test_a_crowd_has_labels_only_where_something_is_said_or_wrong():
     labelled = {each.id for each in message.entities if each.texts and each.id.startswith("object/")}
     assert labelled == {"object/a", "object/b"}
     named = " and ".join(f"o{index} dist a >= 0" for index in range(40))
-    [message] = pointed(f"spec s = G a closeto[2] z\nspec t = G ({named})", {**many, "a": box_at(0.0), "z": box_at(9.0)})
+    [message] = pointed(
+        f"spec s = G a closeto[2] z\nspec t = G ({named})", {**many, "a": box_at(0.0), "z": box_at(9.0)}
+    )
     labelled = {each.id for each in message.entities if each.texts and each.id.startswith("object/")}
     assert {"object/a", "object/z"} < labelled
     assert len(labelled) == 20
