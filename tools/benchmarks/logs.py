@@ -7,10 +7,12 @@ import resource
 import subprocess
 import sys
 import tempfile
+import time
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -21,7 +23,9 @@ from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.logs.messages import Block
 from spatial_replay.logs.source import samples_only
 from spatial_replay.recording import record_source
+from spatial_replay.replay import run_replay
 from spatial_replay.sources.open_log import open_source
+from spatial_replay.spec import parse_specification
 from spatial_replay.trace.trace import Trace
 
 OBJECTS = ("blue1", "blue2", "green1", "green2", "red1", "red2")
@@ -143,6 +147,51 @@ def _chunk_records(log: Path) -> list[tuple[bytes, int]]:
 def _decompressed(records: list[tuple[bytes, int]]) -> int:
     decompressor = zstandard.ZstdDecompressor()
     return sum(zlib.crc32(decompressor.decompress(data, max_output_size=size)) for data, size in records)
+
+
+def bench_annotating(measure: Any) -> None:
+    """`replay -o`: a log of 20 MB to an annotated one, on all cores and on one, beside bare zstd."""
+    count = 25_000
+    with tempfile.TemporaryDirectory() as folder:
+        log, annotated = Path(folder) / "run.mcap", Path(folder) / "annotated.mcap"
+        record_source(Moving(count), log)
+        files = [parse_specification(SPECIFICATION)]
+        per_sample: Any = {"per": count, "unit": "sample", "runs": 5}
+
+        def annotate(_: object) -> None:
+            run_replay(open_source(log), files, keep_leaves=True, output=annotated)
+
+        processor_s: list[float] = []
+
+        def timed(_: object) -> None:
+            begin = time.process_time()
+            annotate(None)
+            processor_s.append(time.process_time() - begin)
+
+        annotate(None)
+        chunks = _chunk_contents(annotated)
+        bare = measure("compressed, checksums, no more", lambda _: _compressed(chunks), **per_sample)
+        first = measure("replay -o", timed, limit_s=15e-6, **per_sample)
+        measure.ratio("processor time, times bare", median(processor_s) / count / bare.median_s, 6.0)
+        cores = os.sched_getaffinity(0)
+        if len(cores) > 1:
+            try:
+                os.sched_setaffinity(0, {min(cores)})
+                one = measure("replay -o with one core", annotate, **per_sample)
+            finally:
+                os.sched_setaffinity(0, cores)
+            measure.ratio(f"{len(cores)} cores, time of one", first.median_s / one.median_s, 1 / 1.7)
+
+
+def _chunk_contents(log: Path) -> list[bytes]:
+    """The content of each chunk, decompressed."""
+    decompressor = zstandard.ZstdDecompressor()
+    return [decompressor.decompress(data, max_output_size=size) for data, size in _chunk_records(log)]
+
+
+def _compressed(chunks: list[bytes]) -> int:
+    compressor = zstandard.ZstdCompressor(level=1)
+    return sum(zlib.crc32(chunk) + len(compressor.compress(chunk)) for chunk in chunks)
 
 
 def bench_replay_large(measure: Any) -> None:

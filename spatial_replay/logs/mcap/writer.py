@@ -8,7 +8,6 @@ broken, and the others can be read without it.
 
 from __future__ import annotations
 
-import os
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -24,6 +23,7 @@ from mcap import records
 from spatial_replay.errors import OutputError
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.mcap.chunk_records import encoded
+from spatial_replay.logs.mcap.chunks import cores
 from spatial_replay.logs.mcap.packing import (
     Batch,
     McapSummary,
@@ -110,7 +110,7 @@ class LogWriter:
         self._schemas: dict[Schema, int] = {}
         self._declarations: dict[int, _Declaration] = {}
         self._lanes = (_Lane(), _Lane())
-        self._workers = ThreadPoolExecutor(min(THREADS, _processors()), "chunk-packing")
+        self._workers = ThreadPoolExecutor(min(THREADS, cores()), "chunk-packing")
         self._packing: deque[tuple[int, Future[list[PackedChunk]]]] = deque()
         self._packing_bytes = 0
         self._closed = False
@@ -326,11 +326,6 @@ class LogWriter:
             self._stream.flush()
         except OSError as error:
             raise output_error(self._path, error) from error
-
-
-def _processors() -> int:
-    """Return how many processors this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _first_from(times_ns: Integers, latest: list[int], limit_ns: int, begin: int) -> int:
