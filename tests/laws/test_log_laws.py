@@ -6,6 +6,7 @@ import io
 import json
 import math
 import tempfile
+import zlib
 from itertools import pairwise
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from hypothesis import strategies as st
 
 from laws.strategies_trace import traces
 from spatial_replay import LogError, Trace, read_trace
+from spatial_replay.compiled import only
 from spatial_replay.logs import (
     LogWriter,
     McapSource,
@@ -24,6 +26,7 @@ from spatial_replay.logs import (
     encode_objects,
     summarise_mcap,
 )
+from spatial_replay.logs.mcap.chunk_records import joined_checksum
 from spatial_replay.logs.objects.wire import WireTemplate
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.topics import OBJECTS, protobuf_channel
@@ -215,3 +218,11 @@ def json_lines(trace):
             objects.append(entry)
         signals = {name: float(values[index]) for name, values in trace.signals.items()}
         yield {"time_ns": time_ns, "objects": objects, "signals": signals}
+
+
+@given(st.lists(st.binary(max_size=200), max_size=6), st.sampled_from(["compiled", "interpreted"]))
+def test_checksums_of_contents_join_to_that_of_all(contents, form):
+    with only(form):
+        sizes = np.array(list(map(len, contents)), np.int64)
+        joined = joined_checksum(np.array(list(map(zlib.crc32, contents)), np.int64), sizes)
+    assert joined == zlib.crc32(b"".join(contents))

@@ -15,7 +15,7 @@ from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from spatial_replay.compiled import elementwise, kernel
+from spatial_replay.compiled import elementwise, inlined, kernel
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.payloads import Payloads
 
@@ -64,6 +64,39 @@ _LAST_OF_LOG_TIME = 13
 _SCHEMA, _CHANNEL, _MESSAGE = 3, 4, 5
 
 
+_POLYNOMIAL = 0xEDB88320
+"""Of CRC-32, the highest power in the lowest bit."""
+
+
+@elementwise
+@kernel
+def joined_checksum(checksums: Integers, sizes: Integers) -> int:
+    """Return the CRC-32 of contents one after the other, from those of each, as zlib does."""
+    joined = 0
+    for i in range(checksums.shape[0]):
+        # x to the power of the bits of this content, modulo the polynomial, by squaring
+        power, square, rest = 1 << 31, 1 << 23, sizes[i]
+        while rest > 0:
+            if rest & 1:
+                power = _product(square, power)
+            square = _product(square, square)
+            rest >>= 1
+        joined = _product(power, joined) ^ checksums[i]
+    return joined
+
+
+@inlined
+def _product(a: int, b: int) -> int:
+    """Multiply two polynomials over bits, modulo that of CRC-32."""
+    product = 0
+    for _ in range(32):
+        if a & 0x80000000:
+            product ^= b
+        a = (a << 1) & 0xFFFFFFFF
+        b = (b >> 1) ^ _POLYNOMIAL if b & 1 else b >> 1
+    return product
+
+
 class RecordHeads(NamedTuple):
     """N schemas, channels and messages.
 
@@ -109,7 +142,7 @@ class _Walk:
         self.count = self.used = self.declarations = 0
         self.channel = -1
 
-    def over(self, content: bytes, passed_over: Bytes) -> int:
+    def over(self, content: bytes | memoryview, passed_over: Bytes) -> int:
         """Walk over the records in some bytes; return where the last whole one ends.
 
         Args:
@@ -265,7 +298,7 @@ class Splitter:
         self._passed_over[list(passed_over)] = 1
         self._walk = _Walk(copies=True)
 
-    def split(self, content: bytes) -> Records:
+    def split(self, content: bytes | memoryview) -> Records:
         """See `split_records`."""
         walk = self._walk
         end = walk.over(content, self._passed_over)
@@ -278,7 +311,7 @@ class Splitter:
             for index in np.flatnonzero(~is_message).tolist():
                 read = records.Schema.read if opcode[index] == Opcode.SCHEMA else records.Channel.read
                 try:
-                    declarations.append(decoded(read, content[begin[index] : stop[index]]))
+                    declarations.append(decoded(read, bytes(content[begin[index] : stop[index]])))
                 except DamageError as error:
                     damage = str(error)
                     is_message[index:] = False

@@ -13,14 +13,23 @@ import zlib
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from threading import Lock
+from itertools import pairwise
+from threading import Lock, local
 from typing import BinaryIO, NamedTuple
 
 import lz4.frame
+import numpy as np
 import zstandard
 
+from spatial_replay.geometry.arrays import starts_from_counts
 from spatial_replay.logs.byte_ranges import is_planned, plan_reads
-from spatial_replay.logs.mcap.chunk_records import RECORD_HEAD, DamageError, Records, Splitter
+from spatial_replay.logs.mcap.chunk_records import (
+    RECORD_HEAD,
+    DamageError,
+    Records,
+    Splitter,
+    joined_checksum,
+)
 
 LARGEST_CHUNK = 2**30
 """Bytes, uncompressed; a chunk that claims more is damaged."""
@@ -31,7 +40,7 @@ _ALWAYS_ALLOWED, _MOST_TIMES_LARGER = 2**26, 1_000
 _CHUNK_HEAD = struct.Struct("<QQQII")
 _FIXED_HEAD = RECORD_HEAD.size + _CHUNK_HEAD.size
 _LONGEST_HEAD = 80
-_TOGETHER, _TOGETHER_BYTES, _AHEAD = 8, 2**20, 24
+_TOGETHER, _TOGETHER_BYTES, _AHEAD = 16, 2**20, 12
 """Chunks, and their bytes, that a thread takes at once; and how many times as many are read ahead."""
 _MOST_THREADS = 4
 """More would wait for the one that takes what they have read."""
@@ -130,19 +139,19 @@ def iter_records(
 ) -> Iterator[tuple[ChunkPlace, Records | DamageError]]:
     """Yield each place with its records, or with the damage that `read_records` raised, in this order.
 
-    Other threads read, check, decompress and split the next places while the caller processes one, on all
-    cores but one. So the caller must not use the stream in between.
+    Other threads, one for each core, read, decompress, check and split the next places while the caller
+    processes one, so the caller must not use the stream in between.
 
     Args:
         passed_over: channels whose messages are not wanted.
     """
     plan_places(stream, places)
-    reading = Lock()
+    reader = _GroupReader(stream, passed_over)
     waiting: deque[tuple[Sequence[ChunkPlace], Future[list[Records | DamageError]]]] = deque()
-    with ThreadPoolExecutor(max(1, min(cores() - 1, _MOST_THREADS)), "chunk-reading") as readers:
+    with ThreadPoolExecutor(min(cores(), _MOST_THREADS), "chunk-reading") as readers:
         try:
             for group in _groups(places):
-                waiting.append((group, readers.submit(_read_group, stream, reading, group, passed_over)))
+                waiting.append((group, readers.submit(reader.read, group)))
                 if len(waiting) > _AHEAD:
                     ready, contents = waiting.popleft()
                     yield from zip(ready, contents.result(), strict=True)
@@ -174,19 +183,72 @@ def plan_places(stream: BinaryIO, places: Iterable[ChunkPlace]) -> None:
     plan_reads(stream, ((place.offset, place.offset + place.length) for place in places))
 
 
-def _read_group(
-    stream: BinaryIO, reading: Lock, places: Sequence[ChunkPlace], passed_over: Collection[int]
-) -> list[Records | DamageError]:
-    with reading:
-        read = _read_places(stream, places)
-    decompressor, splitter = zstandard.ZstdDecompressor(), Splitter(passed_over)
-    found: list[Records | DamageError] = []
-    for place, record in zip(places, read, strict=True):
+class _GroupReader:
+    """Reads groups of chunks on several threads, each with a buffer that serves again and again."""
+
+    def __init__(self, stream: BinaryIO, passed_over: Collection[int]) -> None:
+        self._stream, self._passed_over = stream, passed_over
+        self._reading = Lock()
+        self._own = local()
+
+    def read(self, places: Sequence[ChunkPlace]) -> list[Records | DamageError]:
+        """Return the records in each place, or its damage."""
+        with self._reading:
+            read = _read_places(self._stream, places)
+        decompressor, splitter = zstandard.ZstdDecompressor(), Splitter(self._passed_over)
+        if (contents := self._contents(places, read, decompressor)) is not None:
+            return [splitter.split(content) for content in contents]
+        found: list[Records | DamageError] = []
+        for place, record in zip(places, read, strict=True):
+            try:
+                found.append(splitter.split(_content(place, record, decompressor)))
+            except DamageError as damage:
+                found.append(damage)
+        return found
+
+    def _contents(
+        self,
+        places: Sequence[ChunkPlace],
+        read: Sequence[memoryview],
+        decompressor: zstandard.ZstdDecompressor,
+    ) -> list[memoryview] | None:
+        """Decompress and check all chunks in one step each, so that threads seldom wait for the interpreter.
+
+        Returns:
+            None if they are not all sound and compressed as ours: then each is looked at by itself.
+        """
+        frames, sizes, checksums = list[memoryview](), list[int](), list[int]()
+        for place, record in zip(places, read, strict=True):
+            if not place.compressed or len(record) < max(place.length, _LONGEST_HEAD):
+                return None
+            _, _, size, checksum, name_length = _CHUNK_HEAD.unpack_from(record, RECORD_HEAD.size)
+            begin = _FIXED_HEAD + name_length
+            if bytes(record[_FIXED_HEAD:begin]) != b"zstd" or not checksum or size > _TOGETHER_BYTES:
+                return None
+            frames.append(record[begin + 8 :])
+            sizes.append(size)
+            checksums.append(checksum)
         try:
-            found.append(splitter.split(_content(place, record, decompressor)))
-        except DamageError as damage:
-            found.append(damage)
-    return found
+            for place, record in zip(places, read, strict=True):
+                chunk_place(place.offset, bytes(record[:_LONGEST_HEAD]), len(record))
+            if list(map(zstandard.frame_content_size, frames)) != sizes:
+                return None
+            starts = starts_from_counts(sizes)
+            whole = self._buffer(int(starts[-1]))
+            reader = decompressor.stream_reader(b"".join(frames), read_across_frames=True)
+            if reader.readinto(whole) != len(whole):  # type: ignore[attr-defined, unused-ignore]
+                return None
+        except (DamageError, zstandard.ZstdError):
+            return None
+        if zlib.crc32(whole) != joined_checksum(np.array(checksums, np.int64), np.array(sizes, np.int64)):
+            return None
+        return [whole[begin:end] for begin, end in pairwise(starts.tolist())]
+
+    def _buffer(self, size: int) -> memoryview:
+        buffer: bytearray | None = getattr(self._own, "buffer", None)
+        if buffer is None or len(buffer) < size:
+            self._own.buffer = buffer = bytearray(size + size // 8)
+        return memoryview(buffer)[:size]
 
 
 def _decompressed(
