@@ -88,7 +88,9 @@ def duration_ns(context: click.Context, parameter: click.Parameter, text: str | 
     help="Keep a hidden object where it was for so long, ever less certain, such as 200ms."
     "  [default: hold of the tags file, or 0s]",
 )
-@click.option("--rate", metavar="HZ", type=float, help="Frames a second, for a video without time stamps.")
+@click.option(
+    "--rate", metavar="HZ", type=float, help="Frames a second of a video, instead of its own stamps."
+)
 @click.option(
     "--for", "length_ns", metavar="T", callback=duration_ns, help="Of a camera: end after so much time."
 )
@@ -192,10 +194,12 @@ def _opened(
             raise UsageError("a video or topic is given twice; each camera counts once")
         wanted: list[str | None] = [*topics] or [None] * len(sources)
         each_source = [*sources] * len(topics) if topics else sources
-        return [
+        opened = [
             open_frames(source, topic=topic, rate=rate)
             for source, topic in zip(each_source, wanted, strict=True)
         ]
+        warn(*(each.remark for each in opened if each.remark is not None))
+        return [*opened]
     for option, is_given in (("--topic", bool(topics)), ("--rate", rate is not None)):
         if is_given:
             raise UsageError(f"{option} does not apply to a camera; leave it out")

@@ -96,6 +96,8 @@ def print_tags(family: str, ids: tuple[int, ...], size: float, paper: str, outpu
     # imported here so that --help stays fast
     from spatial_replay.perception.tag_sheet import TagSheet
 
+    if output.suffix.lower() != ".pdf":
+        raise UsageError(f"-o {output.name}: sheets are written as PDF; give a name that ends in .pdf")
     pages = TagSheet(family, ids, size, paper).write(output)
     show(f"wrote {output}: {counted(len(ids), 'tag')} of {size * 1e3:g} mm on {counted(pages, 'page')}")
     return ExitCode.SATISFIED

@@ -23,6 +23,9 @@ _APART: Final = 0.04
 _LOOSE: Final = 0.02
 """A standard deviation of the focal length above this share of it says that views were too much alike."""
 
+_WRONG: Final = 8.0
+"""Pixels by which corners are off when the sheet is not the one that was said; a bent one stays far below."""
+
 _WIDE: Final = 0.6
 """The least share of the image's width and height that the tags of all views should reach over."""
 
@@ -51,7 +54,8 @@ def calibrate_camera(
 
     Raises:
         LogError: there is no frame.
-        UsageError: too few frames show enough of the tags from different sides.
+        UsageError: too few frames show enough of the tags from different sides, or the tags are not where
+            the references have them.
     """
     detector = TagDetector(family)
     known = {each.id: each.corners for each in references}
@@ -83,6 +87,12 @@ def calibrate_camera(
             " or move the camera around the table, near and far"
         )
     found_calibration = calibrate(points, pixels, size)
+    if not found_calibration.rms < _WRONG or not np.isfinite(found_calibration.deviations).all():
+        raise UsageError(
+            f"{name}: no camera sees the tags like that: with the best one, corners are off by"
+            f" {found_calibration.rms:.1f} pixels; give --family, --ids, --size and --paper as the sheet was"
+            " printed, or check the places of the reference tags"
+        )
     return Calibrated(found_calibration, len(views), tuple(_remarks(found_calibration, pixels, size)))
 
 

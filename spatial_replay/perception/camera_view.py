@@ -171,7 +171,7 @@ class CameraView:
             absent = [str(each.id) for each in self.tags.references if each.id not in self.seen]
             lines.append(
                 f"the plane{of_it} is not known: fewer than {LEAST_REFERENCES} reference tags were seen;"
-                f" there was no {tags_listed(absent)}"
+                f" {tags_listed(absent)} {'was' if len(absent) == 1 else 'were'} not"
             )
         for number, count in sorted(self.twice.items()):
             lines.append(

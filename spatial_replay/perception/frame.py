@@ -9,6 +9,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats
 
 Image = NDArray[np.uint8]
@@ -52,6 +53,9 @@ class Frame:
         data: the frame as H.264 in Annex B form, where it came like that; b"" otherwise.
         is_key: whether `data` can be decoded without the frames before.
         detections: the tags that a robot found in it, which is not there itself; None to find them.
+
+    Raises:
+        UsageError: the image is not of these shapes, empty, or its numbers are not bytes.
     """
 
     time_ns: int
@@ -59,6 +63,15 @@ class Frame:
     data: bytes = field(default=b"", repr=False)
     is_key: bool = False
     detections: tuple[Detection, ...] | None = None
+
+    def __post_init__(self) -> None:
+        image = np.asarray(self.image)
+        is_shaped = image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)
+        if image.dtype != np.uint8 or not is_shaped or (self.detections is None and not image.size):
+            raise UsageError(
+                f"the image of a frame at {self.time_ns / 1e9:.3f} s is {image.dtype} {image.shape}; give"
+                " uint8, (height, width) grey or (height, width, 3) blue, green, red"
+            )
 
 
 def encoded_size(data: bytes) -> tuple[int, int] | None:

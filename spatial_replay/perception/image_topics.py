@@ -20,7 +20,7 @@ from spatial_replay.logs.topics import is_image_type
 from spatial_replay.mapping.message_types import short_type
 from spatial_replay.perception.decoder import H264Decoder, Shown, Untrue, has_key
 from spatial_replay.perception.frame import LARGEST_PICTURE, NO_IMAGE, Detection, Frame, Image
-from spatial_replay.perception.opencv import FAMILIES, corners_from_apriltag, decode_image
+from spatial_replay.perception.opencv import FAMILIES, convert, corners_from_apriltag, decode_image
 from spatial_replay.perception.video import VideoFile
 from spatial_replay.text import nearest_hint, time_text
 
@@ -36,6 +36,19 @@ _CHANNELS: Final[Mapping[str, tuple[int, tuple[int, ...]]]] = MappingProxyType(
     }
 )
 """Encodings of raw images: bytes of a pixel, and which of them are blue, green and red, or grey."""
+
+_CONVERTED: Final[Mapping[str, tuple[int, str]]] = MappingProxyType(
+    {
+        **{f"bayer_{order}8": (1, f"Bayer{order.upper()}2BGR") for order in ("rggb", "bggr", "gbrg", "grbg")},
+        "yuv422": (2, "YUV2BGR_UYVY"),
+        "uyvy": (2, "YUV2BGR_UYVY"),
+        "yuv422_yuy2": (2, "YUV2BGR_YUYV"),
+        "yuyv": (2, "YUV2BGR_YUYV"),
+    }
+)
+"""Encodings that OpenCV converts: bytes of a pixel, and what it calls that."""
+
+_ENCODINGS: Final = (*_CHANNELS, "mono16", *_CONVERTED)
 
 _DETECTIONS: Final[Mapping[str, str]] = MappingProxyType(
     {
@@ -56,7 +69,7 @@ class ImageTopic:
         faults: what was lost so far, each with its place.
     """
 
-    copy_fault = None
+    copy_fault = remark = None
 
     def __init__(self, path: LogFile, topic: str | None = None) -> None:
         """Open the log, and choose the topic.
@@ -233,14 +246,21 @@ def _image(value: Any, type_name: str) -> Image:
     if "Compressed" in type_name:
         return decode_image(data)
     encoding, width, height = str(value.encoding).lower(), int(value.width), int(value.height)
-    if encoding not in _CHANNELS:
-        raise LogError(f"the encoding {encoding!r:.40} is not known; known are {', '.join(_CHANNELS)}")
-    size, order = _CHANNELS[encoding]
+    if encoding not in _ENCODINGS:
+        raise LogError(f"the encoding {encoding!r:.40} is not known; known are {', '.join(_ENCODINGS)}")
+    size = _CHANNELS[encoding][0] if encoding in _CHANNELS else _CONVERTED.get(encoding, (2, ""))[0]
     step = int(value.step) or width * size
     if not (0 < width * height <= LARGEST_PICTURE and width * size <= step and step * height <= len(data)):
         raise LogError(f"an image of {width} x {height} ({encoding}) does not fit its {len(data)} bytes")
     rows = np.frombuffer(data, np.uint8, step * height).reshape(height, step)[:, : width * size]
     pixels = rows.reshape(height, width, size)
+    if encoding in _CONVERTED:
+        return convert(pixels, _CONVERTED[encoding][1])
+    if encoding == "mono16":
+        wide = pixels.view(">u2" if getattr(value, "is_bigendian", False) else "<u2")[..., 0]
+        # cameras of 10 or 12 bits leave the upper ones empty
+        return np.asarray(wide >> max(0, int(wide.max()).bit_length() - 8), np.uint8)
+    order = _CHANNELS[encoding][1]
     return np.ascontiguousarray(pixels[..., 0] if size == 1 else pixels[..., order])
 
 

@@ -94,7 +94,7 @@ class TagObserver:
         self._outlines = {each.name: _outline(each.footprint) for each in tags.objects}
         self._doubts: dict[str, tuple[str, int]] = {}
         self._apart: dict[str, tuple[float, int]] = {}
-        self._frames = 0
+        self._frames = self._last_ns = 0
 
     @property
     def fits(self) -> tuple[Fit | None, ...]:
@@ -111,16 +111,23 @@ class TagObserver:
             frames: one of each camera; None of one that has no frame then, but not of all.
 
         Raises:
-            UsageError: a camera is calibrated for another size, or the reference tags do not fit.
+            UsageError: a frame that is not after the one before, a camera that is calibrated for another
+                size, reference tags that do not fit.
         """
         if len(frames) != len(self._cameras) or all(frame is None for frame in frames):
             raise UsageError(
                 f"{counted(len(self._cameras), 'camera')}: give a frame or None of each, not only None"
             )
+        time_ns = next(frame.time_ns for frame in frames if frame is not None)
+        if self._frames and time_ns <= self._last_ns:
+            raise UsageError(
+                f"a frame at {time_ns / 1e9:.3f} s follows one at {self._last_ns / 1e9:.3f} s; give frames"
+                " with increasing times"
+            )
         self._frames += 1
+        self._last_ns = time_ns
         views: list[View | None] = []
         poses: list[tuple[int, Mapping[int, ObjectPose]]] = []
-        time_ns = next(frame.time_ns for frame in frames if frame is not None)
         for camera, frame in zip(self._cameras, frames, strict=True):
             view = None
             if frame is not None:

@@ -33,6 +33,11 @@ FAMILIES: Final[Mapping[str, str]] = MappingProxyType(
 )
 """Families of AprilTags, and what OpenCV calls them."""
 
+FAMILY_SIZES: Final[Mapping[str, int]] = MappingProxyType(
+    {"16h5": 30, "25h9": 35, "36h10": 2320, "36h11": 587}
+)
+"""How many tags each has."""
+
 _OURS_FROM_OPENCV: Final = [1, 0, 3, 2]
 """OpenCV's pictures of AprilTags are upside down, and its corners begin at their top left, clockwise."""
 
@@ -119,7 +124,7 @@ def tag_cells(family: str, number: int) -> Image:
         UsageError: there is no such family, or it has no such tag.
     """
     dictionary = _dictionary(family)
-    count = len(dictionary.bytesList)
+    count = FAMILY_SIZES[family]
     if not 0 <= number < count:
         raise UsageError(f"family {family} has no tag {number}; its tags are 0 to {count - 1}")
     cells = dictionary.markerSize + 2
@@ -196,6 +201,22 @@ def calibrate(points: list[Floats], pixels: list[Floats], size: tuple[int, int])
 
 
 # -------------------------------------------------------------------------------------------------- images
+
+
+def convert(pixels: Image, conversion: str) -> Image:
+    """Return pixels (height, width, bytes) as blue, green, red, by a conversion of OpenCV.
+
+    Raises:
+        LogError: the image is too small for it, or has an odd width.
+    """
+    cv2 = _load()
+    try:
+        return np.asarray(
+            cv2.cvtColor(np.ascontiguousarray(pixels), getattr(cv2, f"COLOR_{conversion}")), np.uint8
+        )
+    except cv2.error:
+        height, width = pixels.shape[:2]
+        raise LogError(f"an image of {width} x {height} cannot be converted ({conversion})") from None
 
 
 def decode_image(data: bytes) -> Image:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -47,8 +48,11 @@ class TagSheet:
     paper: str = "a4"
 
     def __post_init__(self) -> None:
-        if not 0 < len(self.ids) <= MOST_TAGS or len(set(self.ids)) < len(self.ids):
-            raise UsageError(f"give 1 to {MOST_TAGS} different tags; these are {len(self.ids)}")
+        if not 0 < len(self.ids) <= MOST_TAGS:
+            raise UsageError(f"give 1 to {MOST_TAGS} tags; these are {len(self.ids)}")
+        twice = [number for number, count in Counter(self.ids).items() if count > 1]
+        if twice:
+            raise UsageError(f"tag {twice[0]} is given more than once; name each tag once")
         if self.paper not in PAPERS:
             raise UsageError(f"there is no paper {self.paper!r}; known are {', '.join(PAPERS)}")
         if not (math.isfinite(self.size) and self.size > 0) or not self._columns or not self._rows:

@@ -21,7 +21,7 @@ from spatial_replay.geometry.footprint import Footprint
 from spatial_replay.logs.remote import log_file
 from spatial_replay.mapping.yaml_document import Document, Place, checked_document, read_yaml_text
 from spatial_replay.perception.camera_pose import pose_looking_at
-from spatial_replay.perception.opencv import Camera
+from spatial_replay.perception.opencv import FAMILY_SIZES, Camera
 from spatial_replay.trace.time_points import duration_ns_from_text
 
 SCHEMA_FILE: Final = "tags.schema.json"
@@ -330,6 +330,15 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
             faults.append((place, f"tag {number} is {used[number]} already; a tag is in one place"))
         used.setdefault(number, what)
 
+        family = value.get("family", "36h11")
+        if number >= FAMILY_SIZES.get(family, number + 1):
+            last = FAMILY_SIZES[family] - 1
+            faults.append((place, f"family {family} has no tag {number}; its tags are 0 to {last}"))
+
+    if _is_image(value) and isinstance(value.get("size"), str):
+        faults.append(
+            (("size",), f"in plane: image lengths are pixels; write a number; got {value['size']!r}")
+        )
     camera = value.get("camera") or value.get("cameras")
     if "camera" in value and "cameras" in value:
         faults.append((("cameras",), "give either camera, of one or of all, or cameras, one for each"))
@@ -342,6 +351,8 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
             faults.append(
                 (place, "give one of box, disc and polygon, the footprint around the object's centre")
             )
+        if "polygon" in entry and (fault := _outline_fault(entry["polygon"])):
+            faults.append(((*place, "polygon"), fault))
         if ("tag" in entry) == ("tags" in entry):
             faults.append((place, "give either tag, a number, or tags, a list"))
         tags = entry["tags"] if isinstance(entry.get("tags"), list) else [entry.get("tag")]
@@ -377,13 +388,20 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
         other = "the camera with its pose, or write plane: image for pixels"
         if "cameras" in value:
             other = f"the pose of each camera; {lacking[0]} has none"
-        faults.append(
-            (
-                ("plane",),
-                f"the plane is not determined: give {least}, or {other}",
-            )
-        )
+        faults.append((("plane",), f"the plane is not determined: give {least}, or {other}"))
     return faults
+
+
+def _outline_fault(corners: Any) -> str | None:
+    """Return why the corners of a polygon enclose no footprint; None if they do, or are no corners."""
+    try:
+        Footprint.polygon([[_length(each) for each in corner] for corner in corners])
+    except GeometryError as error:
+        # what functions take, a tags file does not have
+        return str(error).removesuffix(", or take its hull (concave='hull')")
+    except (UsageError, TypeError, ValueError):
+        pass
+    return None
 
 
 @cache

@@ -98,6 +98,19 @@ class VideoFile:
             return f"{self.name} has B frames, which a log cannot hold"
         return None
 
+    @property
+    def remark(self) -> str | None:
+        """That its own stamps are not taken, if it has any; None otherwise."""
+        stream = self._stream
+        if self._rate is None or stream.start_time is None:
+            return None
+        own = stream.average_rate
+        rate = f" ({float(own):g} frames a second)" if own else ""
+        return (
+            f"{self.name} has time stamps{rate}; {self._rate:g} frames a second are taken instead of them:"
+            " leave out --rate unless they are wrong"
+        )
+
     def __iter__(self) -> Iterator[Frame]:
         av = load_av()
         last_ns = before_ns = -1

@@ -176,6 +176,59 @@ def test_image_topics_of_ros_1_are_read(folder: Path) -> None:
     assert len(payloads(log, "/camera/image_raw")) == 3
 
 
+@pytest.mark.parametrize(
+    "encoding", ["bayer_rggb8", "bayer_grbg8", "mono16", "big mono16", "yuv422", "yuv422_yuy2"]
+)
+def test_raw_images_as_sensors_give_them_show_the_same_tags(encoding: str, folder: Path) -> None:
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    from spatial_replay.perception import load_tags, observe_frames, open_frames
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    raw, time = store.types["sensor_msgs/msg/Image"], store.types["builtin_interfaces/msg/Time"]
+    header = store.types["std_msgs/msg/Header"]
+    (frame,) = film(approaching(2), 1)
+    grey = frame.image
+    height, width = grey.shape
+    # of 12 bits, as many cameras have; or with colours that are none
+    pixels = {
+        "mono16": (grey.astype("<u2") << 4).view(np.uint8),
+        "big mono16": (grey.astype(">u2") << 4).astype(">u2").view(np.uint8),
+        "yuv422": np.stack([np.full_like(grey, 128), grey], axis=2),
+        "yuv422_yuy2": np.stack([grey, np.full_like(grey, 128)], axis=2),
+    }.get(encoding, grey)
+    is_big = encoding.startswith("big")
+    bag = folder / encoding.replace(" ", "_")
+    with Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        topic = writer.add_connection("/image", raw.__msgtype__, typestore=store)
+        content = np.ascontiguousarray(pixels).ravel()
+        stamp = header(time(5, 0), "camera")
+        message = raw(stamp, height, width, encoding[4 * is_big :], is_big, content.size // height, content)
+        writer.write(topic, 0, store.serialize_cdr(message, raw.__msgtype__))
+    tags = load_tags(folder / "tags.yaml")
+    (shown,) = observe_frames(open_frames(bag), tags)
+    (truth,) = observe_frames([frame], tags)
+    assert {each.id for each in shown.detections} == {each.id for each in truth.detections}
+    off = [
+        np.abs(ours.corners - other.corners).max()
+        for ours, other in zip(shown.detections, truth.detections, strict=True)
+    ]
+    assert max(off) < 0.35
+
+
+def test_in_python_frames_that_are_none_are_refused_in_words(folder: Path) -> None:
+    from spatial_replay.errors import UsageError
+    from spatial_replay.perception import load_tags, observe_frames
+
+    for image in (np.zeros((4, 4)), np.zeros((4, 4, 2), np.uint8), np.zeros((0, 4), np.uint8)):
+        with pytest.raises(UsageError, match=r"give uint8, \(height, width\) grey or"):
+            Frame(0, image)
+    twice = [frame for frame in film(approaching(2), 1) for _ in range(2)]
+    with pytest.raises(UsageError, match="give frames with increasing times"):
+        list(observe_frames(twice, load_tags(folder / "tags.yaml")))
+
+
 def test_in_python_frames_become_samples_for_a_monitor_and_a_recorder(folder: Path, tmp_path: Path) -> None:
     from spatial_replay.perception import load_tags, observe_frames, open_frames
 
@@ -306,7 +359,12 @@ def test_a_video_without_time_stamps_asks_for_its_rate(
     assert "raw.h264 has no time stamps; say how many frames a second it has" in capsys.readouterr().err
     assert not output.exists()
     assert run([*arguments, "--rate", "25"]) == 0
+    assert "--rate" not in capsys.readouterr().err
     assert read_trace(output) == read_trace(folder / "run.mcap")
+    # of one that has stamps, they are not dropped without a word
+    assert run([*arguments[:2], f"{folder}/table.mp4", *arguments[3:], "--rate", "10"]) == 0
+    assert "table.mp4 has time stamps (25 frames a second); 10 frames a second are" in capsys.readouterr().err
+    assert read_trace(output).times_ns[1] == 100_000_000
 
 
 BAD = {

@@ -108,6 +108,7 @@ WRONG = {
     "no such tag": (["print", "--family", "16h5", "--ids", "30", "--size", "40mm"], "its tags are 0 to 29"),
     "no such family": (["print", "--family", "36h13", "--ids", "0", "--size", "40mm"], "known are 16h5"),
     "too large": (["print", "--ids", "0", "--size", "40cm"], "give a smaller --size"),
+    "a tag twice": (["print", "--ids", "0,0,1", "--size", "40mm"], "tag 0 is given more than once"),
     "inches": (["print", "--ids", "0", "--size", "2in"], "write 40mm or 4cm"),
 }
 
@@ -120,6 +121,24 @@ def test_a_wrong_sheet_is_refused_in_words(
     assert run(["tags", *arguments, "-o", f"{tmp_path}/tags.pdf"]) == 2
     assert said in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_sheet_under_another_name_than_that_of_a_pdf_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["tags", "print", "--ids", "0", "--size", "40mm", "-o", f"{tmp_path}/tags.png"]) == 2
+    assert "give a name that ends in .pdf" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_sheet_that_was_printed_otherwise_gives_no_camera(
+    sheet_video: tuple[Path, Camera], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tmp_path / "camera.yaml"
+    wrong = ["--ids", "0-11", "--size", "50mm", "-o", str(output)]
+    assert run(["tags", "calibrate", str(sheet_video[0]), *wrong]) == 2
+    assert "give --family, --ids, --size and --paper as the sheet was printed" in capsys.readouterr().err
+    assert not output.exists()
 
 
 def test_too_few_views_are_refused(

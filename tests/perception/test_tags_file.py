@@ -55,6 +55,16 @@ MISTAKES = {
         f"{BLOCKS}\n{REFERENCES}".replace("tag: 0,", "tag: 0, lifted: true,"),
         "lifted needs a calibrated camera",
     ),
+    "a tag that the family lacks": (
+        TABLE.replace("tag: 1,", "tag: 700,"),
+        "objects.blue.tag: family 36h11 has no tag 700; its tags are 0 to 586",
+    ),
+    "an outline that crosses itself": (
+        TABLE.replace("box: [50mm, 50mm]", "polygon: [[0, 0], [1, 1], [1, 0], [0, 1]]", 1),
+        "objects.red.polygon: the polygon's boundary crosses or touches itself at (0.5, 0.5); list its"
+        " corners in order around it, or split it",
+    ),
+    "millimetres in an image": (f"{BLOCKS}\nplane: image", "lengths are pixels; write a number; got '48mm'"),
     "a size of nothing": (TABLE.replace("48mm", "0mm"), "above 0"),
 }
 
