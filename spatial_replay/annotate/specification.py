@@ -228,7 +228,7 @@ def _add_nodes(
 
 def _add_automaton(result: SpecificationResult, tree: ReportedTree, automaton: Automaton) -> None:
     from spatial_replay.automata.dot_hoa import abbreviated, meanings
-    from spatial_replay.automata.drawing import draw_automaton
+    from spatial_replay.automata.drawing import draw_automaton, guard_of
 
     drawing, short = draw_automaton(automaton), abbreviated(automaton)
     result.automaton.legend.extend(map(tree.named, meanings(short)))
@@ -244,8 +244,8 @@ def _add_automaton(result: SpecificationResult, tree: ReportedTree, automaton: A
             can_reject=not state.is_won,
             distance=state.distance,
         )
-    for move, brief in zip(drawing.moves, draw_automaton(short).moves, strict=True):
-        guard, label = tree.named(move.guard), tree.named(brief.guard)
+    for move in drawing.moves:
+        guard, label = tree.named(move.guard), tree.named(guard_of(short, move))
         result.automaton.moves.add(source=move.source, target=move.target, guard=guard, label=label)
 
 

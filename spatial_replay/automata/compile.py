@@ -8,12 +8,14 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
 from types import MappingProxyType
 from typing import Literal, TypeAlias, get_args
 
 from spatial_replay.automata.automaton import MAX_PROPOSITIONS, MAX_ROWS, Automaton, automaton_of
-from spatial_replay.automata.ltlf import Skeleton, counts_seconds, no_automaton
-from spatial_replay.automata.minimise import least
+from spatial_replay.automata.ltlf import Node, Skeleton, counts_seconds, no_automaton
+from spatial_replay.automata.minimise import Machine, least
 from spatial_replay.automata.mona import compiled_by_mona
 from spatial_replay.automata.products import composed
 from spatial_replay.automata.propositions import Propositions
@@ -172,13 +174,42 @@ def _compiled(
         if each == "mona" and (before := next(stored, None)) is not None:
             return before
         try:
-            compiled = composed if each == "own" else compiled_by_mona
-            machine = compiled(skeleton, count)
+            if each == "own":
+                machine = _composed(_Shape.of(skeleton, count))
+            else:
+                machine = least(compiled_by_mona(skeleton, count))
         except NoAutomatonError as error:
             reasons.append(f"{_NAMES[each]}: {error}")
         else:
-            return _checked(automaton_of(least(machine), spec.name, propositions.all))
+            return _checked(automaton_of(machine, spec.name, propositions.all))
     raise NoAutomatonError("; ".join(reasons))
+
+
+@dataclass(frozen=True, slots=True)
+class _Shape:
+    """All that a machine follows from: a skeleton, without what its propositions say."""
+
+    nodes: tuple[Node, ...]
+    root: int
+    chains: frozenset[tuple[tuple[int, bool], int]]
+    propositions: int
+    skeleton: Skeleton = field(compare=False, repr=False)
+
+    @classmethod
+    def of(cls, skeleton: Skeleton, propositions: int) -> _Shape:
+        chains = frozenset(skeleton.chains.items())
+        return cls(tuple(skeleton.nodes), skeleton.root, chains, propositions, skeleton)
+
+
+# a formula with another threshold has the same machine
+@lru_cache(maxsize=16)
+def _composed(shape: _Shape) -> Machine:
+    """Return the least machine of a shape, by this package.
+
+    Raises:
+        NoAutomatonError: it would take more states or decisions than are explored.
+    """
+    return least(composed(shape.skeleton, shape.propositions))
 
 
 def _read(stored: Iterable[bytes], specification: Specification, spec: NamedSpec) -> Iterator[Automaton]:

@@ -88,6 +88,12 @@ def draw_automaton(automaton: Automaton, visited: Collection[int] = ()) -> Autom
     )
 
 
+def guard_of(automaton: Automaton, move: DrawnMove) -> str:
+    """Return the guard of a move in words, as this automaton names its propositions; it has the move."""
+    found = automaton.transition(move.source, move.target)
+    return "" if found is None else automaton.guard_words(found, LONGEST_GUARD)
+
+
 def _places(automaton: Automaton, shown: Sequence[int]) -> Mapping[int, tuple[int, float]]:
     """Return column and row of each state: columns follow the transitions, rows make few of them cross."""
     kept = set(shown)

@@ -218,7 +218,8 @@ class Monitor:
         for spec, each, names, unit in zip(self._specs, numbers, self._names, self._units, strict=True):
             # bypasses the constructors of frozen values, which would take as long as the kernel
             of_spec = object.__new__(SpecUpdate)
-            of_spec.__dict__.update(spec=spec, numbers=each, names=names, unit=unit)
+            own = of_spec.__dict__
+            own["spec"], own["numbers"], own["names"], own["unit"] = spec, each, names, unit
             specs.append(of_spec)
         settled: tuple[Settled, ...] = ()
         satisfied: tuple[Settled, ...] = ()
@@ -226,9 +227,9 @@ class Monitor:
             self._violations.extend(sample, numbers)
             settled, satisfied = self._violations.settled, self._violations.satisfied
         update = object.__new__(Update)
-        update.__dict__.update(
-            time_ns=time_ns, specs=tuple(specs), places=self._places, settled=settled, satisfied=satisfied
-        )
+        own = update.__dict__
+        own["time_ns"], own["specs"], own["places"] = time_ns, tuple(specs), self._places
+        own["settled"], own["satisfied"] = settled, satisfied
         return update
 
 

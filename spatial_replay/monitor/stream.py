@@ -6,6 +6,7 @@ same bits.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate, pairwise
@@ -128,9 +129,14 @@ class InstanceStream:
         newest = series[:, :, -1]
         for column, settled in enumerate((newest[:, 2] >= 0.0, newest[:, 3] < 0.0)):
             # what is certain stays so: only where the newest sample is, the first one is looked for
-            nodes = np.flatnonzero(settled & (self.settled_ns[:, column] == NEVER))
-            certain = series[nodes, 3] < 0.0 if column else series[nodes, 2] >= 0.0
-            self.settled_ns[nodes, column] = times_ns[certain.argmax(axis=1)]
+            for node in np.flatnonzero(settled & (self.settled_ns[:, column] == NEVER)):
+                self.settled_ns[node, column] = times_ns[_first_certain(series[node], column)]
+
+
+def _first_certain(series: Floats, column: int) -> int:
+    """Return the first sample at which a node, (4, T), is certainly satisfied, or violated with column 1."""
+    ends, is_violation = series[2 + column], bool(column)
+    return bisect_left(range(len(ends)), True, key=lambda k: bool(ends[k] >= 0.0) != is_violation)
 
 
 class EvaluationStream:

@@ -42,8 +42,8 @@ class Playback:
         self.time_ns = self.start_ns
         self.evaluated = evaluated
         self.arrow = ""
-        self._start = scene_start(evaluated.loaded.inside, shown_regions(evaluated.edited.files))
-        self._started = evaluated
+        self._regions = shown_regions(evaluated.edited.files)
+        self._start = scene_start(evaluated.loaded.inside, self._regions)
         self._annotator = evaluated.annotator(self._start)
         self._own = MessageCursor(own, self.start_ns)
         self._next = 0
@@ -69,9 +69,9 @@ class Playback:
         self.time_ns = min(max(time_ns, self.start_ns), self.end_ns)
         self._next = int(np.searchsorted(self._times_ns, self.time_ns, side="right"))
         shown = max(self._next - 1, 0)
-        if self._started is not self.evaluated:
-            regions = shown_regions(self.evaluated.edited.files)
-            self._start, self._started = scene_start(self.evaluated.loaded.inside, regions), self.evaluated
+        regions = shown_regions(self.evaluated.edited.files)
+        if regions != self._regions:
+            self._start, self._regions = scene_start(self.evaluated.loaded.inside, regions), regions
         scene = replace(self._annotator.scene, written_ns=None, place=self._start.place)
         self._annotator = self.evaluated.annotator(scene, self.arrow)
         self._has_ended = False

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from functools import lru_cache, partial
 from os import PathLike
 from pathlib import Path
 from reprlib import repr as shortened
@@ -60,7 +60,7 @@ def parse_specification(
     if profile is not None and profile not in PROFILES:
         raise UsageError(f"unknown profile {profile!r}; the profiles are {', '.join(PROFILES)}")
     text = text.removeprefix("\ufeff")
-    names = RELATION_NAMES | given.keys()
+    names = RELATION_NAMES.union(given)
     if constants:
         text = _constant_writer(text, filename, names)(constants)
     faults = Faults(SourceText.of(text, filename))
@@ -176,12 +176,14 @@ def _check_relations(relations: Mapping[str, Relation]) -> None:
 def constant_writer(specification: Specification) -> Callable[[Mapping[str, float | str]], str]:
     """Return a function that returns a specification's text with other values in its `const` lines.
 
-    For many values in turn; `parse_specification` with `constants` parses the text itself each time.
+    For many values in turn: `parse_specification` with `constants` parses the text that comes of it, too.
     """
     names = RELATION_NAMES | specification.relations
     return _constant_writer(specification.source, specification.filename, names)
 
 
+# a viewer changes the constants of one text again and again
+@lru_cache(maxsize=16)
 def _constant_writer(
     text: str, filename: str, names: frozenset[str]
 ) -> Callable[[Mapping[str, float | str]], str]:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import os
+import random
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given, reject, settings
 from hypothesis import strategies as st
@@ -14,6 +17,9 @@ from hypothesis import strategies as st
 import spatial_replay as sr
 from laws.strategies_monitor import recordings, specifications
 from spatial_replay.compiled import only
+from spatial_replay.monitor.instances import find_instances
+from spatial_replay.monitor.stream import EvaluationStream
+from spatial_replay.trace.sample import FOREVER
 
 RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
 FORMS = ("interpreted", "compiled")
@@ -81,3 +87,28 @@ def replay(*arguments, **environment):
     command = [sys.executable, "-m", "spatial_replay", "replay", *map(str, arguments)]
     done = subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (1, ""), done.stderr
+
+
+@pytest.mark.parametrize(
+    "formula",
+    [
+        "(G p >= 0 <-> F not q >= 0) and (H[0,3] p >= 1 xor O q >= 2)",
+        "G (p >= 1 -> F[0,700] q >= 1)",
+        "G (p >= 1 -> F[0,2] G[0,3] q >= 1)",
+    ],
+)
+def test_a_long_log_at_once_has_the_bits_of_its_parts(formula):
+    """Of a great many samples, more are run together than of few."""
+    numbers = random.Random(0)
+    specification = sr.parse_specification(formula)
+    trace = sr.Trace.from_samples(
+        sr.Sample(k, signals={"p": numbers.uniform(-1, 5), "q": numbers.uniform(-5, 3)}) for k in range(9000)
+    )
+    with only("compiled"):
+        whole = sr.evaluate(specification, trace).result()
+        stream = EvaluationStream(find_instances(specification, {}, [trace], 0, FOREVER), {})
+        ends = [0, 1, 700, 4000, 8500, 9000]
+        parts = [stream.extend(trace.slice(*cut))[0] for cut in pairwise(ends)]
+    series = np.concatenate([each.series for each in parts], axis=2)
+    assert series.tobytes() == whole.series.tobytes()
+    assert stream.streams[0].final.tobytes() == whole.final.tobytes()

@@ -6,7 +6,8 @@ import itertools
 import json
 import os
 import struct
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
@@ -26,8 +27,9 @@ from spatial_replay.serve import open_server
 from spatial_replay.trace.trace import Trace
 
 SAMPLES = 100_000
-WINDOWS = (60, 600)
-"""Samples of windows that make a change expensive."""
+WINDOWS = ("0,600", "0,10000", "0s,1s")
+"""Of the operator below another one; a change costs the same with each."""
+CHANGES = 9
 PATIENCE_S = 60.0
 
 
@@ -102,14 +104,52 @@ def bench_serve_windows(measure: Any) -> None:
     data = _data()
     if not data.is_dir():
         return
-    for samples in WINDOWS:
-        text = f"spec passed = G (red1 closeto[near] blue1 -> F[0, {samples}] red1 below blue1)"
+    for window in WINDOWS:
+        text = _response(window)
         with viewing(_trace(data), text) as viewer:
             viewer.subscribe(CURVES_TOPIC)
             viewer.wait_for(CURVES_TOPIC)
             measure(
-                f"change, window of {samples}", lambda _: viewer.change(CURVES_TOPIC), unit="change", runs=3
+                f"change, window [{window}]",
+                lambda _: viewer.change(CURVES_TOPIC),
+                unit="change",
+                runs=3,
+                limit_s=0.1,
             )
+
+
+def bench_what_if(bench: Any) -> None:
+    """Processor time from a constant to the curves of all, beside numpy over as many numbers."""
+    data = _data()
+    if not data.is_dir():
+        return
+    trace = _trace(data)
+    blocks = json.loads((data / "expected.json").read_text())["blocks_moving_passage"]["spec"]
+    texts = {"block pushing": blocks.replace("closeto ", "closeto[near] ")}
+    texts |= {f"window [{window}]": _response(window) for window in WINDOWS}
+    for name, text in texts.items():
+        loaded = LoadedLog(MemorySource(trace), [sr.parse_specification(f"const near = 70\n{text}")])
+        numbers = np.concatenate([each.series for each in loaded.evaluate().stretches])
+        values = (float(20 + change) for change in range(CHANGES))
+        times = [_spent(partial(_curves_with, loaded, value)) for value in values]
+        passes = [_spent(partial(numbers.min, axis=2)) for _ in range(CHANGES)]
+        bench.quantile(f"{name}: a change", times, 0.5, unit="change", limit_s=0.05)
+        bench.ratio(f"{name}, to numpy's", float(np.median(times) / np.median(passes)), 30.0)
+
+
+def _curves_with(loaded: LoadedLog, near: float) -> bytes:
+    return loaded.evaluate({"near": near}).curves
+
+
+def _spent(run: Callable[[], object]) -> float:
+    """Return the processor time that a run takes, in seconds."""
+    start = time.process_time()
+    run()
+    return time.process_time() - start
+
+
+def _response(window: str) -> str:
+    return f"spec passed = G (red1 closeto[near] blue1 -> F[{window}] red1 below blue1)"
 
 
 def bench_serve_relay(measure: Any) -> None:

@@ -81,42 +81,56 @@ def run_instructions(
             for channel in range(channels):
                 mirror = channel ^ 1 if channels > 1 else channel
                 target = columns[i, channel]
-                first, second = columns[a, channel], columns[b, channel]
-                for k in range(count):
-                    if op == CONSTANT:
+                first, second, opposite = columns[a, channel], columns[b, channel], columns[a, mirror]
+                # a loop for each operation: a single one would ask for each sample which it is
+                if op == CONSTANT:
+                    for k in range(count):
                         target[k] = constants[a]
-                    elif op == MEASURED:
+                elif op == MEASURED:
+                    sign = 0.0 if channel < 2 else -1.0 if channel == 2 else 1.0
+                    for k in range(count):
                         target[k] = values[a, t + k]
-                        if channel == 2:
-                            target[k] -= spreads[a, t + k]
-                        elif channel == 3:
-                            target[k] += spreads[a, t + k]
-                    elif op == SIGNAL:
+                    if sign:
+                        for k in range(count):
+                            target[k] += sign * spreads[a, t + k]
+                elif op == SIGNAL:
+                    for k in range(count):
                         target[k] = signals[a, t + k]
-                    elif op == CLOSEST:
+                elif op == CLOSEST:
+                    for k in range(count):
                         target[k] = closest[a, channel, t + k]
-                    elif op == ADD:
+                elif op == ADD:
+                    for k in range(count):
                         target[k] = first[k] + second[k]
-                    elif op == NEGATE:
-                        target[k] = -columns[a, mirror, k]
-                    elif op in (LEAST, GREATEST):
-                        if first[k] != first[k] or second[k] != second[k]:  # not a number
-                            target[k] = np.nan
-                        elif op == LEAST:
-                            target[k] = min(first[k], second[k])
-                        else:
-                            target[k] = max(first[k], second[k])
-                    elif op == HOLDS:
-                        target[k] = first[k]
-                        if first[k] != first[k] or columns[a, mirror, k] != columns[a, mirror, k]:
-                            target[k] = np.inf if channel % 2 else -np.inf
-                    elif op == AND:
+                elif op == NEGATE:
+                    for k in range(count):
+                        target[k] = -opposite[k]
+                elif op == LEAST:
+                    for k in range(count):
+                        least = min(first[k], second[k])
+                        is_number = first[k] == first[k] and second[k] == second[k]
+                        target[k] = least if is_number else np.nan
+                elif op == GREATEST:
+                    for k in range(count):
+                        greatest = max(first[k], second[k])
+                        is_number = first[k] == first[k] and second[k] == second[k]
+                        target[k] = greatest if is_number else np.nan
+                elif op == HOLDS:
+                    anything = np.inf if channel % 2 else -np.inf
+                    for k in range(count):
+                        is_number = first[k] == first[k] and opposite[k] == opposite[k]
+                        target[k] = first[k] if is_number else anything
+                elif op == AND:
+                    for k in range(count):
                         target[k] = min(first[k], second[k])
-                    elif op == DIVIDE:
+                elif op == DIVIDE:
+                    for k in range(count):
                         target[k] = first[k] / constants[b]
-                    elif op == OR:
+                elif op == OR:
+                    for k in range(count):
                         target[k] = max(first[k], second[k])
-                    else:
+                else:
+                    for k in range(count):
                         value = second[k]
                         # unknown membership: the body may or may not count, so its interval is all reals
                         if members[c, t + k] < 0:

@@ -82,31 +82,30 @@ class PackedPlan(NamedTuple):
     """A plan's arrays in two, since each array costs a call something.
 
     Attributes:
-        whole, numbers: the arrays of integers and of floats, flat, one after the other.
-        starts: where each array begins and ends in one of these, in the order of `PlanArrays`.
+        whole, numbers: the arrays of integers and of floats, flat, one after the other. The former begin with
+            where each array begins and ends in one of these, in the order of `PlanArrays`.
     """
 
     whole: Integers
     numbers: Floats
-    starts: Integers
 
 
 def packed(plan: PlanArrays) -> PackedPlan:
     """Pack arrays, for `_unpacked` to find."""
-    ends = {"i": 0, "f": 0}
-    starts = []
+    ends = {"i": 2 * len(plan), "f": 0}
+    starts = list[int]()
     for array in plan:
         starts += [ends[array.dtype.kind], ends[array.dtype.kind] + array.size]
         ends[array.dtype.kind] += array.size
     whole, numbers = (
         np.concatenate([np.ravel(array) for array in plan if array.dtype.kind == kind]) for kind in ends
     )
-    return PackedPlan(whole, numbers, np.array(starts, np.int64))
+    return PackedPlan(np.concatenate([np.array(starts, np.int64), whole]), numbers)
 
 
 @merged
 def _unpacked(plan: PackedPlan) -> PlanArrays:
-    at, whole, numbers = plan.starts, plan.whole, plan.numbers
+    at, whole, numbers = plan.whole, plan.whole, plan.numbers
     return PlanArrays(
         whole[at[0] : at[1]],
         whole[at[2] : at[3]],
@@ -236,6 +235,8 @@ def _yaw(row: int, classes: Integers, places: Floats, here: int) -> float:
 @merged
 def _measure(plan: PlanArrays, rows: SampleRows, values: Floats, spreads: Floats) -> None:
     """Fill `values` and `spreads` (K, 1), as `measurements.measured` gives them."""
+    if len(values) == 0:  # signals alone
+        return
     classes, places = rows.classes, rows.places
     here = len(classes) - len(places)
     members = np.empty(len(plan.operand_rows), np.int64)

@@ -15,6 +15,7 @@ import numpy as np
 from spatial_replay.compiled import direct, kernel, merged
 from spatial_replay.geometry.arrays import Floats, Integers, starts_from_counts
 from spatial_replay.monitor.atoms.live_kernel import PackedPlan, leaves_of_plan
+from spatial_replay.monitor.online.node_numbers import Results
 from spatial_replay.monitor.online.program import Program
 from spatial_replay.monitor.online.state import KEEPS, OFFSET, POSITION, Memory, Scratch
 from spatial_replay.monitor.online.step import AnyArray, OnlineRun, Tables, step, step_with_windows
@@ -30,15 +31,24 @@ class Buffers(NamedTuple):
     """The arrays of runs, one after the other.
 
     Attributes:
-        numbers, whole: the arrays of floats and of integers.
-        layout: (R, A, 1 + _MOST_DIMENSIONS), for each array of each run where it begins in its buffer, and
-            its shape, 0 for dimensions that it does not have.
-        leaves, nodes: (R + 1,), where the leaves and the nodes of each run begin, and the last end.
+        numbers, whole: the arrays of floats and of integers. The latter begin with how many runs there are,
+            where the leaves of each begin, and the last end, the same of nodes, and a `layout`.
     """
 
     numbers: Floats
     whole: Integers
-    layout: Integers
+
+
+class _Layout(NamedTuple):
+    """What buffers hold.
+
+    Attributes:
+        arrays: (R, ARRAYS, 1 + _MOST_DIMENSIONS), for each array of each run where it begins in its buffer,
+            and its shape, 0 for dimensions that it does not have.
+        leaves, nodes: (R + 1,), where the leaves and the nodes of each run begin, and the last end.
+    """
+
+    arrays: Integers
     leaves: Integers
     nodes: Integers
 
@@ -65,6 +75,16 @@ def _array_3(buffer, layout):  # type: ignore[no-untyped-def]
 def _array_4(buffer, layout):  # type: ignore[no-untyped-def]
     start, size = layout[0], layout[1] * layout[2] * layout[3] * layout[4]
     return buffer[start : start + size].reshape((layout[1], layout[2], layout[3], layout[4]))
+
+
+@merged
+def _layout_of(whole: Integers) -> _Layout:
+    runs = whole[0]
+    leaves = 1 + runs + 1
+    nodes = leaves + runs + 1
+    end = nodes + runs * _ARRAYS * (1 + _MOST_DIMENSIONS)
+    arrays = whole[nodes:end].reshape((runs, _ARRAYS, 1 + _MOST_DIMENSIONS))
+    return _Layout(arrays, whole[1:leaves], whole[leaves:nodes])
 
 
 @merged
@@ -108,6 +128,7 @@ def _run_at(numbers: Floats, whole: Integers, at: Integers) -> tuple[Tables, Mem
     return tables, memory, scratch, _array_2(numbers, at[29])
 
 
+_ARRAYS: Final = 30
 _CLOCK: Final = 15
 _STAMPS: Final = 6
 
@@ -136,22 +157,23 @@ def _own_leaves(leaves: Floats, begin: int, end: int, channels: int) -> Floats:
 
 @kernel
 def _take_in(
-    plan: Integers, constants: Floats, starts: Integers, sample: Floats, numbers: Floats, whole: Integers,
-    layout: Integers, own: Integers, nodes: Integers, channels: int, time_ns: int, series: Floats,
+    plan: Integers, constants: Floats, sample: Floats, numbers: Floats, whole: Integers, channels: int,
+    time_ns: int, series: Floats,
 ) -> int:  # fmt: skip
     """Add a sample to all runs, whose programs have no windows under their parts.
 
     Args:
-        plan, constants, starts: a `PackedPlan`.
+        plan, constants: a `PackedPlan`.
         sample: the numbers for it (see `leaves_of_sample`).
-        numbers, whole, layout, own, nodes: `Buffers`.
+        numbers, whole: `Buffers`.
         channels: how many the runs have.
         series: (N, 4), receives value, now, lower and upper of each node.
 
     Returns:
         0; or, if nothing was added, how many channels are needed, or `_NO_ROOM`.
     """
-    leaves = leaves_of_plan(PackedPlan(plan, constants, starts), sample)
+    leaves = leaves_of_plan(PackedPlan(plan, constants), sample)
+    layout, own, nodes = _layout_of(whole)
     wanted = _wanted(whole, layout, leaves, channels)
     if wanted == 0:
         times_ns = np.empty(1, np.int64)
@@ -160,17 +182,18 @@ def _take_in(
             tables, memory, scratch, final = _run_at(numbers, whole, layout[r])
             of_run = series[nodes[r] : nodes[r + 1]].reshape((nodes[r + 1] - nodes[r], 4, 1))
             at = _own_leaves(leaves, own[r], own[r + 1], channels)
-            step(tables, memory, scratch, at, times_ns, 0, 1, of_run, final)
+            step(tables, memory, scratch, at, times_ns, 0, 1, Results(of_run, final))
     return wanted
 
 
 @kernel
 def _take_in_with_windows(
-    plan: Integers, constants: Floats, starts: Integers, sample: Floats, numbers: Floats, whole: Integers,
-    layout: Integers, own: Integers, nodes: Integers, channels: int, time_ns: int, series: Floats,
+    plan: Integers, constants: Floats, sample: Floats, numbers: Floats, whole: Integers, channels: int,
+    time_ns: int, series: Floats,
 ) -> int:  # fmt: skip
     """`_take_in` for any programs."""
-    leaves = leaves_of_plan(PackedPlan(plan, constants, starts), sample)
+    leaves = leaves_of_plan(PackedPlan(plan, constants), sample)
+    layout, own, nodes = _layout_of(whole)
     wanted = _wanted(whole, layout, leaves, channels)
     if wanted == 0:
         times_ns = np.empty(1, np.int64)
@@ -179,7 +202,7 @@ def _take_in_with_windows(
             tables, memory, scratch, final = _run_at(numbers, whole, layout[r])
             of_run = series[nodes[r] : nodes[r + 1]].reshape((nodes[r + 1] - nodes[r], 4, 1))
             at = _own_leaves(leaves, own[r], own[r + 1], channels)
-            step_with_windows(tables, memory, scratch, at, times_ns, 0, 1, of_run, final)
+            step_with_windows(tables, memory, scratch, at, times_ns, 0, 1, Results(of_run, final))
     return wanted
 
 
@@ -192,10 +215,10 @@ class LiveRuns:
         self._channels = 1
         has_windows = any(run.has_windows for run in self._runs)
         self._take_in: Callable[..., int] = direct(_take_in_with_windows if has_windows else _take_in)
-        leaves = starts_from_counts([len(program.leaves) for program in programs])
-        nodes = starts_from_counts([len(program.reports) for program in programs])
-        self._node_count = int(nodes[-1])
-        self._buffers = _joined(self._runs, leaves, nodes)
+        self._leaves = starts_from_counts([len(program.leaves) for program in programs])
+        self._nodes = starts_from_counts([len(program.reports) for program in programs])
+        self._node_count = int(self._nodes[-1])
+        self._buffers = _joined(self._runs, self._leaves, self._nodes)
 
     @property
     def finals(self) -> list[Floats | None]:
@@ -225,7 +248,7 @@ class LiveRuns:
         times_ns = np.array([time_ns], np.int64)
         series = [
             run.extend(leaves[:, begin:end], times_ns)[:, :, 0]
-            for run, (begin, end) in zip(self._runs, pairwise(self._buffers.leaves), strict=True)
+            for run, (begin, end) in zip(self._runs, pairwise(self._leaves), strict=True)
         ]
         self._channels = max(self._channels, len(leaves))
         self._join()
@@ -235,18 +258,20 @@ class LiveRuns:
         """Put all arrays into two buffers, unless they are there."""
         stamps = (run.arrays[_STAMPS] for run in self._runs)
         if any(each.base is not self._buffers.whole for each in stamps):
-            self._buffers = _joined(self._runs, self._buffers.leaves, self._buffers.nodes)
+            self._buffers = _joined(self._runs, self._leaves, self._nodes)
 
 
 def _joined(runs: Sequence[OnlineRun], leaves: Integers, nodes: Integers) -> Buffers:
     """Let runs go on in two new buffers."""
     arrays = [run.arrays for run in runs]
-    layout = np.zeros((len(runs), len(arrays[0]), 1 + _MOST_DIMENSIONS), np.int64)
-    ends = {"f": 0, "i": 0}
+    layout = np.zeros((len(runs), _ARRAYS, 1 + _MOST_DIMENSIONS), np.int64)
+    ends = {"f": 0, "i": 1 + len(leaves) + len(nodes) + layout.size}
+    head = ends["i"]
     for place, array in zip(layout.reshape(-1, layout.shape[2]), chain.from_iterable(arrays), strict=True):
         place[0], place[1 : 1 + array.ndim] = ends[array.dtype.kind], array.shape
         ends[array.dtype.kind] += array.size
     numbers, whole = np.zeros(ends["f"]), np.zeros(ends["i"], np.int64)
+    whole[:head] = np.concatenate([[len(runs)], leaves, nodes, layout.ravel()])
     for run, places, before in zip(runs, layout, arrays, strict=True):
         views = []
         for place, array in zip(places, before, strict=True):
@@ -257,4 +282,4 @@ def _joined(runs: Sequence[OnlineRun], leaves: Integers, nodes: Integers) -> Buf
             np.copyto(view.view(np.int64), bits, where=bits != 0)
             views.append(view)
         run.work_with(views)
-    return Buffers(numbers, whole, layout, leaves, nodes)
+    return Buffers(numbers, whole)

@@ -18,6 +18,9 @@ TILE = 256
 """How many samples are taken in together: enough to amortise the walk over a program's tables, few enough to
 stay in the processor's cache."""
 
+LONG_TILE = 1024
+"""As many where a great many come together."""
+
 NUMBERS = 8
 """Numbers of a node at a sample: low and high end of its value, of what it is now, of its value over every
 continuation, and of its value if the run ends there."""
