@@ -265,3 +265,14 @@ def test_an_automaton_of_a_log_is_not_taken_for_one_of_another_rate() -> None:
     made = automaton(specification, rate_hz=2)
     stored = [stored_text(made, specification, specification.specs[0]).encode()]
     assert automaton(specification, rate_hz=3, stored=stored) == machine_of("F[0, 3] p >= 0")
+
+
+def test_another_threshold_changes_what_propositions_say_and_no_move() -> None:
+    text = "const near = {}\nspec met = G (a closeto[near] b -> F[0,3] a closeto[5] b)"
+    first, second, same = (automaton(parse_specification(text.format(near))) for near in (1, 2, 5))
+    assert [each.text for each in second.propositions] == ["a closeto[2] b", "a closeto[5] b"]
+    assert [each.text for each in first.propositions] == ["a closeto[1] b", "a closeto[5] b"]
+    assert first.renamed(second.propositions) == second
+    # with one threshold for both, the two propositions are one, and the automaton another
+    assert len(same.propositions) == 1
+    assert len(same.states) < len(second.states)
