@@ -1,4 +1,4 @@
-"""Decode video, and find out which of its frames are true: with `video.py` the only modules that know PyAV.
+"""Decode video, and find out which of its frames are true; the only module that imports PyAV.
 
 A predicted frame is drawn onto the frames before it. Where one of those is missing or damaged, a decoder
 makes up what it lacks, and goes on: what it shows is old, or in parts, until the next key frame.

@@ -1,4 +1,4 @@
-"""Video files and H.264 frames: with `decoder.py` the only modules that know PyAV.
+"""Video files and H.264 frames: what is read, encoded and written with PyAV.
 
 What a log keeps of a video is H.264 in Annex B form, one frame a message, with parameter sets before each key
 frame and without B frames: what `foxglove.CompressedVideo` demands.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from contextlib import suppress
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, Final, Self
@@ -184,7 +185,9 @@ class VideoFile:
                 self._add_fault(f"{self.name}: a frame cannot be decoded ({reason(error)}); left out")
             # the filter takes the packet's content
             if convert is not None and packet.size:
-                copies += [bytes(each) for each in convert.filter(packet)]
+                # one that is damaged has been reported above
+                with suppress(av.InvalidDataError):
+                    copies += [bytes(each) for each in convert.filter(packet)]
             for each in found:
                 yield each._replace(of=b"".join(each.of))
 
