@@ -10,6 +10,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import cache
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple, cast
@@ -166,6 +167,7 @@ class H264Decoder:
         """Open the decoder; frames before the first key frame are not decoded."""
         self._decoder = Decoder(load_av().CodecContext.create("h264", "r"))
         self._is_ready = False
+        self._count = 0
 
     def decode(self, data: bytes, of: Any = None) -> Iterator[Shown]:
         """Yield what comes out with a message: nothing before the first key frame, perhaps earlier messages.
@@ -176,8 +178,12 @@ class H264Decoder:
         self._is_ready |= has_key(data)
         if self._is_ready:
             av = load_av()
+            # in their order, so that those which are skipped are known
+            packet = av.Packet(data)
+            packet.pts, packet.time_base = self._count, Fraction(1)
+            self._count += 1
             try:
-                found = self._decoder.decode(av.Packet(data), of)
+                found = self._decoder.decode(packet, of)
             except av.FFmpegError as error:
                 raise LogError(f"a frame cannot be decoded ({reason(error)})") from None
             for each in found:

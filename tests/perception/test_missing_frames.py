@@ -66,7 +66,9 @@ def without(source: Path, output: Path, gone: set[int], damaged: int | None = No
     return output
 
 
-def log_without(source: Path, output: Path, gone: set[int], damaged: int | None = None) -> Path:
+def log_without(
+    source: Path, output: Path, gone: set[int], damaged: int | None = None, undecodable: int | None = None
+) -> Path:
     """As `without`, of the messages of a log's video."""
     from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo
 
@@ -84,6 +86,10 @@ def log_without(source: Path, output: Path, gone: set[int], damaged: int | None 
                 value = CompressedVideo.FromString(data)
                 at = len(value.data) // 2
                 value.data = value.data[:at] + np.random.default_rng(1).bytes(60) + value.data[at + 60 :]
+                data = value.SerializeToString()
+            if index == undecodable:
+                value = CompressedVideo.FromString(data)
+                value.data = b"\0\0\0\1\x01"
                 data = value.SerializeToString()
             if index not in gone:
                 writer.add_message(channel, message.log_time, data, message.publish_time)
@@ -146,3 +152,14 @@ def test_each_frame_of_a_lossy_topic_has_its_own_stamp_and_comes_out(folder: Pat
     for time_ns, image in shown.items():
         assert not image.any() or np.array_equal(image, whole[time_ns])
     assert sum(image.any() for image in shown.values()) == 6
+
+
+def test_a_message_that_cannot_be_decoded_is_a_sample_without_objects_like_those_after_it(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lossy = log_without(folder / "h264.mcap", folder / "lossy.mcap", set(), undecodable=3)
+    assert record(folder, lossy, folder / "out.mcap") == 3
+    assert "after 0.120 s: a frame cannot be decoded" in capsys.readouterr().err
+    shown = seen(folder / "out.mcap")
+    assert sorted(shown) == list(range(COUNT))
+    assert [each for each in shown if not shown[each]] == [3, 4, 5, 6, 7]
