@@ -129,6 +129,11 @@ def only(form: Literal["compiled", "interpreted"]) -> Iterator[None]:
         _process.only = before
 
 
+def cores() -> int:
+    """Return how many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def over_cores(
     used: Callable[..., object], run: Callable[[int, int], object], count: int, least: int
 ) -> None:
@@ -138,8 +143,7 @@ def over_cores(
         used: the long kernel that `run` calls; all is one share until it is compiled.
         least: the least length of a share, which takes at least about a millisecond.
     """
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    shares = min(cores, count // max(least, 1)) if getattr(used, "is_compiled", False) else 1
+    shares = min(cores(), count // max(least, 1)) if getattr(used, "is_compiled", False) else 1
     if shares < 2:
         run(0, count)
         return

@@ -7,7 +7,6 @@ object for each message, where we need a chunk's messages as columns.
 
 from __future__ import annotations
 
-import os
 import struct
 import zlib
 from collections import deque
@@ -21,6 +20,7 @@ import lz4.frame
 import numpy as np
 import zstandard
 
+from spatial_replay.compiled import cores
 from spatial_replay.geometry.arrays import starts_from_counts
 from spatial_replay.logs.byte_ranges import is_planned, plan_reads
 from spatial_replay.logs.mcap.chunk_records import (
@@ -161,11 +161,6 @@ def iter_records(
         finally:
             # a caller that has seen enough does not wait for the rest
             readers.shutdown(cancel_futures=True)
-
-
-def cores() -> int:
-    """Return how many cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _groups(places: Sequence[ChunkPlace]) -> Iterator[Sequence[ChunkPlace]]:

@@ -20,10 +20,10 @@ from typing import Any, BinaryIO, Self, TypeAlias
 import numpy as np
 from mcap import records
 
+from spatial_replay.compiled import cores
 from spatial_replay.errors import OutputError
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.mcap.chunk_records import encoded
-from spatial_replay.logs.mcap.chunks import cores
 from spatial_replay.logs.mcap.packing import (
     Batch,
     McapSummary,
