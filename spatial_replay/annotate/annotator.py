@@ -23,6 +23,7 @@ from spatial_replay.annotate.robustness import encode_robustness
 from spatial_replay.annotate.scene.scene_entities import encode_frame
 from spatial_replay.annotate.scene.scene_frames import SceneFrames
 from spatial_replay.annotate.scene.scene_update import SceneEncoder, SceneState
+from spatial_replay.annotate.scene.shades import ShadeTracker
 from spatial_replay.annotate.specification import ReportedTree, encode_specification
 from spatial_replay.annotate.standing import FinalStanding, StandingEncoder
 from spatial_replay.annotate.violations import EvaluatedResult, leaf_pairs, violated_since
@@ -87,6 +88,14 @@ class Annotator:
         self._trees = trees
         self._requirements = [
             requirements_of(tree.formula, tree.object, settles=semantics == "ltlf") for tree in trees
+        ]
+        self._shades = [
+            ShadeTracker(
+                instance,
+                requirements_of(tree.formula, tree.object, settles=semantics == "ltlf", splits=True),
+                files[tree.file].regions,
+            )
+            for tree, instance in zip(trees, instances, strict=True)
         ]
         self._since_ns = [np.full(len(own), LATEST_NS) for own in self._requirements]
         self._automata = [each.automaton for each in automata]
@@ -254,6 +263,8 @@ class Annotator:
     def _changes(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> list[EncodedEvent]:
         """Return the events, by time, then in the order of results and of their nodes."""
         self._samples.extend(trace)
+        for shades, block in zip(self._shades, blocks, strict=True):
+            shades.extend(trace, block)
         self._since_ns = [
             violated_since(own, block, since_ns)
             for own, block, since_ns in zip(self._requirements, blocks, self._since_ns, strict=True)
@@ -291,14 +302,16 @@ class Annotator:
                 reporter.violated_ns,
                 tree.title,
                 is_final,
+                shades.shades,
             )
-            for requirements, block, pairs, since_ns, reporter, tree in zip(
+            for requirements, block, pairs, since_ns, reporter, tree, shades in zip(
                 self._requirements,
                 blocks,
                 self._leaf_pairs,
                 self._since_ns,
                 self._reporters,
                 self._trees,
+                self._shades,
                 strict=True,
             )
         ]

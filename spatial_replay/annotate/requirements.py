@@ -11,7 +11,7 @@ specification that this is in, are violated whatever comes. A goal that is not r
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from enum import IntEnum
 from types import MappingProxyType
 from typing import Final, NamedTuple, TypeAlias
@@ -109,6 +109,7 @@ class Requirement(NamedTuple):
         can_violate: whether failing now may be what violates its obligation; not a goal beside invariants.
         is_condition: whether it is left of an implication, which is met without it, too.
         lasts: whether it is asked of samples without end; else only of those up to a deadline.
+        is_invariant: whether its obligation asks it of every sample, and nothing makes up for it.
     """
 
     node: int
@@ -121,6 +122,7 @@ class Requirement(NamedTuple):
     can_violate: bool = True
     is_condition: bool = False
     lasts: bool = False
+    is_invariant: bool = False
 
     def standing(self, series: Floats, at: Integers) -> NDArray[np.uint8]:
         """Return (S,) how it stands, see `Standing`.
@@ -174,11 +176,12 @@ _Bindings: TypeAlias = Mapping[str, Group]
 
 
 def requirements_of(
-    formula: Formula, object: str | None = None, *, settles: bool = True
+    formula: Formula, object: str | None = None, *, settles: bool = True, splits: bool = False
 ) -> tuple[Requirement, ...]:
     """Return the requirements of a formula, by node, but for those needed in both signs (`xor`, `<->`).
 
     Args:
+        splits: whether each conjunct of a requirement stands for itself.
         object: what the parameter of a template stands for.
         settles: whether the semantics has verdicts that stay; without, a goal is pending up to the end.
     """
@@ -192,6 +195,8 @@ def requirements_of(
         for identifier, place in enumerate(places)
         if place.sign and not temporal[identifier] and (place.parent is None or temporal[place.parent])
     ]
+    if splits:
+        found = [(each, places[each]) for identifier, _ in found for each in _conjuncts(places, identifier)]
     invariant = {
         None if place.obligation is None else place.obligation.node for _, place in found if place.always
     }
@@ -205,13 +210,21 @@ def requirements_of(
     return tuple(requirements)
 
 
+def _conjuncts(places: Sequence[_Place], identifier: int) -> list[int]:
+    """Return the conjuncts of a node without temporal operators, in the sign in which it counts."""
+    operands = [each for each, place in enumerate(places) if place.parent == identifier]
+    if not operands or not _needs_all(places[identifier]):
+        return [identifier]
+    return [conjunct for each in operands for conjunct in _conjuncts(places, each)]
+
+
 class _Place(NamedTuple):
     """Where a node is in a formula.
 
     Attributes:
         sign: 0 where it counts in both.
         always: whether no operator above it but conjunctions and those that need it at every sample.
-        is_condition, lasts: see `Requirement`.
+        is_condition, lasts, is_invariant: see `Requirement`.
     """
 
     formula: Formula
@@ -222,6 +235,7 @@ class _Place(NamedTuple):
     always: bool
     is_condition: bool
     lasts: bool
+    is_invariant: bool = True
 
 
 def _places(formula: Formula) -> list[_Place]:
@@ -232,12 +246,15 @@ def _places(formula: Formula) -> list[_Place]:
         passed.append(0)
         if parent is None:
             sign, above, conjunct, always = 1.0, None, Obligation(0, 1.0), True
-            is_condition, lasts = False, False
+            is_condition, lasts, is_invariant = False, False, True
         else:
             up = places[parent]
             is_implied = operator_of(up.formula) == "->" and up.sign > 0.0
             is_condition = up.is_condition or (is_implied and not passed[parent])
             lasts = up.lasts or _is_endless(up.formula)
+            always_of = "G" if up.sign > 0.0 else "F"
+            is_always = operator_of(up.formula) == always_of and _is_endless(up.formula)
+            is_invariant = up.is_invariant and _needs_all_now(up, is_always)
             sign = up.sign * _sign(up.formula, passed[parent])
             above, conjunct, always = up.obligation, up.conjunct, up.always and _needs_all(up)
             if conjunct == Obligation(parent, up.sign) and isinstance(up.formula, Boolean) and _needs_all(up):
@@ -245,7 +262,8 @@ def _places(formula: Formula) -> list[_Place]:
             passed[parent] += 1
         starts = above is None and isinstance(node, Temporal)
         obligation = Obligation(identifier, sign) if starts else above
-        places.append(_Place(node, parent, sign, obligation, conjunct, always, is_condition, lasts))
+        place = _Place(node, parent, sign, obligation, conjunct, always, is_condition, lasts, is_invariant)
+        places.append(place)
     return places
 
 
@@ -268,6 +286,12 @@ def _is_endless(formula: Formula) -> bool:
 
 def _needs_all(place: _Place) -> bool:
     return operator_of(place.formula) in _NEEDS_ALL.get(place.sign, frozenset())
+
+
+def _needs_all_now(place: _Place, is_always: bool) -> bool:
+    """Say whether a node needs its operands wherever it is needed itself, or always."""
+    is_outside = place.obligation is None and not isinstance(place.formula, Temporal)
+    return is_always or is_outside or (isinstance(place.formula, Boolean) and _needs_all(place))
 
 
 def iter_subformulas(formula: Formula) -> Iterator[Formula]:
@@ -316,6 +340,7 @@ def _requirement(identifier: int, place: _Place, object: str | None) -> Requirem
         place.conjunct,
         is_condition=place.is_condition,
         lasts=place.lasts,
+        is_invariant=place.is_invariant and place.obligation is not None,
     )
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from spatial_replay.annotate.deciding_leaf import LeavesBelow, leaves_below
 from spatial_replay.annotate.leaf_history import SettledViolation
 from spatial_replay.annotate.requirements import ClassMembers, Requirement
+from spatial_replay.annotate.scene.shades import Shade
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.geometry.contact import contacts
 from spatial_replay.geometry.measure import Operand
@@ -77,6 +78,7 @@ class EvaluatedResult(NamedTuple):
         violated_ns: since when the formula is violated for certain, or `LATEST_NS`.
         title: what the result is known by; "" leaves it out of the banner.
         is_final: whether the block is about the finished log.
+        shades: the parts of the requirements that objects are coloured by; None for the requirements.
     """
 
     requirements: tuple[Requirement, ...]
@@ -87,6 +89,7 @@ class EvaluatedResult(NamedTuple):
     violated_ns: int = LATEST_NS
     title: str = ""
     is_final: bool = False
+    shades: tuple[Shade, ...] | None = None
 
 
 class Presence(NamedTuple):
@@ -171,9 +174,10 @@ def violated_since(requirements: Sequence[Requirement], block: SeriesBlock, befo
 def worst_robustness(
     results: Sequence[EvaluatedResult], presence: Presence, regions: Sequence[str]
 ) -> tuple[Floats, Floats]:
-    """Return the least robustness of the requirements on each object and region, in the sign that counts.
+    """Return the least robustness of what is asked of each object and region, in the sign that counts.
 
-    Of a finished log that is what their obligations come to, of others how they are met now.
+    Of a conjunction or quantifier that is what is about the object itself. Of a finished log it is what the
+    obligations come to, of others how they are met now.
 
     Returns:
         (S, objects) and (S, regions); NaN where no requirement is known.
@@ -182,13 +186,26 @@ def worst_robustness(
     places = np.full((len(presence.times_ns), len(regions)), np.nan)
     for result in results:
         of = Requirement.outcome if result.is_final else Requirement.robustness
-        for requirement, now in _robustness(result, presence.times_ns, of):
+        shades = tuple(map(Shade, result.requirements)) if result.shades is None else result.shades
+        parts = result._replace(requirements=tuple(each.requirement for each in shades))
+        own_ns = result.block.times_ns
+        at = np.minimum(np.searchsorted(own_ns, presence.times_ns), max(len(own_ns) - 1, 0))
+        for shade, (requirement, whole) in zip(
+            shades, _robustness(parts, presence.times_ns, of), strict=False
+        ):
+            now = shade.outcome(whole) if result.is_final else whole
             for column in _columns(requirement.objects, presence.names):
                 objects[:, column] = np.fmin(objects[:, column], now)
             for column in _columns(requirement.regions, regions):
                 places[:, column] = np.fmin(places[:, column], now)
             for group in requirement.groups:
-                objects = np.where(_members(group, presence), np.fmin(objects, now[:, None]), objects)
+                bound = np.broadcast_to(now[:, None], objects.shape).copy()
+                for column, name in enumerate(presence.names):
+                    if result.is_final:
+                        bound[:, column] = shade.outcome_of(name, now)
+                    elif name in shade.bound:
+                        bound[:, column] = shade.now_of(name, now, at)
+                objects = np.where(_members(group, presence), np.fmin(objects, bound), objects)
     return objects, places
 
 

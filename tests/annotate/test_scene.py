@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,13 +11,16 @@ from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletio
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.reader import make_reader
 
 from spatial_replay import ConvexPart, Footprint, Sample, Trace, TrackedObject, parse_specification
 from spatial_replay.annotate.requirements import requirements_of
 from spatial_replay.annotate.scene.scene_update import PERIOD_NS, SceneEncoder
 from spatial_replay.annotate.violations import EvaluatedResult, leaf_pairs
+from spatial_replay.logs import MemorySource
 from spatial_replay.monitor.instances import find_instances
 from spatial_replay.monitor.stream import EvaluationStream, SeriesBlock
+from spatial_replay.replay import run_replay
 from spatial_replay.spec.formula import Atom, Outline, RegionName, SignedDistance, TrackedName, iter_nodes
 
 FRAME_NS = 1_000_000_000 // 30
@@ -498,3 +502,43 @@ def test_small_things_lie_above_large_ones():
         for name in ("region/town", "region/room", "object/b", "object/a")
     ]
     assert heights == sorted(set(heights))
+
+
+# ------------------------------------------------------------------------------------- whose fault it is
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "spec s = G (p dist car >= 1 and q dist car >= 1)",
+        'group people = class "person"\nspec s = G (forall each in people: each dist car >= 1)',
+        'group people = class "person"\nspec s = G not (exists each in people: each dist car < 1)',
+    ],
+)
+def test_each_object_is_coloured_by_what_is_asked_of_itself(text: str, tmp_path: Path):
+    """`p` is too near in the second sample, `q` never: also in the scene of the finished log."""
+    samples = [
+        Sample(
+            index * 10**8,
+            {
+                "car": TrackedObject(Footprint.box(0, 0, 1, 1)),
+                "p": TrackedObject(Footprint.box(x, 0, x + 1, 1), "person"),
+                "q": TrackedObject(Footprint.box(9, 0, 10, 1), "person"),
+            },
+        )
+        for index, x in enumerate((4.0, 1.5, 4.0))
+    ]
+    output = tmp_path / "annotated.mcap"
+    run_replay(MemorySource.from_samples(samples), [parse_specification(text)], output=output)
+    with output.open("rb") as stream:
+        drawn = [
+            SceneUpdate.FromString(message.data)
+            for *_, message in make_reader(stream).iter_messages(["/spatial/scene"])
+        ]
+    for message, wrong in zip(drawn, [set(), {"car", "p"}, set(), {"car", "p"}], strict=True):
+        red = {
+            each.id.removeprefix("object/")
+            for each in message.entities
+            if each.id.startswith("object/") and each.triangles[0].color.r > each.triangles[0].color.b
+        }
+        assert red == wrong

@@ -146,7 +146,11 @@ function coloursOf({run, result: chosen}, scene, frame) {
     const number = isEnd ? Number(String(outcome).replace("inf", "Infinity")) : sign * result.nodes[node].series[NOW][place];
     for (const entity of entities) least.set(entity, Math.min(number, least.get(entity) ?? Infinity));
   }
-  return (entity, index) => mixed(run.palette, least.get(index), scene.scale);
+  return (entity, index) => {
+    const own = stored(entity), number = least.get(index);
+    // blue: nothing that any result asks of it itself fails, but of another in the same requirement
+    return number < 0 && own[2] > own[0] ? own : mixed(run.palette, number, scene.scale);
+  };
 }
 
 // The colour of a robustness, as annotate/scene/scene_frames.py mixes it.
