@@ -147,19 +147,20 @@ class ImageTopic:
             # from the key frame on, unless the decoder is already past it
             first_ns = last_ns if decoder is None else max(int(shown.key_times_ns[place]), done)
             done = last_ns + 1
-            image = None
+            shows: list[Shown] = []
             for message in self._reader.iter_messages({self.topic}, first_ns, done):
                 with suppress(LogError):
                     value: Any = self._decode(message.payload)
                     time_ns = _stamp_ns(value) or message.log_time_ns
-                    if decoder is None:
-                        image = _image(value, self._type) if time_ns == stamp_ns else image
-                    else:
-                        image = _image_of(stamp_ns, decoder.decode(_h264(value), time_ns), image)
-            if image is None and decoder is not None:
-                # held back, or not true: what follows is decoded from its key frame again
-                image = _image_of(stamp_ns, decoder.rest(), image)
+                    if decoder is not None:
+                        shows += _of_stamp(stamp_ns, decoder.decode(_h264(value), time_ns))
+                    elif time_ns == stamp_ns:
+                        shows.append(Shown(time_ns, _image(value, self._type), True))
+            if decoder is not None and not shows:
+                # held back since something is missing: the next one is decoded from its key frame again
+                shows += _of_stamp(stamp_ns, decoder.rest())
                 decoder, done = H264Decoder(), 0
+            image = next((each.image for each in reversed(shows) if each.is_true), None)
             if image is not None:
                 yield Frame(stamp_ns, image)
 
@@ -228,12 +229,9 @@ def _frame(shown: Shown) -> tuple[int, Frame, bool]:
     return log_ns, Frame(time_ns, shown.image, payload), shown.is_true
 
 
-def _image_of(stamp_ns: int, shown: Iterable[Shown], image: Image | None) -> Image | None:
-    """Return the image with a stamp, if it is true; else the one that was found before."""
-    for each in shown:
-        if each.of == stamp_ns and each.is_true:
-            image = each.image
-    return image
+def _of_stamp(stamp_ns: int, shown: Iterable[Shown]) -> list[Shown]:
+    """Return what is shown with a stamp."""
+    return [each for each in shown if each.of == stamp_ns]
 
 
 def _image(value: Any, type_name: str) -> Image:
