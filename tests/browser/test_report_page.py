@@ -375,6 +375,18 @@ def test_the_scene_names_what_decided_where_no_arrow_can_show_it(open_page: Open
     expect(said).to_contain_text("The nearest that it came to speed <= 1 was at 0.600 s: speed is 1.8.")
 
 
+def test_a_link_to_a_result_unfolds_it_and_scrolls_to_it(open_page: Open) -> None:
+    chosen = open_page("template", at="#t=1&r=7").locator(".verdict.chosen")
+    expect(chosen).to_have_attribute("data-result", "7")
+    expect(chosen.locator("p").first).to_be_visible()
+    in_sight = """chosen => {
+      const box = chosen.getBoundingClientRect();
+      const frame = document.getElementById("verdicts-body").getBoundingClientRect();
+      return box.top >= frame.top - 1 && box.top < frame.bottom;
+    }"""
+    assert chosen.evaluate(in_sight)
+
+
 def test_the_keys_step_through_the_kept_samples_of_a_thinned_run(open_page: Open) -> None:
     for name, words in (("thinned", "a kept sample back, on"), ("violated", "a sample back, on")):
         page = open_page(name)

@@ -68,23 +68,34 @@ function linkVerdicts(clock) {
   }
 }
 
+// So much of a verdict is in sight, in pixels.
+const ROOM = 60;
+
 // Lists of many results: what to list, and which result the panels show.
 function makeVerdicts(clock) {
   const verdicts = [...document.querySelectorAll(".verdict")];
   for (const verdict of verdicts) {
     if (verdict.dataset.result === undefined) continue;
     // what is unfolded is looked at
-    verdict.querySelector("summary")?.addEventListener("click", () => {
+    verdict.querySelector("summary")?.addEventListener("click", (event) => {
       const number = Number(verdict.dataset.result);
       if (verdict.open || number === clock.result) return;
+      // being chosen unfolds it
+      event.preventDefault();
       clock.pause();
       clock.choose(number);
       clock.seek(clock.opening);
     });
   }
+  const list = body("verdicts");
   clock.on("result", () => {
     for (const verdict of verdicts) {
-      verdict.classList.toggle("chosen", verdict.dataset.result === String(clock.result) && verdicts.length > 1);
+      const isChosen = verdict.dataset.result === String(clock.result);
+      verdict.classList.toggle("chosen", isChosen && verdicts.length > 1);
+      if (!isChosen || verdicts.length < 2) continue;
+      verdict.open = true;
+      const box = verdict.getBoundingClientRect(), frame = list.getBoundingClientRect();
+      if (box.top < frame.top || box.top > frame.bottom - ROOM) list.scrollTop += box.top - frame.top;
     }
   });
   const counts = document.getElementById("counts");
