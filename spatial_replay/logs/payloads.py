@@ -174,7 +174,11 @@ class MixedPayloads(Sequence[bytes]):
         return part.encoded(slice(row, row + 1)).tobytes() if isinstance(part, Filled) else part[row]
 
     def __iter__(self) -> Iterator[bytes]:
-        every = [_listed(part) if isinstance(part, Filled) else part for part in self.parts]
+        is_used = np.bincount(self.part, minlength=len(self.parts)) > 0
+        every: list[Sequence[bytes]] = [
+            () if not used else _listed(part) if isinstance(part, Filled) else part
+            for part, used in zip(self.parts, is_used.tolist(), strict=True)
+        ]
         return (every[part][row] for part, row in zip(self.part.tolist(), self.row.tolist(), strict=True))
 
     @cached_property

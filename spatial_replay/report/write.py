@@ -19,6 +19,7 @@ from spatial_replay.errors import UsageError
 from spatial_replay.logs import topics as log_topics
 from spatial_replay.logs.messages import Messages
 from spatial_replay.logs.output_file import refuse_inputs, replacing
+from spatial_replay.logs.payloads import chosen_payloads
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.source import Source, axes_of
 from spatial_replay.logs.source import units_of as declared_units
@@ -67,13 +68,16 @@ class Collector:
         """Take in the next messages."""
         topics = {number: channel.topic for number, channel in messages.channels.items()}
         collected = [number for number, topic in topics.items() if topic in _COLLECTED]
-        for index in np.flatnonzero(np.isin(messages.channel, collected)).tolist():
-            payload, sequence = messages.payloads[index], int(messages.sequence[index])
-            match topics[int(messages.channel[index])]:
+        chosen = np.flatnonzero(np.isin(messages.channel, collected))
+        columns = (messages.channel, messages.sequence, messages.log_time_ns)
+        numbers = zip(*(column[chosen].tolist() for column in columns), strict=True)
+        payloads = chosen_payloads(messages.payloads, chosen)
+        for (channel, sequence, time_ns), payload in zip(numbers, payloads, strict=True):
+            match topics[channel]:
                 case log_topics.EVENTS:
                     self.events.append(event_of(payload))
                 case log_topics.AUTOMATON:
-                    self._add_state(int(messages.log_time_ns[index]), payload)
+                    self._add_state(time_ns, payload)
                 case log_topics.PLAN_DECISION:
                     self.decisions.add_decision(payload)
                 case log_topics.GRADIENT_MAP:
