@@ -14,10 +14,10 @@ import { chooser, type Cursor, type View, type Viewer } from "./viewer";
 const AUTOMATON = "/spatial/automaton";
 const UNKNOWN = -1;
 
-/** A move from one state to another, at the sample that brought it about. */
+/** A move from one set of states to another, at the sample that brought it about. */
 interface Taken {
   readonly time: number;
-  readonly source: number | null;
+  readonly sources: readonly number[];
   readonly targets: readonly number[];
   readonly guard: string;
 }
@@ -150,7 +150,7 @@ export class AutomatonView implements View {
       this.taken.fill(taken.map((each) => each.time), taken.map((each) => element("button", {
         type: "button", class: "event", onclick: () => this.viewer.seek(each.time),
       }, element("span", {}), element("time", {}, secondsText(each.time)), element("span", { class: "sentence" },
-        `${each.source ?? "?"} → ${each.targets.join(" or ")} `, each.guard ? element("code", {}, printable(each.guard)) : ""))));
+        `${each.sources.length ? each.sources.join(" or ") : "?"} → ${each.targets.join(" or ")} `, each.guard ? element("code", {}, printable(each.guard)) : ""))));
     }
     this.taken.show(cursor.time);
   }
@@ -207,7 +207,7 @@ class Run {
       if (before.join() === targets.join()) continue;
       const known = before.length === 1 ? before[0]! : null;
       found.push({
-        time: times[place]!, targets, source: known === UNKNOWN ? null : known,
+        time: times[place]!, targets, sources: known === UNKNOWN ? [] : before,
         guard: known === null ? "" : this.guards.get(`${known} ${targets.join()}`) ?? "",
       });
     }

@@ -197,10 +197,11 @@ export class Tree {
     let node = this.result.nodes[0]!;
     let sign = 1;
     const number = node.series[VALUE]![place]!;
-    if (!Number.isFinite(number)) return path;
+    // an unknown number is that of an atom which is unknown
+    if (!Number.isFinite(number) && !Number.isNaN(number)) return path;
     while (node.children.length) {
       if (TEMPORAL.has(this.operators[node.index]!)) return this.belowTemporal(node, sign * number, place) ?? path;
-      const found = this.operandsOf(node).find(([child, own]) => own * sign * child.series[VALUE]![place]! === number);
+      const found = this.operandsOf(node).find(([child, own]) => isSame(own * sign * child.series[VALUE]![place]!, number));
       if (!found) break;
       [node, sign] = [found[0], sign * found[1]];
       path.push(node.index);
@@ -211,10 +212,10 @@ export class Tree {
   private belowTemporal(top: DrawnNode, number: number, place: number): number[] | null {
     const values = top.series[VALUE]!;
     let sample = place;
-    while (sample > 0 && values[sample - 1] === values[place]) sample -= 1;
+    while (sample > 0 && isSame(values[sample - 1]!, values[place]!)) sample -= 1;
     const waiting: [DrawnNode, number][] = [[top, 1]];
     for (const [node, sign] of waiting) {
-      if (!node.children.length && sign * node.series[NOW]![sample]! === number) return this.above(node.index);
+      if (!node.children.length && isSame(sign * node.series[NOW]![sample]!, number)) return this.above(node.index);
       waiting.push(...this.operandsOf(node).map(([child, own]): [DrawnNode, number] => [child, sign * own]));
     }
     return null;
@@ -224,4 +225,9 @@ export class Tree {
     const signs = SIGNS[this.operators[node.index]!] ?? (() => [1]);
     return node.children.flatMap((child, operand) => signs(operand).map((sign): [DrawnNode, number] => [child, sign]));
   }
+}
+
+/** Whether two numbers are equal, or both unknown. */
+function isSame(one: number, other: number): boolean {
+  return one === other || (Number.isNaN(one) && Number.isNaN(other));
 }

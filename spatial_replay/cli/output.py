@@ -113,7 +113,8 @@ def write_document(
 def counts_text(verdicts: Iterable[str]) -> str:
     """Return how many of some verdicts are of each kind, the worst first."""
     counts = Counter(map(str, verdicts))
-    return ", ".join(f"{counts[verdict]:,} {verdict}" for verdict in WORST_FIRST if counts[verdict])
+    order = ("violated", "unknown", "pending", "satisfied")
+    return ", ".join(f"{counts[verdict]:,} {verdict}" for verdict in order if counts[verdict])
 
 
 def worst_of(results: Sequence[SpecResult]) -> tuple[Sequence[SpecResult], Sequence[SpecResult]]:
@@ -147,7 +148,8 @@ def _numbers(result: SpecResult, first_ns: int) -> str:
         parts.append("marginal")
     certain_ns = result.certain_ns()
     if result.verdict != "violated" and result.first_satisfied_ns not in (None, certain_ns):
-        parts.append(f"first satisfied at {time_text(result.first_satisfied_ns or 0, first_ns)}")
+        how = "held so far" if result.verdict == "unknown" else "first satisfied"
+        parts.append(f"{how} at {time_text(result.first_satisfied_ns or 0, first_ns)}")
     if certain_ns is not None:
         parts.append(f"certain since {time_text(certain_ns, first_ns)}")
     if result.least is not None and result.verdict == "violated":

@@ -59,6 +59,7 @@ class ReportedResult:
         sentences: the explanation of its verdict; none if the page does not explain it.
         decided_ns: the sample that decided it; None without an explanation.
         decided_node: the id of the node that decided it; None without an explanation.
+        decided_text: the atom of the objects that decided it, where that node is a quantifier, or "".
         pointer: the two points between which the atom that decided it stands; None if it has none.
         named: the specs of its file, by name.
         units: those of the numbers that its robustness is the least of.
@@ -75,6 +76,7 @@ class ReportedResult:
     sentences: tuple[Sentence, ...]
     decided_ns: int | None
     decided_node: int | None
+    decided_text: str
     pointer: Pointer | None
     named: Mapping[str, NamedSpec]
     units: tuple[Unit, ...]

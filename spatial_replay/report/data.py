@@ -210,6 +210,7 @@ def _result_value(
         "first": int(np.searchsorted(kept, here[0])) if len(here) else 0,
         "samples": len(here),
         "decided": _place_of(each),
+        "decided_text": each.decided_text,
         "nodes": tree_value(
             each.formula,
             each.result.values,

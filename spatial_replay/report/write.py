@@ -35,7 +35,7 @@ from spatial_replay.report.event_panel import ReportedEvent, event_of
 from spatial_replay.report.page import page
 from spatial_replay.report.picture_panel import pictures_of
 from spatial_replay.report.scene_panel import SceneCollector
-from spatial_replay.spec.formula import Specification
+from spatial_replay.spec.formula import Formula, Quantified, Specification, iter_nodes
 from spatial_replay.spec.relations import RELATION_NAMES
 from spatial_replay.spec.units import units_of
 
@@ -201,6 +201,7 @@ def _results(
             sentences=result.sentences(replayed.first_ns) if is_explained else (),
             decided_ns=None if witness is None else _decided_ns(witness),
             decided_node=None if witness is None else _decided_node(witness),
+            decided_text="" if witness is None else _decided_text(witness, result.formula),
             pointer=None if witness is None else _pointer(witness),
             named={spec.name: spec for spec in file.specs},
             units=units_of(result.formula),
@@ -219,6 +220,14 @@ def _decided_ns(witness: Witness) -> int:
 def _decided_node(witness: Witness) -> int:
     """Return the atom to look at: of a response that was missed, the one by which it came nearest."""
     return witness.path[-1].node if witness.closest_node is None else witness.closest_node
+
+
+def _decided_text(witness: Witness, formula: Formula) -> str:
+    """Return the atom of the objects that decided a quantifier, or "" if what decided is none."""
+    deciding = witness.deciding if witness.closest is None else witness.closest[0]
+    decided = _decided_node(witness)
+    node = next(node for identifier, _, node in iter_nodes(formula) if identifier == decided)
+    return deciding.text if deciding is not None and isinstance(node, Quantified) else ""
 
 
 def _pointer(witness: Witness) -> Pointer | None:

@@ -86,6 +86,19 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Path]:
     ]
     report_of_samples(folder / "reached.html", meeting, "spec meet = F (a ovlp b)")
     report_of_samples(folder / "braking.html", _braking(), BRAKING)
+    people = [
+        sr.Sample(
+            t * 10**8,
+            {"car": sr.Footprint.disc(0, 0, 1)}
+            | {
+                name: sr.TrackedObject(sr.Footprint.disc(x, 0, 1), "person")
+                for name, x in (("ann", 20), ("bob", 9 - t), ("cy", -12 + 2 * t))
+            },
+        )
+        for t in range(9)
+    ]
+    spec = 'group people = class "person"\nspec calm = G (forall p in people: p dist car >= 1)'
+    report_of_samples(folder / "quantifier.html", people, spec)
     _film(folder)
     hostile = [
         sr.Sample(t * 10**8, {name: sr.Footprint.disc(3 * k, t, 1) for k, name in enumerate(HOSTILE)})
@@ -373,6 +386,15 @@ def test_the_scene_names_what_decided_where_no_arrow_can_show_it(open_page: Open
     )
     said = page.locator(".verdict").first
     expect(said).to_contain_text("The nearest that it came to speed <= 1 was at 0.600 s: speed is 1.8.")
+
+
+def test_the_tree_and_the_curve_of_a_quantifier_name_the_object_that_decided(open_page: Open) -> None:
+    page = open_page("quantifier", at="#t=0.8")
+    decided = "cy dist car >= 1"
+    expect(page.locator(".row.decides").last).to_contain_text(f"decided at 0.500 s by {decided}")
+    expect(page.locator(".legend-entry").last).to_contain_text(f"{decided} of it decided at 0.500 s")
+    caption = open_page("quantifier").locator(".caption")
+    expect(caption).to_contain_text(f"what decided the verdict: {decided}")
 
 
 def test_a_link_to_a_result_unfolds_it_and_scrolls_to_it(open_page: Open) -> None:

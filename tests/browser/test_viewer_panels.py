@@ -377,3 +377,25 @@ def test_of_a_run_too_long_to_keep_the_sample_before_is_shown_and_named(
     assert all(0 <= behind <= 4 for behind in shown)
     assert any(shown)
     page.close()
+
+
+def test_of_an_unknown_result_the_path_ends_at_what_is_unknown_and_moves_name_all_states(
+    open_panel: Open, logs: Mapping[str, Path], tmp_path: Path
+) -> None:
+    log = tmp_path / "unseen.mcap"
+    with sr.Recorder(
+        log, specifications=[sr.parse_specification("spec apart = G (a dist b >= 5)")]
+    ) as recorder:
+        for t in range(12):
+            objects = {"a": sr.Footprint.disc(9 - t / 2, 0, 1)}
+            seen = {} if 3 <= t < 6 else {"b": sr.Footprint.disc(0, 0, 1)}
+            recorder.write(sr.Sample(t * 10**8, objects | seen))
+    write_viewer_page(log, log.with_suffix(".html"))
+    page = open_panel("unseen", "specification", logs={"unseen": log})
+    seek(page, 4 * 10**8)
+    expect(page.locator(".chip")).to_have_text("unknown")
+    expect(page.locator(".row.lit").last).to_contain_text("a dist b >= 5")
+    page = open_panel("unseen", "automaton", logs={"unseen": log})
+    seek(page, 11 * 10**8)
+    expect(page.locator(".sentence").first).to_contain_text("0 → 0 or 1")
+    expect(page.locator(".sentence").last).to_contain_text("0 or 1 → 1")

@@ -59,7 +59,7 @@ def test_an_undetermined_result_is_printed_without_an_interval(folder: Path) -> 
     _, *lines = done.stdout.splitlines()
     [apart] = [line for line in lines if line.startswith("  apart")]
     assert ["reach", "satisfied"] in [line.split()[:2] for line in lines]
-    assert apart.startswith("  apart  unknown    robustness not determined, first satisfied at")
+    assert apart.startswith("  apart  unknown    robustness not determined, held so far at")
 
 
 def test_an_annotated_log_names_its_semantics_and_is_replayed_with_the_default(folder: Path) -> None:

@@ -75,7 +75,7 @@ function curvesOf(run, result, quantity) {
   if (decided && !named.includes(decided)) {
     // an atom counts at each sample: its curve is that of the samples themselves
     found.push({node: decided, numbers: decided.series[NOW], name: shortened(decided.text, 40),
-      colour: colour("ink"), isDashed: true, reading: element("span", {class: "number"})});
+      decider: result.decided_text, at: atFault(result.fault), colour: colour("ink"), isDashed: true, reading: element("span", {class: "number"})});
   }
   return found;
 }
@@ -96,7 +96,8 @@ function legendEntry(curve, shown, build) {
       build();
     },
   }, swatch, element("span", {}, curve.isDashed ? element("code", {}, curve.name) : curve.name,
-    curve.isDashed ? " now, which decided" : null), curve.reading);
+    curve.isDashed ? " now, " : null, curve.decider ? element("code", {}, curve.decider) : null,
+    curve.isDashed ? curve.decider ? ` of it decided${curve.at}` : "which decided" : null), curve.reading);
 }
 
 function columns(result, curves) {

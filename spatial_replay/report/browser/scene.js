@@ -388,7 +388,7 @@ function decidedAt({run, sample, result: chosen}) {
   if (indexAt(run.times, result.fault) !== sample || place === null || place >= result.samples) return null;
   const number = node.series[NOW][place] * node.divisor;
   if (Number.isNaN(number)) return null;
-  return ["what decided the verdict: ", ...partWords({result, node}),
+  return ["what decided the verdict: ", ...partWords({result, node: {...node, text: result.decided_text || node.text}}),
     ` ${signWords(number, declaredUnit(node))} now; no arrow shows it`];
 }
 

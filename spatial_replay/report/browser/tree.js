@@ -44,15 +44,21 @@ function commonUnit(nodes) {
 }
 
 // Marks the way to the node that decided the verdict, and scrolls to it.
-function lightPath(list, rows, {nodes, decided}) {
+function lightPath(list, rows, {nodes, decided, fault, decided_text: decider}) {
   for (let place = decided; place !== null; place = nodes[place].parent) {
     rows.find((row) => row.node.index === place)?.parts[0].parentElement.classList.add("decides");
   }
   const last = rows.find((row) => row.node.index === decided)?.parts[0];
   if (!last) return;
+  // of a quantifier, the objects that did
+  if (decider) last.append(` decided${atFault(fault)} by `, element("code", {}, decider));
   const box = last.getBoundingClientRect(), frame = list.getBoundingClientRect();
   if (box.bottom > frame.bottom) list.scrollTop += box.bottom - frame.bottom + frame.height / 3;
   else if (box.top < frame.top) list.scrollTop += box.top - frame.top - frame.height / 3;
+}
+
+function atFault(fault) {
+  return fault === null ? "" : ` at ${secondsText(fault)}`;
 }
 
 function branch(node, rows, hasIntervals = false) {
