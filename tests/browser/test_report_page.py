@@ -419,7 +419,7 @@ def test_the_keys_step_through_the_kept_samples_of_a_thinned_run(open_page: Open
 def test_a_violation_without_an_arrow_is_reported_too(open_page: Open) -> None:
     for time, words in (
         (0.5, "power: nothing is violated now"),
-        (2, "battery >= 0.5 of power fails by 0.1 now; no arrow shows it"),
+        (2, "what decided the verdict: battery >= 0.5 of power fails by 0.1 now; no arrow shows it"),
     ):
         caption = open_page("unseen", at=f"#t={time}").locator(".caption")
         expect(caption).to_have_text(words)
