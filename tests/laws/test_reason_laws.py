@@ -121,7 +121,11 @@ def test_json_headline_and_the_last_event_name_what_settled_the_verdict(
         assert "witness" not in event
     else:
         assert event["witness_ns"] == str(witness.time_ns)
-        assert event["witness"].startswith(f"`{format_formula(leaf)}`")
+        texts = [format_formula(leaf)]
+        if isinstance(leaf, Quantified) and witness.deciding is not None:
+            # the atom of the object that decided it, where that is known
+            texts.append(witness.deciding.text)
+        assert event["witness"].startswith(tuple(f"`{text}`" for text in texts))
 
 
 @settings(max_examples=60)
