@@ -52,7 +52,7 @@ def decoded(read: Callable[[ReadDataStream], _Record], body: bytes) -> _Record:
 Bytes = NDArray[np.uint8]
 Words = NDArray[np.uint64]
 
-_RECORD_HEAD = 9
+_RECORD_HEAD = RECORD_HEAD.size
 MessageHeads: TypeAlias = np.ndarray[Any, np.dtype[np.void]]
 """(M,) with the fields channel, sequence, log_time and publish_time."""
 _MESSAGE_FIELDS = np.dtype(
