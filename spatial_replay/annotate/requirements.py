@@ -108,7 +108,6 @@ class Requirement(NamedTuple):
         conjunct: the conjunct of the formula that it is in.
         can_violate: whether failing now may be what violates its obligation; not a goal beside invariants.
         is_condition: whether it is left of an implication, which is met without it, too.
-        lasts: whether it is asked of samples without end; else only of those up to a deadline.
         is_invariant: whether its obligation asks it of every sample, and nothing makes up for it.
     """
 
@@ -121,7 +120,6 @@ class Requirement(NamedTuple):
     conjunct: Obligation = Obligation(0, 1.0)
     can_violate: bool = True
     is_condition: bool = False
-    lasts: bool = False
     is_invariant: bool = False
 
     def standing(self, series: Floats, at: Integers) -> NDArray[np.uint8]:
@@ -224,7 +222,7 @@ class _Place(NamedTuple):
     Attributes:
         sign: 0 where it counts in both.
         always: whether no operator above it but conjunctions and those that need it at every sample.
-        is_condition, lasts, is_invariant: see `Requirement`.
+        is_condition, is_invariant: see `Requirement`.
     """
 
     formula: Formula
@@ -234,7 +232,6 @@ class _Place(NamedTuple):
     conjunct: Obligation
     always: bool
     is_condition: bool
-    lasts: bool
     is_invariant: bool = True
 
 
@@ -246,12 +243,11 @@ def _places(formula: Formula) -> list[_Place]:
         passed.append(0)
         if parent is None:
             sign, above, conjunct, always = 1.0, None, Obligation(0, 1.0), True
-            is_condition, lasts, is_invariant = False, False, True
+            is_condition, is_invariant = False, True
         else:
             up = places[parent]
             is_implied = operator_of(up.formula) == "->" and up.sign > 0.0
             is_condition = up.is_condition or (is_implied and not passed[parent])
-            lasts = up.lasts or _is_endless(up.formula)
             always_of = "G" if up.sign > 0.0 else "F"
             is_always = operator_of(up.formula) == always_of and _is_endless(up.formula)
             is_invariant = up.is_invariant and _needs_all_now(up, is_always)
@@ -262,7 +258,7 @@ def _places(formula: Formula) -> list[_Place]:
             passed[parent] += 1
         starts = above is None and isinstance(node, Temporal)
         obligation = Obligation(identifier, sign) if starts else above
-        place = _Place(node, parent, sign, obligation, conjunct, always, is_condition, lasts, is_invariant)
+        place = _Place(node, parent, sign, obligation, conjunct, always, is_condition, is_invariant)
         places.append(place)
     return places
 
@@ -339,7 +335,6 @@ def _requirement(identifier: int, place: _Place, object: str | None) -> Requirem
         frozenset(groups),
         place.conjunct,
         is_condition=place.is_condition,
-        lasts=place.lasts,
         is_invariant=place.is_invariant and place.obligation is not None,
     )
 

@@ -214,8 +214,9 @@ def first_violations(results: Sequence[EvaluatedResult], trace: Trace, samples: 
 
     It is shown at the atom that gives the requirement its number: between the two points at which the signed
     distance of its two terms is attained or, of an enclosure, along which the one sticks out of the other.
-    In the sample that settled the formula's violation that is the atom that settled it. What is asked only up
-    to a deadline is still pointed at after that, with the number that settled it. Conditions of implications
+    In the sample that settled the formula's violation that is the atom that settled it. What is not asked of
+    every sample, but up to a deadline or in response, is still pointed at after that, with the number that
+    settled it. Conditions of implications
     are not pointed at: those hold, and what had to follow does not.
 
     Args:
@@ -252,7 +253,7 @@ def first_violations(results: Sequence[EvaluatedResult], trace: Trace, samples: 
 def _shows_settled(result: EvaluatedResult, times_ns: Integers) -> NDArray[np.bool_]:
     """Return (S,), in which samples a result is pointed at by what settled its violation.
 
-    That is the sample that settled it and, if the atom is asked only up to a deadline, all after it.
+    That is the sample that settled it and, if the atom is not asked of every sample, all after it.
     """
     settled = result.settled
     if result.leaf_pairs is None or settled is None or settled.shown is None:
@@ -260,7 +261,8 @@ def _shows_settled(result: EvaluatedResult, times_ns: Integers) -> NDArray[np.bo
     within = _requirement_of(result, settled.shown.node)
     if within is None:
         return np.zeros(len(times_ns), np.bool_)
-    return np.asarray(times_ns == settled.time_ns if within.lasts else times_ns >= settled.time_ns)
+    is_after = times_ns >= settled.time_ns
+    return np.asarray(times_ns == settled.time_ns) if within.is_invariant else is_after
 
 
 def _requirement_of(result: EvaluatedResult, node: int) -> Requirement | None:
@@ -321,7 +323,7 @@ def _first(results: Sequence[EvaluatedResult], times_ns: Integers) -> tuple[Inte
             if requirement.is_condition:
                 continue
             is_first = (now < 0.0) & (now > -np.inf) & (since_ns[number] < earliest)
-            if not requirement.lasts:
+            if not requirement.is_invariant:
                 is_first &= ~is_over
             which[is_first], place[is_first], violated[is_first] = index, number, now[is_first]
             earliest[is_first] = since_ns[number]

@@ -243,6 +243,23 @@ def chosen_payloads(payloads: Sequence[bytes], chosen: Integers) -> Sequence[byt
     return [payloads[index] for index in chosen.tolist()]
 
 
+def iter_alike(payloads: Sequence[bytes]) -> Iterator[tuple[Integers, bytes]]:
+    """Yield messages in groups: their places (k,), and one of those that differ in a few numbers only."""
+    columns = columns_of(payloads)
+    for part, places in zip(columns.parts, _places(columns.part, len(columns.parts)), strict=True):
+        if isinstance(part, Filled):
+            if len(places):
+                yield places, columns[int(places[0])]
+        else:
+            yield from ((np.array([place]), columns[place]) for place in places.tolist())
+
+
+def _places(part: Integers, parts: int) -> list[Integers]:
+    """Return the places of each part's messages."""
+    order = np.argsort(part, kind="stable")
+    return np.split(order, np.cumsum(np.bincount(part, minlength=parts))[:-1])
+
+
 def _listed(part: Filled) -> list[bytes]:
     encoded = part.encoded(slice(None))
     length, whole = len(part.template), encoded.tobytes()

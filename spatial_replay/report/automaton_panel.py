@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,19 +33,25 @@ class StatePathCollector:
     """Collects the states of one result from its messages as they come."""
 
     def __init__(self) -> None:
-        self._times_ns: list[int] = []
-        self._codes: list[int] = []
+        self._times_ns: list[Integers] = []
+        self._codes: list[Integers] = []
         self._sets: dict[tuple[int, ...], int] = {}
 
-    def add(self, time_ns: int, states: tuple[int, ...]) -> None:
-        """Take in the states after the next sample."""
-        self._times_ns.append(time_ns)
-        self._codes.append(self._sets.setdefault(states, len(self._sets)))
+    def extend(self, times_ns: Integers, groups: Sequence[tuple[Integers, tuple[int, ...]]]) -> None:
+        """Take in the states after the next samples: places of samples, each time with their states."""
+        codes = [
+            np.full(len(places), self._sets.setdefault(states, len(self._sets))) for places, states in groups
+        ]
+        places = np.concatenate([places for places, _ in groups])
+        order = np.argsort(places)
+        self._times_ns.append(times_ns[places[order]])
+        self._codes.append(np.concatenate(codes)[order])
 
     @property
     def path(self) -> StatePath:
         """The path so far."""
-        times_ns, codes = np.array(self._times_ns, np.int64), np.array(self._codes, np.int64)
+        none = [np.empty(0, np.int64)]
+        times_ns, codes = (np.concatenate(none + each) for each in (self._times_ns, self._codes))
         return StatePath(times_ns, codes, tuple(self._sets))
 
 

@@ -108,7 +108,7 @@ def requirement_values(
             "node": place[requirement.node],
             "sign": requirement.sign,
             "is_condition": requirement.is_condition,
-            "lasts": requirement.lasts,
+            "is_invariant": requirement.is_invariant,
             "obligation": requirement.obligation
             and {"node": place[requirement.obligation.node], "sign": requirement.obligation.sign},
             "outcome": json_number(float(requirement.outcome(ends, np.zeros(1, np.int64))[0])),

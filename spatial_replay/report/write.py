@@ -16,10 +16,11 @@ import numpy as np
 
 from spatial_replay.annotate.specification import unit_of
 from spatial_replay.errors import UsageError
+from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs import topics as log_topics
 from spatial_replay.logs.messages import Messages
 from spatial_replay.logs.output_file import refuse_inputs, replacing
-from spatial_replay.logs.payloads import chosen_payloads
+from spatial_replay.logs.payloads import chosen_payloads, iter_alike
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.source import Source, axes_of
 from spatial_replay.logs.source import units_of as declared_units
@@ -42,16 +43,12 @@ from spatial_replay.spec.units import units_of
 _COLLECTED: Final = frozenset(
     (
         log_topics.EVENTS,
-        log_topics.AUTOMATON,
         log_topics.PLAN_DECISION,
         log_topics.GRADIENT_MAP,
         log_topics.REDONE_DECISION,
         log_topics.REDONE_MAP,
     )
 )
-_TIME_BYTES: Final = 9
-"""The first field of a state, a fixed64 with its tag."""
-_MOST_KEPT: Final = 4096
 
 
 class Collector:
@@ -62,22 +59,19 @@ class Collector:
         self.decisions = DecisionCollector()
         self.events: list[ReportedEvent] = []
         self._paths: defaultdict[tuple[str, str], StatePathCollector] = defaultdict(StatePathCollector)
-        self._states: dict[bytes, tuple[StatePathCollector, tuple[int, ...]]] = {}
 
     def add(self, messages: Messages) -> None:
         """Take in the next messages."""
         topics = {number: channel.topic for number, channel in messages.channels.items()}
         collected = [number for number, topic in topics.items() if topic in _COLLECTED]
         chosen = np.flatnonzero(np.isin(messages.channel, collected))
-        columns = (messages.channel, messages.sequence, messages.log_time_ns)
+        columns = (messages.channel, messages.sequence)
         numbers = zip(*(column[chosen].tolist() for column in columns), strict=True)
         payloads = chosen_payloads(messages.payloads, chosen)
-        for (channel, sequence, time_ns), payload in zip(numbers, payloads, strict=True):
+        for (channel, sequence), payload in zip(numbers, payloads, strict=True):
             match topics[channel]:
                 case log_topics.EVENTS:
                     self.events.append(event_of(payload))
-                case log_topics.AUTOMATON:
-                    self._add_state(time_ns, payload)
                 case log_topics.PLAN_DECISION:
                     self.decisions.add_decision(payload)
                 case log_topics.GRADIENT_MAP:
@@ -86,18 +80,18 @@ class Collector:
                     self.decisions.redone.add_decision(payload)
                 case log_topics.REDONE_MAP:
                     self.decisions.redone.add_map(sequence, payload)
+        states = [number for number, topic in topics.items() if topic == log_topics.AUTOMATON]
+        chosen = np.flatnonzero(np.isin(messages.channel, states))
+        self._add_states(messages.log_time_ns[chosen], chosen_payloads(messages.payloads, chosen))
 
-    def _add_state(self, time_ns: int, payload: bytes) -> None:
-        # what follows the time is nearly always that of a message before
-        said = payload[_TIME_BYTES:]
-        if said not in self._states:
+    def _add_states(self, times_ns: Integers, payloads: Sequence[bytes]) -> None:
+        groups: defaultdict[tuple[str, str], list[tuple[Integers, tuple[int, ...]]]] = defaultdict(list)
+        # those that differ in times and truths only have the same states
+        for places, payload in iter_alike(payloads):
             message = AutomatonState.FromString(payload)
-            if len(self._states) >= _MOST_KEPT:
-                self._states.clear()
-            path = self._paths[message.specification, message.object]
-            self._states[said] = path, tuple(message.states)
-        path, states = self._states[said]
-        path.add(time_ns, states)
+            groups[message.specification, message.object].append((places, tuple(message.states)))
+        for result, own in groups.items():
+            self._paths[result].extend(times_ns, own)
 
     def path(self, name: str, object: str | None) -> StatePath:
         """Return where the automaton of a result was; an empty path if it has none."""

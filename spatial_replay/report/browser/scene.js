@@ -350,7 +350,7 @@ function wordsOf(clock, scene, frame) {
       return ["the arrow: ", element("code", {}, pointer.text),
         ` of ${run.results[clock.result].title} held here, and what had to follow did not`];
     }
-    return [`the arrow, ${pointer.is_response ? "what came nearest to what had to follow" : "what decided the verdict"}: `, element("code", {}, pointer.text),
+    return [`the arrow, ${roleWords(pointer)}: `, element("code", {}, pointer.text),
       ` of ${run.results[clock.result].title} ${signWords(pointer.number, run.lengths)}`];
   }
   const violation = violationAt(clock, scene, frame);
@@ -358,10 +358,10 @@ function wordsOf(clock, scene, frame) {
   const chosen = run.results.slice(clock.result, clock.result + 1);
   const open = requirementsAt(chosen, clock.sample);
   const inState = (state) => open.filter(({standing}) => standing === state);
-  // a condition holds, and what had to follow did not; what had a deadline was asked before
+  // a condition holds, and what had to follow did not; what is not asked of every sample was asked before
   const isLost = chosen.some((result) =>
     statusOf(run, result, result.nodes[0], placeIn(result, clock.sample)) === "violated");
-  const violated = inState(VIOLATED).filter((each) => !each.isCondition && (each.lasts || !isLost));
+  const violated = inState(VIOLATED).filter((each) => !each.isCondition && (each.isInvariant || !isLost));
   const decided = decidedAt(clock);
   if (decided) return decided;
   if (violated.length) return [...failureWords(violated[0]), others(violated), "; no arrow shows it"];
@@ -405,7 +405,8 @@ function violationWords(run, time, {result: which, node: index, label, robustnes
   if (index < 0) return [`${label.replace(": -", ": −")}, which is violated there`];
   const result = run.results[which], node = result.nodes[index];
   if (moment !== null) {
-    return [...partWords({result, node}), ` ${signWords(number, run.lengths)} at ${secondsText(moment)}, what decided the verdict`];
+    return [...partWords({result, node}),
+      ` ${signWords(number, run.lengths, true)} at ${secondsText(moment)}, ${roleWords(result.pointer)}`];
   }
   const sample = indexAt(run.times, time), place = placeIn(result, sample);
   if (Math.abs(run.times[sample] - time) < 1e-9 && place !== null && place < result.samples) {
@@ -422,8 +423,14 @@ function failureWords(part) {
 }
 
 // An atom that decides a violation and holds is one that should not, or the condition of what failed.
-function signWords(number, unit) {
-  return `${number < 0 ? "fails" : "holds"} by ${numberText(Math.abs(number))}${spaced(unit)}`;
+function signWords(number, unit, isPast = false) {
+  const [fails, holds] = isPast ? ["failed", "held"] : ["fails", "holds"];
+  return `${number < 0 ? fails : holds} by ${numberText(Math.abs(number))}${spaced(unit)}`;
+}
+
+// What the atom that an arrow points at is to the verdict.
+function roleWords(pointer) {
+  return pointer?.is_response ? "what came nearest to what had to follow" : "what decided the verdict";
 }
 
 function spaced(unit) {
@@ -447,8 +454,8 @@ function requirementsAt(results, sample) {
     const place = placeIn(result, sample);
     if (place === null || place >= result.samples) return [];
     return result.requirements
-      .map(({node, standing, is_condition: isCondition, lasts, obligation}) => ({
-        result, node: result.nodes[node], place, standing: standing[place], isCondition, lasts,
+      .map(({node, standing, is_condition: isCondition, is_invariant: isInvariant, obligation}) => ({
+        result, node: result.nodes[node], place, standing: standing[place], isCondition, isInvariant,
         // so far its obligation is not met: of a response, its condition held
         isDue: obligation && obligation.sign * result.nodes[obligation.node].series[VALUE][place] < 0,
       }))
