@@ -20,7 +20,7 @@ from spatial_replay.report.contents import MOST_DRAWN, ReportedResult, RunReport
 from spatial_replay.report.decision_panel import decisions_value
 from spatial_replay.report.event_panel import MOST_EVENTS, event_values
 from spatial_replay.report.picture_panel import picture_values
-from spatial_replay.report.scene_panel import ReportedScene, scene_value
+from spatial_replay.report.scene_panel import scene_value
 from spatial_replay.report.tree_panel import (
     MOST_NODES,
     named_nodes,
@@ -150,7 +150,7 @@ def page_data(report: RunReport) -> PageData:
             # without those of the signs
             "curves": CURVES[2:],
         },
-        "results": [_result_value(each, kept, report, scene, packing) for each in drawn],
+        "results": [_result_value(each, kept, report, packing) for each in drawn],
         "scene": scene_value(scene, report.first_ns, _places(report), packing),
         "events": event_values(report.events, report.first_ns),
         "decisions": decisions["decisions"],
@@ -194,7 +194,7 @@ def _shown_times(report: RunReport, times_ns: Integers, most: int) -> Integers:
 
 
 def _result_value(
-    each: ReportedResult, kept: Integers, report: RunReport, scene: ReportedScene, packing: Packing
+    each: ReportedResult, kept: Integers, report: RunReport, packing: Packing
 ) -> Mapping[str, Any]:
     first_ns = report.first_ns
     samples = np.flatnonzero(np.isin(each.result.times_ns, kept))
@@ -219,7 +219,7 @@ def _result_value(
             report.declared_units,
             each.tree.calls(each.source),
         ),
-        "requirements": requirement_values(each.result, samples, scene.entities_of, packing),
+        "requirements": requirement_values(each.result, samples, packing),
         "series": packing.add(singles(series), "f4"),
         "automaton": None,
         "no_automaton": sentence_parts(each.no_automaton),

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from spatial_replay.annotate.requirements import ClassMembers, Requirement
-from spatial_replay.annotate.scene.scene_frames import DrawnEntity, DrawnViolation, SceneFrame, SceneFrames
-from spatial_replay.annotate.scene.scene_template import OBJECT, REGION
+from spatial_replay.annotate.scene.scene_frames import (
+    SHADES,
+    DrawnEntity,
+    DrawnViolation,
+    SceneFrame,
+    SceneFrames,
+)
+from spatial_replay.annotate.scene.scene_template import REGION
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.report.compact import Packing
-from spatial_replay.spec.formula import ANY_CLASS
 
 MOST_FRAMES: Final = 3_000
 """Frames of a page, at most."""
@@ -34,46 +38,17 @@ class ReportedScene:
     Attributes:
         times_ns: (F,) int64.
         stride: every how many messages there is a frame.
-        scale: the robustness at which colours are full.
     """
 
     times_ns: Integers
     frames: tuple[SceneFrame, ...]
     stride: int
-    scale: float = 1.0
 
     def at(self, times_ns: Integers) -> ReportedScene:
         """Return the scene with its frames at some times only."""
         is_kept = np.isin(self.times_ns, times_ns).tolist()
         frames = tuple(frame for frame, kept in zip(self.frames, is_kept, strict=True) if kept)
         return replace(self, times_ns=self.times_ns[is_kept], frames=frames)
-
-    def entities_of(self, requirement: Requirement) -> list[int]:
-        """Return the places on the page of the entities that a requirement is about."""
-        names = {REGION + name for name in requirement.regions} | {
-            OBJECT + name for name in requirement.objects
-        }
-        return [
-            place
-            for place, (identifier, classes) in enumerate(self._classes.items())
-            if identifier in names
-            or any(_is_member(identifier, classes, each) for each in requirement.groups)
-        ]
-
-    @cached_property
-    def _classes(self) -> Mapping[str, frozenset[str]]:
-        """The classes that each entity ever has, casefolded, in the order of drawing."""
-        return {
-            identifier: frozenset((each.class_name or "").casefold() for each in shown.values())
-            for identifier, shown in sorted(_entities(self.frames).items(), key=_drawing_order)
-        }
-
-
-def _is_member(identifier: str, classes: frozenset[str], group: ClassMembers) -> bool:
-    kind, name = identifier.startswith(OBJECT), identifier.removeprefix(OBJECT)
-    return (
-        kind and name not in group.excluded and (group.class_name == ANY_CLASS or group.class_name in classes)
-    )
 
 
 class SceneCollector:
@@ -83,11 +58,13 @@ class SceneCollector:
         self._frames: list[tuple[int, SceneFrame]] = []
         self._count, self._stride, self._corners = 0, 1, 0
         self._last_ns: int | None = None
-        self._scale = 1.0
 
     def add(self, frames: SceneFrames) -> None:
         """Take in what the next messages show."""
-        self._scale = frames.scale
+        # no others have a place
+        chosen = np.arange(-self._count % self._stride, len(frames.times_ns), self._stride)
+        is_again = len(frames.times_ns) > 0 and int(frames.times_ns[0]) == self._last_ns
+        frames = replace(frames, chosen=np.union1d(chosen, [0]) if is_again else chosen)
         for index, time_ns in enumerate(frames.times_ns.tolist()):
             self.add_frame(time_ns, partial(frames.frame, index))
 
@@ -116,7 +93,7 @@ class SceneCollector:
     def scene(self) -> ReportedScene:
         """The frames so far."""
         times_ns = np.array([time_ns for time_ns, _ in self._frames], np.int64)
-        return ReportedScene(times_ns, tuple(frame for _, frame in self._frames), self._stride, self._scale)
+        return ReportedScene(times_ns, tuple(frame for _, frame in self._frames), self._stride)
 
 
 class _Box(NamedTuple):
@@ -140,7 +117,8 @@ def scene_value(
     """
     entities = _entities(scene.frames)
     # of one result there is one arrow in a frame
-    results = {result: place for (result, _), (place, _) in places.items()}
+    results = dict(sorted((result, place) for (result, _), (place, _) in places.items()))
+    listed = sorted(results, key=results.__getitem__)
     most = max(1, MOST_ARROWS // max(len(scene.frames), 1))
     shown = [
         (number, arrow)
@@ -153,11 +131,11 @@ def scene_value(
     return {
         "times": packing.add((scene.times_ns - first_ns) / 1e9, "f8"),
         "stride": scene.stride,
-        "scale": scene.scale,
+        "shades": packing.add(SHADES, "u1"),
         "low": box.low.tolist(),
         "high": (box.low + box.size).tolist(),
         "entities": [
-            _entity_value(identifier, shown, len(scene.frames), box, packing)
+            _entity_value(identifier, shown, len(scene.frames), listed, box, packing)
             for identifier, shown in sorted(entities.items(), key=_drawing_order)
         ],
         "violations": {
@@ -210,9 +188,18 @@ def _joined(points: Sequence[Floats]) -> Floats:
 
 
 def _entity_value(
-    identifier: str, shown: Mapping[int, DrawnEntity], frames: int, box: _Box, packing: Packing
+    identifier: str,
+    shown: Mapping[int, DrawnEntity],
+    frames: int,
+    results: Sequence[int],
+    box: _Box,
+    packing: Packing,
 ) -> Mapping[str, Any]:
-    """Return one entity: its form in each frame, and its points and colours in the frames that have it."""
+    """Return one entity: its form in each frame, and its points and colours in the frames that have it.
+
+    Args:
+        results: those of the page, which it has shades for in this order.
+    """
     forms: dict[tuple[int, ...], int] = {}
     of_frame = np.full(frames, _ABSENT, np.int64)
     for number, each in shown.items():
@@ -220,6 +207,8 @@ def _entity_value(
         of_frame[number] = forms.setdefault(form, len(forms))
     kind, _, name = identifier.partition("/")
     rings = [ring for each in shown.values() for ring in each.rings]
+    has_shades = all(each.shades for each in shown.values())
+    shades = [np.frombuffer(each.shades, np.uint8)[list(results)] for each in shown.values() if has_shades]
     return {
         "kind": kind,
         "name": name,
@@ -227,4 +216,5 @@ def _entity_value(
         "form": packing.add(of_frame, "u2"),
         "points": packing.add(box.steps(_joined(rings)), "u2"),
         "colours": packing.add(np.array([each.colour for each in shown.values()]), "u1"),
+        "shades": packing.add(np.array(shades), "u1") if has_shades else None,
     }

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
 import numpy as np
 
-from spatial_replay.annotate.requirements import Requirement, requirements_of
+from spatial_replay.annotate.requirements import requirements_of
 from spatial_replay.annotate.specification import unit_of
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.result import SpecResult
@@ -17,7 +17,7 @@ from spatial_replay.monitor.verdict import final_verdict
 from spatial_replay.report.compact import Packing
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Boolean, Formula, Temporal, iter_nodes, operands_of, operator_of
-from spatial_replay.text import json_number, with_unit
+from spatial_replay.text import with_unit
 
 MOST_NODES: Final = 400
 """Nodes of a tree that a page shows, at most."""
@@ -86,33 +86,21 @@ def tree_value(
     ]
 
 
-def requirement_values(
-    result: SpecResult,
-    samples: Integers,
-    entities_of: Callable[[Requirement], Sequence[int]],
-    packing: Packing,
-) -> list[Mapping[str, Any]]:
+def requirement_values(result: SpecResult, samples: Integers, packing: Packing) -> list[Mapping[str, Any]]:
     """Return the requirements of a formula (see `annotate.requirements`) whose nodes are shown.
 
     Args:
-        entities_of: which entities of the page's scene a requirement is about.
         samples: (S,) indices of those that the page has.
     """
     place = {identifier: index for index, identifier in enumerate(shown_nodes(result.formula))}
     settles = result.semantics == "ltlf"
-    # of the finished log
-    ends = np.full((len(result.final), 4, 1), np.nan)
-    ends[:, 2:, 0] = result.final
     return [
         {
             "node": place[requirement.node],
-            "sign": requirement.sign,
             "is_condition": requirement.is_condition,
             "is_invariant": requirement.is_invariant,
             "obligation": requirement.obligation
             and {"node": place[requirement.obligation.node], "sign": requirement.obligation.sign},
-            "outcome": json_number(float(requirement.outcome(ends, np.zeros(1, np.int64))[0])),
-            "entities": entities_of(requirement),
             "standing": packing.add(requirement.standing(result.series, samples), "u1"),
         }
         for requirement in requirements_of(result.formula, result.object, settles=settles)

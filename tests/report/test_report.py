@@ -194,6 +194,37 @@ def test_the_scene_is_that_of_the_messages(tmp_path: Path) -> None:
     assert places == [[0, result["requirements"][0]["node"]]] * 4
 
 
+PEOPLE = "group people = left, near, far"
+
+
+def test_of_several_results_each_colours_objects_as_if_it_were_the_only_one(tmp_path: Path) -> None:
+    names = {"left": -3.0, "near": -0.5, "far": 2.0}
+    samples = [
+        sr.Sample(t * 10**8, {
+            "car": sr.Footprint.box(t, 0, t + 1, 1),
+            **{name: sr.Footprint.box(x + 3, 1.5, x + 4, 2.5) for name, x in names.items()},
+        })
+        for t in range(8)
+    ]  # fmt: skip
+    lines = [
+        "spec each = G (forall p in people: p dist car >= 1)",
+        "spec both = G (near dist car >= 1 and far dist car >= 0.7)",
+        "spec there = F (left dist car >= 4)",
+    ]
+    several = report_of_samples(tmp_path / "several.html", samples, "\n".join([PEOPLE, *lines]))
+    scene = several.facts["scene"]
+    palette = several.numbers(scene["shades"]).reshape(256, 3).astype(int)
+    assert len(scene["entities"]) == 4
+    for place, result in enumerate(several.facts["results"]):
+        [line] = [each for each in lines if f"spec {result['name']} " in each]
+        alone = report_of_samples(tmp_path / f"{place}.html", samples, f"{PEOPLE}\n{line}")
+        for drawn, own in zip(scene["entities"], alone.facts["scene"]["entities"], strict=True):
+            assert own["shades"] is None
+            shades = several.numbers(drawn["shades"]).reshape(-1, len(lines))[:, place]
+            expected = alone.numbers(own["colours"]).reshape(-1, 3)
+            assert np.abs(palette[shades] - expected).max() <= 1, (line, drawn["name"])
+
+
 def test_an_absent_object_is_not_drawn(tmp_path: Path) -> None:
     samples = [
         each if t != 2 else sr.Sample(each.time_ns, {"a": each.objects["a"]})

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from spatial_replay.annotate.rings import Rings
 from spatial_replay.annotate.scene.scene_template import OBJECT, REGION, Banner, CauseText, Region, border_of
 from spatial_replay.annotate.scene.scene_text import ArrowTexts
-from spatial_replay.annotate.violations import Presence, Violations
+from spatial_replay.annotate.violations import Violations
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.palette import NEGATIVE, NEUTRAL, POSITIVE
@@ -39,6 +39,13 @@ def colours(robustness: ArrayLike, scale: ArrayLike) -> Floats:
     return np.asarray(np.round(mixed * 255.0) / 255.0)
 
 
+def shade_codes(robustness: Floats, scale: ArrayLike) -> NDArray[np.uint8]:
+    """Return robustness (...) as places in `SHADES`: what `colours` makes of it, to the step of a screen."""
+    share = np.minimum(np.abs(np.nan_to_num(robustness)) / np.asarray(scale), 1.0)
+    codes = np.where(robustness >= 0.0, 128.0 + np.round(127.0 * share), 127.0 - np.round(126.0 * share))
+    return np.where(np.isnan(robustness), 0.0, codes).astype(np.uint8)
+
+
 def cell_colours(robustness: Floats) -> NDArray[np.uint8]:
     """Return the colours (..., 4) of cells (...): full where the map is largest, transparent where NaN."""
     largest = float(np.abs(robustness[np.isfinite(robustness)]).max(initial=0.0))
@@ -46,6 +53,18 @@ def cell_colours(robustness: Floats) -> NDArray[np.uint8]:
     shares = np.concatenate([colours(robustness, largest or 1.0), opacity[..., None]], axis=-1)
     return np.asarray(np.round(255.0 * shares), np.uint8)
 
+
+def _shades() -> NDArray[np.uint8]:
+    codes = np.arange(256.0)
+    # the slightest below 0 is below 0, too
+    shares = np.where(codes < 128.0, (codes - 127.0) / 126.0 - 1e-9, (codes - 128.0) / 127.0)
+    shares[0] = np.nan
+    return np.asarray(np.round(255.0 * colours(shares, 1.0)), np.uint8)
+
+
+SHADES: Final = _shades()
+"""(256, 3), red, green and blue of `shade_codes`."""
+SHADES.flags.writeable = False
 
 ABSENT, DELETED, FIRST_FORM = -1, 0, 1
 """What an object is in a message: not there, just gone, or drawn in one of the forms from here on."""
@@ -57,12 +76,13 @@ class DrawnEntity(NamedTuple):
     Attributes:
         rings: its outlines, (n, 2) each.
         colour: red, green and blue, 0 to 255.
-        class_name: of an object that has one.
+        shades: of each result, its colour if that were the only one, a place in `SHADES`; empty for one
+            result, and for very many.
     """
 
     rings: tuple[Floats, ...]
     colour: tuple[int, int, int]
-    class_name: str | None = None
+    shades: bytes = b""
 
 
 class DrawnViolation(NamedTuple):
@@ -143,6 +163,7 @@ class SceneFrames:
         objects, regions: (S, objects) and (S, regions), the worst robustness of their requirements.
         object_colours, region_colours: the same with a last axis of red, green and blue, 0 to 1.
         scale: the robustness at which colours are full.
+        chosen: (K,) int64, the messages that frames are made of, in order; None for all.
     """
 
     times_ns: Integers
@@ -151,30 +172,35 @@ class SceneFrames:
     object_colours: Floats
     region_colours: Floats
     scale: float
-    _presence: Presence
     _content: SceneContent
     _regions: tuple[Region, ...]
-    _find_arrows: Callable[[], Sequence[Arrows]]
+    _find_arrows: Callable[[Integers], Sequence[Arrows]]
+    _find_shades: Callable[[Integers], tuple[NDArray[np.uint8], NDArray[np.uint8]]]
+    chosen: Integers | None = None
 
     @cached_property
-    def _arrows(self) -> Sequence[Arrows]:
-        return self._find_arrows()
+    def _details(self) -> tuple[Integers, Sequence[Arrows], NDArray[np.uint8], NDArray[np.uint8]]:
+        """The chosen messages, their arrows, and the shades of their objects and regions, a result each."""
+        chosen = np.arange(len(self.times_ns)) if self.chosen is None else self.chosen
+        return chosen, self._find_arrows(chosen), *self._find_shades(chosen)
 
     def frame(self, index: int) -> SceneFrame:
-        """Return what one of the messages shows."""
+        """Return what one of the chosen messages shows."""
+        chosen, found, of_objects, of_regions = self._details
+        place = int(np.searchsorted(chosen, index))
         entities = {
-            REGION + region.name: DrawnEntity(tuple(border_of(region)), _bytes(colour))
-            for region, colour in zip(self._regions, self.region_colours[index], strict=True)
+            REGION + region.name: DrawnEntity(tuple(border_of(region)), _bytes(colour), shades.tobytes())
+            for region, colour, shades in zip(
+                self._regions, self.region_colours[index], of_regions[place], strict=True
+            )
         }
         content = self._content
         for column, name in enumerate(content.names):
             if content.forms[index, column] >= FIRST_FORM:
                 rings = content.rings.rings_of(int(content.observations[index, column]))
                 colour = _bytes(self.object_colours[index, column])
-                code = int(self._presence.class_code[index, column])
-                class_name = self._presence.classes[code] if code >= 0 else None
-                entities[OBJECT + name] = DrawnEntity(rings, colour, class_name)
-        arrows = (each.at(index) for each in self._arrows)
+                entities[OBJECT + name] = DrawnEntity(rings, colour, of_objects[place, column].tobytes())
+        arrows = (each.at(place) for each in found)
         violations = tuple(each for each in arrows if each is not None)
         return SceneFrame(entities, violations)
 

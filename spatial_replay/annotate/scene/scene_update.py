@@ -24,6 +24,7 @@ from spatial_replay.annotate.scene.scene_frames import (
     SceneContent,
     SceneFrames,
     colours,
+    shade_codes,
 )
 from spatial_replay.annotate.scene.scene_template import (
     LEVELS,
@@ -63,6 +64,8 @@ _UNSCALED: Final = 1.0
 """The scale before any object is shown, and that of a scene of points, which have no size."""
 
 _MOST_TEMPLATES: Final = 256
+_MOST_SHADES: Final = 4_096
+"""Shades of one message, of each result and each object or region, at most."""
 _NOWHERE: Final = (0.0, 0.0)
 _BANNER_LIFT: Final = 0.06
 """How far the banner is above the scene, by the scene's height."""
@@ -183,8 +186,9 @@ class SceneEncoder:
             templates=MappingProxyType(dict(list(templates.items())[-_MOST_TEMPLATES:])),
         )
         find_arrows = partial(_arrows_of, results, trace, written, state.first_ns or 0, self.unit)
+        find_shades = partial(_shades_of, results, presence, [each.name for each in self._drawn], scales)
         frames = SceneFrames(
-            times_ns, objects, regions, *shades, scale, presence, content, self._drawn, find_arrows
+            times_ns, objects, regions, *shades, scale, content, self._drawn, find_arrows, find_shades
         )
         return SceneMessages(times_ns, filled_in(len(written), filled), after, frames)
 
@@ -240,14 +244,42 @@ class SceneEncoder:
 
 
 def _arrows_of(
-    results: Sequence[EvaluatedResult], trace: Trace, written: Integers, first_ns: int, unit: str
+    results: Sequence[EvaluatedResult],
+    trace: Trace,
+    written: Integers,
+    first_ns: int,
+    unit: str,
+    chosen: Integers,
 ) -> list[Arrows]:
-    """Return the arrows of each result in some samples, as if it were the only one."""
+    """Return the arrows of each result in some messages, as if it were the only one."""
     arrows = []
     for number, result in enumerate(results):
-        found = first_violations([result], trace, written)
+        found = first_violations([result], trace, written[chosen])
         arrows.append(Arrows(number, found, arrow_texts([result], found, first_ns, unit)))
     return arrows
+
+
+def _shades_of(
+    results: Sequence[EvaluatedResult],
+    presence: Presence,
+    regions: Sequence[str],
+    scales: Floats,
+    chosen: Integers,
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Return (K, objects, R) and (K, regions, R) of some messages, as if each result were the only one.
+
+    One result has none, as its shades are the colours; nor have very many.
+    """
+    entities = len(presence.names) + len(regions)
+    shaded = results if 1 < len(results) <= _MOST_SHADES // max(entities, 1) else ()
+    own = presence._replace(times_ns=presence.times_ns[chosen], class_code=presence.class_code[chosen])
+    of_objects = np.empty((len(chosen), len(presence.names), len(shaded)), np.uint8)
+    of_regions = np.empty((len(chosen), len(regions), len(shaded)), np.uint8)
+    for number, result in enumerate(shaded):
+        objects, places = worst_robustness([result], own, regions)
+        of_objects[:, :, number] = shade_codes(objects, scales[chosen])
+        of_regions[:, :, number] = shade_codes(places, scales[chosen])
+    return of_objects, of_regions
 
 
 def _words_of_arrow(

@@ -21,7 +21,7 @@ function makeScene(clock, name = "scene") {
   place.append(made, element("div", {class: "scene-foot"}, caption, element("span", {class: "choice"},
     layerBox("names", "labels", layers, redraw), layerBox("trails", "trails", layers, redraw),
     hasMaps ? layerBox("map", "map", layers, redraw) : null)),
-  key([{ground: "positive", words: clock.run.results.length > 1
+  key([{ground: "positive", words: scene.entities.some((each) => each.shades)
     ? "its requirements in the chosen result hold now" : "its requirements hold now"},
     {ground: "negative", words: "one is violated, whatever comes"},
     {ground: "neutral", words: "no requirement, still to come, or unknown"}]));
@@ -82,7 +82,7 @@ function readScene(run) {
     high: [greatest(0), greatest(1)],
     violations,
     stride: scene.stride,
-    scale: scene.scale,
+    shades: numbers(scene.shades),
     entities: scene.entities.map((entity) => readEntity(entity, numbers, coordinates)),
   };
 }
@@ -103,6 +103,7 @@ function readEntity(entity, numbers, coordinates) {
     ...entity, form, starts, shown,
     points: coordinates(numbers(entity.points)),
     colours: numbers(entity.colours),
+    shades: entity.shades && numbers(entity.shades),
   };
 }
 
@@ -120,7 +121,7 @@ function drawScene(context, clock, scene, layers, width, height) {
   if (layers.trails) drawTrails(context, scene, frame, at);
   const labels = [];
   const colourAt = coloursOf(clock, scene, frame);
-  scene.entities.forEach((entity, place) => drawEntity(context, entity, frame, at, labels, colourAt(entity, place)));
+  scene.entities.forEach((entity) => drawEntity(context, entity, frame, at, labels, colourAt(entity)));
   if (decision) drawPlan(context, clock, decision, at);
   const names = layers.labels ? drawLabels(context, labels, width) : [];
   const violation = pointerAt(clock) ?? violationAt(clock, scene, frame);
@@ -132,35 +133,14 @@ function violationAt({result}, scene, frame) {
   return scene.violations.get(frame)?.find((each) => each.result === result);
 }
 
-// The colours of entities in a frame: by the requirements of the chosen result, where there are several.
-function coloursOf({run, result: chosen}, scene, frame) {
-  const stored = (entity) => entity.colours.subarray(3 * entity.shown[frame], 3 * entity.shown[frame] + 3);
-  const result = run.results[chosen];
-  if (run.results.length < 2 || !result) return stored;
-  const place = placeIn(result, indexAt(run.times, scene.times[frame]));
-  const least = new Map();
-  const isEnd = frame === scene.times.length - 1 && place === result.samples - 1;
-  for (const {node, sign, outcome, standing, entities} of place === null || place >= result.samples ? [] : result.requirements) {
-    if (isEnd ? outcome === null : standing[place] !== HOLDING && standing[place] !== VIOLATED) continue;
-    // at the end, what it came to; JSON has infinite numbers as texts
-    const number = isEnd ? Number(String(outcome).replace("inf", "Infinity")) : sign * result.nodes[node].series[NOW][place];
-    for (const entity of entities) least.set(entity, Math.min(number, least.get(entity) ?? Infinity));
-  }
-  return (entity, index) => {
-    const own = stored(entity), number = least.get(index);
-    // blue: nothing that any result asks of it itself fails, but of another in the same requirement
-    return number < 0 && own[2] > own[0] ? own : mixed(run.palette, number, scene.scale);
+// The colours of entities in a frame: of the requirements of the chosen result, where there are several.
+function coloursOf({run, result}, scene, frame) {
+  return (entity) => {
+    const place = entity.shown[frame];
+    if (!entity.shades) return entity.colours.subarray(3 * place, 3 * place + 3);
+    const shade = entity.shades[run.results.length * place + result];
+    return scene.shades.subarray(3 * shade, 3 * shade + 3);
   };
-}
-
-// The colour of a robustness, as annotate/scene/scene_frames.py mixes it.
-function mixed(palette, number, scale) {
-  const parts = (name) => [1, 3, 5].map((start) => parseInt(palette[name].slice(start, start + 2), 16));
-  const grey = parts("neutral");
-  if (number === undefined) return grey;
-  const hue = parts(number >= 0 ? "positive" : "negative");
-  const share = 0.4 + 0.6 * Math.min(Math.abs(number) / scale, 1);
-  return grey.map((part, index) => Math.round(part + share * (hue[index] - part)));
 }
 
 function drawEntity(context, entity, frame, at, labels, [red, green, blue]) {
