@@ -18,6 +18,7 @@ from spatial_replay.annotate.automaton_state import (
 )
 from spatial_replay.annotate.deciding_leaf import NewestSamples
 from spatial_replay.annotate.events import EncodedEvent, EventReporter, encoded_occurrence
+from spatial_replay.annotate.leaf_pairs import leaf_pairs
 from spatial_replay.annotate.requirements import requirements_of
 from spatial_replay.annotate.robustness import encode_robustness
 from spatial_replay.annotate.scene.scene_entities import encode_frame
@@ -26,7 +27,7 @@ from spatial_replay.annotate.scene.scene_update import SceneEncoder, SceneState
 from spatial_replay.annotate.scene.shades import ShadeTracker
 from spatial_replay.annotate.specification import ReportedTree, encode_specification
 from spatial_replay.annotate.standing import FinalStanding, StandingEncoder
-from spatial_replay.annotate.violations import EvaluatedResult, leaf_pairs, violated_since
+from spatial_replay.annotate.violations import EvaluatedResult, violated_since
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.messages import Channel, Messages, messages_of
 from spatial_replay.logs.payloads import chosen_payloads, joined_payloads

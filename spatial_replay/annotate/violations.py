@@ -5,64 +5,28 @@ The scene is coloured by the one, and an arrow in it points at the other.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spatial_replay.annotate.deciding_leaf import LeavesBelow, leaves_below
 from spatial_replay.annotate.leaf_history import SettledViolation
+from spatial_replay.annotate.leaf_pairs import LeafPairs, Pair, pair_of
 from spatial_replay.annotate.requirements import ClassMembers, Requirement
 from spatial_replay.annotate.scene.shades import Shade
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.geometry.contact import contacts
 from spatial_replay.geometry.measure import Operand
 from spatial_replay.monitor.atoms.terms import TraceScene
-from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.online.codes import low_and_high
-from spatial_replay.monitor.sentences import divisor_of
 from spatial_replay.monitor.stream import SeriesBlock
-from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import (
     ANY_CLASS,
-    Atom,
     Formula,
-    Outline,
-    Protrusion,
-    SignedDistance,
-    Term,
 )
-from spatial_replay.spec.relations import RELATION_NAMES
-from spatial_replay.spec.walks import iter_expressions, looks_back, substitute
 from spatial_replay.trace.sample import LATEST_NS
 from spatial_replay.trace.trace import Trace
-
-
-class Pair(NamedTuple):
-    """Two terms that an atom relates: by their distance, or by how far one sticks out of the other."""
-
-    first: Term
-    second: Term
-    is_protrusion: bool
-
-
-class LeafPairs(NamedTuple):
-    """The pairs of objects and regions that the leaves of one result relate.
-
-    Attributes:
-        pairs: of each of the program's leaves; None for one that does not relate two things in one sample.
-        below: of each requirement of the formula, its leaves.
-        regions: shapes by name.
-        divisors: of each leaf, what `scale` divides its number by.
-        texts: of each leaf, in the language.
-    """
-
-    pairs: tuple[Pair | None, ...]
-    below: tuple[LeavesBelow, ...]
-    regions: Mapping[str, Outline]
-    divisors: Floats
-    texts: tuple[str, ...]
 
 
 class EvaluatedResult(NamedTuple):
@@ -122,6 +86,8 @@ class Violations(NamedTuple):
             unit of the log, where `scale` divides the number of the atom.
         holds: (S,), whether the atom holds, where it should not.
         moment_ns: (S,) int64, of which sample the number is; -1 for the sample itself.
+        atom: (S,) int64, which of `atoms` decides the leaf, if that is a quantifier; else -1.
+        atoms: atoms in words, with the objects that a quantifier binds.
     """
 
     result: Integers
@@ -133,26 +99,8 @@ class Violations(NamedTuple):
     robustness: Floats
     holds: NDArray[np.bool_]
     moment_ns: Integers
-
-
-def leaf_pairs(
-    instance: Instance,
-    requirements: Sequence[Requirement],
-    regions: Mapping[str, Outline],
-    relations: frozenset[str] = frozenset(),
-) -> LeafPairs:
-    """Return what the leaves of an instance relate.
-
-    Args:
-        relations: the names of those that the file defines.
-    """
-    below = leaves_below(instance.formula, instance.program.leaves)
-    leaves = [substitute(leaf, instance.bindings) for leaf in instance.program.leaves]
-    pairs = tuple(map(_pair, leaves))
-    texts = tuple(format_formula(leaf, relations=RELATION_NAMES | relations) for leaf in leaves)
-    divisors = np.array([divisor_of(leaf) for leaf in instance.program.leaves])
-    of_requirements = tuple(below[requirement.node] for requirement in requirements)
-    return LeafPairs(pairs, of_requirements, regions, divisors, texts)
+    atom: Integers
+    atoms: list[str]
 
 
 def violated_since(requirements: Sequence[Requirement], block: SeriesBlock, before_ns: Integers) -> Integers:
@@ -234,6 +182,8 @@ def first_violations(results: Sequence[EvaluatedResult], trace: Trace, samples: 
         robustness=robustness,
         holds=np.zeros(len(samples), np.bool_),
         moment_ns=np.full(len(samples), -1, np.int64),
+        atom=np.full(len(samples), -1, np.int64),
+        atoms=[],
     )
     for index, result in enumerate(results):
         here = np.flatnonzero(which == index)
@@ -246,7 +196,7 @@ def first_violations(results: Sequence[EvaluatedResult], trace: Trace, samples: 
             leaf = found.leaf[here]
             known = here[leaf >= 0]
             found.robustness[known] *= result.leaf_pairs.divisors[leaf[leaf >= 0]]
-            _locate(result.leaf_pairs, trace, samples, here, found)
+            _locate(result, trace, samples, here, found)
     return found
 
 
@@ -358,21 +308,51 @@ def _deciding(
     return leaf, is_turned
 
 
-def _locate(pairs: LeafPairs, trace: Trace, samples: Integers, here: Integers, found: Violations) -> None:
-    """Fill in the points of the samples `here` (H,), whose leaves are given."""
-    scene = TraceScene(trace, pairs.regions)
+def _locate(
+    result: EvaluatedResult, trace: Trace, samples: Integers, here: Integers, found: Violations
+) -> None:
+    """Fill in the points of the samples `here` (H,), whose leaves are given, and the atoms of quantifiers."""
+    if result.leaf_pairs is None:
+        return
     leaf = found.leaf[here]
     for index in np.unique(leaf[leaf >= 0]).tolist():
-        pair = pairs.pairs[index]
-        if pair is None:
-            continue
         there = here[leaf == index]
-        operands = [scene.resolve(term).operand for term in (pair.first, pair.second)]
-        first, second = (Operand(each.rows[samples[there]], each.enlargement) for each in operands)
-        numbers = contacts(scene.batch, first, second, is_protrusion=pair.is_protrusion)
-        found.points[there] = numbers[:, :4].reshape(-1, 2, 2)
-        found.top[there] = numbers[:, 5]
-        found.is_shown[there] = np.isfinite(numbers[:, :5]).all(axis=1)
+        pair = result.leaf_pairs.pairs[index]
+        if pair is not None:
+            _point_at(result.leaf_pairs, pair, trace, samples, there, found)
+        for body, those in _bound(result, index, trace.times_ns[samples[there]]):
+            of_body = pair_of(body)
+            those = there[those][found.moment_ns[there[those]] < 0]
+            if of_body is not None and len(those):
+                found.atom[those] = len(found.atoms)
+                found.atoms.append(result.leaf_pairs.text_of(body))
+                _point_at(result.leaf_pairs, of_body, trace, samples, those, found)
+
+
+def _bound(result: EvaluatedResult, leaf: int, times_ns: Integers) -> Iterator[tuple[Formula, Integers]]:
+    """Yield what a quantifier asks of the objects that decide it, and at which of some times (k,) they do."""
+    shades = [each for each in result.shades or () if each.leaf == leaf and each.bodies]
+    if shades:
+        # of the finished log there is the last sample alone
+        at = np.searchsorted(result.block.times_ns, times_ns) - (
+            len(result.block.times_ns) if result.is_final else 0
+        )
+        worst = shades[0].worst[at]
+        for which in np.unique(worst[worst >= 0]).tolist():
+            yield shades[0].bodies[which], np.flatnonzero(worst == which)
+
+
+def _point_at(
+    pairs: LeafPairs, pair: Pair, trace: Trace, samples: Integers, there: Integers, found: Violations
+) -> None:
+    """Fill in the points of some samples between which an atom is shown."""
+    scene = TraceScene(trace, pairs.regions)
+    operands = [scene.resolve(term).operand for term in (pair.first, pair.second)]
+    first, second = (Operand(each.rows[samples[there]], each.enlargement) for each in operands)
+    numbers = contacts(scene.batch, first, second, is_protrusion=pair.is_protrusion)
+    found.points[there] = numbers[:, :4].reshape(-1, 2, 2)
+    found.top[there] = numbers[:, 5]
+    found.is_shown[there] = np.isfinite(numbers[:, :5]).all(axis=1)
 
 
 def _columns(chosen: frozenset[str], names: Sequence[str]) -> list[int]:
@@ -385,24 +365,3 @@ def _members(group: ClassMembers, presence: Presence) -> NDArray[np.bool_]:
     included = np.array([name not in group.excluded for name in presence.names], np.bool_)
     # absent objects have the code -1, and so the last entry
     return np.array([*fits, False], np.bool_)[presence.class_code] & included
-
-
-def _pair(leaf: Formula) -> Pair | None:
-    """Return the first distance or enclosure in an atom, or else the distance of its first terms."""
-    if not isinstance(leaf, Atom):
-        return None
-    for pair in _pairs(leaf):
-        if not any(map(looks_back, (pair.first, pair.second))):
-            return pair
-    return None
-
-
-def _pairs(atom: Atom) -> Iterator[Pair]:
-    for part in iter_expressions(atom.expression):
-        match part:
-            case SignedDistance():
-                yield Pair(part.first, part.second, False)
-            case Protrusion():
-                yield Pair(part.inner, part.outer, True)
-    if len(atom.terms) > 1:
-        yield Pair(atom.terms[0], atom.terms[1], False)

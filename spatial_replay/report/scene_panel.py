@@ -142,6 +142,7 @@ def scene_value(
             "frames": packing.add(np.array([number for number, _ in shown]), "i4"),
             "points": packing.add(box.steps(_joined([each.ends for each in arrows])), "u2"),
             "labels": [each.label for each in arrows],
+            "atoms": [each.atom for each in arrows],
             "robustness": packing.add(np.array([each.robustness for each in arrows]), "f8"),
             "holds": packing.add(np.array([each.holds for each in arrows]), "u1"),
             # of those about an earlier sample

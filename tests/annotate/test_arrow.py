@@ -79,6 +79,35 @@ def test_what_the_arrow_says_is_true_in_every_sample(
     assert {index: found[index] for index in expected} == expected
 
 
+@pytest.mark.parametrize(
+    ("asked", "expected"),
+    [
+        (
+            "forall p, q in boxes: p dist q >= 2.5",
+            {10: "", 11: "a dist b >= 2.5: -0.25", 19: "a dist b >= 2.5: -2.25"},
+        ),
+        (
+            "not (exists p in boxes: p dist b <= 2.5 and not (p ovlp b))",
+            {9: "", 10: "", 19: ""},
+        ),
+        (
+            "not (exists p in (boxes except b): p dist b <= 2.5)",
+            {9: "", 11: "a dist b <= 2.5: holds by 0.25", 19: "a dist b <= 2.5: holds by 2.25"},
+        ),
+        (
+            "(forall p in (boxes except b): p dist b >= 2.5) and a dist b >= 1",
+            {11: "a dist b >= 2.5: -0.25", 19: "a dist b >= 2.5: -2.25"},
+        ),
+    ],
+    ids=["two objects", "no single atom", "exists", "conjunction"],
+)
+def test_the_arrow_of_a_quantifier_names_the_objects_that_decide_it(
+    tmp_path: Path, asked: str, expected: dict[int, str]
+) -> None:
+    found = labels(tmp_path, f"group boxes = all\nspec s = G ({asked})", NEARING)
+    assert {index: found[index] for index in expected} == expected
+
+
 def test_every_label_of_an_arrow_has_its_unit_and_three_digits(tmp_path: Path) -> None:
     sizes = [2.5534e-05, 0.00141421, 0.0517, 0.132, 12.3456, 987654.0]
     found = labels(tmp_path, "spec s = G (a dist b >= 987655)", [987655 - 1.5, 987000.0], unit="mm")

@@ -98,6 +98,7 @@ class DrawnViolation(NamedTuple):
         moment_ns: the time of the earlier sample that the number is of, which settled the violation; None if
             it is of this one.
         holds: whether it is an atom that holds and should not.
+        atom: the atom of the objects that decide a quantifier, where the leaf is one, or "".
     """
 
     ends: Floats
@@ -108,6 +109,7 @@ class DrawnViolation(NamedTuple):
     leaf: int = -1
     moment_ns: int | None = None
     holds: bool = False
+    atom: str = ""
 
 
 class Arrows(NamedTuple):
@@ -131,10 +133,9 @@ class Arrows(NamedTuple):
         robustness, holds = float(found.robustness[index]), bool(found.holds[index])
         label = self.texts.label(index)
         moment_ns = int(found.moment_ns[index]) if found.moment_ns[index] >= 0 else None
-        node, leaf = int(found.node[index]), int(found.leaf[index])
-        return DrawnViolation(
-            found.points[index], label, self.result, node, robustness, leaf, moment_ns, holds
-        )
+        node, leaf, atom = (int(each[index]) for each in (found.node, found.leaf, found.atom))
+        of = (self.result, node, robustness, leaf, moment_ns, holds, found.atoms[atom] if atom >= 0 else "")
+        return DrawnViolation(found.points[index], label, *of)
 
 
 class SceneFrame(NamedTuple):

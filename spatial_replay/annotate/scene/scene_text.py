@@ -133,13 +133,14 @@ def arrow_texts(
     robustness = np.where(found.holds, -found.robustness, found.robustness)[shown].tolist()
     texts = [robustness_text(number, unit).encode() for number in robustness]
     words = -(-np.fromiter(map(len, texts), np.int64, len(texts)) // 8)
-    columns = [each[shown] for each in (found.result, found.leaf, found.holds, found.moment_ns)]
+    of = found.result, found.leaf, found.holds, found.moment_ns, found.atom
+    columns = [each[shown] for each in of]
     causes, cause = list[CauseText](), np.zeros(len(found.result), np.int64)
     for places in equal_places(combined([*columns, words], len(shown))):
         cause[shown[places]] = len(causes)
-        result, leaf, holds, moment_ns = (int(each[places[0]]) for each in columns)
+        result, leaf, holds, moment_ns, atom = (int(each[places[0]]) for each in columns)
         known = results[result].leaf_pairs if result >= 0 and leaf >= 0 else None
-        text = "" if known is None else known.texts[leaf]
+        text = found.atoms[atom] if atom >= 0 else "" if known is None else known.texts[leaf]
         text = text if len(text) <= _LONGEST_CAUSE else f"{text[: _LONGEST_CAUSE - 1]}…"
         at = "" if moment_ns < 0 else f" at {Instant(moment_ns, first_ns)}"
         causes.append(CauseText(f"{text}{at}: {'holds by ' if holds else ''}", int(words[places[0]])))

@@ -15,8 +15,9 @@ from typing import Final
 
 import numpy as np
 
+from spatial_replay.annotate.deciding_leaf import leaf_key
 from spatial_replay.annotate.requirements import Requirement
-from spatial_replay.geometry.arrays import Floats
+from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.monitor.instances import Instance
@@ -43,6 +44,9 @@ class Shade:
         least: the least number of the part so far.
         is_known: whether the part was known in all samples.
         least_bound: the least of `bound` so far.
+        leaf: which of the program's leaves the quantifier is; -1 if the part is none.
+        bodies: what the quantifier asks of each of its bindings.
+        worst: (T,), which of them decides it in each sample of the block; -1 where the part holds.
     """
 
     requirement: Requirement
@@ -50,6 +54,9 @@ class Shade:
     least: float = math.inf
     is_known: bool = True
     least_bound: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    leaf: int = -1
+    bodies: tuple[Formula, ...] = ()
+    worst: Integers = field(default_factory=lambda: np.empty(0, np.int64))
 
     def outcome(self, whole: Floats) -> Floats:
         """Return what the part comes to over a finished log, given what its obligation does, (S,)."""
@@ -86,7 +93,11 @@ class ShadeTracker:
         self._leaves = [
             _separable(substitute(nodes[each.node], instance.bindings), each.sign) for each in parts
         ]
-        self.shades: tuple[Shade, ...] = tuple(map(Shade, parts))
+        numbers = {leaf_key(leaf): index for index, leaf in enumerate(instance.program.leaves)}
+        self.shades: tuple[Shade, ...] = tuple(
+            Shade(each, leaf=-1 if leaf is None else numbers[leaf_key(nodes[each.node])])
+            for each, leaf in zip(parts, self._leaves, strict=True)
+        )
 
     def extend(self, trace: Trace, block: SeriesBlock) -> None:
         """Take in the next samples."""
@@ -103,17 +114,22 @@ class ShadeTracker:
         least = min(shade.least, float(known.min(initial=math.inf)))
         is_known = shade.is_known and len(known) == len(now)
         fails = np.flatnonzero(now < 0.0)
-        bound = _NO_NUMBERS
+        bound: dict[str, Floats] = {}
+        bodies, worst = tuple[Formula, ...](), np.full(len(now), -1, np.int64)
         if leaf is not None and len(fails):
             chosen = trace.take(np.searchsorted(trace.times_ns, block.times_ns[fails]))
-            of_fails = _numbers_of(leaf, part.sign, TraceScene(chosen, self._regions))
-            bound = {name: np.full(len(now), np.nan) for name in of_fails}
-            for name, numbers in of_fails.items():
-                bound[name][fails] = numbers
+            tuples, bodies, of_fails = _numbers_of(leaf, part.sign, TraceScene(chosen, self._regions))
+            if bodies:
+                is_least = of_fails == now[fails]
+                worst[fails] = np.where(is_least.any(axis=0), is_least.argmax(axis=0), -1)
+            for names, own in zip(tuples, of_fails, strict=True):
+                for name in names:
+                    numbers = bound.setdefault(name, np.full(len(now), np.nan))
+                    numbers[fails] = np.fmin(numbers[fails], own)
         least_bound = dict(shade.least_bound)
         for name, numbers in bound.items():
             least_bound[name] = float(np.fmin.reduce(numbers, initial=least_bound.get(name, math.inf)))
-        return Shade(part, bound, least, is_known, least_bound)
+        return Shade(part, bound, least, is_known, least_bound, shade.leaf, bodies, worst)
 
 
 def _separable(leaf: Formula, sign: float) -> Quantified | None:
@@ -123,23 +139,20 @@ def _separable(leaf: Formula, sign: float) -> Quantified | None:
     return None if any(map(looks_back, iter_terms([leaf]))) else leaf
 
 
-def _numbers_of(leaf: Quantified, sign: float, scene: TraceScene) -> dict[str, Floats]:
-    """Return the least number (T,) of each member of a quantifier; nothing for very many."""
-    names = scene.candidates(leaf.group)
+def _numbers_of(
+    leaf: Quantified, sign: float, scene: TraceScene
+) -> tuple[Sequence[tuple[str, ...]], tuple[Formula, ...], Floats]:
+    """Return the B bindings of a quantifier, what it asks of each, and its numbers (B, T); not of many."""
+    names, none = scene.candidates(leaf.group), np.empty((0, len(scene.trace)))
     if math.perm(len(names), len(leaf.variables)) > _MOST_BINDINGS:
-        return {}
+        return (), (), none
     tuples = list(permutations(names, len(leaf.variables)))
-    bodies = [
+    bodies = tuple(
         substitute(leaf.body, dict(zip(leaf.variables, map(TrackedName, each), strict=True)))
         for each in tuples
-    ]
+    )
     if not bodies:
-        return {}
+        return (), (), none
     values = leaf_values(scene, bodies, {})
     low, high = low_and_high(len(values), wide=False)
-    numbers = np.where(values[low] == values[high], sign * values[low], np.nan)
-    found: dict[str, Floats] = {}
-    for each, own in zip(tuples, numbers, strict=True):
-        for name in each:
-            found[name] = np.fmin(found[name], own) if name in found else own
-    return found
+    return tuples, bodies, np.where(values[low] == values[high], sign * values[low], np.nan)

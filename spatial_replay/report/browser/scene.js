@@ -59,7 +59,7 @@ function readScene(run) {
   const size = [scene.high[0] - scene.low[0], scene.high[1] - scene.low[1]];
   const coordinates = (steps) => Float64Array.from(
     steps, (step, index) => scene.low[index % 2] + step / STEPS_OF_SCENE * size[index % 2]);
-  const {labels, moments, ...found} = scene.violations;
+  const {labels, atoms, moments, ...found} = scene.violations;
   const points = coordinates(numbers(found.points)), places = numbers(found.places);
   const robustness = numbers(found.robustness), holds = numbers(found.holds);
   // of each frame, those of its violated results
@@ -67,7 +67,8 @@ function readScene(run) {
   numbers(found.frames).forEach((frame, index) => {
     if (!violations.has(frame)) violations.set(frame, []);
     violations.get(frame).push({
-      ends: points.subarray(4 * index, 4 * index + 4), label: labels[index], robustness: robustness[index],
+      ends: points.subarray(4 * index, 4 * index + 4), label: labels[index], atom: atoms[index],
+      robustness: robustness[index],
       result: places[2 * index], node: places[2 * index + 1], holds: holds[index] === 1, moment: moments[index],
     });
   });
@@ -380,7 +381,7 @@ function lostBefore({run, sample, result: chosen}) {
 }
 
 // What the arrow points at; of a requirement that the page leaves out, only the number.
-function violationWords(run, time, {result: which, node: index, label, robustness, holds, moment}) {
+function violationWords(run, time, {result: which, node: index, label, atom, robustness, holds, moment}) {
   const number = holds ? -robustness : robustness;
   if (index < 0) return [`${label.replace(": -", ": −")}, which is violated there`];
   const result = run.results[which], node = result.nodes[index];
@@ -390,7 +391,8 @@ function violationWords(run, time, {result: which, node: index, label, robustnes
   }
   const sample = indexAt(run.times, time), place = placeIn(result, sample);
   if (Math.abs(run.times[sample] - time) < 1e-9 && place !== null && place < result.samples) {
-    return failureWords({result, node, place});
+    if (!atom) return failureWords({result, node, place});
+    return [...partWords({result, node: {text: atom}}), ` ${signWords(number, run.lengths)} now`];
   }
   // a page of a long run leaves samples out: the atom that decides is not known
   return [...partWords({result, node}), ` is violated by ${numberText(-robustness)}${spaced(run.lengths)} now`];
