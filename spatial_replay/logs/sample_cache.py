@@ -12,7 +12,6 @@ import os
 import shutil
 import tempfile
 import time
-import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -26,6 +25,7 @@ from numpy.typing import NDArray
 from spatial_replay.compiled import source_digest
 from spatial_replay.errors import SpatialReplayError
 from spatial_replay.geometry.batch import FootprintBatch
+from spatial_replay.logs.checksums import crc32
 from spatial_replay.logs.downloads import gigabytes, user_cache_folder
 from spatial_replay.logs.read_options import SAMPLES_LIMIT
 from spatial_replay.trace.trace import Trace
@@ -225,7 +225,7 @@ def _encoded(trace: Trace) -> list[bytes | memoryview]:
         described[name] = [len(words), *progression]
         if len(words) and not progression:
             parts.append(words.data.cast("B"))
-            checksum = zlib.crc32(words.data, checksum)
+            checksum = crc32(words.data, checksum)
     head = {
         "names": trace.names,
         "classes": trace.classes,
@@ -234,7 +234,7 @@ def _encoded(trace: Trace) -> list[bytes | memoryview]:
         "checksum": checksum,
     }
     line = json.dumps(head).encode()
-    return [b"%08x" % zlib.crc32(line), line, b"\n", *parts]
+    return [b"%08x" % crc32(line), line, b"\n", *parts]
 
 
 def _progression(words: NDArray[np.int64]) -> list[int]:
@@ -272,7 +272,7 @@ def _head(stream: BinaryIO) -> Mapping[str, Any] | None:
     line = stream.readline(_HEAD_BYTES)
     if line == _END:
         return None
-    if not line.endswith(b"\n") or int(line[:8], 16) != zlib.crc32(line[8:-1]):
+    if not line.endswith(b"\n") or int(line[:8], 16) != crc32(line[8:-1]):
         raise ValueError("a line breaks off")
     head: Mapping[str, Any] = json.loads(line[8:])
     return head
@@ -288,7 +288,7 @@ def _trace(head: Mapping[str, Any], stream: BinaryIO, shared: _SharedColumns) ->
         words = np.empty(count, np.int64)
         if count and stream.readinto(words.data.cast("B")) != words.nbytes:  # type: ignore[attr-defined]
             raise ValueError("a column breaks off")
-        checksum = zlib.crc32(words.data, checksum)
+        checksum = crc32(words.data, checksum)
         columns[name] = words
     if checksum != head["checksum"]:
         raise ValueError("the checksum does not fit")

@@ -76,13 +76,14 @@ def test_a_conversion_that_does_not_fit_on_the_disk_leaves_no_half_log(tmp_path:
         for tick in range(3_000):
             box = {"name": "a", "polygon": [[0, 0], [1, 0], [1, 1 + tick]]}
             stream.write(json.dumps({"time_ns": tick, "objects": [box]}) + "\n")
+    # bytecode must not be cut off at that size, where other tests would find it
     program = (
-        "import resource, signal, sys; from spatial_replay.cli import run;"
+        "import resource, signal, sys; sys.dont_write_bytecode = True; from spatial_replay.cli import run;"
         "signal.signal(signal.SIGXFSZ, signal.SIG_IGN);"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000));"
         "sys.exit(run(['record', 'tracks', 'tracks.jsonl', '-o', 'run.mcap']))"
     )
     command = [sys.executable, "-c", program]
     ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert "run.mcap could not be written" in ended.stderr
+    assert "run.mcap could not be written" in ended.stderr, ended
     assert not (tmp_path / "run.mcap").exists()

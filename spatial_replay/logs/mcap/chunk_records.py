@@ -15,7 +15,7 @@ from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from spatial_replay.compiled import elementwise, inlined, kernel
+from spatial_replay.compiled import elementwise, long_kernel
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.payloads import Payloads
 
@@ -64,39 +64,6 @@ _LAST_OF_LOG_TIME = 13
 _SCHEMA, _CHANNEL, _MESSAGE = 3, 4, 5
 
 
-_POLYNOMIAL = 0xEDB88320
-"""Of CRC-32, the highest power in the lowest bit."""
-
-
-@elementwise
-@kernel
-def joined_checksum(checksums: Integers, sizes: Integers) -> int:
-    """Return the CRC-32 of contents one after the other, from those of each, as zlib does."""
-    joined = 0
-    for i in range(checksums.shape[0]):
-        # x to the power of the bits of this content, modulo the polynomial, by squaring
-        power, square, rest = 1 << 31, 1 << 23, sizes[i]
-        while rest > 0:
-            if rest & 1:
-                power = _product(square, power)
-            square = _product(square, square)
-            rest >>= 1
-        joined = _product(power, joined) ^ checksums[i]
-    return joined
-
-
-@inlined
-def _product(a: int, b: int) -> int:
-    """Multiply two polynomials over bits, modulo that of CRC-32."""
-    product = 0
-    for _ in range(32):
-        if a & 0x80000000:
-            product ^= b
-        a = (a << 1) & 0xFFFFFFFF
-        b = (b >> 1) ^ _POLYNOMIAL if b & 1 else b >> 1
-    return product
-
-
 class RecordHeads(NamedTuple):
     """N schemas, channels and messages.
 
@@ -118,16 +85,16 @@ class RecordHeads(NamedTuple):
 def walk_records(content: bytes) -> tuple[RecordHeads, bool]:
     """Return the schemas, channels and messages in some bytes, and whether the last record breaks off."""
     walk = _Walk(copies=False)
-    end = walk.over(content, np.empty(0, np.uint8))
+    end = walk.over(content, np.array([len(content)]), np.empty(0, np.uint8))
     fields = (walk.heads[name].astype(np.uint64) for name in _MESSAGE_FIELDS.names or ())
     return RecordHeads(*walk.places[:3].copy(), *fields), end < len(content)
 
 
 class _Walk:
-    """Walks over the records of chunks, one chunk after the other; its arrays serve for all of them.
+    """Walks over the records of chunks, some chunks after the other; its arrays serve for all of them.
 
     Attributes:
-        count, declarations: how many records the last one has, and how many of them are not messages.
+        count, declarations: how many records the last ones have, and how many of them are not messages.
         channel: the one of all its messages; -1 without any, -2 if they differ or have times beyond int64.
         payloads: theirs, one after the other in the first `used` bytes, if they are copied.
     """
@@ -137,15 +104,16 @@ class _Walk:
         self._copies = copies
         self._places = np.empty((5, 0), np.int64)
         self._heads = np.empty(0, np.uint8)
-        self._state = np.zeros(5, np.int64)
+        self._state = np.zeros(6, np.int64)
         self.payloads = np.empty(0, np.uint8)
         self.count = self.used = self.declarations = 0
         self.channel = -1
 
-    def over(self, content: bytes | memoryview, passed_over: Bytes) -> int:
+    def over(self, content: bytes | memoryview, ends: Integers, passed_over: Bytes) -> int:
         """Walk over the records in some bytes; return where the last whole one ends.
 
         Args:
+            ends: (C,) int64, where chunks end, in each of which the records must be whole.
             passed_over: by channel, 1 if its messages are not wanted.
         """
         view = np.frombuffer(content, np.uint8)
@@ -155,10 +123,10 @@ class _Walk:
         # room for as many records as there could be would be many times the bytes
         if (enough := len(content) // 128 + 32) > self._places.shape[1]:
             self._make_room(2 * enough)
-        self._state[:4], self._state[4] = 0, -1
+        self._state[:] = 0, 0, 0, 0, 0, -1
         while True:
-            _walk_on(view, passed_over, self._state, self._places, self._heads, self.payloads)
-            position, self.count, self.used, self.declarations, self.channel = self._state.tolist()
+            _walk_on(view, ends, passed_over, self._state, self._places, self._heads, self.payloads)
+            position, _, self.count, self.used, self.declarations, self.channel = self._state.tolist()
             if self.count < self._places.shape[1]:
                 return int(position)
             self._make_room(2 * self.count)
@@ -183,18 +151,37 @@ class _Walk:
 
 
 @elementwise
-@kernel
+@long_kernel
 def _walk_on(
-    content: Bytes, passed_over: Bytes, state: Integers, places: Integers, heads: Bytes, payloads: Bytes
+    content: Bytes,
+    ends: Integers,
+    passed_over: Bytes,
+    state: Integers,
+    places: Integers,
+    heads: Bytes,
+    payloads: Bytes,
 ) -> None:
     """Fill in the records from a position on that there is room for: where they are, heads and payloads.
 
     Args:
-        state: position, records, bytes of payloads, declarations and the channel so far; see `_Walk`.
+        state: position, chunk, records, bytes of payloads, declarations and the channel so far; see `_Walk`.
     """
-    size = content.shape[0]
-    position, count, used, declarations, only = state[0], state[1], state[2], state[3], state[4]
-    while position + _RECORD_HEAD <= size and count < places.shape[1]:
+    position, chunk, count, used, declarations, only = (
+        state[0],
+        state[1],
+        state[2],
+        state[3],
+        state[4],
+        state[5],
+    )
+    size = ends[chunk]
+    while count < places.shape[1]:
+        if position == size and chunk + 1 < ends.shape[0]:
+            chunk += 1
+            size = ends[chunk]
+            continue
+        if position + _RECORD_HEAD > size:
+            break
         begin = position + _RECORD_HEAD
         # from the highest byte on, so that no length, however large, overflows
         length = 0
@@ -226,7 +213,8 @@ def _walk_on(
             places[3, count], places[4, count] = before, used
             count += 1
         position = end
-    state[0], state[1], state[2], state[3], state[4] = position, count, used, declarations, only
+    state[0], state[1], state[2] = position, chunk, count
+    state[3], state[4], state[5] = used, declarations, only
 
 
 Declaration: TypeAlias = records.Schema | records.Channel
@@ -286,7 +274,7 @@ def split_records(content: bytes) -> Records:
 
 
 class Splitter:
-    """Splits the records of chunks, one chunk after the other, as `split_records` does; for one thread."""
+    """Splits the records of chunks, some chunks after the other, as `split_records` does; for one thread."""
 
     def __init__(self, passed_over: Collection[int] = ()) -> None:
         """Begin.
@@ -298,10 +286,15 @@ class Splitter:
         self._passed_over[list(passed_over)] = 1
         self._walk = _Walk(copies=True)
 
-    def split(self, content: bytes | memoryview) -> Records:
-        """See `split_records`."""
+    def split(self, content: bytes | memoryview, sizes: Sequence[int] = ()) -> Records:
+        """See `split_records`.
+
+        Args:
+            sizes: of the chunks that the content is made of; it is one chunk without.
+        """
         walk = self._walk
-        end = walk.over(content, self._passed_over)
+        ends = np.cumsum(sizes or [len(content)])
+        end = walk.over(content, ends, self._passed_over)
         damage = "a record breaks off" if end < len(content) else None
         heads, bounds = walk.heads, walk.places[3:].copy()
         declarations: list[Declaration] = []

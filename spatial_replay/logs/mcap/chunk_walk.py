@@ -54,15 +54,15 @@ class ChunkWalk:
 
     def iter_messages(
         self, places: Sequence[ChunkPlace], is_wanted: Callable[[str], bool] = lambda topic: True
-    ) -> Iterator[tuple[ChunkPlace, RawMessages]]:
-        """Yield the messages in each place; what is lost of them goes to the faults.
+    ) -> Iterator[tuple[Sequence[ChunkPlace], RawMessages]]:
+        """Yield the messages in all places, some places at once; what is lost of them goes to the faults.
 
         Args:
             is_wanted: which topics matter; messages of others may be left out.
         """
         passed_over = [n for n, each in self.channels.items() if not is_wanted(each.topic)]
-        for place, found in iter_records(self.stream, places, passed_over):
-            yield place, self._messages(place, found)
+        for several, found in iter_records(self.stream, places, passed_over):
+            yield several, self._messages(several, found)
 
     def numbers(self, is_chosen: Callable[[str], bool]) -> Booleans:
         """Return by number, (65536,), whether the topic of a channel is chosen."""
@@ -70,13 +70,13 @@ class ChunkWalk:
         chosen[[number for number, each in self.channels.items() if is_chosen(each.topic)]] = True
         return chosen
 
-    def _messages(self, place: ChunkPlace, found: Records | DamageError) -> RawMessages:
+    def _messages(self, places: Sequence[ChunkPlace], found: Records | DamageError) -> RawMessages:
         if isinstance(found, DamageError):
-            self._fault(place, f"{found}; the ", " are lost")
+            self._fault(places, f"{found}; the ", " are lost")
             return RawMessages.join([])
         messages = found.messages
         if found.damage:
-            self._fault(place, f"{found.damage}; of the ", f", {len(messages)} could be read")
+            self._fault(places, f"{found.damage}; of the ", f", {len(messages)} could be read")
         self._take_in(found.declarations)
         if messages.channel >= 0 and self._is_declared[messages.channel]:
             return messages
@@ -84,7 +84,7 @@ class ChunkWalk:
         if is_usable.all():
             return messages
         lost = len(messages) - np.count_nonzero(is_usable)
-        self._fault(place, f"{lost} of the ", " have no channel, or a time beyond 2**63 - 1 ns")
+        self._fault(places, f"{lost} of the ", " have no channel, or a time beyond 2**63 - 1 ns")
         return messages.take(np.flatnonzero(is_usable))
 
     def _find_channels(self) -> None:
@@ -113,7 +113,9 @@ class ChunkWalk:
             MappingProxyType(channel.metadata),
         )
 
-    def _fault(self, place: ChunkPlace, before: str, after: str) -> None:
-        """Report what happened to messages in a place, in words before and after their times."""
-        span = "messages between ", Instant(place.start_ns, 0), " and ", Instant(place.end_ns, 0)
-        self.faults.add(Sentence(f"{self._name}: at byte {place.offset}: ", Sentence(before, *span, after)))
+    def _fault(self, places: Sequence[ChunkPlace], before: str, after: str) -> None:
+        """Report what happened to messages in some places, in words before and after their times."""
+        first, last = min(place.start_ns for place in places), max(place.end_ns for place in places)
+        span = "messages between ", Instant(first, 0), " and ", Instant(last, 0)
+        where = f"{self._name}: at byte {places[0].offset}: "
+        self.faults.add(Sentence(where, Sentence(before, *span, after)))

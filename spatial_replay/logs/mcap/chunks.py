@@ -8,27 +8,23 @@ object for each message, where we need a chunk's messages as columns.
 from __future__ import annotations
 
 import struct
-import zlib
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from itertools import pairwise
 from threading import Lock, local
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO, NamedTuple, TypeAlias
 
 import lz4.frame
-import numpy as np
 import zstandard
 
 from spatial_replay.compiled import cores
-from spatial_replay.geometry.arrays import starts_from_counts
 from spatial_replay.logs.byte_ranges import is_planned, plan_reads
+from spatial_replay.logs.checksums import crc32, joined_checksum
 from spatial_replay.logs.mcap.chunk_records import (
     RECORD_HEAD,
     DamageError,
     Records,
     Splitter,
-    joined_checksum,
 )
 
 LARGEST_CHUNK = 2**30
@@ -40,8 +36,12 @@ _ALWAYS_ALLOWED, _MOST_TIMES_LARGER = 2**26, 1_000
 _CHUNK_HEAD = struct.Struct("<QQQII")
 _FIXED_HEAD = RECORD_HEAD.size + _CHUNK_HEAD.size
 _LONGEST_HEAD = 80
-_TOGETHER, _TOGETHER_BYTES, _AHEAD = 16, 2**20, 12
-"""Chunks, and their bytes, that a thread takes at once; and how many times as many are read ahead."""
+_TOGETHER, _TOGETHER_BYTES = 16, 2**20
+"""Chunks, and their bytes, that a thread takes at once: what it decompresses stays in the cache."""
+_AHEAD, _AHEAD_BYTES = 48, 2**24
+"""How many times as many are read ahead, at most, and their bytes: more than a block of samples has."""
+_LEAST_AHEAD = 8
+"""So many are read ahead however large they are, so that each thread has work."""
 _MOST_THREADS = 4
 """More would wait for the one that takes what they have read."""
 _MOST_SPREAD = 1.5
@@ -127,7 +127,7 @@ def _content(place: ChunkPlace, record: memoryview, decompressor: zstandard.Zstd
     content = _decompressed(bytes(record[_FIXED_HEAD:begin]), record[begin + 8 :], size, decompressor)
     if len(content) != size:
         raise DamageError(f"the chunk holds {len(content)} bytes instead of {size}")
-    if (checksum or place.has_checksum) and zlib.crc32(content) != checksum:
+    if (checksum or place.has_checksum) and crc32(content) != checksum:
         if not checksum:
             raise DamageError("the chunk has no checksum, and every log of ours has one")
         raise DamageError("the chunk's checksum does not fit its content")
@@ -136,28 +136,32 @@ def _content(place: ChunkPlace, record: memoryview, decompressor: zstandard.Zstd
 
 def iter_records(
     stream: BinaryIO, places: Sequence[ChunkPlace], passed_over: Collection[int] = ()
-) -> Iterator[tuple[ChunkPlace, Records | DamageError]]:
-    """Yield each place with its records, or with the damage that `read_records` raised, in this order.
+) -> Iterator[tuple[Sequence[ChunkPlace], Records | DamageError]]:
+    """Yield places with their records, or with the damage that `read_records` raised, in this order.
 
-    Other threads, one for each core, read, decompress, check and split the next places while the caller
-    processes one, so the caller must not use the stream in between.
+    Sound chunks that follow each other come several at once, damaged ones alone. Other threads, one for each
+    core, read, decompress, check and split the next places while the caller processes some, so the caller
+    must not use the stream in between.
 
     Args:
         passed_over: channels whose messages are not wanted.
     """
     plan_places(stream, places)
     reader = _GroupReader(stream, passed_over)
-    waiting: deque[tuple[Sequence[ChunkPlace], Future[list[Records | DamageError]]]] = deque()
+    waiting: deque[tuple[int, Future[_Found]]] = deque()
+    ahead = 0
     with ThreadPoolExecutor(min(cores(), _MOST_THREADS), "chunk-reading") as readers:
         try:
             for group in _groups(places):
-                waiting.append((group, readers.submit(reader.read, group)))
-                if len(waiting) > _AHEAD:
-                    ready, contents = waiting.popleft()
-                    yield from zip(ready, contents.result(), strict=True)
-            while waiting:
-                ready, contents = waiting.popleft()
-                yield from zip(ready, contents.result(), strict=True)
+                size = sum(place.length for place in group)
+                waiting.append((size, readers.submit(reader.read, group)))
+                ahead += size
+                while len(waiting) > _AHEAD or (ahead > _AHEAD_BYTES and len(waiting) > _LEAST_AHEAD):
+                    size, ready = waiting.popleft()
+                    ahead -= size
+                    yield from ready.result()
+            for _, ready in waiting:
+                yield from ready.result()
         finally:
             # a caller that has seen enough does not wait for the rest
             readers.shutdown(cancel_futures=True)
@@ -178,6 +182,9 @@ def plan_places(stream: BinaryIO, places: Iterable[ChunkPlace]) -> None:
     plan_reads(stream, ((place.offset, place.offset + place.length) for place in places))
 
 
+_Found: TypeAlias = "list[tuple[Sequence[ChunkPlace], Records | DamageError]]"
+
+
 class _GroupReader:
     """Reads groups of chunks on several threads, each with a buffer that serves again and again."""
 
@@ -186,31 +193,34 @@ class _GroupReader:
         self._reading = Lock()
         self._own = local()
 
-    def read(self, places: Sequence[ChunkPlace]) -> list[Records | DamageError]:
-        """Return the records in each place, or its damage."""
+    def read(self, places: Sequence[ChunkPlace]) -> _Found:
+        """Return the records in all places, or in each, with its damage."""
         with self._reading:
             read = _read_places(self._stream, places)
         decompressor, splitter = zstandard.ZstdDecompressor(), Splitter(self._passed_over)
-        if (contents := self._contents(places, read, decompressor)) is not None:
-            return [splitter.split(content) for content in contents]
-        found: list[Records | DamageError] = []
+        if (content := self._content(places, read, decompressor)) is not None:
+            records = splitter.split(*content)
+            if records.damage is None:
+                return [(places, records)]
+        found: _Found = []
         for place, record in zip(places, read, strict=True):
             try:
-                found.append(splitter.split(_content(place, record, decompressor)))
+                found.append(([place], splitter.split(_content(place, record, decompressor))))
             except DamageError as damage:
-                found.append(damage)
+                found.append(([place], damage))
         return found
 
-    def _contents(
+    def _content(
         self,
         places: Sequence[ChunkPlace],
         read: Sequence[memoryview],
         decompressor: zstandard.ZstdDecompressor,
-    ) -> list[memoryview] | None:
+    ) -> tuple[memoryview, list[int]] | None:
         """Decompress and check all chunks in one step each, so that threads seldom wait for the interpreter.
 
         Returns:
-            None if they are not all sound and compressed as ours: then each is looked at by itself.
+            all contents and their sizes; None if they are not all sound and compressed as ours: then each is
+            looked at by itself.
         """
         frames, sizes, checksums = list[memoryview](), list[int](), list[int]()
         for place, record in zip(places, read, strict=True):
@@ -228,16 +238,15 @@ class _GroupReader:
                 chunk_place(place.offset, bytes(record[:_LONGEST_HEAD]), len(record))
             if list(map(zstandard.frame_content_size, frames)) != sizes:
                 return None
-            starts = starts_from_counts(sizes)
-            whole = self._buffer(int(starts[-1]))
+            whole = self._buffer(sum(sizes))
             reader = decompressor.stream_reader(b"".join(frames), read_across_frames=True)
             if reader.readinto(whole) != len(whole):  # type: ignore[attr-defined, unused-ignore]
                 return None
         except (DamageError, zstandard.ZstdError):
             return None
-        if zlib.crc32(whole) != joined_checksum(np.array(checksums, np.int64), np.array(sizes, np.int64)):
+        if crc32(whole) != joined_checksum(checksums, sizes):
             return None
-        return [whole[begin:end] for begin, end in pairwise(starts.tolist())]
+        return whole, sizes
 
     def _buffer(self, size: int) -> memoryview:
         buffer: bytearray | None = getattr(self._own, "buffer", None)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import struct
-import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from heapq import merge
@@ -18,6 +17,7 @@ from typing import BinaryIO
 from mcap import records
 from mcap.opcode import Opcode
 
+from spatial_replay.logs.checksums import crc32
 from spatial_replay.logs.mcap.chunk_records import RECORD_HEAD, DamageError, decoded
 from spatial_replay.logs.mcap.chunks import ChunkPlace, chunk_place
 from spatial_replay.logs.messages import Attachment
@@ -120,7 +120,7 @@ def _from_summary(stream: BinaryIO, size: int) -> Directory:
     stream.seek(footer.summary_start)
     section = stream.read(size - tail_bytes - footer.summary_start)
     has_checksum = footer.summary_crc or _is_own(directory.header)
-    if has_checksum and zlib.crc32(section + tail[: _FOOTER_BYTES - 4]) != footer.summary_crc:
+    if has_checksum and crc32(section + tail[: _FOOTER_BYTES - 4]) != footer.summary_crc:
         raise DamageError("the summary's checksum does not fit")
     for opcode, body in _iter_bodies(section):
         _take_in(directory, opcode, body)
@@ -348,7 +348,7 @@ def iter_attachments(
             texts = len(record.name.encode()) + len(record.media_type.encode())
             size = _ATTACHMENT_NUMBERS + texts + len(record.data)
             checksum = int.from_bytes(body[size : size + 4], "little")
-            if (checksum or _is_own(directory.header)) and zlib.crc32(body[:size]) != checksum:
+            if (checksum or _is_own(directory.header)) and crc32(body[:size]) != checksum:
                 raise DamageError("an attachment's checksum does not fit")
         except DamageError as damage:
             faults.add(f"{name}: at byte {offset}: {damage}; the attachment is lost")

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import struct
 import threading
-import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -22,6 +21,7 @@ from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
 from spatial_replay.geometry.arrays import Integers, equal_places, starts_from_counts
+from spatial_replay.logs.checksums import crc32
 from spatial_replay.logs.mcap.chunk_records import RECORD_HEAD, encoded
 from spatial_replay.logs.messages import Messages
 from spatial_replay.logs.payloads import Filled, MixedPayloads, columns_of
@@ -250,7 +250,7 @@ def _packed(
         index: of each channel, the entries of its messages.
     """
     compressed = _compressor().compress(content)
-    about = start_ns, end_ns, len(content), zlib.crc32(content)
+    about = start_ns, end_ns, len(content), crc32(content)
     length = _CHUNK.size - RECORD_HEAD.size + len(compressed)
     parts = [_CHUNK.pack(Opcode.CHUNK, length, *about, len(_ZSTD), _ZSTD, len(compressed)), compressed]
     offsets, size = dict[int, int](), 0
@@ -320,7 +320,7 @@ class McapSummary:
                 section += content
         footer = struct.pack("<BQQQ", Opcode.FOOTER, 20, offset, offset + len(section))
         section += encoded(*offsets) + footer
-        return section + struct.pack("<I", zlib.crc32(section))
+        return section + struct.pack("<I", crc32(section))
 
     def _statistics(self) -> records.Statistics:
         return records.Statistics(

@@ -239,12 +239,13 @@ def _blocks(
         and (place.channels is None or not place.channels.isdisjoint(numbers))
     ]
     waiting: list[RawMessages] = []
-    size = samples = 0
-    for number, (place, messages) in enumerate(walk.iter_messages(places, is_wanted), 1):
+    size = samples = number = 0
+    for several, messages in walk.iter_messages(places, is_wanted):
+        number += len(several)
         if declared < len(walk.channels):
             declared = len(walk.channels)
             wanted, objects = walk.numbers(is_wanted), walk.numbers(OBJECTS.__eq__)
-        is_inside = place.start_ns >= start_ns and place.end_ns < end_ns
+        is_inside = all(place.start_ns >= start_ns and place.end_ns < end_ns for place in several)
         if not is_inside or messages.channel < 0 or not wanted[messages.channel]:
             heads = messages.heads
             is_chosen = wanted[heads["channel"]]
