@@ -123,8 +123,8 @@ def scene_value(
     shown = [
         (number, arrow)
         for number, frame in enumerate(scene.frames)
-        for arrow in frame.violations
-        if results.get(arrow.result, most) < most
+        for result, place in results.items()
+        if place < most and (arrow := frame.violation(result)) is not None
     ]
     arrows = [arrow for _, arrow in shown]
     box = _box(entities, arrows)

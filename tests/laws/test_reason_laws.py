@@ -52,7 +52,7 @@ class Run:
 
     def _show(self, frames: SceneFrames) -> None:
         for index, time_ns in enumerate(frames.times_ns.tolist()):
-            self.arrows[time_ns] = next(iter(frames.frame(index).violations), None)
+            self.arrows[time_ns] = frames.frame(index).violation(0)
 
     @property
     def last_event(self) -> dict[str, str]:

@@ -143,11 +143,17 @@ class SceneFrame(NamedTuple):
 
     Attributes:
         entities: by their ids.
-        violations: of each result that an arrow can show it of.
+        arrows: of the results, in the chosen messages.
+        place: which of those it is.
     """
 
     entities: Mapping[str, DrawnEntity]
-    violations: tuple[DrawnViolation, ...]
+    arrows: Sequence[Arrows] = ()
+    place: int = 0
+
+    def violation(self, result: int) -> DrawnViolation | None:
+        """Return the arrow at the first violation of a result, if it has one here."""
+        return self.arrows[result].at(self.place)
 
     @property
     def corners(self) -> int:
@@ -201,9 +207,7 @@ class SceneFrames:
                 rings = content.rings.rings_of(int(content.observations[index, column]))
                 colour = _bytes(self.object_colours[index, column])
                 entities[OBJECT + name] = DrawnEntity(rings, colour, of_objects[place, column].tobytes())
-        arrows = (each.at(place) for each in found)
-        violations = tuple(each for each in arrows if each is not None)
-        return SceneFrame(entities, violations)
+        return SceneFrame(entities, found, place)
 
 
 class SceneContent(NamedTuple):
