@@ -101,7 +101,9 @@ def explain(
         if idle:
             texts.append([each.message for each in idle])
         if others:
-            texts.append([others_text(others)])
+            texts.append(
+                [others_text(others, [str(verdict_of(each, node, goes_on=goes_on)) for each in others])]
+            )
         for number, lines in enumerate(texts):
             show(*([""] if number else []), *(_lines_on_terminal(lines) if sys.stdout.isatty() else lines))
     verdicts = [each.verdict for each in results]

@@ -127,10 +127,14 @@ def worst_of(results: Sequence[SpecResult]) -> tuple[Sequence[SpecResult], Seque
     return results[:shown], results[shown:]
 
 
-def others_text(others: Sequence[SpecResult]) -> str:
-    """Return the line about results that are not printed."""
+def others_text(others: Sequence[SpecResult], verdicts: Sequence[str] | None = None) -> str:
+    """Return the line about results that are not printed.
+
+    Args:
+        verdicts: theirs, where these are not the final ones.
+    """
     one = ", --each VAR=OBJECT shows one" if any(each.object is not None for each in others) else ""
-    counts = counts_text(each.verdict for each in others)
+    counts = counts_text([each.verdict for each in others] if verdicts is None else verdicts)
     return f"… and {len(others):,} more: {counts}; --json has all{one}"
 
 

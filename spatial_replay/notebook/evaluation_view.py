@@ -89,6 +89,8 @@ def _results_table(results: Sequence[SpecResult]) -> Html:
 
 
 def _first_satisfied(result: SpecResult) -> str:
+    if result.verdict is Verdict.UNKNOWN:
+        return "not known"
     at_ns = result.first_satisfied_ns
     return "never" if at_ns is None else f"{(at_ns - int(result.times_ns[0])) / 1e9:.3f} s"
 

@@ -79,13 +79,18 @@ def test_a_named_spec_is_explained_at_a_time(folder: Path, capsys: pytest.Captur
     assert at_the_end.startswith("`reach` is satisfied: robustness 0.5, certain since 1.500 s.")
 
 
-def test_the_heading_of_many_results_counts_those_that_are_pending(
+def test_many_results_are_counted_with_those_that_are_pending(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     lines = [f"spec s{k} = G (battery >= {k / 10})" for k in range(8)]
     (folder / "run.spatial").write_text("\n".join(lines), encoding="utf-8")
     _, text = said(capsys, *EXPLAIN, "--at", "0.5s")
     assert text.splitlines()[0] == "8 results: 3 violated, 5 pending"
+    lines = [f"spec s{k} = G (battery >= {k / 100})" for k in range(24)]
+    (folder / "run.spatial").write_text("\n".join(lines), encoding="utf-8")
+    _, text = said(capsys, *EXPLAIN, "--at", "0.5s")
+    assert text.splitlines()[0] == "24 results: 24 pending"
+    assert text.splitlines()[-1] == "… and 12 more: 12 pending; --json has all"
 
 
 def test_options_that_cannot_be_explained_are_refused_by_name(

@@ -36,6 +36,7 @@ def test_a_page_of_a_result_shows_no_other_result():
 def test_a_page_shows_the_interval_of_an_unknown_robustness():
     text = shown(judged("G a dist b <= 1", points(a=[0, None], b=[0, 0])))
     assert "■ unknown" in text
+    assert "not known" in text
     assert "-inf to" in text
 
 
