@@ -172,8 +172,8 @@ def planning_command(scenario: str) -> click.Command:
             f"wrote {output}: {counted(planned.samples, 'sample')} over {planned.seconds:.3f} s; "
             f"{counted(planned.steps, 'motion')}, {counted(planned.pruned, 'edge')} given up"
         )
-        if planned.bounds:
-            show(planned.bounds)
+        for note in filter(None, (planned.bounds, planned.yaws)):
+            show(note)
         show_film(simulation)
         show(f"planning took {planned.planning_s:.2f} s", err=True)
         show(f"the planner: {planned.reason}")

@@ -5,19 +5,21 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from spatial_replay.annotate.automaton_state import SpecAutomaton
 from spatial_replay.annotate.specification import logged_specifications
 from spatial_replay.automata.automaton import Automaton
+from spatial_replay.automata.compile import chosen_spec
 from spatial_replay.compiled import compile_ahead
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
@@ -41,7 +43,8 @@ from spatial_replay.simulation.tabletop import SAMPLES_PER_S
 from spatial_replay.simulation.world import TreeTick, World
 from spatial_replay.simulation.worlds import default_specification, make_world
 from spatial_replay.spec import parse_specification
-from spatial_replay.spec.formula import Specification
+from spatial_replay.spec.formula import Atom, Formula, Misalignment, Specification
+from spatial_replay.spec.walks import base_of, iter_expressions, iter_formulas
 from spatial_replay.trace.sample import Sample
 
 _TREES = protobuf_channel(BEHAVIOUR_TREE, BehaviourTree)
@@ -73,6 +76,15 @@ _PRESETS: MappingProxyType[Skill, _Preset] = MappingProxyType(
 )
 
 
+def _yaws_text(yaws: Sequence[float]) -> str:
+    listed = ", ".join(f"{math.degrees(yaw):.0f}" for yaw in yaws)
+    return f"objects may be turned to {listed} degrees, since orientations are compared" if yaws else ""
+
+
+_SAME_YAW: Final = math.radians(1.0)
+"""Yaws that differ by less count as one."""
+
+
 def settings_for(world: World) -> Settings:
     """Return the planner settings for a world."""
     bodies, space = world.bodies, world.workspace
@@ -98,11 +110,35 @@ def settings_for(world: World) -> Settings:
     )
 
 
-def _settings(world: World, changes: Mapping[str, Any]) -> Settings:
-    settings = changed_settings(settings_for(world), changes)
+def _settings(world: World, formula: Formula, changes: Mapping[str, Any]) -> Settings:
+    preset = settings_for(world)
+    if not preset.workspace.yaws:
+        yaws = yaws_for(formula, world.sample())
+        preset = replace(preset, workspace=replace(preset.workspace, yaws=yaws))
+    settings = changed_settings(preset, changes)
     if settings.skill != world.skill:
         raise UsageError(f"the robot of {world.name} can only {world.skill} objects; leave `skill` out")
     return settings
+
+
+def yaws_for(formula: Formula, sample: Sample) -> tuple[float, ...]:
+    """Return the yaws, in radians, that objects may need for a formula: none if no relation compares any.
+
+    These are the ones that the compared objects have, for `a oriented[k] b`, and quarter turns from
+    the first of them.
+    """
+    atoms = [each for each in iter_formulas(formula) if isinstance(each, Atom)]
+    parts = [part for atom in atoms for part in iter_expressions(atom.expression)]
+    compared = [
+        term for part in parts if isinstance(part, Misalignment) for term in (part.first, part.second)
+    ]
+    tracked = [sample.objects.get(getattr(base_of(term), "name", "")) for term in compared]
+    known = [each.yaw for each in tracked if isinstance(each, TrackedObject) and each.yaw is not None]
+    yaws: list[float] = []
+    for yaw in (*known, *(turn * math.pi / 2 + yaw for yaw in known[:1] for turn in (1, 2, 3))):
+        if all(abs(math.remainder(yaw - each, math.tau)) > _SAME_YAW for each in yaws):
+            yaws.append(math.remainder(yaw, math.tau))
+    return tuple(sorted(yaws))
 
 
 class WorldExecutor:
@@ -201,6 +237,8 @@ class PlannedRun:
         steps: number of executed motions.
         pruned: number of pruned edges of the automaton.
         planning_s: time spent planning, in seconds of real time.
+        bounds: how many samples the bounds in seconds are, in words; empty without any.
+        yaws: to which yaws objects may be turned since the specification compares some, in words.
     """
 
     samples: int
@@ -213,6 +251,7 @@ class PlannedRun:
     pruned: int
     planning_s: float
     bounds: str = ""
+    yaws: str = ""
 
     @property
     def satisfied(self) -> bool:
@@ -271,7 +310,8 @@ def record_plan(
     opened = make_world(scenario, seed=seed, noise_m=noise_m, injections=injections, starts=starts, gui=gui)
     with closing(opened) as world:
         refuse_unknown_names([kept, *others], world.sample())
-        planner = Planner(kept, _settings(world, changes), name=name, rate_hz=SAMPLES_PER_S)
+        settings = _settings(world, chosen_spec(kept, name).formula, changes)
+        planner = Planner(kept, settings, name=name, rate_hz=SAMPLES_PER_S)
         warm_up_planner()
         # a replay does not know the rate, and has no automaton for bounds in seconds: neither has the log
         known = _known(kept, planner.automaton) if planner.rate_hz is None else []
@@ -303,6 +343,7 @@ def record_plan(
             pruned=len(last.pruned),
             planning_s=loop.planning_s,
             bounds=planner.bounds,
+            yaws="" if world.workspace.yaws or "yaws" in changes else _yaws_text(settings.workspace.yaws),
         )
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from fractions import Fraction
 from itertools import combinations
-from typing import Final, TypeVar
+from typing import TypeVar
 
 from spatial_replay.sanity.linear import Inequality
 from spatial_replay.sanity.sums import (
@@ -32,9 +32,6 @@ from spatial_replay.spec.formula import (
     Term,
 )
 
-MAX_TERMS: Final = 16
-"""How many terms laws are written out for; between more of them only those of one measurement are."""
-
 
 def laws(
     quantities: Iterable[Quantity], inside: Iterable[Protrusion], regions: Mapping[str, Outline]
@@ -47,8 +44,6 @@ def laws(
     used = list(dict.fromkeys(quantities))
     terms = [term for term in terms_in(used) if is_solid(term)]
     found = list(_single(used))
-    if len(terms) > MAX_TERMS:
-        return found
     extents = _Extents(used, terms, regions)
     distances = [each for each in used if isinstance(each, SignedDistance)]
     protrusions = [each for each in used if isinstance(each, Protrusion)]
@@ -136,14 +131,20 @@ def _transitive(
     protrusions: dict[Protrusion, None], within: dict[Protrusion, None], regions: Mapping[str, Outline]
 ) -> Iterator[Inequality]:
     """Yield that a sticks out of c at most as far as a out of b and b out of c together."""
-    given = [each for each in protrusions if is_solid(each.inner) and is_solid(each.outer)]
-    waiting = list(given)
+    outers: dict[Term, dict[Term, Protrusion]] = {}
+    for each in protrusions:
+        if is_solid(each.inner) and is_solid(each.outer):
+            outers.setdefault(each.inner, {})[each.outer] = each
+    beyond = {term: _reached(term, outers) for term in outers}
+    waiting = [each for found in outers.values() for each in found.values()]
     for first in waiting:
-        for second in given:
-            a, b, c = first.inner, first.outer, second.outer
+        a, b = first.inner, first.outer
+        for c, second in outers.get(b, {}).items():
             # heights count between a and c, but not on the way over a region without any
             is_gap = is_flat(b, regions) and not is_flat(a, regions) and not is_flat(c, regions)
-            if b != second.inner or a == c or is_gap:
+            # steps over what no measurement begins or ends with say the same one by one
+            leads = c in outers[a] or not beyond.get(c, frozenset()).isdisjoint(outers[a])
+            if a == c or is_gap or not (leads or is_flat(a, regions)):
                 continue
             whole = Protrusion(a, c)
             yield _law((whole, 1), (first, -1), (second, -1))
@@ -154,25 +155,38 @@ def _transitive(
                 waiting.append(whole)
 
 
+def _reached(term: Term, outers: Mapping[Term, Mapping[Term, Protrusion]]) -> frozenset[Term]:
+    """Return what a chain of protrusions leads to from a term."""
+    waiting, found = [term], set[Term]()
+    while waiting:
+        more = outers.get(waiting.pop(), {}).keys() - found
+        found |= more
+        waiting += more
+    return frozenset(found)
+
+
 def _nested(
     distances: dict[SignedDistance, None], within: dict[Protrusion, None], regions: Mapping[str, Outline]
 ) -> Iterator[Inequality]:
     """Yield that what is inside overlaps, and is as far from others as its outside or farther."""
-    inside = [each for each in within if is_solid(each.inner) and is_solid(each.outer)]
+    inside: dict[Term, list[Protrusion]] = {}
+    for each in within:
+        if is_solid(each.inner) and is_solid(each.outer):
+            for term in (each.inner, each.outer):
+                inside.setdefault(term, []).append(each)
     waiting = list(distances)
     for pair in waiting:
-        for each in inside:
-            a, b = each.inner, each.outer
-            if pair == _distance(a, b):
-                yield _law((pair, 1), (each, -1))
-            elif not (is_flat(a, regions) and not is_flat(b, regions)):
-                for c, other in ((pair.first, pair.second), (pair.second, pair.first)):
-                    if other in (a, b):
-                        near, far = _distance(b, c), _distance(a, c)
-                        yield _law((near, 1), (far, -1), (each, -1))
-                        more = [one for one in (near, far) if one not in distances]
-                        distances.update(dict.fromkeys(more))
-                        waiting += more
+        for other, c in ((pair.first, pair.second), (pair.second, pair.first)):
+            for each in inside.get(other, ()):
+                a, b = each.inner, each.outer
+                if c in (a, b) and c != other:
+                    yield _law((pair, 1), (each, -1))
+                elif not (is_flat(a, regions) and not is_flat(b, regions)):
+                    near, far = _distance(b, c), _distance(a, c)
+                    yield _law((near, 1), (far, -1), (each, -1))
+                    more = [one for one in (near, far) if one not in distances]
+                    distances.update(dict.fromkeys(more))
+                    waiting += more
 
 
 class _Extents:

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Mapping, Sequence
 from fractions import Fraction
+from itertools import compress
+from operator import not_
 from typing import Final, NamedTuple, TypeAlias
 
 Real: TypeAlias = Fraction | float
@@ -52,24 +54,34 @@ class Solution(NamedTuple):
 
 
 def solve(
-    inequalities: Sequence[Inequality], *, exact: bool = True, start: Mapping[Hashable, Real] | None = None
+    inequalities: Sequence[Inequality],
+    laws: Sequence[Inequality] = (),
+    *,
+    exact: bool = True,
+    start: Mapping[Hashable, Real] | None = None,
 ) -> Solution:
     """Return values that keep all inequalities, or labels of some that exclude each other.
 
     Args:
+        laws: more inequalities, each of which is looked into only once values would break it: of many laws,
+            few matter to one question.
         exact: compute with fractions; else with floats, up to a tolerance.
         start: values that quantities keep unless an inequality moves them; 0 without it.
     """
     tableau = _Tableau(0.0 if exact else _TOLERANCE, start or {})
-    for index, each in enumerate(inequalities):
-        if not tableau.add(each, index):
-            break
-    found = tableau.conflict if tableau.conflict is not None else tableau.search()
-    if found is None:
-        return Solution(tableau.values(), None)
+    added, waiting = list(inequalities), list(laws)
+    found = tableau.extended(added, 0)
+    while found is None:
+        kept = [tableau.keeps(each) for each in waiting]
+        if all(kept):
+            return Solution(tableau.values(), None)
+        broken = list(compress(waiting, map(not_, kept)))
+        waiting = list(compress(waiting, kept))
+        added += broken
+        found = tableau.extended(broken, len(added) - len(broken))
     if not found:
         return Solution(None, None)
-    labels = (inequalities[index].label for index in found)
+    labels = (added[index].label for index in found)
     return Solution(None, frozenset(label for label in labels if label is not None))
 
 
@@ -96,6 +108,18 @@ class _Tableau:
         self._value: list[_Pair] = []
         self._lower: list[tuple[_Pair, int] | None] = []
         self._upper: list[tuple[_Pair, int] | None] = []
+
+    def extended(self, inequalities: Sequence[Inequality], first: int) -> set[int] | None:
+        """Add bounds, numbered from `first`, and move variables into all; return as `search` does."""
+        for index, each in enumerate(inequalities, first):
+            if not self.add(each, index):
+                return self.conflict
+        return self.search()
+
+    def keeps(self, inequality: Inequality) -> bool:
+        """Return whether the present values keep an inequality that is not strict."""
+        whole, small = self._sum({self._quantity(key): factor for key, factor in inequality.coefficients})
+        return not self._below((inequality.bound, 0), (whole, small))
 
     def add(self, inequality: Inequality, index: int) -> bool:
         """Add a bound; return whether it does not contradict the opposite bound."""
@@ -158,9 +182,19 @@ class _Tableau:
         number = self._numbers.get(normal)
         if number is None:
             # quantities are numbered before the sums of them
-            row = {self._quantity(key): factor for key, factor in normal}
+            terms = [(self._quantity(key), factor) for key, factor in normal]
             number = self._numbers[normal] = self._new()
-            self._rows[number] = row
+            row: dict[int, Real] = {}
+            for quantity, factor in terms:
+                # one that is a sum by now is replaced by that
+                whole: dict[int, Real] = self._rows.get(quantity, {quantity: 1})
+                for variable, weight in whole.items():
+                    row[variable] = row.get(variable, 0) + factor * weight
+            self._rows[number] = {
+                variable: weight
+                for variable, weight in row.items()
+                if weight > self._tolerance or weight < -self._tolerance
+            }
         return number
 
     def _quantity(self, key: Hashable) -> int:

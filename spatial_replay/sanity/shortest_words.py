@@ -14,6 +14,7 @@ from spatial_replay.errors import NoAutomatonError
 from spatial_replay.sanity.conditions import Fact, FactDiagrams, is_negated
 from spatial_replay.sanity.laws import laws
 from spatial_replay.sanity.linear import solve
+from spatial_replay.sanity.sums import terms_in
 from spatial_replay.spec.formula import Protrusion, Signal
 
 Cube: TypeAlias = dict[int, bool]
@@ -28,7 +29,7 @@ MAX_STEPS: Final = 200_000
 MAX_ALL_STEPS: Final = 800_000
 """How many steps all questions about one specification take together."""
 
-_STEPS_AT_ONCE: Final = 60_000
+_STEPS_AT_ONCE: Final = 150_000
 """How many steps a question takes whose answer would spare others."""
 
 _STEPS_OF_GEOMETRY: Final = 50
@@ -81,6 +82,8 @@ class WordSearch:
         self._exclusions: list[frozenset[tuple[int, bool]]] = []
         self._allowed = YES
         self._possible: dict[frozenset[tuple[int, bool]], frozenset[int] | None] = {}
+        self._terms: dict[int, frozenset[object]] = {}
+        self._open: dict[tuple[int, int], set[int]] = {}
         self._steps = self._all_steps = 0
 
     def shortest(self, *sides: Side) -> Answer:
@@ -125,20 +128,23 @@ class WordSearch:
         before: dict[tuple[int, ...], tuple[tuple[int, ...] | None, Cube]] = {}
         order = count()
         # what geometry says is asked when a move is taken out, of few of all that are put in
-        waiting: list[tuple[int, int, int, int, int, tuple[int, ...] | None]] = []
+        waiting: list[tuple[tuple[int, tuple[int, ...], int], int, int, int, tuple[int, ...] | None]] = []
 
         def put_in(moves: int, leaves: Sequence[int], length: int, source: tuple[int, ...] | None) -> None:
             for leaf in leaves:
                 after = self._tuples[leaf]
                 if after not in before and all(map(_may_agree, sides, after)):
-                    least = length + max(map(_least_left, sides, after))
-                    heappush(waiting, (least, -length, next(order), moves, leaf, source))
+                    # of equals, those first that need least for the last side: what has to hold once
+                    left = tuple(map(_least_left, sides, after))
+                    key = length + max(left), left[::-1], -length
+                    heappush(waiting, (key, next(order), moves, leaf, source))
 
         put_in(*self._joined(sides, tuple(side.automaton.initial for side in sides)), 1, None)
         while waiting:
-            _, length, _, moves, leaf, source = heappop(waiting)
+            (_, _, length), _, moves, leaf, source = heappop(waiting)
             after = self._tuples[leaf]
-            if after in before:
+            is_closed = geometry and self._allowed != YES and leaf not in self._open_leaves(moves)
+            if after in before or is_closed:
                 continue
             cube = self._cube(self._leading(moves, leaf)) if geometry else {}
             if cube is None:
@@ -176,6 +182,25 @@ class WordSearch:
         self._spend(len(known))
         decisions = [self._diagrams[node] for node in known.values()]
         return whole, list(dict.fromkeys(each.low for each in decisions if each.variable == LEAF))
+
+    def _open_leaves(self, moves: int) -> set[int]:
+        """Return the leaves of a diagram to which facts lead that are not excluded together yet."""
+        key = moves, self._allowed
+        if key not in self._open:
+            leaves, waiting, visited = set(), [key], {key}
+            while waiting:
+                node, allowed = waiting.pop()
+                variable = min(self._diagrams[node].variable, self._diagrams[allowed].variable)
+                if allowed != NO and self._diagrams[node].variable == LEAF:
+                    leaves.add(self._diagrams[node].low)
+                elif allowed != NO:
+                    branches = [self._diagrams.branches(each, variable) for each in (node, allowed)]
+                    more = set(zip(*branches, strict=True)) - visited
+                    visited |= more
+                    waiting += more
+            self._spend(len(visited))
+            self._open[key] = leaves
+        return self._open[key]
 
     def _number(self, states: tuple[int, ...]) -> int:
         if states not in self._numbers:
@@ -229,11 +254,12 @@ class WordSearch:
                 less = {each: value for each, value in cube.items() if each != fact}
                 if self._is_certain(condition, less):
                     cube = less
-            conflict = self._conflict(cube)
-            if conflict is None:
+            conflicts = list(filter(None, map(self._conflict, self._parts(cube))))
+            if not conflicts:
                 return cube
-            self._exclusions.append(frozenset(conflict.items()))
-            self._allowed = self._diagrams.both(self._allowed, self._clause(conflict))
+            for conflict in conflicts:
+                self._exclusions.append(frozenset(conflict.items()))
+                self._allowed = self._diagrams.both(self._allowed, self._clause(conflict))
         raise UndecidedError
 
     def _first(self, node: int) -> Cube:
@@ -288,6 +314,28 @@ class WordSearch:
             self._possible[key] = self._asked(cube)
         return self._possible[key]
 
+    def _parts(self, cube: Cube) -> list[Cube]:
+        """Return a cube in parts that are about different things: no law is about two of them."""
+        parts: list[tuple[frozenset[object], Cube]] = []
+        for number, value in cube.items():
+            about, part = self._about_of(number), {number: value}
+            apart = []
+            for terms, other in parts:
+                if terms.isdisjoint(about):
+                    apart.append((terms, other))
+                else:
+                    about, part = terms | about, {**other, **part}
+            parts = [*apart, (about, part)]
+        return [part for _, part in parts]
+
+    def _about_of(self, number: int) -> frozenset[object]:
+        """Return the terms and signals that a fact is about."""
+        if number not in self._terms:
+            quantities = [quantity for quantity, _ in self._conditions.facts[number].weights]
+            signals = [each for each in quantities if isinstance(each, Signal)]
+            self._terms[number] = frozenset([*signals, *terms_in(quantities)])
+        return self._terms[number]
+
     def _asked(self, cube: Cube) -> frozenset[int] | None:
         facts = self._conditions.facts
         own = [
@@ -304,7 +352,7 @@ class WordSearch:
         quantities = dict.fromkeys(quantity for each in weights for quantity, _ in each)
         geometry = [each for each in quantities if not isinstance(each, Signal)]
         known = laws(geometry, inside, self._conditions.regions) if geometry else []
-        return solve([*own, *known]).conflict
+        return solve(own, known).conflict
 
     def _about(self, sides: Sequence[Side]) -> Iterator[frozenset[tuple[int, bool]]]:
         """Yield the exclusions between facts that automata read."""

@@ -62,9 +62,11 @@ def best_grasp(
         return f"{name} lies out of the robot's reach"
     if not in_reach(*goal):
         return f"({goal[0]:.2f}, {goal[1]:.2f}) is out of the robot's reach"
-    across = [(thickness, angle) for thickness, angle in _angles(scene, name) if thickness <= _THICKEST]
+    angles = _angles(scene, name)
+    across = [(thickness, angle) for thickness, angle in angles if thickness <= _THICKEST]
     if not across:
-        return f"{name} is too thick for the gripper as it lies"
+        thinnest = f"{min(angles)[0] * 100:.1f} cm, and {_THICKEST * 100:.1f} cm fit between the fingers"
+        return f"{name} is too thick for the gripper as it lies: {thinnest}"
     bottom, top = scene.height(name)
     above_bottom = max(FINGERTIP + 0.003, top - bottom - _BELOW_TOP)
     best, best_room, can_turn_hand, can_pick, can_place = None, _ROOM, False, False, False

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 import spatial_replay as sr
 from laws.reference import Interval, Prefix
+from spatial_replay.sanity.linear import Inequality, solve
 
 NAMES = "abc"
 
@@ -248,3 +249,31 @@ def test_shortest_runs_are_found_exactly_where_there_are_runs(text: str) -> None
             assert not lengths[satisfied]
         verdict = sr.evaluate(specification, sr.Trace.from_samples(example.samples)).verdict
         assert verdict == ("satisfied" if satisfied else "violated")
+
+
+sums = st.dictionaries(st.sampled_from("xyzw"), st.sampled_from([-2, -1, 1, 2]), min_size=1, max_size=3)
+
+
+@given(
+    st.lists(st.tuples(sums, st.integers(-3, 3), st.booleans()), min_size=1, max_size=6),
+    st.lists(st.tuples(sums, st.integers(-2, 2)), max_size=8),
+)
+@settings(max_examples=150)
+def test_laws_that_are_added_only_when_they_are_broken_decide_as_all_of_them_do(
+    asked: list[tuple[dict[str, int], int, bool]], known: list[tuple[dict[str, int], int]]
+) -> None:
+    own = [
+        Inequality(tuple(weights.items()), bound, strict, n)
+        for n, (weights, bound, strict) in enumerate(asked)
+    ]
+    laws = [Inequality(tuple(weights.items()), bound) for weights, bound in known]
+    found = solve(own, laws)
+    assert (found.conflict is None) == (solve([*own, *laws]).conflict is None)
+    if found.values is not None:
+        reached = [
+            sum(weight * found.values[key] for key, weight in each.coefficients) for each in (*own, *laws)
+        ]
+        assert all(value <= each.bound for value, each in zip(reached, (*own, *laws), strict=True))
+    else:
+        # what conflicts does so by itself, together with the laws
+        assert solve([each for each in own if each.label in found.conflict], laws).conflict is not None

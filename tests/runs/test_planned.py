@@ -107,6 +107,19 @@ def test_a_push_stops_before_the_sample_that_would_violate() -> None:
     assert sr.evaluate(file, sr.Trace.from_samples(seen)).node("apart").verdict == "satisfied"
 
 
+def test_objects_whose_orientations_are_compared_may_turn_unless_yaws_are_given(tmp_path: Path) -> None:
+    pytest.importorskip("pybullet", reason="PyBullet is not installed; it has wheels for Python 3.11")
+    facing = sr.parse_specification("F (red oriented[0.03] green)")
+    log = tmp_path / "run.mcap"
+    planned = record_plan("push", log, facing, seed=3)
+    assert planned.satisfied
+    assert planned.yaws.endswith("degrees, since orientations are compared")
+    assert read_decisions(log).decisions[0].target.turn != 0.0
+    assert recompute_decisions(open_source(log)).differences == ()
+    kept = record_plan("push", log, facing, seed=3, changes={"yaws": []})
+    assert (kept.ended, kept.yaws) == ("no path", "")
+
+
 def test_a_knife_is_turned_to_its_place(tmp_path: Path) -> None:
     pytest.importorskip("pybullet", reason="PyBullet is not installed; it has wheels for Python 3.11")
     knife = sr.parse_specification(

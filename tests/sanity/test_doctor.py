@@ -63,6 +63,22 @@ def test_what_geometry_excludes_is_named(formula: str, excluded: tuple[str, ...]
     assert exclusions(formula) == (excluded,)
 
 
+@pytest.mark.parametrize(
+    ("relations", "excluded"),
+    [
+        ([f"a{n} leftof a{n + 1}" for n in range(24)] + ["a24 leftof a0"], 25),
+        ([f"a{n} enclosedin a{n + 1}" for n in range(18)] + ["a18 leftof b", "b ovlp a0"], 20),
+        ([f"a{n} enclosedin left_bin" for n in range(30)] + ["a29 ovlp right_bin"], 2),
+    ],
+    ids=("in a row", "in each other", "in a bin"),
+)
+def test_what_excludes_each_other_is_found_among_many_objects(relations: list[str], excluded: int) -> None:
+    (found,) = exclusions(" and ".join(relations))
+    assert len(found) == excluded
+    # without the last one, all of them can hold
+    assert findings(f"spec s = F ({' and '.join(relations[:-1])})") == []
+
+
 def test_the_published_profile_compares_centroids() -> None:
     assert exclusions("a leftof b and b leftof a", "spatial_spec") == (("a leftof b", "b leftof a"),)
     # by their centroids, overlapping objects may be left of each other

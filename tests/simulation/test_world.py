@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import math
+from contextlib import closing
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from simulation.worlds import centre, off, world
+from simulation.worlds import NO_SIMULATOR, centre, off, world
 from spatial_replay import Sample, TrackedObject, UsageError
 from spatial_replay.simulation.injection import Start
+from spatial_replay.simulation.scenarios.push import SCENARIO as PUSH
 from spatial_replay.simulation.shapes import Box, footprint, height
+from spatial_replay.simulation.tabletop import Tabletop
 from spatial_replay.simulation.worlds import SCENARIOS, default_specification, make_world
 from spatial_replay.spec import object_names
 
@@ -173,3 +177,14 @@ def test_a_pushed_block_is_turned_to_the_yaw_that_is_asked_for() -> None:
         made.attach(lambda sample: "enough" if sample.signals["finger_width"] < 0.045 else None)
         assert made.push("blue", [(0.5, 0.12)], yaw=before).reason == "enough"
         assert made.sample().signals["finger_width"] > 0.06
+
+
+def test_a_block_wider_than_the_fingers_open_is_pushed_but_not_turned() -> None:
+    pytest.importorskip("pybullet", reason=NO_SIMULATOR)
+    green, *others = PUSH.placements
+    wide = replace(green, body=replace(green.body, shape=Box(0.08, 0.08, 0.04)))
+    with closing(Tabletop(replace(PUSH, placements=(wide, *others)))) as made:
+        assert made.push("green", [(0.4, -0.1)]).succeeded
+        done = made.push("green", [(0.4, -0.1)], yaw=0.5)
+    too_thick = "green is too thick for the gripper as it lies: 8.0 cm, and 7.2 cm fit between the fingers"
+    assert (done.succeeded, done.reason) == (False, too_thick)

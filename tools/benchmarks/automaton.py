@@ -69,7 +69,9 @@ def bench_doctor(measure: Any) -> None:
         f"spec s{n} = G (a dist b >= 0.{n + 10}) and F (a leftof c{n} and b ovlp c{n})" for n in range(12)
     )
     deadline = "G (a leftof b -> F[0, 1000] a ovlp b)"
+    row = " and ".join(f"a{n} leftof a{n + 1}" for n in range(30))
     tasks = {"pick-place": PICK_PLACE, "12 responses": spatial, "12 specs": several, "1000 samples": deadline}
+    tasks["31 objects in a row, or in a ring"] = f"(F ({row})) or (F ({row} and a30 leftof a0))"
     for name, text in tasks.items():
         specification = sr.parse_specification(text)
         measure(f"doctor, {name}", lambda _, it=specification: sr.doctor(it), limit_s=1.0)
