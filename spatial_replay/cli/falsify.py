@@ -106,6 +106,8 @@ def falsify(
 
     files = load_spec_options(specs, profile, constants, lambda: default_specification(scenario))
     options = [word for spec in specs for word in ("--spec", str(spec))]
+    options += [word for name, value in constants.items() for word in ("--const", f"{name}={value}")]
+    options += [] if profile is None else ["--profile", profile]
     simulation, parameters = scenario_simulation(scenario, files, vary, options, is_planned=planned)
     found = search_failures(
         simulation,
@@ -146,6 +148,10 @@ def _lines(found: Falsification) -> Iterator[str]:
         lowest = found.lowest
         yield f"{runs} of {found.name}: none violated{doubt}"
         yield f"  the lowest: run {lowest.number}, {_judged(lowest)}, with {found.text_of(lowest.case)}"
+        if len({run.robustness for run in found.runs}) == 1 < len(found.runs):
+            yield "  it is the same in every run: what is varied does not change it"
+        elif not found.is_exhausted:
+            yield "  that is no proof: the same command with a larger --budget goes on from there"
     if found.is_exhausted:
         yield "  the search ended early: there was nothing else to try"
     if len(found.runs) > 1:

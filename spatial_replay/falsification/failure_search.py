@@ -20,13 +20,14 @@ from spatial_replay.batch.workers import Progress, WorkerLost, Workers, no_progr
 from spatial_replay.compare.clips import cut_clip
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.falsification.failures import Failure, Falsification, SearchedRun
-from spatial_replay.falsification.optimiser import Descents
+from spatial_replay.falsification.optimiser import LARGEST_COST, Descents
 from spatial_replay.falsification.parameters import Case, Parameter, Space, key_of
 from spatial_replay.falsification.rounds import Rounds, lost, simulate_rounds, write_whole
 from spatial_replay.falsification.simulations import Simulation, own_simulation, scenario_simulation
 from spatial_replay.logs.downloads import local_copy
 from spatial_replay.logs.output_file import refuse_addresses
 from spatial_replay.replay.selection import DEFAULT_OPTIONS
+from spatial_replay.sanity import refuse_always_true
 from spatial_replay.sources.open_log import open_source
 from spatial_replay.spec.format import format_specification
 from spatial_replay.spec.formula import Specification
@@ -34,7 +35,7 @@ from spatial_replay.spec.overrides import load_specifications
 from spatial_replay.text import json_number
 from spatial_replay.trace.sample import Sample
 
-FORMAT: Final = 1
+FORMAT: Final = 2
 MOST_RUNS: Final = 1_000_000
 _SEARCH: Final = "search.json"
 _HALVINGS: Final = 3
@@ -43,8 +44,6 @@ _BARREN: Final = 50
 """Rounds without a new case after which there is nothing else to try."""
 _DRAWN: Final = 10
 """Runs of a round where nothing but seeds is varied."""
-_LARGEST: Final = 1e9
-"""Stands for infinite costs, of which an optimiser can make nothing; doubled, for impossible cases."""
 
 _Result = TypeVar("_Result")
 
@@ -79,7 +78,8 @@ def falsify(
 
     Raises:
         UsageError: what cannot be varied, a folder of another search, an extra that is not installed.
-        SpecificationError: a specification with errors, or names that the world does not have.
+        SpecificationError: a specification with errors, one that no run violates, or names that the world
+            does not have.
         LogError: what an earlier search has left is damaged.
         OutputError: a file cannot be written.
     """
@@ -120,6 +120,7 @@ def search_failures(
 
     Raises:
         UsageError: nothing to vary, no budget, the folder is not one of this search.
+        SpecificationError: a specification that no run violates.
         LogError: what an earlier search has left is damaged.
         OutputError: a file cannot be written; the same call goes on from there.
     """
@@ -128,6 +129,8 @@ def search_failures(
     if seed < 0:
         raise UsageError(f"the seed is {seed}; give 0 or more")
     space = Space(_distinct(parameters))
+    for file in simulation.files:
+        refuse_always_true(file)
     refuse_addresses(Path(folder))
     files = LocalFolder(Path(folder))
     _claim(files, _identity(simulation, space, seed))
@@ -292,7 +295,7 @@ class _Search:
                 key = key_of(case)
                 if key not in costs and not self._simulation.is_possible(case):
                     self._impossible.add(key)
-                    costs[key] = 2 * _LARGEST
+                    costs[key] = 2 * LARGEST_COST
                 elif key not in costs:
                     new[key] = case
             asked = [*new.values()][: budget - len(runs)]
@@ -387,4 +390,4 @@ def _finish(simulation: Simulation, failure: Failure) -> None:
 
 
 def _cost(run: SearchedRun) -> float:
-    return min(max(run.robustness, -_LARGEST), _LARGEST)
+    return min(max(run.robustness, -LARGEST_COST), LARGEST_COST)

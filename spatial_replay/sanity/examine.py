@@ -123,10 +123,26 @@ def refuse_unsatisfiable(specification: Specification, name: str) -> None:
     Raises:
         SpecificationError: it is one.
     """
-    spec = next(spec for spec in specification.specs if spec.name == name)
-    finding = _Examiner(specification).why_empty(_Part(spec.name, spec.formula, spec.span))
-    if finding is not None:
-        raise SpecificationError([replace(finding.diagnostic, severity="error")])
+    _refuse(specification, [name], satisfied=True)
+
+
+def refuse_always_true(specification: Specification) -> None:
+    """Refuse results that no run violates with a margin.
+
+    Raises:
+        SpecificationError: there are some; all are reported together.
+    """
+    _refuse(specification, [spec.name for spec in specification.results], satisfied=False)
+
+
+def _refuse(specification: Specification, names: Sequence[str], *, satisfied: bool) -> None:
+    """Refuse those specs of some names that no run satisfies, or violates."""
+    examiner = _Examiner(specification)
+    specs = [spec for spec in specification.specs if spec.name in names]
+    found = [examiner.why_empty(_Part(spec.name, spec.formula, spec.span), satisfied) for spec in specs]
+    errors = [replace(each.diagnostic, severity="error") for each in found if each is not None]
+    if errors:
+        raise SpecificationError(errors)
 
 
 @dataclass(frozen=True)
@@ -193,11 +209,12 @@ class _Examiner:
         places = sorted(self._findings, key=lambda each: (each.diagnostic.line, each.diagnostic.column))
         return Examination(tuple(places), described, tuple(self._notes))
 
-    def why_empty(self, part: _Part) -> Finding | None:
-        """Return the finding that no run satisfies a part; None if one may."""
-        if self._is_empty(part, True):
-            self._examine(part)
-        return self._findings[0] if self._findings else None
+    def why_empty(self, part: _Part, satisfied: bool) -> Finding | None:
+        """Return the finding that no run satisfies, or violates, a part; None if one may."""
+        if not self._is_empty(part, satisfied):
+            return None
+        self._examine(part)
+        return self._findings[-1]
 
     def _reading(self, part: _Part) -> SpecReading:
         if part.name not in self._readings:

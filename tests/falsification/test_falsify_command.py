@@ -12,7 +12,7 @@ import pytest
 import spatial_replay as sr
 from spatial_replay.cli import run
 
-NEAR = "spec near = G (red dist blue <= 0.19)\n"
+NEAR = "const far = 1\nspec near = G (red dist blue <= far)\n"
 VARIED = ("--vary", "start.red=0.03", "--vary", "slip@T", "--seed", "2")
 
 
@@ -27,7 +27,8 @@ def test_a_failure_is_the_log_that_its_command_records(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     Path("near.spatial").write_text(NEAR)
-    command = ["falsify", "push", "--spec", "near.spatial", "-o", "found", *VARIED, "--budget", "3"]
+    given = ["--spec", "near.spatial", "--const", "far=0.19"]
+    command = ["falsify", "push", *given, "-o", "found", *VARIED, "--budget", "3"]
     assert run(command) == 1
     said = capsys.readouterr().out
     assert said.startswith("run 1, with nothing varied: satisfied, near 0.0")
@@ -52,6 +53,17 @@ def test_a_failure_is_the_log_that_its_command_records(
     assert {file: file.read_bytes() for file in Path("found").rglob("*.*")} == before
 
 
+def test_a_specification_that_no_run_violates_is_refused_before_the_first_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    spec = tmp_path / "beside.spatial"
+    spec.write_text("spec low = G (tool_z >= 0)\nspec beside = G (red dist blue >= 0 or red dist blue < 1)\n")
+    assert run(["falsify", "push", "--spec", str(spec), "-o", str(tmp_path / "found")]) == 2
+    said = capsys.readouterr().err
+    assert "beside.spatial:2:6: error: every run satisfies beside: " in said
+    assert not (tmp_path / "found").exists()
+
+
 def test_what_was_covered_is_said_where_nothing_is_found(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -62,8 +74,9 @@ def test_what_was_covered_is_said_where_nothing_is_found(
     assert said[0].startswith("run 1, with nothing varied: satisfied, push 0.0")
     assert said[1] == "2 runs of push: none violated, 1 unknown"
     assert said[2].startswith("  the lowest: run 1, satisfied, push 0.0")
-    assert said[4].split()[:5] == ["noise", "0", "to", "0.05", "m"]
-    assert sorted(said[4].split()[5:]) == ["0"] * 9 + ["1"]
+    assert said[3] == "  that is no proof: the same command with a larger --budget goes on from there"
+    assert said[5].split()[:5] == ["noise", "0", "to", "0.05", "m"]
+    assert sorted(said[5].split()[5:]) == ["0"] * 9 + ["1"]
 
 
 def test_a_mishap_after_the_end_of_the_run_is_refused(
@@ -138,9 +151,13 @@ def test_starts_that_there_are_not_are_refused(
     assert not (tmp_path / "run.mcap").exists()
 
 
-def test_starts_in_which_objects_would_lie_in_each_other_are_left_out(tmp_path: Path) -> None:
-    never = sr.parse_specification("spec calm = G (tool_z >= -5)")
-    found = sr.falsify("push", never, output=tmp_path / "found", vary=["start=0.15"], budget=2)
+def test_starts_in_which_objects_would_lie_in_each_other_are_left_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    spec = tmp_path / "calm.spatial"
+    spec.write_text("spec calm = G (finger_width <= 5)\n")
+    given = {"output": tmp_path / "found", "vary": ["start=0.15"], "budget": 2}
+    found = sr.falsify("push", spec, **given)
     assert found.impossible > 0
     (_, other) = found.runs
     starts = [
