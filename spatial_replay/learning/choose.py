@@ -125,39 +125,39 @@ def _characteristic(fit: FittedLimits, most: int) -> list[Line]:
 
 def _goals(fit: FittedLimits) -> list[Line]:
     """Return how good runs end: a distance for each object, and relations that began otherwise."""
-    bits = fit.bits
     scored: list[tuple[float, int, Line]] = []
     joined, placed = _Groups(), Counter[Party]()
     pairs = set()
     of_class: set[int] = set()
+    centre = _centre(fit)
     for _, index in sorted(_distances(fit), key=lambda each: (-each[0], each[1])):
         quantity = fit.quantities[index]
         if index not in of_class and (
-            _places(fit, quantity, placed) if fit.landmarks else joined.join(*quantity.parties)
+            _places(fit, quantity, placed, centre) if fit.landmarks else joined.join(*quantity.parties)
         ):
             of_class.update(fit.members[index])
             fact = near = fit.fact(FINALLY, 1, index)
             if fit.limits[FINALLY, 0, index] > 0.0:
                 fact = replace(fit.fact(FINALLY, 0, index), other_limit=near.limit)
             bit = fit.bits_between(index)
-            if any(placed[each] == 1 for each in quantity.parties):
+            if centre in quantity.parties or any(placed[each] == 1 for each in quantity.parties):
                 # the nearest landmark says most, whatever the way there was
                 bit = max(bit, _LEAST_BITS_PLACED)
             scored.append((bit, index, Line("finally", fact)))
             pairs |= {quantity.pair, *(fit.quantities[each].pair for each in fit.members[index])}
     before: dict[tuple[str, Party], set[Party]] = {}
     relations = [
-        (float(bits[FINALLY, 0, index]), index)
+        (bit, index)
         for index, quantity in enumerate(fit.quantities)
         if quantity.relation not in ("dist", "signal")
         and (not fit.landmarks or fit.landmarks.intersection(quantity.parties))
-        and bits[FINALLY, 0, index] >= _LEAST_BITS
+        and (bit := _said_at_end(fit, index)) >= _LEAST_BITS
         and fit.moves[index]
         and _agrees(fit, FINALLY, 0, index)
     ]
     for bit, index in sorted(relations, key=lambda each: _by_worth(fit, *each)):
         quantity = fit.quantities[index]
-        began = max(float(run.first[0, 1, index]) for run in fit.good) < fit.limits[FINALLY, 0, index]
+        began = _begins_otherwise(fit, index)
         if index in of_class or not (began or quantity.pair in pairs):
             continue
         if quantity.relation == "ovlp" and quantity.pair in pairs:
@@ -176,10 +176,43 @@ def _goals(fit: FittedLimits) -> list[Line]:
     return _spread([(bit, line) for bit, _, line in ordered], fit.landmarks)
 
 
-def _places(fit: FittedLimits, quantity: Quantity, placed: Counter[Party]) -> bool:
-    """Return whether a distance says where something is put by what stays, as no two others do yet."""
+def _begins_otherwise(fit: FittedLimits, index: int) -> bool:
+    """Return whether what holds at the end holds in no good run's first sample."""
+    return bool(max(run.first[0, 1, index] for run in fit.good) < fit.limits[FINALLY, 0, index])
+
+
+def _said_at_end(fit: FittedLimits, index: int) -> float:
+    """Return how much it says that a relation holds at the end."""
+    quantity, bits = fit.quantities[index], float(fit.bits[FINALLY, 0, index])
+    is_put = quantity.relation == "enclosedin" and quantity.parties[1] in fit.landmarks
+    if is_put and _begins_otherwise(fit, index):
+        # what is put into a landmark is there on purpose, also where that is done early in each run
+        return max(bits, _LEAST_BITS_PLACED)
+    return bits
+
+
+def _centre(fit: FittedLimits) -> Party | None:
+    """Return the landmark next to which most objects end, such as a plate; None if no two end by the same."""
+    nearest: dict[Party, tuple[float, Party]] = {}
+    for index, quantity in enumerate(fit.quantities):
+        still = [each for each in quantity.parties if each in fit.landmarks and not each.is_class]
+        moved = [each for each in quantity.parties if each not in fit.landmarks and not each.is_class]
+        if quantity.relation == "dist" and len(still) == len(moved) == 1 and fit.moves[index]:
+            found = float(fit.lowest[FINALLY, 0, index]), still[0]
+            nearest[moved[0]] = min(nearest.get(moved[0], found), found)
+    counts = Counter(landmark for _, landmark in nearest.values())
+    return max(
+        (each for each in counts if counts[each] > 1), key=lambda each: (counts[each], each), default=None
+    )
+
+
+def _places(fit: FittedLimits, quantity: Quantity, placed: Counter[Party], centre: Party | None) -> bool:
+    """Return whether a distance says where something is put by what stays, as no two others do yet.
+
+    That from the centre always does.
+    """
     moved = [each for each in quantity.parties if each not in fit.landmarks]
-    if len(moved) != 1 or placed[moved[0]] == _DISTANCES:
+    if len(moved) != 1 or (placed[moved[0]] >= _DISTANCES and centre not in quantity.parties):
         return False
     placed.update(moved)
     return True
