@@ -263,6 +263,9 @@ def _omissions(report: RunReport, samples: int, kept: int, maps: int) -> Iterato
         )
     if report.scene.stride > 1:
         yield f"The scene has every {_ordinal(report.scene.stride)} message of /spatial/scene."
+    drawn = [each for frame in report.scene.frames[:1] for each in frame.entities.values()]
+    if len(report.results) > 1 and not all(each.shades for each in drawn):
+        yield "The scene has the colours of all results together: there are too many for colours of each."
     if len(report.results) > MOST_DRAWN:
         yield (
             f"Explanations, trees and curves are of {MOST_DRAWN} of {len(report.results):,} results, "

@@ -225,6 +225,16 @@ def test_of_several_results_each_colours_objects_as_if_it_were_the_only_one(tmp_
             assert np.abs(palette[shades] - expected).max() <= 1, (line, drawn["name"])
 
 
+def test_a_page_says_where_results_are_too_many_for_colours_of_each(tmp_path: Path) -> None:
+    discs = {f"o{number}": sr.Footprint.disc(3 * number, 0, 0.3) for number in range(64)}
+    page = tmp_path / "run.html"
+    for count in (64, 65):
+        lines = [f"spec s{k} = G (o{k % 64} dist o{(k + 1) % 64} >= {1 + k / 10})" for k in range(count)]
+        drawn = report_of_samples(page, [sr.Sample(0, discs)], "\n".join(lines)).facts["scene"]["entities"]
+        is_alike = "the colours of all results together" in page.read_text(encoding="utf-8")
+        assert is_alike == (count > 64) == all(each["shades"] is None for each in drawn)
+
+
 def test_an_absent_object_is_not_drawn(tmp_path: Path) -> None:
     samples = [
         each if t != 2 else sr.Sample(each.time_ns, {"a": each.objects["a"]})
