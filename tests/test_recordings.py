@@ -65,3 +65,12 @@ def test_the_script_reproduces_the_committed_files():
     command = [sys.executable, str(ROOT / "tools" / "make_recordings"), "--check"]
     result = subprocess.run(command, capture_output=True, text=True, check=False)
     assert (result.returncode, result.stdout + result.stderr) == (0, "")
+
+
+def test_recorded_logs_verify_whole_with_their_decisions(capsys):
+    for log in sorted(RECORDINGS.glob("*.mcap")):
+        assert run_in_process(["verify", str(log), "--decisions"]) == 0
+        said = capsys.readouterr()
+        assert "samples, messages, specifications and results match" in said.out
+        assert "3 decisions recomputed with 9 maps, all match" in said.out
+        assert "not covered" not in said.out + said.err

@@ -38,7 +38,7 @@ def test_a_report_uses_the_specification_of_the_log_by_default(tmp_path: Path) -
 
 def test_a_report_covers_the_readable_part_of_a_damaged_log(tmp_path: Path) -> None:
     log = tmp_path / "broken.mcap"
-    log.write_bytes((RECORDINGS / "push.mcap").read_bytes()[:200_000])
+    log.write_bytes((RECORDINGS / "push.mcap").read_bytes()[:900_000])
     code, said = call("report", log, "--spec", RECORDINGS / "push.spatial", "-o", tmp_path / "run.html")
     assert code == 3
     assert "damaged" in said

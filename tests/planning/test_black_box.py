@@ -156,15 +156,17 @@ def test_verify_notices_edited_and_removed_plan_settings(tmp_path):
 
 
 def test_verify_notices_that_a_log_without_a_hash_of_its_plan_settings_has_none(tmp_path):
-    # it was recorded before certificates had one
-    assert sr.verify(RECORDED).differences == ()
-    with_plan(RECORDED, tmp_path / "removed.mcap", None)
+    # as logs were recorded before certificates had one
+    earlier = tmp_path / "earlier.mcap"
+    with_plan(RECORDED, earlier, dict(open_source(RECORDED).metadata())[PLAN_METADATA], is_hashed=False)
+    assert sr.verify(earlier).differences == ()
+    with_plan(earlier, tmp_path / "removed.mcap", None)
     (difference,) = sr.verify(tmp_path / "removed.mcap").differences
     assert difference.startswith("no plan settings: ")
 
 
-def with_plan(log, output, plan):
-    """Copy a log with other plan settings, or without any."""
+def with_plan(log, output, plan, is_hashed=True):
+    """Copy a log with other plan settings, or without any; and with their hash, unless told otherwise."""
     source = open_source(log)
     with output.open("wb") as stream, LogWriter(stream) as writer:
         for block in source.iter_blocks():
@@ -173,7 +175,8 @@ def with_plan(log, output, plan):
             writer.add_attachment(attachment.name, attachment.media_type, attachment.data)
         for name, data in source.metadata():
             if name != PLAN_METADATA:
-                writer.add_metadata(name, data)
+                kept = {key: value for key, value in data.items() if is_hashed or key != "plan_sha256"}
+                writer.add_metadata(name, kept)
             elif plan is not None:
                 writer.add_metadata(name, plan)
 

@@ -336,7 +336,7 @@ def test_a_unit_that_is_declared_is_shown(tmp_path: Path, data_folder: Path) -> 
 
 def test_a_damaged_log_is_said_to_be_so_first(tmp_path: Path) -> None:
     log = tmp_path / "broken.mcap"
-    log.write_bytes((RECORDINGS / "push.mcap").read_bytes()[:200_000])
+    log.write_bytes((RECORDINGS / "push.mcap").read_bytes()[:900_000])
     source = open_source(log)
     write_report(source, load_files([RECORDINGS / "push.spatial"], source), tmp_path / "run.html")
     page = page_of(tmp_path / "run.html")
