@@ -31,6 +31,8 @@ _FALLS: Final = 1e-3
 """Generations after which a descent is given up whose least cost does not fall by such a part of itself."""
 _DRAWN: Final = 20
 """Points that CMA-ES draws for each one that is asked for."""
+_PARTS: Final = 3
+"""Rounds of a generation: the model knows the costs of one when it picks the next."""
 _KNOWN: Final = 80
 """Points that the model is fitted to: half of them the best, half the newest."""
 _LENGTHS: Final = (0.15, 0.3, 0.6)
@@ -63,6 +65,9 @@ class Descents:
         self._strategy: Any = None
         self._least, self._stalled = np.inf, 0
         self._asked: list[NDArray[np.float64]] = []
+        # of the generation that is being asked for: what was drawn, and the points and costs so far
+        self._drawn: list[NDArray[np.float64]] = []
+        self._generation: list[tuple[NDArray[np.float64], float]] = []
         self._points: list[NDArray[np.float64]] = []
         self._costs: list[float] = []
 
@@ -78,18 +83,17 @@ class Descents:
             is_found: whether one of them is what is searched for: the next descent then begins elsewhere.
         """
         self._remember(costs)
+        self._generation += zip(self._asked, costs, strict=True)
         if is_found:
             self._strategy = None
         elif self._strategy is None:
             self._strategy = self._descent(self._asked[int(np.argmin(costs))])
             self._least, self._stalled = min(costs), 0
+        elif len(self._generation) < self._strategy.popsize:
+            return
         else:
-            self._strategy.tell(self._asked, list(costs))
-            is_lower = min(costs) < self._least - _FALLS * abs(self._least)
-            self._stalled = 0 if is_lower else self._stalled + 1
-            self._least = min(self._least, *costs)
-            if self._strategy.stop() or self._stalled == _STALLED:
-                self._strategy = None
+            self._end_generation()
+        self._generation, self._drawn = [], []
 
     def _look(self) -> list[NDArray[np.float64]]:
         """Return points of which each tenth of each dimension has one."""
@@ -99,14 +103,31 @@ class Descents:
         ]
         return list(np.array(columns).T)
 
+    def _end_generation(self) -> None:
+        points, costs = map(list, zip(*self._generation, strict=True))
+        self._strategy.tell(points, costs)
+        least = min(costs)
+        is_lower = least < self._least - _FALLS * abs(self._least)
+        self._stalled = 0 if is_lower else self._stalled + 1
+        self._least = min(self._least, least)
+        if self._strategy.stop() or self._stalled == _STALLED:
+            self._strategy = None
+
     def _promising(self) -> list[NDArray[np.float64]]:
-        """Return those points of the descent that the model expects the least costs of."""
-        count = self._strategy.popsize
-        drawn: list[NDArray[np.float64]] = self._strategy.ask(_DRAWN * count)
+        """Return those points of a generation that the model expects the least costs of, a part of it."""
+        size = self._strategy.popsize
+        if not self._drawn:
+            self._drawn = self._strategy.ask(_DRAWN * size)
         expected = expected_costs(
-            np.array(self._points), np.array(self._costs), np.array([each[: self._size] for each in drawn])
+            np.array(self._points),
+            np.array(self._costs),
+            np.array([each[: self._size] for each in self._drawn]),
         )
-        return [drawn[place] for place in np.argsort(expected, kind="stable")[:count]]
+        count = min(-(-size // _PARTS), size - len(self._generation))
+        order = np.argsort(expected, kind="stable").tolist()
+        chosen = [self._drawn[place] for place in order[:count]]
+        self._drawn = [self._drawn[place] for place in sorted(order[count:])]
+        return chosen
 
     def _remember(self, costs: Sequence[float]) -> None:
         """Keep the newest points, and the best of those before them."""

@@ -315,13 +315,18 @@ def _invariants(fit: FittedLimits) -> list[Line]:
 
 def _chain(fit: FittedLimits, goals: Sequence[LimitedRelation]) -> Iterator[Line]:
     """Yield the order in which goals are reached, each before the next."""
+    goals = [each.near for each in goals]
     times, _ = fit.times(goals, fit.good)
-    medians = np.median(times, axis=1) if len(goals) else np.empty(0)
     gaps = {(line.fact, line.later): (line, gap) for line, gap, _ in fit.orders(goals)}
-    reached = [goals[index] for index in np.argsort(medians, kind="stable").tolist()]
+    # what holds from the beginning is not reached
+    reached = [
+        goals[index]
+        for index in np.argsort(np.median(times, axis=1), kind="stable").tolist()
+        if times[index].min() > 0
+    ]
     last: LimitedRelation | None = None
     for first, later in pairwise(reached):
-        key = (last or first).near, later.near
+        key = last or first, later
         if key in gaps:
             yield gaps[key][0]
             last = None

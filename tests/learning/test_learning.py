@@ -75,6 +75,29 @@ def test_good_runs_alone_say_how_they_end_and_what_they_keep() -> None:
     assert verdicts(learned, BAD)[0] == verdicts(learned, BAD)[2] == "violated"
 
 
+def breakfast(off: float) -> sr.Trace:
+    """A bun is put on a plate, cups beside it, and sugar between a tin and a can far from it, one by one."""
+    ends = {"bun": (0.0, off), "cup": (0.2 + off, 0.0), "mug": (-0.2, off), "sugar": (0.9 - off, 0.15)}
+    stays = {"plate": box(-0.05, -0.05, 0.2), "tin": box(1.0, 0.0), "can": box(1.0, 0.3)}
+    samples = []
+    for index in range(80):
+        objects = dict(stays)
+        for place, (name, (x, y)) in enumerate(ends.items()):
+            share = min(max((index - 20 * place) / 4, 0.0), 1.0)
+            objects[name] = box(share * x + (1 - share) * 0.3 * place, share * y - (1 - share), 0.05)
+        samples.append(sr.Sample(index * STEP_NS, objects))
+    return sr.Trace.from_samples(samples)
+
+
+def test_where_objects_end_is_said_by_what_they_are_put_into_beside_and_far_from() -> None:
+    lines = sr.learn([breakfast(each) for each in (0.0, 0.004, 0.01, 0.013, 0.02)]).lines
+    assert "bun ends inside plate" in [line.title for line in lines]
+    for distance in ("sugar dist tin", "can dist sugar", "plate dist sugar"):
+        assert any(line.pattern == "finally" and distance in line.text for line in lines)
+    # in all runs, nothing is put down sooner
+    assert any(line.title.endswith(" apart until bun is inside plate") for line in lines)
+
+
 def test_objects_with_other_names_in_every_run_are_compared_by_their_class() -> None:
     good = [delivery(each, names=f"{{}} {index}") for index, each in enumerate(CLEAR)]
     bad = [delivery(0.4, names="{} x"), delivery(0.3, names="{} y")]
