@@ -78,6 +78,14 @@ def piece(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Resu
     return _Kernel(function, {"no_cpython_wrapper": True, "no_cfunc_wrapper": True})
 
 
+def uncounted(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+    """Return a piece that allocates no array, and so takes no part in the counting of references.
+
+    Its slices cost next to nothing, and a loop over one from its beginning becomes vector instructions.
+    """
+    return _Kernel(function, {"_nrt": False, "no_cpython_wrapper": True, "no_cfunc_wrapper": True})
+
+
 def merged(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
     """Return a piece that becomes part of its callers.
 

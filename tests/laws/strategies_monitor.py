@@ -104,6 +104,13 @@ def windows_of(operands, bounds):
 
 
 _responses = responses(windows_of(_literals, st.one_of(sample_bounds(), time_bounds())))
+nested_windows = responses(
+    windows_of(
+        windows_of(_literals, st.one_of(sample_bounds(), time_bounds())),
+        st.one_of(sample_bounds(), time_bounds()),
+    )
+)
+"""Windows below windows, which are kept at each position that is open."""
 formulas_of_leaves = st.one_of(_responses, _nested(1), _nested(2), _nested(3), _nested(4), _windows_within)
 
 

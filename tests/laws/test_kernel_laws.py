@@ -95,6 +95,7 @@ def replay(*arguments, **environment):
         "(G p >= 0 <-> F not q >= 0) and (H[0,3] p >= 1 xor O q >= 2)",
         "G (p >= 1 -> F[0,700] q >= 1)",
         "G (p >= 1 -> F[0,2] G[0,3] q >= 1)",
+        "G (p >= 1 -> F[0s,0.000000005s] (p >= 2 U[0s,0.00000002s] q >= 1))",
     ],
 )
 def test_a_long_log_at_once_has_the_bits_of_its_parts(formula):

@@ -39,13 +39,15 @@ AHEAD = 16  # added to a code from ONCE on: its mirror image in time (see `finis
 # a = -1 for the left operand of an until that is `true`, of a release that is `false`
 NODE_CODE, NODE_A, NODE_B, NODE_WEAK, NODE_UNIT, NODE_LOW, NODE_HIGH = range(7)
 NODE_VARIABLE, NODE_TABLE, NODE_DEPENDS = 7, 8, 9  # the first two -1 for none
-NODE_WIDTH = 10
+NODE_TIMED = 10  # the number of a window or shift ahead in seconds, -1 for none
+NODE_WIDTH = 11
 # codes of parts' nodes
 LITERAL = 0  # signal a, negated if b
 PART_AND, PART_OR = 2, 3
 UNTIL, RELEASE = 4, 5  # max(b, min(a, next)); min(b, max(a, next))
 PART_WINDOW_MAX, PART_WINDOW_MIN = 6, 7  # of a, over [low, high] ahead
 SHIFT = 8  # a, low ahead; a is wanted up to high ahead
+AHEAD_OF = (PART_WINDOW_MAX, PART_WINDOW_MIN, SHIFT)
 PAST_SINCE, PAST_TRIGGER = 9, 10  # max(b, min(a, previous)); min(b, max(a, previous))
 PAST_WINDOW_MAX, PAST_WINDOW_MIN = 11, 12
 PAST_DELAY = 13
@@ -57,9 +59,10 @@ BINARY_NODES = (
 # columns of parts: nodes, numbers of variables and tables, where its tables and its cells start
 PART_FIRST, PART_END, PART_VARIABLES, PART_TABLES, PART_TABLE_START, PART_CELL_START = range(6)
 PART_KIND, PART_IS_REMEMBERING, PART_END_CORNER = 6, 7, 8  # the corner that ends a run
+PART_IS_NESTED = 9  # whether a node below the root depends on a variable, or any on a table
 # of clauses: signals, whether they join by minimum, and the part beside them, -1 for none
-PART_ENDING, PART_LOWER, PART_UPPER, PART_IS_MINIMUM, PART_BESIDE = 9, 10, 11, 12, 13
-PART_WIDTH = 14
+PART_ENDING, PART_LOWER, PART_UPPER, PART_IS_MINIMUM, PART_BESIDE = 10, 11, 12, 13, 14
+PART_WIDTH = 15
 # kinds of parts
 TABLE, WINDOWED, CLAUSES = 0, 1, 2  # see `tables`, `windows`, `clauses`
 

@@ -26,6 +26,13 @@ ROOM: Final = 64
 _NO_ROOM: Final = -1
 _MOST_DIMENSIONS: Final = 4
 
+# where each array comes in `OnlineRun.arrays`
+_TABLES_AT: Final = Tables(*range(len(Tables._fields)))
+_MEMORY_AT: Final = Memory(*range(len(_TABLES_AT), len(_TABLES_AT) + len(Memory._fields)))
+_SCRATCH_AT: Final = Scratch(*range(_MEMORY_AT.clock + 1, _MEMORY_AT.clock + 1 + len(Scratch._fields)))
+_FINAL: Final = _SCRATCH_AT.nodes + 1
+_ARRAYS: Final = _FINAL + 1
+
 
 class Buffers(NamedTuple):
     """The arrays of runs, one after the other.
@@ -91,46 +98,48 @@ def _layout_of(whole: Integers) -> _Layout:
 def _run_at(numbers: Floats, whole: Integers, at: Integers) -> tuple[Tables, Memory, Scratch, Floats]:
     """Return a run's arrays, in the order of `OnlineRun.arrays`."""
     tables = Tables(
-        signals=_array_2(whole, at[0]),
-        nodes=_array_2(whole, at[1]),
-        parts=_array_2(whole, at[2]),
-        reports=_array_2(whole, at[3]),
-        operands=_array_1(whole, at[4]),
+        signals=_array_2(whole, at[_TABLES_AT.signals]),
+        nodes=_array_2(whole, at[_TABLES_AT.nodes]),
+        parts=_array_2(whole, at[_TABLES_AT.parts]),
+        reports=_array_2(whole, at[_TABLES_AT.reports]),
+        operands=_array_1(whole, at[_TABLES_AT.operands]),
     )
     memory = Memory(
-        history=_array_3(numbers, at[5]),
-        stamps=_array_1(whole, at[6]),
-        running=_array_2(numbers, at[7]),
-        firsts=_array_2(numbers, at[8]),
-        wedges=_array_3(whole, at[9]),
-        wedge_ends=_array_3(whole, at[10]),
-        wedge_next=_array_1(whole, at[11]),
-        heights=_array_4(numbers, at[12]),
-        tables=_array_2(numbers, at[13]),
-        cells=_array_1(whole, at[14]),
-        clock=_array_1(whole, at[15]),
+        history=_array_3(numbers, at[_MEMORY_AT.history]),
+        stamps=_array_1(whole, at[_MEMORY_AT.stamps]),
+        running=_array_2(numbers, at[_MEMORY_AT.running]),
+        firsts=_array_2(numbers, at[_MEMORY_AT.firsts]),
+        wedges=_array_3(whole, at[_MEMORY_AT.wedges]),
+        wedge_ends=_array_3(whole, at[_MEMORY_AT.wedge_ends]),
+        wedge_next=_array_1(whole, at[_MEMORY_AT.wedge_next]),
+        heights=_array_4(numbers, at[_MEMORY_AT.heights]),
+        tables=_array_2(numbers, at[_MEMORY_AT.tables]),
+        cells=_array_1(whole, at[_MEMORY_AT.cells]),
+        columns=_array_3(numbers, at[_MEMORY_AT.columns]),
+        known=_array_2(whole, at[_MEMORY_AT.known]),
+        lows=_array_1(whole, at[_MEMORY_AT.lows]),
+        window_ends=_array_3(whole, at[_MEMORY_AT.window_ends]),
+        window_next=_array_2(whole, at[_MEMORY_AT.window_next]),
+        clock=_array_1(whole, at[_MEMORY_AT.clock]),
     )
     scratch = Scratch(
-        columns=_array_2(numbers, at[16]),
-        low=_array_1(whole, at[17]),
-        high=_array_1(whole, at[18]),
-        plain=_array_1(whole, at[19]),
-        values=_array_1(numbers, at[20]),
-        point=_array_1(numbers, at[21]),
-        order=_array_1(whole, at[22]),
-        starts=_array_1(numbers, at[23]),
-        fresh=_array_1(numbers, at[24]),
-        wedge=_array_1(whole, at[25]),
-        series=_array_2(numbers, at[26]),
-        parts=_array_3(numbers, at[27]),
-        nodes=_array_3(numbers, at[28]),
+        columns=_array_2(numbers, at[_SCRATCH_AT.columns]),
+        low=_array_1(whole, at[_SCRATCH_AT.low]),
+        high=_array_1(whole, at[_SCRATCH_AT.high]),
+        plain=_array_1(whole, at[_SCRATCH_AT.plain]),
+        changed=_array_1(whole, at[_SCRATCH_AT.changed]),
+        values=_array_1(numbers, at[_SCRATCH_AT.values]),
+        point=_array_1(numbers, at[_SCRATCH_AT.point]),
+        order=_array_1(whole, at[_SCRATCH_AT.order]),
+        starts=_array_1(numbers, at[_SCRATCH_AT.starts]),
+        fresh=_array_1(numbers, at[_SCRATCH_AT.fresh]),
+        extrema=_array_2(numbers, at[_SCRATCH_AT.extrema]),
+        ends=_array_2(whole, at[_SCRATCH_AT.ends]),
+        series=_array_2(numbers, at[_SCRATCH_AT.series]),
+        parts=_array_3(numbers, at[_SCRATCH_AT.parts]),
+        nodes=_array_3(numbers, at[_SCRATCH_AT.nodes]),
     )
-    return tables, memory, scratch, _array_2(numbers, at[29])
-
-
-_ARRAYS: Final = 30
-_CLOCK: Final = 15
-_STAMPS: Final = 6
+    return tables, memory, scratch, _array_2(numbers, at[_FINAL])
 
 
 @merged
@@ -139,8 +148,8 @@ def _wanted(whole: Integers, layout: Integers, leaves: Floats, channels: int) ->
     if leaves.shape[0] > channels:
         return int(leaves.shape[0])
     for r in range(layout.shape[0]):
-        clock = _array_1(whole, layout[r, _CLOCK])
-        if clock[KEEPS] and clock[POSITION] - clock[OFFSET] >= layout[r, _STAMPS, 1]:
+        clock = _array_1(whole, layout[r, _MEMORY_AT.clock])
+        if clock[KEEPS] and clock[POSITION] - clock[OFFSET] >= layout[r, _MEMORY_AT.stamps, 1]:
             return _NO_ROOM
     return 0
 
@@ -256,7 +265,7 @@ class LiveRuns:
 
     def _join(self) -> None:
         """Put all arrays into two buffers, unless they are there."""
-        stamps = (run.arrays[_STAMPS] for run in self._runs)
+        stamps = (run.arrays[_MEMORY_AT.stamps] for run in self._runs)
         if any(each.base is not self._buffers.whole for each in stamps):
             self._buffers = _joined(self._runs, self._leaves, self._nodes)
 

@@ -237,6 +237,11 @@ class PartRows:
         return all(row[0] in flat or (row[0] in _RUNNING and row[-1]) for row in self._rows)
 
     @property
+    def is_nested(self) -> bool:
+        """Whether more than the root alone depends on what is to come, or anything on a table."""
+        return self.tables > 1 or any(row[-1] for row in self.fields[:-1])
+
+    @property
     def is_remembering(self) -> bool:
         """Whether a past operator stands over a future one."""
         return any(row[0] in _PAST for row in self._rows)

@@ -47,6 +47,7 @@ class Program:
         windows: how many signals keep a ring of positions.
         table_size: how many numbers the parts' tables hold for one channel.
         cells: how many rows of bookkeeping the parts need.
+        timed: how many windows in seconds parts run over what is open.
         keeps_history: whether any window, delay or part looks at more than the newest sample.
     """
 
@@ -59,6 +60,7 @@ class Program:
     windows: int
     table_size: int
     cells: int
+    timed: int
     keeps_history: bool
 
 
@@ -93,6 +95,7 @@ def compile_formula(formula: Formula) -> Program:
         windows=signals.windows,
         table_size=parts.table_size,
         cells=parts.cells,
+        timed=parts.timed,
         keeps_history=signals.keeps_history or parts.keeps_history,
     )
 
@@ -105,6 +108,7 @@ class _Parts:
         self.node_rows: list[Row] = []
         self.table_size = 0
         self.cells = 0
+        self.timed = 0
         self.keeps_history = False
         self._built: dict[tuple[Row, ...] | Row, int] = {}
 
@@ -115,7 +119,7 @@ class _Parts:
         if own not in self._built:
             self._built[own] = len(self.part_rows)
             end = len(self.node_rows)
-            row = (end, end, 0, 0, self.table_size, self.cells, codes.CLAUSES, 0, 0, *own)
+            row = (end, end, 0, 0, self.table_size, self.cells, codes.CLAUSES, 0, 0, 0, *own)
             self.part_rows.append(row)
         return self._built[own]
 
@@ -137,10 +141,14 @@ class _Parts:
                 codes.TABLE if part.is_flat else codes.WINDOWED,
                 int(part.is_remembering),
                 part.end_corner,
+                int(part.is_nested),
                 *[NOTHING] * 5,
             )
         )
-        self.node_rows.extend(rows)
+        for row in rows:
+            is_timed = row[codes.NODE_CODE] in codes.AHEAD_OF and row[codes.NODE_UNIT] != codes.SAMPLES
+            self.node_rows.append((*row, self.timed if is_timed else NOTHING))
+            self.timed += is_timed
         self.table_size += part.tables << part.variables
         self.cells += 1 + part.variables + part.tables
         self.keeps_history |= not part.is_flat

@@ -11,7 +11,15 @@ import numpy as np
 
 from spatial_replay.compiled import inlined, piece
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.monitor.online.codes import BEGUN, CHANNELS, HISTORICALLY, ONCE, SAMPLES
+from spatial_replay.monitor.online.codes import (
+    BEGUN,
+    CHANNELS,
+    HISTORICALLY,
+    ONCE,
+    PART_KIND,
+    SAMPLES,
+    WINDOWED,
+)
 from spatial_replay.monitor.online.program import Program
 
 TILE = 256
@@ -25,6 +33,9 @@ NUMBERS = 8
 """Numbers of a node at a sample: low and high end of its value, of what it is now, of its value over every
 continuation, and of its value if the run ends there."""
 
+
+LOOKS = 6
+"""How many of these a part with windows computes apart: what it is now comes with its value."""
 
 POSITION, OFFSET, START_NS, KEEPS = range(4)
 CLOCK = 4
@@ -45,6 +56,12 @@ class Memory(NamedTuple):
         heights: (B, CHANNELS, 3, room), numbers beside the positions of the first rings.
         tables: (CHANNELS, ...), the parts' tables (see `tables`).
         cells: the parts' bookkeeping (see `windows`).
+        columns: (LOOKS, D, room), the nodes of the parts with windows at the recent samples, for each number.
+        known: (P, LOOKS), the last sample that each part's columns know, -1 for none.
+        lows: (D,), the first position of each of these nodes that matters.
+        window_ends: (W, 2, room), where the windows in seconds ahead of the recent samples start, and what
+            comes after them.
+        window_next: (W, 3), the next sample to take in, and the next positions whose windows start and end.
         clock: (CLOCK,), the number of samples so far; the one that the recent samples begin with; the time
             of the first; 1 if more than the newest sample is looked at, else 0.
     """
@@ -59,6 +76,11 @@ class Memory(NamedTuple):
     heights: Floats
     tables: Floats
     cells: Integers
+    columns: Floats
+    known: Integers
+    lows: Integers
+    window_ends: Integers
+    window_next: Integers
     clock: Integers
 
 
@@ -66,13 +88,14 @@ class Scratch(NamedTuple):
     """Room to work in, of no meaning between two calls.
 
     Attributes:
-        columns: (D, room), a column per node of a part.
-        low, high, plain: (D,), ranges of positions per node.
+        columns: (D, tile), a column per node of a part.
+        low, high, plain, changed: (D,), positions per node.
         values: (D,), a number per node.
         point, order: (16,), a point at which a table is read.
         starts: values that past operators start from, one per table.
         fresh: a part's next tables.
-        wedge: (room,), positions.
+        extrema: (2, 2 * room), extrema over windows of growing width.
+        ends: (2, room), where windows start and end.
         series: (3, tile), what one part says in one channel.
         parts: (P, NUMBERS, tile), what each part says.
         nodes: (N, NUMBERS, tile), what each node of the tree says.
@@ -82,12 +105,14 @@ class Scratch(NamedTuple):
     low: Integers
     high: Integers
     plain: Integers
+    changed: Integers
     values: Floats
     point: Floats
     order: Integers
     starts: Floats
     fresh: Floats
-    wedge: Integers
+    extrema: Floats
+    ends: Integers
     series: Floats
     parts: Floats
     nodes: Floats
@@ -97,6 +122,7 @@ def first_memory(program: Program, room: int) -> Memory:
     """Return the memory before the first sample, with room for some recent ones."""
     signals = len(program.signals)
     cells = np.zeros(program.cells, np.int64)
+    nodes = len(program.nodes) if has_windows(program) else 0
     for _, _, variables, tables, _, cell, *_ in program.parts:
         cells[cell + 1 + variables : cell + 1 + variables + tables] = -1
     return Memory(
@@ -110,8 +136,18 @@ def first_memory(program: Program, room: int) -> Memory:
         heights=np.zeros((int(np.isin(program.signals[:, 0], BEGUN).sum()), CHANNELS, 3, room)),
         tables=np.zeros((CHANNELS, program.table_size)),
         cells=cells,
+        columns=np.zeros((LOOKS, nodes, room)),
+        known=np.full((len(program.parts), LOOKS), -1),
+        lows=np.zeros(nodes, np.int64),
+        window_ends=np.zeros((program.timed, 2, room), np.int64),
+        window_next=np.full((program.timed, 3), -1),
         clock=np.array([0, 0, 0, int(program.keeps_history)], np.int64),
     )
+
+
+def has_windows(program: Program) -> bool:
+    """Return whether any part is run over what is open."""
+    return bool((program.parts[:, PART_KIND] == WINDOWED).any())
 
 
 def scratch_for(program: Program, room: int, tile: int) -> Scratch:
@@ -119,18 +155,21 @@ def scratch_for(program: Program, room: int, tile: int) -> Scratch:
     widest = max((int(end - first) for first, end, *_ in program.parts), default=0)
     largest = max(((1 << int(part[2])) * int(part[3]) for part in program.parts), default=1)
     most_tables = max((int(part[3]) for part in program.parts), default=1)
-    low, high, plain = np.zeros((3, widest), np.int64)
+    low, high, plain, changed = np.zeros((4, widest), np.int64)
+    open_room = room if has_windows(program) else 0
     return Scratch(
-        columns=np.zeros((widest, max(room, tile))),
+        columns=np.zeros((widest, tile)),
         low=low,
         high=high,
         plain=plain,
+        changed=changed,
         values=np.zeros(max(widest, 1)),
         point=np.zeros(16),
         order=np.zeros(16, np.int64),
         starts=np.zeros(most_tables),
         fresh=np.zeros(largest),
-        wedge=np.zeros(room, np.int64),
+        extrema=np.zeros((2, 2 * open_room)),
+        ends=np.zeros((2, open_room), np.int64),
         series=np.zeros((3, tile)),
         parts=np.zeros((len(program.parts), NUMBERS, tile)),
         nodes=np.zeros((len(program.reports), NUMBERS, tile)),
@@ -146,6 +185,13 @@ def widen(memory: Memory, before: int) -> None:
         if before == 1:
             state[1] = state[0]
         state[2:] = state[:2]
+    _know_no_columns(memory)
+
+
+def _know_no_columns(memory: Memory) -> None:
+    """Have the columns of parts with windows computed again: positions have moved, or there are more."""
+    memory.known[:] = -1
+    memory.window_next[:] = -1
 
 
 def forget(memory: Memory, moved: int, used: int, channels: int) -> None:
@@ -153,6 +199,7 @@ def forget(memory: Memory, moved: int, used: int, channels: int) -> None:
     memory.stamps[: used - moved] = memory.stamps[moved:used].copy()
     history = memory.history[:channels]
     history[:, :, : used - moved] = history[:, :, moved:used].copy()
+    _know_no_columns(memory)
 
 
 def doubled(memory: Memory, channels: int) -> Memory:
@@ -169,7 +216,10 @@ def doubled(memory: Memory, channels: int) -> Memory:
             heights[window, channel][:, entries % (2 * old)] = memory.heights[window, channel][
                 :, entries % old
             ]
+    _know_no_columns(memory)
     return memory._replace(
+        columns=np.zeros((*memory.columns.shape[:2], 2 * old)),
+        window_ends=np.zeros((*memory.window_ends.shape[:2], 2 * old), np.int64),
         stamps=np.concatenate((memory.stamps, np.zeros(old, np.int64))),
         history=history,
         wedges=wedges,
@@ -202,15 +252,6 @@ def first_after(stamps: Integers, offset: int, last: int, position: int, distanc
         else:
             high = middle
     return offset + low
-
-
-@piece
-def first_onward(stamps: Integers, offset: int, last: int, position: int, distance: int, before: int) -> int:
-    """Return `first_after`, searched step by step from its result for the previous position."""
-    origin = stamps[position - offset]
-    while before <= last and stamps[before - offset] - origin < distance:
-        before += 1
-    return before
 
 
 @piece

@@ -32,6 +32,7 @@ from spatial_replay.monitor.online.state import (
     doubled,
     first_memory,
     forget,
+    has_windows,
     scratch_for,
     widen,
 )
@@ -95,7 +96,7 @@ def step_with_windows(
         part = tables.parts[p]
         if part[codes.PART_KIND] == codes.WINDOWED:
             step_windows(
-                tables.nodes, part, memory, scratch, channels, position, offset, count, scratch.parts[p]
+                tables.nodes, part, p, memory, scratch, channels, position, offset, count, scratch.parts[p]
             )
     report(tables.reports, tables.operands, memory, scratch, channels, begin, count, t, results)
     memory.clock[POSITION] = position + count
@@ -147,7 +148,7 @@ class OnlineRun:
     @property
     def has_windows(self) -> bool:
         """Whether `step_with_windows` runs it."""
-        return bool((self._program.parts[:, codes.PART_KIND] == codes.WINDOWED).any())
+        return has_windows(self._program)
 
     @property
     def arrays(self) -> list[AnyArray]:

@@ -2,9 +2,9 @@
 
 Such a part's value at its oldest open positions changes with every sample, so the samples since then are
 stored. Its table (see `tables`) belongs to a *base*: the last position of the root all of whose windows have
-closed. Later positions are run backwards from the newest sample each time, at a cost that depends on how many
-samples the windows span, and read into the table. A past operator with a future operator below it carries a
-table of its own from base to base.
+closed, or that of some samples ago. Later positions are columns of numbers (see `open_windows`), which are
+read into the table. A past operator with a future operator below it carries a table of its own from base to
+base.
 
 A part's cells hold: the base, as the next position to absorb; for each variable, its position in the table;
 for each table of a past operator, the position it belongs to (-1: before the first).
@@ -12,41 +12,37 @@ for each table of a past operator, the position it belongs to (-1: before the fi
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
-from spatial_replay.compiled import inlined, kernel, piece
+from spatial_replay.compiled import inlined, kernel, uncounted
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
+from spatial_replay.monitor.online.open_windows import (
+    Look,
+    Stretch,
+    beyond,
+    bring_up,
+    enter_samples,
+    extremum,
+    join,
+    recent_of,
+    run_shift,
+    run_window,
+)
 from spatial_replay.monitor.online.state import (
     NUMBERS,
     Memory,
     Scratch,
     ahead,
     behind,
-    first_after,
     first_behind,
-    first_onward,
     is_closed,
     last_ahead,
 )
 from spatial_replay.monitor.online.tables import corner_value, read_table
 
-
-class Look(NamedTuple):
-    """How a run over the recent samples sees them.
-
-    Attributes:
-        channel, mirror: the channel whose values it takes, and the one that negation takes them from.
-        mode: what lies beyond the last sample.
-        corner: where mode is `OPEN_CORNER`, the values that the variables have there.
-    """
-
-    channel: int
-    mirror: int
-    mode: int
-    corner: int
+CLOSING = 16
+"""So many samples together are looked at for positions that have closed."""
 
 
 @inlined
@@ -56,7 +52,7 @@ def _cells_of(part: Integers) -> tuple[int, int, int]:
     return base, base + 1, base + 1 + part[codes.PART_VARIABLES]
 
 
-@piece
+@uncounted
 def reach(
     nodes: Integers, part: Integers, memory: Memory, scratch: Scratch, root_low: int, root_high: int,
     offset: int, last: int,
@@ -130,34 +126,6 @@ def _operands_reach(
 
 
 @inlined
-def _beyond(mode: int, weak: int) -> float:
-    """Return the value an operator that is still open takes from beyond the last sample."""
-    if mode == codes.OPEN_END:
-        return np.inf if weak else -np.inf
-    return np.inf if mode == codes.OPEN_HIGH else -np.inf
-
-
-@inlined
-def _run_boolean(
-    node: Integers, columns: Floats, target: Floats, history: Floats, look: Look, begin: int, end: int
-) -> None:
-    """Run a literal, a conjunction or a disjunction."""
-    code, a, b = node[codes.NODE_CODE], node[codes.NODE_A], node[codes.NODE_B]
-    if code == codes.PART_AND:
-        for k in range(begin, end):
-            target[k] = min(columns[a, k], columns[b, k])
-    elif code == codes.PART_OR:
-        for k in range(begin, end):
-            target[k] = max(columns[a, k], columns[b, k])
-    elif b:
-        for k in range(begin, end):
-            target[k] = -history[look.mirror, a, k]
-    else:
-        for k in range(begin, end):
-            target[k] = history[look.channel, a, k]
-
-
-@inlined
 def _run_recurrence(
     node: Integers, columns: Floats, target: Floats, start: float, begin: int, end: int, step: int
 ) -> None:
@@ -173,75 +141,18 @@ def _run_recurrence(
         target[k] = value
 
 
-@piece
-def _run_window(
-    node: Integers, source: Floats, target: Floats, low: int, high: int, stamps: Integers, offset: int,
-    last: int, mode: int, wedge: Integers,
-) -> None:  # fmt: skip
-    """Run a bounded operator at low … high: the extremum of `source` over the window ahead or behind."""
-    unit, near, far = node[codes.NODE_UNIT], node[codes.NODE_LOW], node[codes.NODE_HIGH]
-    is_ahead = node[codes.NODE_CODE] in (codes.PART_WINDOW_MAX, codes.PART_WINDOW_MIN)
-    sign = 1.0 if node[codes.NODE_CODE] in (codes.PART_WINDOW_MAX, codes.PAST_WINDOW_MAX) else -1.0
-    nearest, beyond_farthest = (near, far + 1) if is_ahead else (-far, 1 - near)
-    head = tail = entering = 0
-    start = after = offset
-    if unit != codes.SAMPLES:
-        newest = last if is_ahead else low
-        start = first_after(stamps, offset, newest, low, nearest)
-        after = first_after(stamps, offset, newest, low, beyond_farthest)
-    for position in range(low, high + 1):
-        if unit == codes.SAMPLES:
-            start, after = max(position + nearest, offset), min(position + beyond_farthest, last + 1)
-        else:
-            newest = last if is_ahead else position
-            start = first_onward(stamps, offset, newest, position, nearest, start)
-            after = first_onward(stamps, offset, newest, position, beyond_farthest, after)
-        entering = max(entering, start)
-        while entering < after:
-            value = sign * source[entering - offset]
-            while tail > head and sign * source[wedge[tail - 1] - offset] <= value:
-                tail -= 1
-            wedge[tail] = entering
-            tail += 1
-            entering += 1
-        while tail > head and wedge[head] < start:
-            head += 1
-        result = source[wedge[head] - offset] if tail > head else -sign * np.inf
-        if is_ahead and not is_closed(stamps, offset, last, position, unit, far):
-            beyond = _beyond(mode, node[codes.NODE_WEAK])
-            result = max(result, beyond) if sign > 0 else min(result, beyond)
-        target[position - offset] = result
-
-
-@inlined
-def _run_shift(
-    node: Integers, source: Floats, target: Floats, low: int, high: int, stamps: Integers, offset: int,
-    last: int, mode: int,
-) -> None:  # fmt: skip
-    """Run a shift or a delay at positions low … high: `source` at a distance ahead or behind."""
-    unit, distance = node[codes.NODE_UNIT], node[codes.NODE_LOW]
-    is_ahead = node[codes.NODE_CODE] == codes.SHIFT
-    missing = _beyond(mode if is_ahead else codes.OPEN_END, node[codes.NODE_WEAK])
-    for position in range(low, high + 1):
-        if is_ahead:
-            at = ahead(stamps, offset, last, position, unit, distance)
-        else:
-            at = behind(stamps, offset, position, unit, distance)
-        target[position - offset] = source[at - offset] if offset <= at <= last else missing
-
-
 @inlined
 def _run_until(
-    node: Integers, part: Integers, target: Floats, low: int, high: int, look: Look, memory: Memory,
-    scratch: Scratch, offset: int,
+    node: Integers, part: Integers, columns: Floats, target: Floats, low: int, high: int, look: Look,
+    memory: Memory, scratch: Scratch, offset: int,
 ) -> None:  # fmt: skip
     """Run an unbounded until or release at low … high; its variable's value goes to the point."""
     variable = node[codes.NODE_VARIABLE]
     if look.mode == codes.OPEN_CORNER:
         after = corner_value(look.corner, variable) if variable >= 0 else -np.inf
     else:
-        after = _beyond(look.mode, node[codes.NODE_WEAK])
-    _run_recurrence(node, scratch.columns, target, after, high - offset, low - offset - 1, -1)
+        after = beyond(look.mode, node[codes.NODE_WEAK])
+    _run_recurrence(node, columns, target, after, high - offset, low - offset - 1, -1)
     if variable >= 0:
         boundary = memory.cells[_cells_of(part)[1] + variable]
         scratch.point[variable] = target[boundary - offset] if boundary <= high else after
@@ -249,8 +160,8 @@ def _run_until(
 
 @inlined
 def _run_since(
-    node: Integers, part: Integers, tables: Floats, target: Floats, high: int, memory: Memory,
-    scratch: Scratch, offset: int,
+    node: Integers, part: Integers, tables: Floats, columns: Floats, target: Floats, high: int,
+    memory: Memory, scratch: Scratch, offset: int,
 ) -> None:  # fmt: skip
     """Run an unbounded since or trigger from the position of its table up to `high`."""
     table, variables = node[codes.NODE_TABLE], part[codes.PART_VARIABLES]
@@ -261,59 +172,201 @@ def _run_since(
         at = table << variables
         value = read_table(tables[at : at + (1 << variables)], variables, scratch.point, scratch.order)
     scratch.starts[table] = value
-    _run_recurrence(node, scratch.columns, target, value, start + 1 - offset, high - offset + 1, 1)
+    _run_recurrence(node, columns, target, value, start + 1 - offset, high - offset + 1, 1)
 
 
-@piece
-def _run_columns(
-    nodes: Integers, part: Integers, tables: Floats, look: Look, memory: Memory, scratch: Scratch,
-    offset: int, last: int,
+@uncounted
+def _run_dependent(
+    nodes: Integers, part: Integers, tables: Floats, columns: Floats, look: Look, low: Integers,
+    high: Integers, memory: Memory, scratch: Scratch, offset: int, last: int,
 ) -> None:  # fmt: skip
-    """Run every node of a part over the positions that matter, operands first.
+    """Run the nodes of a part that depend on a variable or a table, over the positions that matter.
 
     `scratch.point` receives the variables' values where the table's base ends, `scratch.starts` the
     values that past operators start from.
     """
-    first, stamps, columns = part[codes.PART_FIRST], memory.stamps, scratch.columns
+    first = part[codes.PART_FIRST]
     for d in range(first, part[codes.PART_END]):
         node = nodes[d]
-        if look.corner > 0 and not node[codes.NODE_DEPENDS]:
-            continue  # the same at every corner
-        code, target = node[codes.NODE_CODE], columns[d - first]
-        low, high = scratch.low[d - first], scratch.high[d - first]
-        if code in (codes.LITERAL, codes.PART_AND, codes.PART_OR):
-            begin, end = low - offset, high - offset + 1
-            _run_boolean(node, columns, target, memory.history, look, begin, end)
+        if not node[codes.NODE_DEPENDS]:
+            continue
+        code, a, b, target = node[0], node[codes.NODE_A], node[codes.NODE_B], columns[d - first]
+        own_low, own_high = low[d - first], high[d - first]
+        begin, end = own_low - offset, own_high - offset + 1
+        if code in (codes.PART_AND, codes.PART_OR):
+            one, two = columns[a, begin:end], columns[b, begin:end]
+            join(code == codes.PART_OR, one, two, target[begin:end])
         elif code in (codes.UNTIL, codes.RELEASE):
-            _run_until(node, part, target, low, high, look, memory, scratch, offset)
+            _run_until(node, part, columns, target, own_low, own_high, look, memory, scratch, offset)
         elif code in (codes.PAST_SINCE, codes.PAST_TRIGGER):
-            _run_since(node, part, tables, target, high, memory, scratch, offset)
+            _run_since(node, part, tables, columns, target, own_high, memory, scratch, offset)
         elif code in (codes.SHIFT, codes.PAST_DELAY):
-            source = columns[node[codes.NODE_A]]
-            _run_shift(node, source, target, low, high, stamps, offset, last, look.mode)
+            run_shift(
+                node, columns[a], target, own_low, own_high + 1, look.mode, memory.stamps,
+                memory.window_ends, memory.window_next, offset, last,
+            )  # fmt: skip
         else:
-            source = columns[node[codes.NODE_A]]
-            _run_window(node, source, target, low, high, stamps, offset, last, look.mode, scratch.wedge)
+            run_window(
+                node, columns[a], target, own_low, own_high + 1, look.mode, recent_of(memory, scratch),
+                offset, last,
+            )  # fmt: skip
+
+
+@inlined
+def _look_of(which: int, channels: int) -> Look:
+    """Return how a part is seen for one of its numbers."""
+    nominal_high = 1 if channels > 1 else 0
+    wide_low = 2 if channels > 2 else 0
+    channel = (0 if which < 2 else wide_low) + (nominal_high if which % 2 else 0)
+    mode = codes.OPEN_LOW if which == 4 else codes.OPEN_HIGH if which == 5 else codes.OPEN_END
+    return Look(channel, channel ^ nominal_high, mode, 0)
+
+
+@inlined
+def _bring_columns_up(
+    nodes: Integers, part: Integers, number: int, which: int, look: Look, memory: Memory, scratch: Scratch,
+    offset: int, last: int,
+) -> None:  # fmt: skip
+    """Bring a part's columns for one of its numbers up to the last sample."""
+    at = which if which < 2 else which - 2
+    known = memory.known[number, at]
+    if known < 0:
+        _find_lows(nodes, part, memory, scratch, offset, last)
+    if known < last:
+        columns = memory.columns[at, part[codes.PART_FIRST] : part[codes.PART_END]]
+        stretch = Stretch(offset, last, max(known + 1, offset))
+        bring_up(nodes, part, columns, look, recent_of(memory, scratch), stretch)
+        memory.known[number, at] = last
+
+
+@uncounted
+def _bring_looks_up(
+    nodes: Integers, part: Integers, number: int, channels: int, memory: Memory, scratch: Scratch,
+    offset: int, last: int,
+) -> None:  # fmt: skip
+    """Bring the columns for one number of each channel up to the last sample."""
+    for channel in range(channels):
+        which = channel if channel < 2 else channel + 2
+        look = _look_of(which, channels)
+        _bring_columns_up(nodes, part, number, which, look, memory, scratch, offset, last)
+
+
+@uncounted
+def _find_lows(
+    nodes: Integers, part: Integers, memory: Memory, scratch: Scratch, offset: int, last: int
+) -> None:
+    """Enter the first position of each node that still matters."""
+    base = min(memory.cells[part[codes.PART_CELL_START]], last)
+    reach(nodes, part, memory, scratch, base, last, offset, last)
+    for d in range(part[codes.PART_FIRST], part[codes.PART_END]):
+        memory.lows[d] = scratch.low[d - part[codes.PART_FIRST]]
+
+
+@uncounted
+def _root_value(root: Integers, columns: Floats, after: float, first: int, last: int, offset: int) -> float:
+    """Return an unbounded until or release at `first`, given what it is after `last`."""
+    a, b, is_until = root[codes.NODE_A], root[codes.NODE_B], root[codes.NODE_CODE] == codes.UNTIL
+    if a < 0:
+        return extremum(is_until, columns[b, first - offset : last + 1 - offset], after)
+    value = after
+    for k in range(last - offset, first - offset - 1, -1):
+        if is_until:
+            value = max(columns[b, k], min(columns[a, k], value))
+        else:
+            value = min(columns[b, k], max(columns[a, k], value))
+    return value
+
+
+@inlined
+def _is_plain(nodes: Integers, part: Integers) -> bool:
+    """Return whether the root is all that depends on a variable."""
+    return part[codes.PART_VARIABLES] == 1 and not part[codes.PART_IS_NESTED]
 
 
 @inlined
 def _value_at_first(
-    nodes: Integers, part: Integers, tables: Floats, look: Look, memory: Memory, scratch: Scratch,
-    offset: int, last: int,
+    nodes: Integers, part: Integers, number: int, which: int, channels: int, memory: Memory,
+    scratch: Scratch, offset: int, last: int,
 ) -> float:  # fmt: skip
-    """Return the part's value at the first sample, given a run over the recent ones."""
-    _run_columns(nodes, part, tables, look, memory, scratch, offset, last)
-    if memory.cells[part[codes.PART_CELL_START]] == 0:
-        return float(scratch.columns[part[codes.PART_END] - 1 - part[codes.PART_FIRST], 0 - offset])
-    variables = part[codes.PART_VARIABLES]
+    """Return one of a part's numbers at the first sample."""
+    look = _look_of(which, channels)
+    base, variables = memory.cells[part[codes.PART_CELL_START]], part[codes.PART_VARIABLES]
+    tables = memory.tables[look.channel, part[codes.PART_TABLE_START] : _tables_end(part)]
+    at = which if which < 2 else which - 2
+    columns = memory.columns[at, part[codes.PART_FIRST] : part[codes.PART_END]]
+    root = nodes[part[codes.PART_END] - 1]
+    is_plain, value = _is_plain(nodes, part), beyond(look.mode, root[codes.NODE_WEAK])
+    # where anything may still come to outdo the rest, the rest makes no difference
+    is_known = is_plain and root[codes.NODE_A] < 0 and look.mode != codes.OPEN_END
+    if not (is_known and (look.mode == codes.OPEN_HIGH) == (root[codes.NODE_CODE] == codes.UNTIL)):
+        _bring_columns_up(nodes, part, number, which, look, memory, scratch, offset, last)
+        if is_plain:
+            value = _root_value(root, columns, value, base, last, offset)
+    if is_plain:
+        return value if base == 0 else max(tables[0], min(value, tables[1]))
+    if part[codes.PART_IS_NESTED]:
+        low = memory.lows[part[codes.PART_FIRST] : part[codes.PART_END]]
+        scratch.high[: len(low)] = last
+        _run_dependent(nodes, part, tables, columns, look, low, scratch.high, memory, scratch, offset, last)
+    if base == 0:
+        return float(columns[len(columns) - 1, 0 - offset])
     return read_table(tables[: 1 << variables], variables, scratch.point, scratch.order)
 
 
-@piece
+@uncounted
 def _absorb(
+    nodes: Integers, part: Integers, number: int, memory: Memory, scratch: Scratch, channels: int,
+    offset: int, last: int,
+) -> None:  # fmt: skip
+    """Move the base forward over every position whose windows have all closed."""
+    base = _cells_of(part)[0]
+    before = memory.cells[base]
+    # of closed positions a column holds the same whatever is open, so that any look of a channel will do
+    _bring_looks_up(nodes, part, number, channels, memory, scratch, offset, last)
+    if part[codes.PART_IS_NESTED]:
+        _absorb_nested(nodes, part, memory, scratch, channels, offset, last)
+    else:
+        _absorb_plain(nodes, part, memory, scratch, channels, offset, last)
+    if memory.cells[base] > before:
+        _find_lows(nodes, part, memory, scratch, offset, last)
+
+
+@uncounted
+def _absorb_plain(
     nodes: Integers, part: Integers, memory: Memory, scratch: Scratch, channels: int, offset: int, last: int
 ) -> None:
-    """Move the base forward over every position whose windows have all closed."""
+    """Absorb what has closed, many positions at a time, where no more than the root has a variable."""
+    base, boundary, _ = _cells_of(part)
+    cells, root, size = memory.cells, nodes[part[codes.PART_END] - 1], CLOSING
+    nodes_of_part = part[codes.PART_END] - part[codes.PART_FIRST]
+    while size > 0:
+        first, newest = cells[base], cells[base] + size - 1
+        if newest > last or not reach(nodes, part, memory, scratch, newest, newest, offset, last):
+            size //= 2
+            continue
+        for channel in range(channels):
+            columns = memory.columns[channel, part[codes.PART_FIRST] : part[codes.PART_END]]
+            tables = memory.tables[channel, part[codes.PART_TABLE_START] : _tables_end(part)]
+            if part[codes.PART_VARIABLES] == 0:
+                if first == 0:
+                    tables[0] = columns[nodes_of_part - 1, 0 - offset]
+                continue
+            worst = _root_value(root, columns, -np.inf, first, newest, offset)
+            best = _root_value(root, columns, np.inf, first, newest, offset)
+            if first > 0:
+                low, high = tables[0], tables[1]
+                worst, best = max(low, min(worst, high)), max(low, min(best, high))
+            tables[0], tables[1] = worst, best
+        cells[base] = newest + 1
+        if part[codes.PART_VARIABLES] > 0:
+            cells[boundary] = newest + 1
+
+
+@uncounted
+def _absorb_nested(
+    nodes: Integers, part: Integers, memory: Memory, scratch: Scratch, channels: int, offset: int, last: int
+) -> None:
+    """Absorb what has closed, position by position."""
     base, boundaries, states = _cells_of(part)
     cells = memory.cells
     while cells[base] <= last:
@@ -335,34 +388,41 @@ def _absorb(
         cells[base] += 1
 
 
-@piece
+@uncounted
 def _renew_tables(
     nodes: Integers, part: Integers, channel: int, mirror: int, memory: Memory, scratch: Scratch,
     offset: int, last: int,
 ) -> None:  # fmt: skip
     """Renew the tables of a part, in one channel, after adding the position at its base."""
-    first, fresh, size = part[codes.PART_FIRST], scratch.fresh, 1 << part[codes.PART_VARIABLES]
-    states = _cells_of(part)[2]
-    tables = _tables_of(part, channel, memory)
+    first, end, variables = part[codes.PART_FIRST], part[codes.PART_END], part[codes.PART_VARIABLES]
+    fresh, size = scratch.fresh, 1 << variables
+    base, _, states = _cells_of(part)
+    tables = memory.tables[channel, part[codes.PART_TABLE_START] : _tables_end(part)]
+    columns = memory.columns[channel, first:end]
     for corner in range(size):
         look = Look(channel, mirror, codes.OPEN_CORNER, corner)
-        fresh[corner] = _value_at_first(nodes, part, tables, look, memory, scratch, offset, last)
-        for d in range(first, part[codes.PART_END]):
+        _run_dependent(
+            nodes, part, tables, columns, look, scratch.low, scratch.high, memory, scratch, offset, last
+        )
+        if memory.cells[base] == 0:
+            fresh[corner] = columns[end - 1 - first, 0 - offset]
+        else:
+            fresh[corner] = read_table(tables[:size], variables, scratch.point, scratch.order)
+        for d in range(first, end):
             table = nodes[d, codes.NODE_TABLE]
             if table >= 0:
                 state = scratch.plain[d - first] - 1
                 is_new = state > memory.cells[states + table]
-                value = scratch.columns[d - first, state - offset] if is_new else scratch.starts[table]
+                value = columns[d - first, state - offset] if is_new else scratch.starts[table]
                 fresh[table * size + corner] = value
     for k in range(len(tables)):
         tables[k] = fresh[k]
 
 
-@piece
-def _tables_of(part: Integers, channel: int, memory: Memory) -> Floats:
-    """Return a part's own table and those of its past operators, one after the other."""
-    start = part[codes.PART_TABLE_START]
-    return memory.tables[channel, start : start + (part[codes.PART_TABLES] << part[codes.PART_VARIABLES])]
+@inlined
+def _tables_end(part: Integers) -> int:
+    """Return where a part's own table and those of its past operators end; they begin with its own."""
+    return int(part[codes.PART_TABLE_START] + (part[codes.PART_TABLES] << part[codes.PART_VARIABLES]))
 
 
 @inlined
@@ -372,29 +432,27 @@ def _is_settled(part: Integers, memory: Memory) -> bool:
     return bool(without_state and memory.cells[part[codes.PART_CELL_START]] > 0)
 
 
-@piece
+@uncounted
 def step_windows(
-    nodes: Integers, part: Integers, memory: Memory, scratch: Scratch, channels: int, position: int,
-    offset: int, count: int, numbers: Floats,
+    nodes: Integers, part: Integers, number: int, memory: Memory, scratch: Scratch, channels: int,
+    position: int, offset: int, count: int, numbers: Floats,
 ) -> None:  # fmt: skip
     """Run a part with windows over `count` samples, the first of them at `position`.
 
     Args:
+        number: of the part.
         numbers: (NUMBERS, TILE), filled with the part's numbers; those of an ending run for the last sample.
     """
-    nominal_high = 1 if channels > 1 else 0
-    wide_low = 2 if channels > 2 else 0
-    nodes_of_part = part[codes.PART_END] - part[codes.PART_FIRST]
+    root = nodes[part[codes.PART_END] - 1]
     for k in range(count):
         last = position + k
         if _is_settled(part, memory):
             for which in range(NUMBERS):
-                channel = (0 if which < 4 else wide_low) + (nominal_high if which % 2 else 0)
-                numbers[which, k] = _tables_of(part, channel, memory)[0]
+                channel = _look_of(which, channels).channel
+                numbers[which, k] = memory.tables[channel, part[codes.PART_TABLE_START]]
             continue
-        base = min(memory.cells[part[codes.PART_CELL_START]], last)
-        reach(nodes, part, memory, scratch, base, last, offset, last)
-        scratch.high[:nodes_of_part] = last
+        if len(memory.window_next):
+            enter_samples(nodes, part, memory.stamps, memory.window_ends, memory.window_next, offset, last)
         for which in range(NUMBERS):
             # numbers 2 and 3 (now) come with 0 and 1; those of an ending run count for the last sample only
             if which in (2, 3) or (which >= 6 and k < count - 1):
@@ -405,14 +463,18 @@ def step_windows(
             if which >= 6 and channels < 4:
                 numbers[which, k] = numbers[which - 6, k]
                 continue
-            channel = (0 if which < 2 else wide_low) + (nominal_high if which % 2 else 0)
-            mode = codes.OPEN_LOW if which == 4 else codes.OPEN_HIGH if which == 5 else codes.OPEN_END
-            look = Look(channel, channel ^ nominal_high, mode, 0)
-            tables = _tables_of(part, channel, memory)
-            numbers[which, k] = _value_at_first(nodes, part, tables, look, memory, scratch, offset, last)
+            numbers[which, k] = _value_at_first(
+                nodes, part, number, which, channels, memory, scratch, offset, last
+            )
             if which < 2 and part[codes.PART_IS_REMEMBERING]:
-                numbers[which + 2, k] = scratch.columns[nodes_of_part - 1, last - offset]
-        _absorb(nodes, part, memory, scratch, channels, offset, last)
+                columns = memory.columns[which, part[codes.PART_FIRST] : part[codes.PART_END]]
+                if _is_plain(nodes, part):
+                    after = beyond(codes.OPEN_END, root[codes.NODE_WEAK])
+                    numbers[which + 2, k] = _root_value(root, columns, after, last, last, offset)
+                else:
+                    numbers[which + 2, k] = columns[len(columns) - 1, last - offset]
+        if last % CLOSING == CLOSING - 1:
+            _absorb(nodes, part, number, memory, scratch, channels, offset, last)
 
 
 @kernel
