@@ -21,7 +21,7 @@ from spatial_replay.lazy import Displayed, drawn_as_svg
 MAX_PROPOSITIONS = 64
 """How many propositions an automaton reads at most."""
 
-MAX_ROWS = 200_000
+MAX_ROWS = 300_000
 """How many states an automaton has at most, and how many decisions."""
 
 _OF_MOVES = {"_moves", "_above", "distances", "can_accept", "can_reject", "transitions", "is_listable"}

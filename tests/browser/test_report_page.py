@@ -50,7 +50,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Path]:
     write_report(open_source(folder / "layers.mcap"), [], folder / "layers.html")
     report_of_recording(folder / "edited.html", "push.mcap", "push_edited.spatial")
     broken = folder / "broken.mcap"
-    broken.write_bytes((RECORDINGS / "push.mcap").read_bytes()[:300_000])
+    broken.write_bytes((RECORDINGS / "push.mcap").read_bytes()[:900_000])
     source = open_source(broken)
     files = load_files([RECORDINGS / "push.spatial"], source)
     write_report(source, files, folder / "damaged.html")

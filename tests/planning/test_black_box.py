@@ -166,7 +166,7 @@ def test_verify_notices_that_a_log_without_a_hash_of_its_plan_settings_has_none(
 
 
 def with_plan(log, output, plan, is_hashed=True):
-    """Copy a log with other plan settings, or without any; and with their hash, unless told otherwise."""
+    """Copy a log with other plan settings, or without any; `is_hashed` says whether their hash is kept."""
     source = open_source(log)
     with output.open("wb") as stream, LogWriter(stream) as writer:
         for block in source.iter_blocks():
