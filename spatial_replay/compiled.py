@@ -43,6 +43,8 @@ _GUESS_S: Final = 2e-6
 """For each element of its arrays, the time a kernel is expected to take when it was never run."""
 _LONG: Final = 3.0
 """How many times that a kernel takes whose calls are long: it works on pairs of elements."""
+_COPYING: Final = 0.01
+"""The same of a kernel that copies bytes: it takes many at once."""
 _CALL: Final = 32
 """As many elements take as long as what a call costs anyway."""
 _STALE_S: Final = 7 * 24 * 3600.0
@@ -59,7 +61,12 @@ def long_kernel(function: Callable[_Arguments, _Result]) -> Callable[_Arguments,
 
     Not for short calls: each would hand the interpreter to a busy thread, which keeps it for milliseconds.
     """
-    return _Kernel(function, {"nogil": True})
+    return _Kernel(function, {"nogil": True}, times=_LONG)
+
+
+def copying_kernel(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
+    """Return a long kernel that copies bytes and takes whole slices, which the interpreter does as fast."""
+    return _Kernel(function, {"nogil": True}, times=_COPYING)
 
 
 def elementwise(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
@@ -70,7 +77,7 @@ def elementwise(function: Callable[_Arguments, _Result]) -> Callable[_Arguments,
     divide by zero.
     """
     kernel = cast("_Kernel[_Arguments, _Result]", function)
-    return _Kernel(kernel.__wrapped__, kernel.options, is_elementwise=True)
+    return _Kernel(kernel.__wrapped__, kernel.options, is_elementwise=True, times=kernel.times)
 
 
 def piece(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
@@ -182,12 +189,13 @@ class _Kernel(Generic[_Arguments, _Result]):
         options: dict[str, Any],
         *,
         is_elementwise: bool = False,
+        times: float = 1.0,
     ) -> None:
         self.__wrapped__ = function
         self.__name__ = function.__name__
         self.__doc__ = function.__doc__
         self.__module__ = function.__module__
-        self.options = options
+        self.options, self.times = options, times
         self._is_elementwise = is_elementwise
         self._compiled: Callable[_Arguments, _Result] | None = None
         self._interpreted: Callable[_Arguments, _Result] | None = None
@@ -226,8 +234,8 @@ class _Kernel(Generic[_Arguments, _Result]):
             return _process.only == "interpreted"
         if not _process.interprets:
             return False
-        guess = _GUESS_S * (_LONG if "nogil" in self.options else 1.0)
-        cost = self._spent_s + elements * (guess if self._element_s is None else self._element_s)
+        guess = _GUESS_S * self.times if self._element_s is None else self._element_s
+        cost = self._spent_s + elements * guess
         if not _process.has_compiler:
             cost -= _COMPILER_S
         # asked last, since looking for the cache takes its time, too

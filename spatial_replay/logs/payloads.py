@@ -130,16 +130,6 @@ class Filled:
         """Encode some of the messages, (k, L) uint8."""
         return self.template.fill(self.words[rows], self.marks[rows])
 
-    def write(self, content: memoryview, begins: Integers, rows: Integers) -> None:
-        """Fill in some of the messages (k,) at `begins` (k,), where content holds the pattern."""
-        if self.words.size:
-            # any 8 bytes of the content, as a word
-            anywhere: NDArray[np.void] = np.ndarray((len(content) - 7,), "V8", content, 0, (1,))
-            anywhere[begins[:, None] + self.template.word_offsets] = self.words.view("V8")[rows]
-        if self.marks.size:
-            everywhere = np.frombuffer(content, np.uint8)
-            everywhere[begins[:, None] + self.template.mark_offsets] = self.marks[rows]
-
 
 Part: TypeAlias = "Filled | Sequence[bytes]"
 

@@ -6,6 +6,7 @@ import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Protocol, TypeAlias
 
@@ -19,7 +20,7 @@ from spatial_replay.geometry.contact import contacts
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
 from spatial_replay.geometry.measure import Operand
 from spatial_replay.logs.mcap.writer import LogWriter
-from spatial_replay.logs.messages import MemorySink, Messages
+from spatial_replay.logs.messages import Messages
 from spatial_replay.logs.output_file import Durability, open_output
 from spatial_replay.logs.topics import PLAN_METADATA
 from spatial_replay.recording.recording import Recording, RunEvent
@@ -207,7 +208,8 @@ def warm_up(files: Sequence[Specification], automata: Sequence[SpecAutomaton]) -
         automata: those of the specifications, which are not compiled again.
     """
     compile_ahead()
-    recording = Recording(MemorySink(), files, known=automata)
+    writer = LogWriter(BytesIO())
+    recording = Recording(writer, files, known=automata)
     objects = ["object", *(name for file in files for name in object_names(file))]
     signals = {name: 0.0 for file in files for name in signal_names(file)}
     samples = [
@@ -226,6 +228,7 @@ def warm_up(files: Sequence[Specification], automata: Sequence[SpecAutomaton]) -
     # without objects: intervals of unknown atoms run code of their own
     recording.add(Trace.from_samples([Sample(10**10, {})]))
     recording.end()
+    writer.close()
     # the arrow at a violation, of which these samples may have none
     shapes = FootprintBatch.from_footprints([Footprint.box(x, 0, x + 1, 1) for x in range(2)])
     contacts(shapes, *(Operand(np.array([[row]])) for row in range(2)), is_protrusion=False)

@@ -23,15 +23,9 @@ from mcap import records
 from spatial_replay.compiled import cores
 from spatial_replay.errors import OutputError
 from spatial_replay.geometry.arrays import Integers
+from spatial_replay.logs.mcap.chunk_content import Batch, MessageRange, OpenChunk
 from spatial_replay.logs.mcap.chunk_records import encoded
-from spatial_replay.logs.mcap.packing import (
-    Batch,
-    McapSummary,
-    MessageRange,
-    OpenChunk,
-    PackedChunk,
-    pack,
-)
+from spatial_replay.logs.mcap.packing import McapSummary, PackedChunk, pack
 from spatial_replay.logs.messages import Channel, Messages, Schema, messages_of, select
 from spatial_replay.logs.output_file import output_error
 from spatial_replay.logs.topics import LIBRARY, MAGIC, OWN_PREFIX
