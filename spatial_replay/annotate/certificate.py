@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from spatial_replay import __version__
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.messages import Messages
+from spatial_replay.logs.payloads import side_by_side
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.spec.format import format_specification
 from spatial_replay.spec.formula import Specification
@@ -41,9 +42,9 @@ class Hashing:
         self._waiting: deque[tuple[int, Future[None]]] = deque()
         self._waiting_bytes = 0
 
-    def update(self, hashed: hashlib._Hash, buffer: bytes | NDArray[np.generic]) -> None:
+    def update(self, hashed: hashlib._Hash, buffer: bytes | memoryview | NDArray[np.generic]) -> None:
         """Take a buffer, which must not change afterwards, into a hash."""
-        size = len(buffer) if isinstance(buffer, bytes) else buffer.nbytes
+        size = buffer.nbytes if isinstance(buffer, np.ndarray) else len(buffer)
         while self._waiting and (
             len(self._waiting) >= _MOST_WAITING or self._waiting_bytes + size > _MOST_WAITING_BYTES
         ):
@@ -139,14 +140,13 @@ class MessageHash:
         codes = codes[messages.channel]
         for code in np.flatnonzero(np.bincount(codes)).tolist():
             rows = np.flatnonzero(codes == code)
-            payloads = [messages.payloads[row] for row in rows.tolist()]
-            lengths = np.fromiter(map(len, payloads), np.int64, len(payloads))
+            lengths, payloads = side_by_side(messages.payloads, rows)
             hashes = self._topics.setdefault(
                 topics[code], (hashlib.sha256(), hashlib.sha256(), hashlib.sha256())
             )
             self._hashing.update(hashes[0], _integers(messages.log_time_ns[rows]))
             self._hashing.update(hashes[1], _integers(lengths))
-            self._hashing.update(hashes[2], b"".join(payloads))
+            self._hashing.update(hashes[2], payloads)
 
     def hexdigest(self) -> str:
         self._hashing.finish()

@@ -332,13 +332,30 @@ _POWERS: Final = np.array([float(f"1e{digits}") for digits in range(20)])
 _POWERS.flags.writeable = False
 
 
+_TOGETHER: Final = 4096
+"""Numbers that are rounded at once: all passes over them stay within the processor's cache."""
+
+
 def rounded(numbers: Floats) -> Floats:
     """Return numbers with four digits, so that viewers print them short; very large and small ones stay."""
+    shown = np.array(numbers, np.float64, order="C")
+    flat = shown.reshape(-1)
+    for begin in range(0, len(flat), _TOGETHER):
+        part = flat[begin : begin + _TOGETHER]
+        part[:] = _rounded(part)
+    return shown
+
+
+def _rounded(numbers: Floats) -> Floats:
     size = np.abs(numbers)
     is_usual = (size >= 1e-15) & (size < 1e15)
-    digits = 3.0 - np.floor(np.log10(np.where(is_usual, size, 1.0)))
-    power = _POWERS[np.abs(digits).astype(np.int64)]
-    usual = np.where(is_usual, numbers, 0.0)
+    usual = numbers
+    if not is_usual.all():
+        size, usual = np.where(is_usual, size, 1.0), np.where(is_usual, numbers, 0.0)
+    digits = (3.0 - np.floor(np.log10(size))).astype(np.int64)
+    power = _POWERS[np.abs(digits)]
     # quotients and products of whole numbers, so that the result is the number nearest to those digits
-    shown = np.where(digits < 0.0, np.round(usual / power) * power, np.round(usual * power) / power)
-    return np.asarray(np.where(is_usual, shown, numbers))
+    shown = np.round(usual * power) / power
+    if (digits < 0).any():
+        shown = np.where(digits < 0, np.round(usual / power) * power, shown)
+    return np.where(is_usual, shown, numbers) if usual is not numbers else shown

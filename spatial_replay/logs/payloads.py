@@ -250,6 +250,18 @@ def _places(part: Integers, parts: int) -> list[Integers]:
     return np.split(order, np.cumsum(np.bincount(part, minlength=parts))[:-1])
 
 
+def side_by_side(payloads: Sequence[bytes], chosen: Integers) -> tuple[Integers, bytes | memoryview]:
+    """Return the lengths (m,) of chosen payloads, and their bytes, one after the other."""
+    columns = columns_of(payloads)
+    if isinstance(part := columns.parts[0], Payloads) and len(columns.parts) == 1 and len(chosen):
+        own = part.take(columns.row[chosen])
+        if (own.begin[1:] == own.end[:-1]).all():
+            # as they were read, and so without a copy
+            return own.lengths, memoryview(own.data)[own.begin[0] : own.end[-1]]
+    listed = [payloads[index] for index in chosen.tolist()]
+    return np.fromiter(map(len, listed), np.int64, len(listed)), b"".join(listed)
+
+
 def _listed(part: Filled) -> list[bytes]:
     encoded = part.encoded(slice(None))
     length, whole = len(part.template), encoded.tobytes()

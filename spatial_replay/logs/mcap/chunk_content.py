@@ -8,10 +8,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from mcap.opcode import Opcode
+from numpy.typing import NDArray
 
 from spatial_replay.compiled import copying_kernel, elementwise, kernel, merged
 from spatial_replay.geometry.arrays import Integers, equal_places, starts_from_counts
@@ -226,13 +227,10 @@ def _joined(filled: Sequence[tuple[Integers, Filled, Integers]]) -> _Templates:
     templates = [each.template for _, each, _ in filled]
     words = np.empty(sum(len(rows) * each.words.shape[1] for _, each, rows in filled), np.uint64)
     marks = np.empty(sum(len(rows) * each.marks.shape[1] for _, each, rows in filled), np.uint8)
-    at = [0, 0]
+    word = mark = 0
     for _, each, rows in filled:
-        for number, (target, column) in enumerate(((words, each.words), (marks, each.marks))):
-            begin, end = at[number], at[number] + len(rows) * column.shape[1]
-            # whatever the mode, rows are within bounds; only this one fills the target at once
-            np.take(column, rows, axis=0, out=target[begin:end].reshape(len(rows), -1), mode="clip")
-            at[number] = end
+        word = _take(each.words, rows, words, word)
+        mark = _take(each.marks, rows, marks, mark)
     pattern = np.frombuffer(bytearray().join([each.pattern for each in templates]), np.uint8)
     return _Templates(
         np.concatenate([_NONE, *(places for places, _, _ in filled)]),
@@ -247,6 +245,14 @@ def _joined(filled: Sequence[tuple[Integers, Filled, Integers]]) -> _Templates:
         words,
         marks,
     )
+
+
+def _take(columns: NDArray[Any], rows: Integers, joined: NDArray[Any], begin: int) -> int:
+    """Copy rows, one after the other; return where they end."""
+    end = begin + columns[:1].size * len(rows)
+    # whatever the mode, rows are within bounds; only this one fills the target at once
+    np.take(columns, rows, axis=0, out=joined[begin:end].reshape(len(rows), -1), mode="clip")
+    return end
 
 
 def _columns(data: bytes, begin: Integers, end: Integers, place: Integers) -> _Columns:

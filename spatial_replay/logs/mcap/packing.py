@@ -43,7 +43,7 @@ class PackedChunk:
         index_offsets: for each channel, where its entries begin in the index.
     """
 
-    parts: Sequence[bytes]
+    parts: Sequence[bytes | memoryview]
     record_bytes: int
     index_bytes: int
     index_offsets: Mapping[int, int]
@@ -62,18 +62,20 @@ def pack(chunks: Sequence[OpenChunk]) -> list[PackedChunk]:
     """
     content = _room(sum(chunk.size for chunk in chunks))
     laid_out = lay_out(chunks, content)
-    contents = [content[begin:end] for begin, end in pairwise(laid_out.begin.tolist())]
+    contents: list[bytes | bytearray | memoryview] = [
+        content[begin:end] for begin, end in pairwise(laid_out.begin.tolist())
+    ]
     compressed = _compressor().multi_compress_to_buffer(contents)
-    entries, at = memoryview(laid_out.entries.astype("<i8", copy=False)).cast("B"), 0
-    columns = laid_out.counts, laid_out.low_ns, laid_out.high_ns
+    entries, at = memoryview(laid_out.entries.astype("<i8", copy=False).tobytes()), 0
+    low_ns, high_ns = laid_out.low_ns.tolist(), laid_out.high_ns.tolist()
     packed = []
-    for own, data, (counts, low_ns, high_ns) in zip(
-        contents, compressed, zip(*(each.tolist() for each in columns), strict=True), strict=True
-    ):
-        about = low_ns, high_ns, len(own), crc32(own)
+    for number, (own, counts) in enumerate(zip(contents, laid_out.counts.tolist(), strict=True)):
+        data = compressed[number].tobytes()
+        about = low_ns[number], high_ns[number], len(own), crc32(own)
         length = _CHUNK.size - RECORD_HEAD.size + len(data)
         head = _CHUNK.pack(Opcode.CHUNK, length, *about, len(_ZSTD), _ZSTD, len(data))
-        parts, offsets, size = [head, data.tobytes()], dict[int, int](), 0
+        parts: list[bytes | memoryview] = [head, data]
+        offsets, size = dict[int, int](), 0
         numbers = {channel: count for channel, count in enumerate(counts) if count}
         for channel, count in numbers.items():
             listed = entries[at : at + count * _INDEX_ENTRY]
@@ -83,7 +85,7 @@ def pack(chunks: Sequence[OpenChunk]) -> list[PackedChunk]:
             at += len(listed)
         sizes = len(data), len(own)
         record_bytes = RECORD_HEAD.size + length
-        packed.append(PackedChunk(parts, record_bytes, size, offsets, *sizes, numbers, low_ns, high_ns))
+        packed.append(PackedChunk(parts, record_bytes, size, offsets, *sizes, numbers, *about[:2]))
     return packed
 
 
