@@ -252,21 +252,20 @@ class StandingEncoder:
             violated = tuple((each, over[each]) for each in order[: counts[first], first].tolist())
             said = tuple(texts[which[first]] for texts, which in words)
             layout = _Layout(int(worst[first]), said, violated, final)
-            rows = series[layout.worst][:_MOST_ROWS, :, members]
-            own = [rounded(rows[:, [1, 0]]).reshape(-1, len(members))]
+            value, now = series[layout.worst][:_MOST_ROWS, :2].transpose(1, 0, 2)[:, :, members]
+            shown = rounded(np.stack([now, value], axis=1))
+            own = [numbers[:, members], shown.reshape(-1, len(members))]
             for each, _ in layout.violated:
                 certain_ns = np.minimum(since_ns[each, members], times_ns[members])
                 seconds = (certain_ns - (self._first_ns or 0)) / 1e9
                 own.append(np.stack([np.round(seconds, 3), rounded(-series[each][0, 3, members])]))
-            own.append(rounded(rows[:, 1]))
-            filled = np.concatenate([numbers[:, members], *own]).T
-            stamps = times_ns[members].astype(np.uint64)[:, None]
-            bits = np.concatenate([stamps, np.ascontiguousarray(filled).view(np.uint64)], axis=1)
-            own_marks = codes[layout.worst][:_MOST_ROWS, members]
-            every = np.concatenate([marks[:, members], own_marks, _present(rows[:, 1])])
-            filled_groups.append(
-                (members, Filled(self._template(layout), bits, np.ascontiguousarray(every.T)))
-            )
+            own.append(shown[:, 0])
+            bits = np.empty((len(members), 1 + sum(map(len, own))), np.uint64)
+            bits[:, 0] = times_ns[members]
+            np.concatenate([each.T for each in own], axis=1, out=bits[:, 1:].view(np.float64))
+            every = [marks[:, members], codes[layout.worst][:_MOST_ROWS, members], _present(now)]
+            own_marks = np.ascontiguousarray(np.concatenate(every).T)
+            filled_groups.append((members, Filled(self._template(layout), bits, own_marks)))
         return filled_in(len(times_ns), filled_groups)
 
     def _rows(self, series: Sequence[Floats], codes: Sequence[Codes]) -> tuple[Codes, Floats]:
@@ -320,7 +319,10 @@ def named_parts(tree: ReportedTree) -> dict[str, tuple[int, Formula]]:
 
 def _present(now: Floats) -> Codes:
     """Return the number of `Present` for each robustness in one sample."""
-    return np.where(now >= 0.0, HOLDS_NOW, np.where(now < 0.0, FAILS_NOW, UNKNOWN_NOW)).astype(np.uint8)
+    codes = np.full(now.shape, UNKNOWN_NOW, np.uint8)
+    codes[now >= 0.0] = HOLDS_NOW
+    codes[now < 0.0] = FAILS_NOW
+    return codes
 
 
 def part_title(name: str, tree: ReportedTree) -> str:
