@@ -255,7 +255,7 @@ def test_the_decision_before_the_cursor_shows_candidates_maps_and_edges_given_up
                 assert (candidate.rejected or candidate.object) in text
         for each in decision.pruned:
             expect(page.locator(".tasks")).to_contain_text(f"{each.source} → {each.target}")
-    expect(page.locator(".card")).to_contain_text("Done at 10.367 s")
+    expect(page.locator(".card")).to_contain_text("Done at 10.467 s")
     maps = sum(len(each.maps) for edge in decisions[0].considered for each in edge.candidates)
     expect(page.locator(".candidate canvas")).to_have_count(maps)
     expect(page.locator(".card > figure canvas")).to_have_count(1)
