@@ -5,19 +5,25 @@ from __future__ import annotations
 import io
 import json
 import math
+import struct
 import tempfile
 import zlib
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.records import Chunk, MessageIndex
+from mcap.stream_reader import StreamReader
 
 from laws.strategies_trace import traces
-from spatial_replay import LogError, Trace, read_trace
+from spatial_replay import LogError, Sample, Trace, read_trace
 from spatial_replay.compiled import only
 from spatial_replay.logs import (
+    Channel,
     LogWriter,
     McapSource,
     MemorySource,
@@ -218,6 +224,44 @@ def json_lines(trace):
             objects.append(entry)
         signals = {name: float(values[index]) for name, values in trace.signals.items()}
         yield {"time_ns": time_ns, "objects": objects, "signals": signals}
+
+
+@given(
+    st.lists(st.tuples(st.sampled_from("abc"), st.binary(max_size=40)), min_size=20, max_size=60),
+    st.sampled_from(["compiled", "interpreted"]),
+)
+def test_a_copy_has_each_message_where_the_index_says(written, form):
+    channels = {number: Channel(f"/{name}", "json", None) for number, name in enumerate("abc")}
+    numbers = np.array([ord(name) - ord("a") for name, _ in written], np.int64)
+    times_ns = np.arange(len(written), dtype=np.int64) * 10**8
+    payloads = [payload for _, payload in written]
+    original, copy = io.BytesIO(), io.BytesIO()
+    with LogWriter(original) as writer:
+        writer.write_messages(messages_of(Trace.from_samples([Sample(0)]), 0))
+        writer.write_messages(
+            Messages(channels, numbers, np.arange(len(written)), times_ns, times_ns, payloads)
+        )
+    with tempfile.TemporaryDirectory() as folder, only(form):
+        path = Path(folder, "run.mcap")
+        path.write_bytes(original.getvalue())
+        with LogWriter(copy) as writer:
+            for block in open_source(path).iter_blocks():
+                writer.write_messages(block.messages)
+    found = {name: [] for name in "abc"}
+    for _, channel, message in make_reader(io.BytesIO(copy.getvalue())).iter_messages():
+        if channel.topic in ("/a", "/b", "/c"):
+            found[channel.topic[1:]].append((message.log_time, message.data))
+    assert found == {
+        name: [(k * 10**8, own) for k, (to, own) in enumerate(written) if to == name] for name in "abc"
+    }
+    content = b""
+    for record in StreamReader(io.BytesIO(copy.getvalue()), emit_chunks=True).records:
+        if isinstance(record, Chunk):
+            content = zstandard.decompress(record.data, max_output_size=record.uncompressed_size)
+        elif isinstance(record, MessageIndex):
+            for time_ns, place in record.records:
+                _, _, number, _, log_time_ns = struct.unpack_from("<BQHIQ", content, place)
+                assert (number, log_time_ns) == (record.channel_id, time_ns)
 
 
 @given(st.lists(st.binary(max_size=200), max_size=6), st.sampled_from(["compiled", "interpreted"]))
