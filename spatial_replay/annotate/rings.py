@@ -52,6 +52,10 @@ def rings_of(footprints: FootprintBatch, point_radius: float) -> Rings:
     is_round = (counts == 1) | (footprints.radius > 0.0)
     lengths = np.where(is_round, ROUND, counts)
     part_start = starts_from_counts(lengths)
+    form, forms = _forms(footprints, lengths)
+    if not is_round.any():
+        corners = footprints.vertices[footprints.vertex_start[0] : footprints.vertex_start[-1]]
+        return Rings(part_start[footprints.part_start], corners, form, forms)
     points = np.empty((part_start[-1], 2))
     straight = ~is_round
     points[flat_index(part_start[:-1][straight], counts[straight])] = footprints.vertices[
@@ -62,7 +66,6 @@ def rings_of(footprints: FootprintBatch, point_radius: float) -> Rings:
         corners = footprints.vertices[footprints.vertex_start[parts][:, None] + np.arange(count)]
         radius = np.where(footprints.radius[parts] > 0.0, footprints.radius[parts], point_radius)
         points[part_start[parts][:, None] + np.arange(ROUND)] = _rounded(corners, radius)
-    form, forms = _forms(footprints, lengths)
     return Rings(part_start[footprints.part_start], points, form, forms)
 
 
@@ -75,10 +78,12 @@ def extents(footprints: FootprintBatch) -> Floats:
     """Return (R,) the longer side of each footprint's bounding box."""
     if not len(footprints):
         return np.empty(0)
-    radius = np.repeat(footprints.radius, np.diff(footprints.vertex_start))[:, None]
+    below = above = footprints.vertices
+    if footprints.radius.any():
+        radius = np.repeat(footprints.radius, np.diff(footprints.vertex_start))[:, None]
+        below, above = below - radius, above + radius
     begins = footprints.vertex_start[footprints.part_start[:-1]]
-    low = np.minimum.reduceat(footprints.vertices - radius, begins)
-    high = np.maximum.reduceat(footprints.vertices + radius, begins)
+    low, high = np.minimum.reduceat(below, begins), np.maximum.reduceat(above, begins)
     sides = high - low
     return np.asarray(np.maximum(sides[:, 0], sides[:, 1]))
 
