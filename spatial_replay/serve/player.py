@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection
 from enum import Enum, auto
 from typing import Final, NamedTuple, Protocol
@@ -12,12 +11,13 @@ import numpy as np
 from spatial_replay.annotate.curves import CURVES_CHANNEL
 from spatial_replay.errors import SpatialReplayError
 from spatial_replay.logs.messages import Messages, messages_of, select
-from spatial_replay.logs.topics import CURVES_TOPIC, EVENT_LOG, EVENTS
+from spatial_replay.logs.topics import CURVES_TOPIC
 from spatial_replay.replay.loaded_log import EditedFiles, constant_values
 from spatial_replay.replay.playback import Playback
 from spatial_replay.serve.pace import PlaybackState
 from spatial_replay.serve.requests import PendingRequests, Values
 from spatial_replay.serve.session import ARROW, Session
+from spatial_replay.serve.thinning import Thinning
 from spatial_replay.text import nearest_hint
 
 
@@ -62,25 +62,6 @@ class Viewers(Protocol):
         """Send a note."""
 
 
-_NEVER_THINNED: Final = (EVENTS, EVENT_LOG)
-
-
-def thin(messages: Messages, most: int) -> Messages:
-    """Return of each topic the messages of at most `most` times, evenly spread and with the last.
-
-    One more time than that is left as it is: a turn of the playback has one more by chance.
-    """
-    kept = np.ones(len(messages), np.bool_)
-    for number, channel in messages.channels.items():
-        own = messages.channel == number
-        times_ns, which = np.unique(messages.log_time_ns[own], return_inverse=True)
-        if len(times_ns) > most + 1 and channel.topic not in _NEVER_THINNED:
-            chosen = np.zeros(len(times_ns), np.bool_)
-            chosen[np.linspace(len(times_ns) - 1, 0, most, endpoint=False).astype(np.int64)] = True
-            kept[own] = chosen[which]
-    return messages if kept.all() else select(messages, np.flatnonzero(kept))
-
-
 _MOST_NAMED: Final = 10
 """The most results that a note lists."""
 
@@ -91,9 +72,6 @@ SPECIFICATION = "specification"
 
 PERIOD_S: Final = 1 / 30
 """The time between two turns."""
-
-MOST_A_SECOND: Final = 600
-"""The most samples sent in a second, since viewers can take no more."""
 
 _CURVES_EVERY: Final = 60
 """Turns after which the curves are sent again: some viewers drop them while they open their panels."""
@@ -112,6 +90,7 @@ class Player:
         self._playback = playback
         self._session = session
         self._viewers = viewers
+        self._thinning = Thinning()
         self._turns = 0
 
     def run(self) -> None:
@@ -194,8 +173,8 @@ class Player:
         if span is None:
             return
         time_ns = span.time_ns
-        most = max(1, math.ceil(MOST_A_SECOND * span.elapsed_s))
-        self._viewers.publish(thin(self._playback.advance_to(time_ns), most))
+        coming = self._playback.advance_to(time_ns)
+        self._viewers.publish(self._thinning.thin(coming, span.elapsed_s))
         self._viewers.send_time(time_ns)
         self._turns += 1
         if self._turns % _CURVES_EVERY == 0:

@@ -556,6 +556,22 @@ def test_the_scene_is_coloured_for_the_chosen_result(open_page: Open) -> None:
     expect(page.locator(".caption")).to_contain_text("parallel")
 
 
+def test_the_heading_of_an_unfolded_result_chooses_it_and_folds_it_once_it_is_chosen(open_page: Open) -> None:
+    page = open_page("unseen")
+    first, second = page.locator(".verdict").all()
+    expect(first).to_have_class("verdict chosen")
+    for use in (lambda heading: heading.click(), lambda heading: heading.press("Enter")):
+        for other in (second, first, second, first):
+            use(other.locator("summary"))
+            expect(other).to_have_class("verdict chosen")
+            expect(other).to_have_attribute("open", "")
+            expect(page.locator("#tree .which")).to_contain_text(other.locator(".name").first.inner_text())
+        use(first.locator("summary"))
+        expect(first).not_to_have_attribute("open", "")
+        use(first.locator("summary"))
+        expect(first).to_have_attribute("open", "")
+
+
 def test_numbers_of_a_thinned_run_are_those_of_the_time_that_is_named(open_page: Open) -> None:
     page = open_page("thinned")
     numbers = two_discs(12_000)

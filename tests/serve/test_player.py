@@ -24,12 +24,13 @@ from spatial_replay import UsageError
 from spatial_replay.annotate.curves import CURVES_CHANNEL
 from spatial_replay.logs import Messages
 from spatial_replay.logs.schemas.Robustness_pb2 import Robustness
-from spatial_replay.logs.topics import ROBUSTNESS
+from spatial_replay.logs.topics import ROBUSTNESS, SCENE, STANDING
 from spatial_replay.replay import Evaluated, LoadedLog, Playback
 from spatial_replay.serve.pace import MOST_LATE_S, PlaybackState, Status
-from spatial_replay.serve.player import MOST_A_SECOND, Level, Note, Player
+from spatial_replay.serve.player import Level, Note, Player
 from spatial_replay.serve.requests import MOST_OPEN, Questions
 from spatial_replay.serve.session import Session
+from spatial_replay.serve.thinning import MOST_A_SECOND
 
 PATIENCE_S = 10.0
 MOST_SAMPLES = math.ceil(MOST_A_SECOND * MOST_LATE_S)
@@ -196,6 +197,25 @@ def test_a_fast_playback_is_thinned_to_what_viewers_can_take() -> None:
         assert 0.5 * MOST_A_SECOND <= len(sent) <= 0.55 * MOST_A_SECOND
         assert sent[-1] == 1_999 * step_ns
         assert max(np.diff(sent)) <= 8 * step_ns
+
+
+@pytest.mark.parametrize("speed", [1.0, 4.0, 20.0, 100.0])
+def test_the_scene_and_the_standing_have_at_most_50_messages_a_second_at_any_speed(speed: float) -> None:
+    clock = Clock()
+    with playing(loaded_of(400, 10_000_000), clock) as (session, viewers):
+        session.control(is_playing=True, speed=speed)
+        play_to_the_end(session, clock, [0.03125])
+        sent = [each for each in viewers.until(is_over) if isinstance(each, Messages)]
+        for topic in (SCENE, STANDING):
+            times_ns = [
+                time_ns
+                for each in sent
+                for time_ns, number in zip(each.log_time_ns.tolist(), each.channel.tolist(), strict=True)
+                if each.channels[number].topic == topic
+            ]
+            # a few may come at once at the start
+            assert 0.8 * 50 * clock.now <= len(times_ns) <= 50 * clock.now + 10
+            assert times_ns[-1] >= 3_980_000_000
 
 
 def test_a_late_playback_falls_behind_the_clock() -> None:

@@ -5,15 +5,20 @@ from __future__ import annotations
 from collections import Counter
 
 import numpy as np
+import pytest
+from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from hypothesis import given
 from hypothesis import strategies as st
 
 from spatial_replay.logs import Channel, Messages
-from spatial_replay.logs.topics import EVENTS, ROBUSTNESS, SCENE
-from spatial_replay.serve.player import thin
+from spatial_replay.logs.messages import messages_of
+from spatial_replay.logs.topics import EVENTS, OBJECTS, ROBUSTNESS, SCENE, STANDING
+from spatial_replay.serve.pace import MOST_LATE_S
+from spatial_replay.serve.thinning import MOST_A_SECOND, MOST_DRAWN_A_SECOND, Thinning
 
 CHANNELS = {
-    number: Channel(topic, "protobuf", None) for number, topic in enumerate((EVENTS, ROBUSTNESS, SCENE))
+    number: Channel(topic, "protobuf", None) for number, topic in enumerate((EVENTS, ROBUSTNESS, OBJECTS))
 }
 
 
@@ -27,6 +32,11 @@ def messages(times: list[tuple[int, int]]) -> Messages:
         publish_time_ns=times_ns,
         payloads=[bytes([index % 256]) for index in range(len(times))],
     )
+
+
+def thin(whole: Messages, most: int) -> Messages:
+    """Thin the messages of a turn in which so many samples of a topic may be sent."""
+    return Thinning().thin(whole, (most - 0.5) / MOST_A_SECOND)
 
 
 def kept(of: Messages) -> list[tuple[int, int, bytes]]:
@@ -54,3 +64,51 @@ def test_each_topic_keeps_at_most_so_many_times_and_its_last(times: list[tuple[i
 def test_the_times_that_stay_are_spread_evenly() -> None:
     sent = thin(messages([(time_ns, 1) for time_ns in range(100)]), 5)
     assert set(np.diff(sent.log_time_ns).tolist()) <= {19, 20}
+
+
+def on_topic(topic: str, times_ns: list[int], payloads: list[bytes] | None = None) -> Messages:
+    return messages_of(
+        Channel(topic, "protobuf", None), np.array(times_ns, np.int64), payloads or [b""] * len(times_ns), 0
+    )
+
+
+TURNS = st.lists(st.floats(0.025, MOST_LATE_S), min_size=10, max_size=60)
+
+
+@pytest.mark.parametrize("speed", [1, 4, 20, 100])
+@given(TURNS, st.sampled_from([5, 20, 50]))
+def test_a_topic_that_is_drawn_has_less_than_60_messages_in_any_second(
+    speed: int, turns: list[float], rate: int
+) -> None:
+    thinning = Thinning()
+    ends_s = np.cumsum(turns)
+    step_ns = 10**9 // rate
+    counts, until_ns = [], 0
+    for end_s, elapsed_s in zip(ends_s, turns, strict=True):
+        end_ns = round(end_s * speed * 1e9)
+        coming = list(range(-(-until_ns // step_ns) * step_ns, end_ns, step_ns))
+        until_ns = end_ns
+        sent = thinning.thin(on_topic(STANDING, coming), elapsed_s).log_time_ns.tolist()
+        assert sent[-1:] == coming[-1:]
+        if speed * rate <= MOST_DRAWN_A_SECOND:
+            assert sent == coming
+        counts.append(len(sent))
+    for first, start_s in enumerate(ends_s):
+        within = (ends_s >= start_s) & (ends_s < start_s + 1)
+        assert sum(np.array(counts)[within]) < 60, f"from turn {first}"
+
+
+def test_what_a_scene_that_is_left_out_deletes_is_deleted_by_the_next_one() -> None:
+    scenes = []
+    for number in range(100):
+        scene = SceneUpdate()
+        scene.entities.add(id=f"object/{number}")
+        scene.deletions.add(id=f"object/{number - 1}", type=SceneEntityDeletion.MATCHING_ID)
+        scenes.append(scene.SerializeToString())
+    sent = Thinning().thin(on_topic(SCENE, list(range(100)), scenes), 0.1)
+    decoded = [SceneUpdate.FromString(payload) for payload in sent.payloads]
+    assert len(decoded) < 10
+    assert [each.id for scene in decoded for each in scene.deletions] == [
+        f"object/{n - 1}" for n in range(100)
+    ]
+    assert [scene.entities[0].id for scene in decoded] == [f"object/{n}" for n in sent.log_time_ns]

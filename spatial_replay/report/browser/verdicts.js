@@ -76,11 +76,10 @@ function makeVerdicts(clock) {
   const verdicts = [...document.querySelectorAll(".verdict")];
   for (const verdict of verdicts) {
     if (verdict.dataset.result === undefined) continue;
-    // what is unfolded is looked at
+    // the heading of another result chooses it, which unfolds it; that of the chosen one folds it
     verdict.querySelector("summary")?.addEventListener("click", (event) => {
       const number = Number(verdict.dataset.result);
-      if (verdict.open || number === clock.result) return;
-      // being chosen unfolds it
+      if (number === clock.result) return;
       event.preventDefault();
       clock.pause();
       clock.choose(number);
