@@ -17,7 +17,7 @@ from spatial_replay.replay.playback import Playback
 from spatial_replay.serve.pace import PlaybackState
 from spatial_replay.serve.requests import PendingRequests, Values
 from spatial_replay.serve.session import ARROW, Session
-from spatial_replay.serve.thinning import Thinning
+from spatial_replay.serve.thinning import PlaybackThinning
 from spatial_replay.text import nearest_hint
 
 
@@ -90,7 +90,7 @@ class Player:
         self._playback = playback
         self._session = session
         self._viewers = viewers
-        self._thinning = Thinning()
+        self._thinning = PlaybackThinning()
         self._turns = 0
 
     def run(self) -> None:

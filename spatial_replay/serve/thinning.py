@@ -49,7 +49,7 @@ _DRAWN: Final = (
 )
 
 
-class Thinning:
+class PlaybackThinning:
     """Thin the messages of a playback, turn by turn; in the thread of its player.
 
     Of a topic that the layout draws, at most `MOST_DRAWN_A_SECOND` messages are sent for each second that

@@ -85,6 +85,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Path]:
         for t in range(6)
     ]
     report_of_samples(folder / "reached.html", meeting, "spec meet = F (a ovlp b)")
+    report_of_samples(folder / "touched.html", meeting, "spec clear = G (not (a ovlp b))")
     report_of_samples(folder / "braking.html", _braking(), BRAKING)
     people = [
         sr.Sample(
@@ -533,6 +534,26 @@ def test_text_arrow_tree_and_curve_are_of_one_atom_when_the_page_opens(open_page
     expect(decides).to_contain_text(atom)
     expect(decides.locator(".number").nth(1)).to_have_text(number)
     expect(page.locator(".legend-entry", has_text=atom).locator(".number")).to_have_text(number)
+
+
+RECORD_TEXTS = """
+window.drawn = [];
+const fill = CanvasRenderingContext2D.prototype.fillText;
+CanvasRenderingContext2D.prototype.fillText = function (text, ...at) {
+  window.drawn.push(text);
+  return fill.call(this, text, ...at);
+};
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "label"), [("touched", "a ovlp b: holds by "), ("violated", f": {MINUS}0.155")]
+)
+def test_the_arrow_of_an_atom_that_holds_and_should_not_says_that_it_holds(
+    open_page: Open, name: str, label: str
+) -> None:
+    drawn = open_page(name, script=RECORD_TEXTS).evaluate("window.drawn")
+    assert [text for text in drawn if label in text], drawn
 
 
 def test_many_results_are_counted_sorted_and_filtered(open_page: Open) -> None:

@@ -15,7 +15,7 @@ from spatial_replay.logs import Channel, Messages
 from spatial_replay.logs.messages import messages_of
 from spatial_replay.logs.topics import EVENTS, OBJECTS, ROBUSTNESS, SCENE, STANDING
 from spatial_replay.serve.pace import MOST_LATE_S
-from spatial_replay.serve.thinning import MOST_A_SECOND, MOST_DRAWN_A_SECOND, Thinning
+from spatial_replay.serve.thinning import MOST_A_SECOND, MOST_DRAWN_A_SECOND, PlaybackThinning
 
 CHANNELS = {
     number: Channel(topic, "protobuf", None) for number, topic in enumerate((EVENTS, ROBUSTNESS, OBJECTS))
@@ -36,7 +36,7 @@ def messages(times: list[tuple[int, int]]) -> Messages:
 
 def thin(whole: Messages, most: int) -> Messages:
     """Thin the messages of a turn in which so many samples of a topic may be sent."""
-    return Thinning().thin(whole, (most - 0.5) / MOST_A_SECOND)
+    return PlaybackThinning().thin(whole, (most - 0.5) / MOST_A_SECOND)
 
 
 def kept(of: Messages) -> list[tuple[int, int, bytes]]:
@@ -80,7 +80,7 @@ TURNS = st.lists(st.floats(0.025, MOST_LATE_S), min_size=10, max_size=60)
 def test_a_topic_that_is_drawn_has_less_than_60_messages_in_any_second(
     speed: int, turns: list[float], rate: int
 ) -> None:
-    thinning = Thinning()
+    thinning = PlaybackThinning()
     ends_s = np.cumsum(turns)
     step_ns = 10**9 // rate
     counts, until_ns = [], 0
@@ -105,7 +105,7 @@ def test_what_a_scene_that_is_left_out_deletes_is_deleted_by_the_next_one() -> N
         scene.entities.add(id=f"object/{number}")
         scene.deletions.add(id=f"object/{number - 1}", type=SceneEntityDeletion.MATCHING_ID)
         scenes.append(scene.SerializeToString())
-    sent = Thinning().thin(on_topic(SCENE, list(range(100)), scenes), 0.1)
+    sent = PlaybackThinning().thin(on_topic(SCENE, list(range(100)), scenes), 0.1)
     decoded = [SceneUpdate.FromString(payload) for payload in sent.payloads]
     assert len(decoded) < 10
     assert [each.id for scene in decoded for each in scene.deletions] == [
