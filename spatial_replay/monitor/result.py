@@ -276,7 +276,7 @@ class SpecResult(Displayed):
 
     @property
     def least_at_ns(self) -> int | None:
-        """When the first cause was worst, if that was later than when it settled the verdict; else None."""
+        """When the first cause became as bad as it is, if after it settled the verdict; else None."""
         return self._least_at_ns(self.causes)
 
     @cached_property
@@ -433,9 +433,11 @@ class SpecResult(Displayed):
         first = causes[0] if causes else None
         if self.leaves is None or first is None or first.witness is None or first.settled_ns is None:
             return None
-        is_worse = bool(self.final[first.node, 1] < first.witness.upper)
+        least = float(self.final[first.node, 1])
+        if not least < first.witness.upper:
+            return None
         of = self.evidence.instance
-        return time_of_least(of, self.leaves, self.times_ns, first.node) if is_worse else None
+        return time_of_least(of, self.leaves, self.times_ns, first.node, first.settled_ns, least)
 
     def _name_of(self, node: int) -> str:
         return self.name if node == 0 else self.nodes[node].name or shortened_formula(self.nodes[node].text)

@@ -389,10 +389,22 @@ def _gap(gap: Gap, first_ns: int) -> Sentence:
     return Sentence(f"{many}, the first at ", first, ", the last at ", last, ".")
 
 
+def open_text(witness: Witness) -> str:
+    """Return between which numbers an atom lies whose uncertainty leaves a verdict open; "" if none does."""
+    deciding = witness.deciding
+    if witness.verdict is not Verdict.UNKNOWN or deciding is None or deciding.unknown:
+        return ""
+    return _between(deciding, witness.units)
+
+
+def _between(deciding: DecidingAtom, units: Mapping[str, str]) -> str:
+    low, high = (amount_text(each, deciding.atom, units) for each in (deciding.lower, deciding.upper))
+    return f"between {low} and {high}"
+
+
 def _uncertain(witness: Witness, deciding: DecidingAtom, first_ns: int) -> Sentence:
-    low, high = (amount_text(each, deciding.atom, witness.units) for each in (deciding.lower, deciding.upper))
     return Sentence(
-        f"`{deciding.text}` lies between {low} and {high} at ",
+        f"`{deciding.text}` lies {_between(deciding, witness.units)} at ",
         Instant(witness.time_ns, first_ns),
         f"{_in_time(witness)}: the uncertainty of the objects leaves open whether it holds.",
     )
@@ -404,8 +416,7 @@ def _open_end(deciding: DecidingAtom, time_ns: int, first_ns: int, units: Mappin
     if deciding.unknown:
         reasons = " and ".join(deciding.unknown)
         return Sentence(f"By how much is open: `{deciding.text}` is unknown at ", when, f", {reasons}.")
-    low, high = (amount_text(each, deciding.atom, units) for each in (deciding.lower, deciding.upper))
-    what = f"By how much is uncertain: `{deciding.text}` lies between {low} and {high} at "
+    what = f"By how much is uncertain: `{deciding.text}` lies {_between(deciding, units)} at "
     return Sentence(what, when, ".")
 
 

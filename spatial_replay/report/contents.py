@@ -39,6 +39,7 @@ class Pointer(NamedTuple):
         number: its robustness, in the unit of the log where `scale` divides it.
         is_condition: whether it is in the condition of an implication, whose response is what was missed.
         is_response: whether it is what came nearest to such a response.
+        objects: what it is about.
     """
 
     ends: Floats
@@ -46,6 +47,7 @@ class Pointer(NamedTuple):
     number: float
     is_condition: bool = False
     is_response: bool = False
+    objects: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,6 +62,7 @@ class ReportedResult:
         decided_ns: the sample that decided it; None without an explanation.
         decided_node: the id of the node that decided it; None without an explanation.
         decided_text: the atom of the objects that decided it, where that node is a quantifier, or "".
+        left_open: between which numbers that atom lies, if its uncertainty leaves the verdict open, or "".
         pointer: the two points between which the atom that decided it stands; None if it has none.
         named: the specs of its file, by name.
         units: those of the numbers that its robustness is the least of.
@@ -77,6 +80,7 @@ class ReportedResult:
     decided_ns: int | None
     decided_node: int | None
     decided_text: str
+    left_open: str
     pointer: Pointer | None
     named: Mapping[str, NamedSpec]
     units: tuple[Unit, ...]

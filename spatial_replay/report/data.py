@@ -211,6 +211,7 @@ def _result_value(
         "samples": len(here),
         "decided": _place_of(each),
         "decided_text": each.decided_text,
+        "left_open": each.left_open,
         "nodes": tree_value(
             each.formula,
             each.result.values,
@@ -250,10 +251,11 @@ def _pointer_value(each: ReportedResult, first_ns: int, lengths: str) -> Mapping
         "time": (each.fault_ns - first_ns) / 1e9,
         "ends": each.pointer.ends.reshape(-1).tolist(),
         "text": each.pointer.text,
-        "label": f"{holds}{each.pointer.number:.3g} {lengths}".rstrip(),
+        "label": each.left_open or f"{holds}{each.pointer.number:.3g} {lengths}".rstrip(),
         "number": json_number(each.pointer.number),
         "is_condition": each.pointer.is_condition,
         "is_response": each.pointer.is_response,
+        "objects": list(each.pointer.objects),
     }
 
 

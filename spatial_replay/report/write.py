@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
@@ -24,9 +25,9 @@ from spatial_replay.logs.payloads import chosen_payloads, iter_alike
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.source import Source, axes_of
 from spatial_replay.logs.source import units_of as declared_units
-from spatial_replay.monitor.sentences import divisor_of
+from spatial_replay.monitor.sentences import divisor_of, open_text
 from spatial_replay.monitor.verdict import Verdict
-from spatial_replay.monitor.witness.witness import Witness
+from spatial_replay.monitor.witness.witness import Witness, WitnessStep
 from spatial_replay.replay.engine import Replay, Replayed
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions
 from spatial_replay.report.automaton_panel import StatePath, StatePathCollector
@@ -193,9 +194,10 @@ def _results(
             source=file.source,
             relations=RELATION_NAMES | file.relations,
             sentences=result.sentences(replayed.first_ns) if is_explained else (),
-            decided_ns=None if witness is None else _decided_ns(witness),
-            decided_node=None if witness is None else _decided_node(witness),
+            decided_ns=None if witness is None else _decided(witness).time_ns,
+            decided_node=None if witness is None else _decided(witness).node,
             decided_text="" if witness is None else _decided_text(witness, result.formula),
+            left_open="" if witness is None else open_text(witness),
             pointer=None if witness is None else _pointer(witness),
             named={spec.name: spec for spec in file.specs},
             units=units_of(result.formula),
@@ -206,20 +208,19 @@ def _results(
         )
 
 
-def _decided_ns(witness: Witness) -> int:
-    """Return when to look: of a response that was missed, when it came nearest."""
-    return witness.time_ns if witness.closest is None else witness.closest[1]
+def _decided(witness: Witness) -> WitnessStep:
+    """Return what to look at, and when: what decided or, of a response that was missed, came nearest.
 
-
-def _decided_node(witness: Witness) -> int:
-    """Return the atom to look at: of a response that was missed, the one by which it came nearest."""
-    return witness.path[-1].node if witness.closest_node is None else witness.closest_node
+    Where an operator took its number from the past, that is the operator: it failed then, and not before.
+    """
+    path = witness.closest_path or witness.path
+    return next((step for step, below in pairwise(path) if below.time_ns < step.time_ns), path[-1])
 
 
 def _decided_text(witness: Witness, formula: Formula) -> str:
     """Return the atom of the objects that decided a quantifier, or "" if what decided is none."""
     deciding = witness.deciding if witness.closest is None else witness.closest[0]
-    decided = _decided_node(witness)
+    decided = _decided(witness).node
     node = next(node for identifier, _, node in iter_nodes(formula) if identifier == decided)
     return deciding.text if deciding is not None and isinstance(node, Quantified) else ""
 
@@ -228,13 +229,15 @@ def _pointer(witness: Witness) -> Pointer | None:
     deciding = witness.deciding if witness.closest is None else witness.closest[0]
     if deciding is None or deciding.unknown:
         return None
+    if _decided(witness) != (witness.closest_path or witness.path)[-1]:
+        return None  # things stood elsewhere when the atom had its number
     for measured in deciding.measured:
         if measured.contact is not None:
             ends = np.array([measured.contact.first, measured.contact.second])
             number = deciding.value * divisor_of(deciding.atom)
             is_response = witness.closest is not None
             is_condition = not is_response and witness.missed is not None and witness.missed.is_condition
-            return Pointer(ends, deciding.text, number, is_condition, is_response)
+            return Pointer(ends, deciding.text, number, is_condition, is_response, deciding.objects)
     return None
 
 

@@ -87,6 +87,17 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Path]:
     report_of_samples(folder / "reached.html", meeting, "spec meet = F (a ovlp b)")
     report_of_samples(folder / "touched.html", meeting, "spec clear = G (not (a ovlp b))")
     report_of_samples(folder / "braking.html", _braking(), BRAKING)
+    unsure = [
+        sr.Sample(
+            t * 10**8,
+            {
+                "a": sr.Footprint.disc(t - 4, 0, 1),
+                "ghost": sr.TrackedObject(sr.Footprint.disc(0, 2.6, 1), uncertainty=0.3),
+            },
+        )
+        for t in range(9)
+    ]
+    report_of_samples(folder / "unsure.html", unsure, "spec ghosts = G (a dist ghost >= 0.5)")
     people = [
         sr.Sample(
             t * 10**8,
@@ -554,6 +565,19 @@ def test_the_arrow_of_an_atom_that_holds_and_should_not_says_that_it_holds(
 ) -> None:
     drawn = open_page(name, script=RECORD_TEXTS).evaluate("window.drawn")
     assert [text for text in drawn if label in text], drawn
+
+
+def test_what_uncertainty_leaves_open_is_shown_as_open(open_page: Open) -> None:
+    page = open_page("unsure")
+    between = "between -0.2 and 0.4"
+    expect(page.locator(".verdict")).to_contain_text(f"a dist ghost >= 0.5 lies {between} at 0.400 s")
+    expect(page.locator(".caption")).to_have_text(
+        "the grey arrow, what leaves the verdict open: a dist ghost >= 0.5 of ghosts lies "
+        + between.replace("-", MINUS)
+    )
+    expect(page.locator(".tree .row.decides .mark")).to_have_text(["?", "?"])
+    page.keyboard.press("Home")
+    expect(page.locator(".tree .row.decides .mark")).to_have_text(["+", "+"])
 
 
 def test_many_results_are_counted_sorted_and_filtered(open_page: Open) -> None:

@@ -7,10 +7,13 @@ import hashlib
 import os
 import re
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
 from foxglove_schemas_protobuf.Grid_pb2 import Grid
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import spatial_replay as sr
 from report.report_pages import (
@@ -83,6 +86,37 @@ def test_of_a_missed_response_all_is_about_what_came_nearest(tmp_path: Path) -> 
     assert soon["nodes"][soon["decided"]]["text"] == "a dist b <= 3"
     [event] = [each for each in page.facts["events"] if each["specification"] == "soon"]
     assert "did not: a dist b <= 3 fails by 2." in "".join(event["parts"])
+
+
+PAST = ("O %s", "O[0s, 2s] %s", "H %s", "H[1s, 3s] %s", "Y %s", "%s S (q >= 0)", "%s S[0s, 2s] (q >= 0)")
+PAST_SPECS = "".join(
+    f"spec right_{k} = G ((c >= 0) -> {past % '(p >= 0)'})\n"
+    f"spec left_{k} = G (({past % '(p >= 0)'}) -> (c >= 0))\n"
+    f"spec alone_{k} = G ({past % '(p >= 0)'})\n"
+    for k, past in enumerate(PAST)
+)
+
+
+@settings(max_examples=6, deadline=None)
+@given(st.lists(st.tuples(*[st.integers(-9, 9)] * 3), min_size=8, max_size=8))
+def test_what_asks_for_the_past_is_shown_when_it_failed_and_was_worst_when_its_curve_was(
+    numbers: list[tuple[int, int, int]],
+) -> None:
+    samples = [
+        sr.Sample(k * 10**9, {}, dict(zip("pqc", map(float, each), strict=True)))
+        for k, each in enumerate(numbers)
+    ]
+    with TemporaryDirectory() as folder:
+        page = report_of_samples(Path(folder) / "run.html", samples, PAST_SPECS)
+    shown = {each["title"]: each for each in page.facts["results"]}
+    for result in sr.evaluate(sr.parse_specification(PAST_SPECS), sr.Trace.from_samples(samples)):
+        if (since_ns := result.violated_at_ns) is None:
+            continue
+        assert shown[result.title]["fault"] == since_ns / 1e9
+        curve, since = result.nodes[0].value, since_ns // 10**9
+        worst_ns = since_ns if result.least_at_ns is None else result.least_at_ns
+        first = since + curve[since:].tolist().index(result.robustness)
+        assert worst_ns == first * 10**9
 
 
 def test_each_violated_result_has_an_arrow_of_its_own(tmp_path: Path) -> None:

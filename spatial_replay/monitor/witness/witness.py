@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -68,7 +69,7 @@ class Witness:
         gaps: of an unknown atom, when what it is about is missing.
         closest: of a missed response, the atom by which it came closest to holding, and the time of its
             sample; None if that is what decides, or if there is no such atom.
-        closest_node: the id of that atom's node.
+        closest_path: from the response to that atom.
         units: those that the log declares, of signals by their names, of lengths by "".
         unit: the declared one of `lower` and `upper`, or "".
     """
@@ -87,7 +88,7 @@ class Witness:
     missed: MissedResponse | None = None
     gaps: tuple[Gap, ...] = ()
     closest: tuple[DecidingAtom, int] | None = None
-    closest_node: int | None = None
+    closest_path: tuple[WitnessStep, ...] = ()
     units: Mapping[str, str] = field(default_factory=dict, repr=False, hash=False)
     unit: str = ""
 
@@ -161,11 +162,12 @@ def find_witness(
         if other is not None and other.lower < other.upper:
             open_end = other, other_path[-1].time_ns
     missed = missed_response(found, nodes, done, times_ns) if verdict is Verdict.VIOLATED else None
-    closest, closest_node = None, None
+    closest: tuple[DecidingAtom, int] | None = None
+    closest_path: tuple[WitnessStep, ...] = ()
     if missed is not None and missed.is_condition:
         _, best_path, best = follow(End.HIGH, missed.node, missed.sample)
         if best is not None and not best.unknown:
-            closest, closest_node = (best, best_path[-1].time_ns), best_path[-1].node
+            closest, closest_path = (best, best_path[-1].time_ns), best_path
     return Witness(
         instance.name,
         instance.object,
@@ -181,17 +183,34 @@ def find_witness(
         missed,
         evidence.gaps(deciding.atom) if deciding is not None and deciding.unknown else (),
         closest,
-        closest_node,
+        closest_path,
         evidence.units,
         declared_unit(nodes[node], evidence.units),
     )
 
 
-def time_of_least(instance: Instance, leaves: Floats, times_ns: Integers, node: int) -> int:
-    """Return the time of the sample that gives a violated node its robustness on the whole log."""
-    done = evaluate_offline(instance.formula, instance.program.leaves, leaves, times_ns)
+def time_of_least(
+    instance: Instance, leaves: Floats, times_ns: Integers, node: int, settled_ns: int, least: float
+) -> int:
+    """Return when the robustness of a violated node became, for certain, as low as it is on the whole log.
+
+    Args:
+        settled_ns: when its violation became certain, which is not later.
+        least: the upper end of its interval for the finished log.
+    """
+    order = instance.program.leaves
+    done = evaluate_offline(instance.formula, order, leaves, times_ns)
     path = deciding_path(instance.formula, done, times_ns, node, End.HIGH)
-    return int(times_ns[path.steps[-1].sample])
+    earliest = max(bisect_left(times_ns, settled_ns), *(step.sample for step in path.steps))
+
+    def is_reached(sample: int) -> bool:
+        until = slice(sample + 1)
+        then = evaluate_unfinished(instance.formula, order, leaves[..., until], times_ns[until])
+        return bool(then.ends(node)[1][0] <= least)
+
+    # most often no more samples are needed than decide it
+    later = range(earliest, earliest if is_reached(earliest) else len(times_ns) - 1)
+    return int(times_ns[earliest + bisect_left(later, True, key=is_reached)])
 
 
 def _step(node: int, formula: Formula, time_ns: int) -> WitnessStep:

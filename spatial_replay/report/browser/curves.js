@@ -75,7 +75,7 @@ function curvesOf(run, result, quantity) {
   if (decided && !named.includes(decided)) {
     // an atom counts at each sample: its curve is that of the samples themselves
     found.push({node: decided, numbers: decided.series[NOW], name: shortened(decided.text, 40),
-      decider: result.decided_text, at: atFault(result.fault), colour: colour("ink"), isDashed: true, reading: element("span", {class: "number"})});
+      decider: result.decided_text, isOpen: Boolean(result.left_open), at: atFault(result.fault), colour: colour("ink"), isDashed: true, reading: element("span", {class: "number"})});
   }
   return found;
 }
@@ -97,7 +97,7 @@ function legendEntry(curve, shown, build) {
     },
   }, swatch, element("span", {}, curve.isDashed ? element("code", {}, curve.name) : curve.name,
     curve.isDashed ? " now, " : null, curve.decider ? element("code", {}, curve.decider) : null,
-    curve.isDashed ? curve.decider ? ` of it decided${curve.at}` : "which decided" : null), curve.reading);
+    curve.isDashed ? curve.decider ? ` of it ${curve.isOpen ? "was uncertain" : "decided"}${curve.at}` : curve.isOpen ? "which is uncertain" : "which decided" : null), curve.reading);
 }
 
 function columns(result, curves) {

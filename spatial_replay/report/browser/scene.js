@@ -126,7 +126,8 @@ function drawScene(context, clock, scene, layers, width, height) {
   if (decision) drawPlan(context, clock, decision, at);
   const names = layers.labels ? drawLabels(context, labels, width) : [];
   const violation = pointerAt(clock) ?? violationAt(clock, scene, frame);
-  if (violation) drawViolation(context, violation, at, names, [width, height]);
+  const inks = clock.run.results[clock.result]?.left_open ? ["neutral", "quiet"] : ["negative-line", "negative-text"];
+  if (violation) drawViolation(context, violation, at, names, [width, height], inks);
 }
 
 // The arrow of the chosen result in a frame.
@@ -135,8 +136,12 @@ function violationAt({result}, scene, frame) {
 }
 
 // The colours of entities in a frame: of the requirements of the chosen result, where there are several.
-function coloursOf({run, result}, scene, frame) {
+function coloursOf(clock, scene, frame) {
+  const {run, result} = clock;
+  // whether what is asked of them holds is not known
+  const open = run.results[result]?.left_open ? pointerAt(clock)?.objects ?? [] : [];
   return (entity) => {
+    if (open.includes(entity.name)) return rgb(run.palette.neutral);
     const place = entity.shown[frame];
     if (!entity.shades) return entity.colours.subarray(3 * place, 3 * place + 3);
     const shade = entity.shades[run.results.length * place + result];
@@ -211,11 +216,11 @@ function outlined(context, text, x, y, fill) {
   context.fillText(text, x, y);
 }
 
-function drawViolation(context, {ends, label, text: atom}, at, names, [width, height]) {
+function drawViolation(context, {ends, label, text: atom}, at, names, [width, height], [line, ink]) {
   const [x0, y0, x1, y1] = [at.x(ends[0]), at.y(ends[1]), at.x(ends[2]), at.y(ends[3])];
   const length = Math.hypot(x1 - x0, y1 - y0), angle = Math.atan2(y1 - y0, x1 - x0);
   const head = Math.min(11, length / 2);
-  context.strokeStyle = context.fillStyle = colour("negative-line");
+  context.strokeStyle = context.fillStyle = colour(line);
   context.lineWidth = 3;
   context.beginPath();
   context.moveTo(x0, y0);
@@ -229,7 +234,7 @@ function drawViolation(context, {ends, label, text: atom}, at, names, [width, he
   context.closePath();
   context.fill();
   context.font = `600 ${FONT}`;
-  const number = label.replace("-", "−");
+  const number = minusWords(label);
   const halfOf = (words) => context.measureText(words).width / 2 + 4;
   const texts = atom ? [48, 32, 20, 12].map((most) => `${shortened(atom, most)}: ${number}`) : [];
   const text = [...texts, number].find((words) => 2 * halfOf(words) <= width) ?? number;
@@ -238,7 +243,7 @@ function drawViolation(context, {ends, label, text: atom}, at, names, [width, he
   const rows = [-12, 15, -27, 30, -42, 45, -57, 60, -72, 75].map((step) => (y0 + y1) / 2 + step)
     .filter((row) => row >= 10 && row <= height - 10);
   const row = rows.find((each) => !covers(names, x, each, half)) ?? rows[0] ?? 10;
-  outlined(context, text, x, row, colour("negative-text"));
+  outlined(context, text, x, row, colour(ink));
 }
 
 function drawPlan(context, clock, {target, outcome, time}, at) {
@@ -327,6 +332,11 @@ function wordsOf(clock, scene, frame) {
   const {run} = clock;
   const pointer = pointerAt(clock);
   if (pointer) {
+    const {title, left_open: between} = run.results[clock.result];
+    if (between) {
+      return ["the grey arrow, what leaves the verdict open: ", element("code", {}, pointer.text),
+        ` of ${title} lies ${minusWords(between)}`];
+    }
     if (pointer.is_condition) {
       return ["the arrow: ", element("code", {}, pointer.text),
         ` of ${run.results[clock.result].title} held here, and what had to follow did not`];
@@ -369,7 +379,11 @@ function decidedAt({run, sample, result: chosen}) {
   if (indexAt(run.times, result.fault) !== sample || place === null || place >= result.samples) return null;
   const number = node.series[NOW][place] * node.divisor;
   if (Number.isNaN(number)) return null;
-  return ["what decided the verdict: ", ...partWords({result, node: {...node, text: result.decided_text || node.text}}),
+  const part = partWords({result, node: {...node, text: result.decided_text || node.text}});
+  if (result.left_open) {
+    return ["what leaves the verdict open: ", ...part, ` lies ${minusWords(result.left_open)}; no arrow shows it`];
+  }
+  return ["what decided the verdict: ", ...part,
     ` ${signWords(number, declaredUnit(node))} now; no arrow shows it`];
 }
 
@@ -413,6 +427,10 @@ function signWords(number, unit, isPast = false) {
 // What the atom that an arrow points at is to the verdict.
 function roleWords(pointer) {
   return pointer?.is_response ? "what came nearest to what had to follow" : "what decided the verdict";
+}
+
+function minusWords(text) {
+  return text.replace(/-(?=\d)/g, "−");
 }
 
 function spaced(unit) {

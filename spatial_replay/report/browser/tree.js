@@ -46,7 +46,10 @@ function commonUnit(nodes) {
 // Marks the way to the node that decided the verdict, and scrolls to it.
 function lightPath(list, rows, {nodes, decided, fault, decided_text: decider}) {
   for (let place = decided; place !== null; place = nodes[place].parent) {
-    rows.find((row) => row.node.index === place)?.parts[0].parentElement.classList.add("decides");
+    const row = rows.find((each) => each.node.index === place);
+    if (!row) continue;
+    row.isOnPath = true;
+    row.parts[0].parentElement.classList.add("decides");
   }
   const last = rows.find((row) => row.node.index === decided)?.parts[0];
   if (!last) return;
@@ -89,14 +92,16 @@ function makeRow(node, hasIntervals) {
 
 function showRow(row, run, result, place, isLast) {
   const {node} = row;
-  const status = statusOf(run, result, node, place);
+  // uncertainty left it open: its number alone would say that it holds, or fails
+  const isLeftOpen = result.left_open && row.isOnPath && place === indexAt(result.times, result.fault);
+  const status = isLeftOpen ? "unknown" : statusOf(run, result, node, place);
   if (status !== row.status) {
     row.status = status;
     setMark(row.sign, status);
     row.words.textContent = ` ${STATUSES[status].words} `;
   }
   const isPresent = place !== null && place < result.samples;
-  const isPending = status === "pending";
+  const isPending = status === "pending" || status === "unknown";
   showNumber(row.now, isPresent ? node.series[NOW][place] : NaN, !isPresent, isPending);
   const hasValue = node.initial && place !== null;
   const at = Math.min(place ?? 0, result.samples - 1);
