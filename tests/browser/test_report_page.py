@@ -379,7 +379,8 @@ def test_the_scene_says_what_is_violated_now(open_page: Open) -> None:
     )
     caption = open_page("violated", at="#t=9.9").locator(".caption")
     expect(caption).to_have_text(
-        "the arrow: spoon dist plate <= 0.08 of table_set failed by 0.1552 at 4.000 s, what decided the verdict"
+        "the arrow: spoon dist plate <= 0.08 of table_set failed by 0.1552 at 4.000 s, "
+        "what decided the verdict"
     )
 
 
