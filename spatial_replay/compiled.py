@@ -14,6 +14,7 @@ kernel is never mistaken for the one before. `SPATIAL_REPLAY_CACHE` names anothe
 
 from __future__ import annotations
 
+import ctypes
 import hashlib
 import os
 import shutil
@@ -24,7 +25,8 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
+from operator import methodcaller
 from pathlib import Path
 from types import FunctionType
 from typing import Any, Final, Generic, Literal, ParamSpec, TypeVar, cast
@@ -112,10 +114,17 @@ def inlined(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Re
     return _Kernel(function, options)
 
 
-def direct(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """Return what calls of a kernel run from now on, without asking at each call; after `compile_ahead`."""
-    kernel = cast("_Kernel[_Arguments, _Result]", function)
-    return function if _process.interprets or _process.only == "interpreted" else kernel.compiled()
+def by_address(function: Callable[[int, int, int, int], int]) -> Callable[[int, bytes, int, int], int]:
+    """Return a kernel of an address, of bytes, and of two more integers, that a call reaches directly.
+
+    Looking at what a call is given takes as long as many a kernel: a quarter of a microsecond for each array.
+    What it is given here is not looked at, and has to stay where it is as long as the call lasts.
+    """
+    kernel = cast("_Kernel[[int, int, int, int], int]", function)
+    if _process.only == "interpreted":
+        run = kernel.interpreted()
+        return lambda frame, given, *rest: run(frame, np.frombuffer(given, np.uint8).ctypes.data, *rest)
+    return kernel.entry()
 
 
 def compile_ahead() -> None:
@@ -199,6 +208,7 @@ class _Kernel(Generic[_Arguments, _Result]):
         self._is_elementwise = is_elementwise
         self._compiled: Callable[_Arguments, _Result] | None = None
         self._interpreted: Callable[_Arguments, _Result] | None = None
+        self._entry: Callable[..., Any] | None = None
         self._spent_s = 0.0
         self._element_s: float | None = None
 
@@ -227,7 +237,7 @@ class _Kernel(Generic[_Arguments, _Result]):
     @property
     def is_compiled(self) -> bool:
         """Whether there is machine code for the arguments of at least one call."""
-        return bool(getattr(self._compiled, "signatures", ()))
+        return self._entry is not None or bool(getattr(self._compiled, "signatures", ()))
 
     def _may_interpret(self, elements: int) -> bool:
         if _process.only is not None:
@@ -244,13 +254,21 @@ class _Kernel(Generic[_Arguments, _Result]):
     def interpreted(self) -> Callable[_Arguments, _Result]:
         """Return the function as it stands, calling others as they stand."""
         if self._interpreted is None:
-            self._interpreted = _linked(self.__wrapped__, _Kernel.interpreted)
+            self._interpreted = _linked(self.__wrapped__, methodcaller("interpreted"))
         return self._interpreted
+
+    def entry(self) -> Callable[..., Any]:
+        """Return the machine code of a function of four integers, to be called without looking at these."""
+        if self._entry is None:
+            self._entry = _process.compile_entry(_linked(self.__wrapped__, methodcaller("compiled")))
+        return self._entry
 
     def compiled(self) -> Callable[_Arguments, _Result]:
         """Return the function as machine code, calling machine code."""
         if self._compiled is None:
-            self._compiled = _process.compile(_linked(self.__wrapped__, _Kernel.compiled), self.options)
+            self._compiled = _process.compile(
+                _linked(self.__wrapped__, methodcaller("compiled")), self.options
+            )
         return self._compiled
 
 
@@ -299,6 +317,31 @@ def _view(value: Any) -> object:
     return memoryview(cast(bytes, value)) if isinstance(value, np.ndarray) else value
 
 
+class _ArrayAt(_Kernel[[int, int], Any]):
+    """An array of so many numbers that begins at an address."""
+
+    def __init__(self, name: str, kind: type) -> None:
+        super().__init__(lambda address, count: None, {"no_cpython_wrapper": True})
+        self.__name__ = name
+        self._kind = kind
+
+    def interpreted(self) -> Callable[[int, int], Any]:
+        kind: Any = ctypes.c_double if self._kind is np.float64 else ctypes.c_int64
+        return lambda address, count: np.frombuffer(
+            (kind * int(count)).from_address(int(address)), self._kind
+        )
+
+    def compiled(self) -> Callable[[int, int], Any]:
+        if self._compiled is None:
+            self._compiled = _process.array_at(self._kind)
+        return self._compiled
+
+
+floats_at: Final = _ArrayAt("floats_at", np.float64)
+integers_at: Final = _ArrayAt("integers_at", np.int64)
+"""Within kernels that are called by address alone."""
+
+
 class _Process:
     """What this process knows about its kernels: the compiler, the cache, who listens."""
 
@@ -332,17 +375,52 @@ class _Process:
 
     def compile(self, function: Callable[..., Any], options: dict[str, Any]) -> Any:
         """Return a function that is compiled for the types of its arguments when it is called."""
+        return self._compile(lambda numba: numba.njit, function, options)
+
+    def compile_entry(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        """Compile a function of four integers; return it as what takes bytes for the second of them."""
+        made = self._compile(
+            lambda numba: partial(numba.cfunc, "int64(int64, int64, int64, int64)"), function, {}
+        )
+        integer = ctypes.c_int64
+        call = ctypes.PYFUNCTYPE(integer, integer, ctypes.c_char_p, integer, integer)(made.address)
+        call.code = made  # type: ignore[attr-defined]  # lives as long as the function
+        return cast(Callable[..., Any], call)
+
+    def array_at(self, kind: type) -> Any:
+        """Return a function of an address and a count, compiled into every kernel that calls it."""
+        import numba
+        from numba.core import cgutils, types
+        from numba.extending import intrinsic
+
+        @intrinsic
+        def pointer_to(_context, address):  # type: ignore[no-untyped-def]
+            def generate(_context, builder, _signature, arguments):  # type: ignore[no-untyped-def]
+                return builder.inttoptr(arguments[0], cgutils.voidptr_t)
+
+            return types.voidptr(address), generate
+
+        carray, pointer_at = cast(Any, numba).carray, cast(Any, pointer_to)
+
+        def array_at(address, count):  # type: ignore[no-untyped-def]
+            return carray(pointer_at(address), (count,), dtype=kind)
+
+        return self._compile(lambda numba: numba.njit, array_at, {"forceinline": True})
+
+    def _compile(
+        self, form: Callable[[Any], Callable[..., Any]], function: Callable[..., Any], options: dict[str, Any]
+    ) -> Any:
         with self._lock:
             if self._compiler is None:
                 self._compiler = self._load()
             numba = self._compiler
             if self._folder is None:
-                return numba.njit(error_model="numpy", **options)(function)
+                return form(numba)(error_model="numpy", **options)(function)
             # the folder is read from the compiler's settings when a function is decorated; they belong to
             # the user's own functions, too, and are put back
             before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(self._folder)
             try:
-                return numba.njit(cache=True, error_model="numpy", **options)(function)
+                return form(numba)(cache=True, error_model="numpy", **options)(function)
             finally:
                 numba.config.CACHE_DIR = before
 

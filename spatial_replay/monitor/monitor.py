@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
@@ -79,22 +79,45 @@ class SpecUpdate:
         return online_verdict(float(self.numbers[0, 2]), float(self.numbers[0, 3]))
 
 
+class Monitored(NamedTuple):
+    """What a monitor evaluates, the same after every sample.
+
+    Attributes:
+        specs: the result specs, with the names of their nodes and the unit of each.
+        places: for each name of a node, its index in `specs` and its node.
+    """
+
+    specs: tuple[tuple[NamedSpec, tuple[str | None, ...], str], ...]
+    places: Mapping[str, tuple[int, int]]
+
+
 @dataclass(frozen=True, eq=False)
 class Update:
     """The numbers and verdicts after a sample.
 
     Attributes:
-        specs: one for each result spec, in the order of the text.
-        places: for each name, its index in `specs` and its node.
+        numbers: for each result spec (N, 4), as in `SpecUpdate`.
+        monitored: what they are numbers of.
         settled: what `violations` are found from.
         satisfied: the specs that are satisfied whatever comes; why is found when asked for (`reason`).
     """
 
     time_ns: int
-    specs: tuple[SpecUpdate, ...]
-    places: Mapping[str, tuple[int, int]] = field(repr=False)
+    numbers: Sequence[Floats | None] = field(repr=False)
+    monitored: Monitored = field(repr=False)
     settled: tuple[Settled, ...] = field(repr=False, default=())
     satisfied: tuple[Settled, ...] = field(repr=False, default=())
+
+    @cached_property
+    def specs(self) -> tuple[SpecUpdate, ...]:
+        """One for each result spec, in the order of the text."""
+        each = zip(self.monitored.specs, self.numbers, strict=True)
+        return tuple([SpecUpdate(spec, numbers, names, unit) for (spec, names, unit), numbers in each])
+
+    @property
+    def places(self) -> Mapping[str, tuple[int, int]]:
+        """For each name, its index in `specs` and its node."""
+        return self.monitored.places
 
     @cached_property
     def violations(self) -> tuple[Violation, ...]:
@@ -175,9 +198,11 @@ class Monitor:
             names = ", ".join(f"{spec.name}({spec.parameter})" for spec in templates)
             raise UsageError(f"{names} is a template; name its object, or evaluate it over a log")
         self._specs = specification.results
-        self._names = tuple(tuple(node.name for _, _, node in iter_nodes(s.formula)) for s in self._specs)
+        node_names = tuple(tuple(node.name for _, _, node in iter_nodes(s.formula)) for s in self._specs)
         self._units = tuple(declared_unit(spec.formula, known) for spec in self._specs)
-        self._places = _places_of_names(self._names)
+        self._monitored = Monitored(
+            tuple(zip(self._specs, node_names, self._units, strict=True)), _places_of_names(node_names)
+        )
         compile_ahead()
         # a trial run loads every kernel now, so that no sample has to wait for one
         trial = LiveStream(specification, checked, 0)
@@ -214,21 +239,15 @@ class Monitor:
             )
         self._last_ns = time_ns
         self._numbers = numbers = self._live.extend(sample)
-        specs = []
-        for spec, each, names, unit in zip(self._specs, numbers, self._names, self._units, strict=True):
-            # bypasses the constructors of frozen values, which would take as long as the kernel
-            of_spec = object.__new__(SpecUpdate)
-            own = of_spec.__dict__
-            own["spec"], own["numbers"], own["names"], own["unit"] = spec, each, names, unit
-            specs.append(of_spec)
         settled: tuple[Settled, ...] = ()
         satisfied: tuple[Settled, ...] = ()
         if self._violations is not None:
             self._violations.extend(sample, numbers)
             settled, satisfied = self._violations.settled, self._violations.satisfied
+        # bypasses the constructor of a frozen value, which would take as long as the kernel
         update = object.__new__(Update)
         own = update.__dict__
-        own["time_ns"], own["specs"], own["places"] = time_ns, tuple(specs), self._places
+        own["time_ns"], own["numbers"], own["monitored"] = time_ns, numbers, self._monitored
         own["settled"], own["satisfied"] = settled, satisfied
         return update
 

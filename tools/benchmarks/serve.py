@@ -29,6 +29,8 @@ from spatial_replay.trace.trace import Trace
 SAMPLES = 100_000
 WINDOWS = ("0,600", "0,10000", "0s,1s")
 """Of the operator below another one; a change costs the same with each."""
+OUTER = ("0,5", "0s,0.2s")
+"""Of the window above another one, which is kept at each position that is open."""
 CHANGES = 9
 PATIENCE_S = 60.0
 
@@ -128,6 +130,7 @@ def bench_what_if(bench: Any) -> None:
     cases = [("block pushing", blocks.replace("closeto ", "closeto[near] "), 25.0)]
     # parsing and the encoding of curves weigh more beside few numbers
     cases += [(f"window [{window}]", _response(window), 90.0) for window in WINDOWS]
+    cases += [(f"a window below one [{outer}]", _nested(outer), 200.0) for outer in OUTER]
     for name, text, most in cases:
         loaded = LoadedLog(MemorySource(trace), [sr.parse_specification(f"const near = 70\n{text}")])
         numbers = np.concatenate([each.series for each in loaded.evaluate().stretches])
@@ -147,6 +150,12 @@ def _spent(run: Callable[[], object]) -> float:
     start = time.process_time()
     run()
     return time.process_time() - start
+
+
+def _nested(outer: str) -> str:
+    unit = "s" if "s" in outer else ""
+    inner = f"0{unit},{2 if unit else 60}{unit}"
+    return f"spec passed = G (red1 closeto[near] blue1 -> F[{outer}] G[{inner}] red1 below blue1)"
 
 
 def _response(window: str) -> str:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from array import array
 from collections import OrderedDict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import chain, zip_longest
 from math import nan
 from types import MappingProxyType
@@ -80,22 +80,23 @@ class LeafPlan:
         """The memory of its arrays."""
         return sum(array.nbytes for array in self.arrays)
 
-    def numbers(self, samples: Sequence[Sample | None], stands_for: Mapping[str, str]) -> Floats:
-        """Flatten samples for `leaves_of_sample`.
+    def numbers(self, samples: Sequence[Sample | None], stands_for: Mapping[str, str]) -> bytes:
+        """Flatten samples for `leaves_of_sample`, as the bytes of doubles.
 
         Args:
             samples: the one at each of the frame's delays; None before the first.
             stands_for: the objects that go by another name among the plan's members.
         """
         numbers: list[float] = [ABSENT if sample is None else 0 for sample in samples]
+        if not self._places:
+            signals = cast(Sample, samples[0]).signals
+            return array("d", numbers + [signals.get(name, nan) for name in self._signals]).tobytes()
         parts: list[float] = []
         vertices: list[bytes] = []
         classes = self._classes
+        lookups = [_NOTHING_THERE if sample is None else sample.objects.get for sample in samples]
         for place, name in self._places:
-            sample = samples[place]
-            tracked: Any = None
-            if sample is not None:
-                tracked = sample.objects.get(stands_for.get(name, name) if stands_for else name)
+            tracked: Any = lookups[place](stands_for.get(name, name) if stands_for else name)
             if tracked is None:
                 numbers += _NO_OBJECT_THERE
                 continue
@@ -111,10 +112,11 @@ class LeafPlan:
             newest = cast(Sample, samples[0]).signals
             parts += [newest.get(name, nan) for name in self._signals]
         # one copy of all: each array that is made or passed costs as much as some objects
-        return np.frombuffer(b"".join((array("d", numbers + parts), *vertices)))
+        return b"".join((array("d", numbers + parts), *vertices))
 
 
 _NO_HEIGHT = (nan, nan)
+_NOTHING_THERE: Callable[[str], None] = MappingProxyType[str, None]({}).get
 _NO_OBJECT_THERE = (ABSENT, 0, nan, nan, nan, 0.0)
 
 
@@ -247,10 +249,13 @@ class SampleLeaves:
             UsageError: more bindings than `MAX_BINDINGS`.
         """
         planned = self.planned(samples)
-        return self._values_with_unknown() if planned is None else leaves_of_sample(*planned)
+        if planned is None:
+            return self._values_with_unknown()
+        plan, numbers = planned
+        return leaves_of_sample(plan, np.frombuffer(numbers))
 
-    def planned(self, samples: Sequence[Sample | None]) -> tuple[PackedPlan, Floats] | None:
-        """Return what `leaves_of_sample` takes; None if `values` alone can compute the leaves.
+    def planned(self, samples: Sequence[Sample | None]) -> tuple[PackedPlan, bytes] | None:
+        """Return what `leaves_of_sample` takes, as bytes; None if `values` alone can compute the leaves.
 
         Raises:
             UsageError: more bindings than `MAX_BINDINGS`.

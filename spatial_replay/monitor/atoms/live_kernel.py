@@ -7,7 +7,7 @@ or object has the class code `ABSENT`.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, Final, NamedTuple, cast
 
 import numpy as np
 
@@ -103,38 +103,51 @@ def packed(plan: PlanArrays) -> PackedPlan:
     return PackedPlan(np.concatenate([np.array(starts, np.int64), whole]), numbers)
 
 
+_AT: Final[Any] = PlanArrays(*cast(Any, range(len(PlanArrays._fields))))
+"""The number of each array."""
+
+
+@merged
+def _integers(plan: PackedPlan, number: int) -> Integers:
+    return plan.whole[plan.whole[2 * number] : plan.whole[2 * number + 1]]
+
+
+@merged
+def _floats(plan: PackedPlan, number: int) -> Floats:
+    return plan.numbers[plan.whole[2 * number] : plan.whole[2 * number + 1]]
+
+
 @merged
 def _unpacked(plan: PackedPlan) -> PlanArrays:
-    at, whole, numbers = plan.whole, plan.whole, plan.numbers
     return PlanArrays(
-        whole[at[0] : at[1]],
-        whole[at[2] : at[3]],
-        whole[at[4] : at[5]],
-        numbers[at[6] : at[7]],
-        numbers[at[8] : at[9]],
-        numbers[at[10] : at[11]].reshape((-1, 2)),
-        whole[at[12] : at[13]],
-        whole[at[14] : at[15]],
-        whole[at[16] : at[17]],
-        numbers[at[18] : at[19]],
-        whole[at[20] : at[21]],
-        whole[at[22] : at[23]],
-        whole[at[24] : at[25]],
-        whole[at[26] : at[27]],
-        whole[at[28] : at[29]].reshape((-1, 3)),
-        whole[at[30] : at[31]],
-        whole[at[32] : at[33]],
-        whole[at[34] : at[35]],
-        whole[at[36] : at[37]],
-        whole[at[38] : at[39]],
-        numbers[at[40] : at[41]],
-        whole[at[42] : at[43]],
-        whole[at[44] : at[45]],
-        whole[at[46] : at[47]],
-        whole[at[48] : at[49]],
-        whole[at[50] : at[51]].reshape((-1, 4)),
-        numbers[at[52] : at[53]],
-        whole[at[54] : at[55]],
+        extent=_integers(plan, _AT.extent),
+        region_parts=_integers(plan, _AT.region_parts),
+        region_sizes=_integers(plan, _AT.region_sizes),
+        region_radius=_floats(plan, _AT.region_radius),
+        region_vertices=_floats(plan, _AT.region_vertices),
+        region_heights=_floats(plan, _AT.region_heights).reshape((-1, 2)),
+        operand_start=_integers(plan, _AT.operand_start),
+        operand_rows=_integers(plan, _AT.operand_rows),
+        operand_classes=_integers(plan, _AT.operand_classes),
+        enlargement=_floats(plan, _AT.enlargement),
+        geometric=_integers(plan, _AT.geometric),
+        quantity=_integers(plan, _AT.quantity),
+        first=_integers(plan, _AT.first),
+        second=_integers(plan, _AT.second),
+        yaws=_integers(plan, _AT.yaws).reshape((-1, 3)),
+        required_start=_integers(plan, _AT.required_start),
+        required=_integers(plan, _AT.required),
+        closest_start=_integers(plan, _AT.closest_start),
+        closest_rows=_integers(plan, _AT.closest_rows),
+        closest_classes=_integers(plan, _AT.closest_classes),
+        closest_enlargement=_floats(plan, _AT.closest_enlargement),
+        member_start=_integers(plan, _AT.member_start),
+        member_rows=_integers(plan, _AT.member_rows),
+        member_classes=_integers(plan, _AT.member_classes),
+        is_group=_integers(plan, _AT.is_group),
+        code=_integers(plan, _AT.code).reshape((-1, 4)),
+        constants=_floats(plan, _AT.constants),
+        outputs=_integers(plan, _AT.outputs),
     )
 
 
@@ -344,9 +357,26 @@ def _channels_of(values: Floats, spreads: Floats, signals: Floats, closest: Floa
 
 
 @merged
+def _leaves_of_signals(plan: PlanArrays, numbers: Floats) -> Floats:
+    """Compute the leaves where there are no regions and no objects, with few arrays."""
+    samples, count = plan.extent[0], plan.extent[3]
+    signals = numbers[samples : samples + count].reshape((count, 1))
+    nothing = numbers[:0].reshape((0, 1))
+    closest, members = numbers[:0].reshape((0, 4, 1)), np.empty((0, 1), np.int8)
+    leaves = np.empty((_channels_of(nothing, nothing, signals, closest, members), len(plan.outputs), 1))
+    run_instructions(
+        plan.code, plan.constants, nothing, nothing, signals, closest, members, plan.outputs, leaves, 0, 1
+    )
+    return leaves
+
+
+@merged
 def leaves_of_plan(packed_plan: PackedPlan, numbers: Floats) -> Floats:
     """Compute `leaves_of_sample`, within another kernel."""
     plan = _unpacked(packed_plan)
+    measured = len(plan.required_start) - 1 + len(plan.closest_enlargement)
+    if plan.extent[1] + plan.extent[2] + len(plan.is_group) + measured == 0:
+        return _leaves_of_signals(plan, numbers)
     rows = _rows_of_sample(plan, numbers)
     values = np.empty((len(plan.required_start) - 1, 1))
     spreads = np.empty((len(plan.required_start) - 1, 1))

@@ -6,24 +6,30 @@ lie in two buffers, of floats and of integers.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from itertools import chain, pairwise
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from spatial_replay.compiled import direct, kernel, merged
+from spatial_replay.compiled import by_address, floats_at, integers_at, kernel, merged
 from spatial_replay.geometry.arrays import Floats, Integers, starts_from_counts
 from spatial_replay.monitor.atoms.live_kernel import PackedPlan, leaves_of_plan
 from spatial_replay.monitor.online.node_numbers import Results
 from spatial_replay.monitor.online.program import Program
 from spatial_replay.monitor.online.state import KEEPS, OFFSET, POSITION, Memory, Scratch
 from spatial_replay.monitor.online.step import AnyArray, OnlineRun, Tables, step, step_with_windows
+from spatial_replay.monitor.online.windows import forget
 
 ROOM: Final = 64
 """Recent samples a run has room for at first: few, so that they stay in the processor's cache."""
 
 _NO_ROOM: Final = -1
+
+# of a frame: a plan's arrays, those of `Buffers`, and the results, each by its address and length; how many
+# channels there are, and the time of the sample
+_PLAN, _CONSTANTS, _NUMBERS, _WHOLE, _SERIES, _CHANNELS, _TIME = 0, 2, 4, 6, 8, 10, 11
+_FRAME: Final = 12
 _MOST_DIMENSIONS: Final = 4
 
 # where each array comes in `OnlineRun.arrays`
@@ -143,20 +149,24 @@ def _run_at(numbers: Floats, whole: Integers, at: Integers) -> tuple[Tables, Mem
 
 
 @merged
-def _wanted(whole: Integers, layout: Integers, leaves: Floats, channels: int) -> int:
+def _wanted(numbers: Floats, whole: Integers, layout: Integers, leaves: Floats, channels: int) -> int:
     """Return how many channels runs lack, `_NO_ROOM` if one has no room for a sample, 0 if all is well."""
     if leaves.shape[0] > channels:
         return int(leaves.shape[0])
     for r in range(layout.shape[0]):
         clock = _array_1(whole, layout[r, _MEMORY_AT.clock])
         if clock[KEEPS] and clock[POSITION] - clock[OFFSET] >= layout[r, _MEMORY_AT.stamps, 1]:
-            return _NO_ROOM
+            tables, memory, scratch, _ = _run_at(numbers, whole, layout[r])
+            if not forget(tables.signals, tables.nodes, tables.parts, memory, scratch, channels):
+                return _NO_ROOM
     return 0
 
 
 @merged
 def _own_leaves(leaves: Floats, begin: int, end: int, channels: int) -> Floats:
     """Return some leaves in so many channels (see `in_channels`)."""
+    if leaves.shape[0] == channels and leaves.shape[1] == end - begin:
+        return leaves
     own = np.empty((channels, end - begin, 1))
     for channel in range(channels):
         for k in range(end - begin):
@@ -165,53 +175,58 @@ def _own_leaves(leaves: Floats, begin: int, end: int, channels: int) -> Floats:
 
 
 @kernel
-def _take_in(
-    plan: Integers, constants: Floats, sample: Floats, numbers: Floats, whole: Integers, channels: int,
-    time_ns: int, series: Floats,
-) -> int:  # fmt: skip
+def _take_in(frame_at: int, sample_at: int, length: int, time_ns: int) -> int:
     """Add a sample to all runs, whose programs have no windows under their parts.
 
     Args:
-        plan, constants: a `PackedPlan`.
-        sample: the numbers for it (see `leaves_of_sample`).
-        numbers, whole: `Buffers`.
-        channels: how many the runs have.
-        series: (N, 4), receives value, now, lower and upper of each node.
+        frame_at: address of a frame: of each array and how long it is, and how many channels the runs have.
+        sample_at, length: address of the numbers for the sample (see `leaves_of_sample`), and their count.
 
     Returns:
         0; or, if nothing was added, how many channels are needed, or `_NO_ROOM`.
     """
-    leaves = leaves_of_plan(PackedPlan(plan, constants), sample)
+    frame = integers_at(frame_at, _FRAME)
+    plan = PackedPlan(
+        integers_at(frame[_PLAN], frame[_PLAN + 1]), floats_at(frame[_CONSTANTS], frame[_CONSTANTS + 1])
+    )
+    leaves = leaves_of_plan(plan, floats_at(sample_at, length))
+    numbers = floats_at(frame[_NUMBERS], frame[_NUMBERS + 1])
+    whole = integers_at(frame[_WHOLE], frame[_WHOLE + 1])
+    series = floats_at(frame[_SERIES], frame[_SERIES + 1]).reshape((-1, 4, 1))
     layout, own, nodes = _layout_of(whole)
-    wanted = _wanted(whole, layout, leaves, channels)
+    wanted = _wanted(numbers, whole, layout, leaves, frame[_CHANNELS])
     if wanted == 0:
-        times_ns = np.empty(1, np.int64)
+        times_ns = frame[_TIME:]
         times_ns[0] = time_ns
         for r in range(layout.shape[0]):
             tables, memory, scratch, final = _run_at(numbers, whole, layout[r])
-            of_run = series[nodes[r] : nodes[r + 1]].reshape((nodes[r + 1] - nodes[r], 4, 1))
-            at = _own_leaves(leaves, own[r], own[r + 1], channels)
-            step(tables, memory, scratch, at, times_ns, 0, 1, Results(of_run, final))
+            at = _own_leaves(leaves, own[r], own[r + 1], frame[_CHANNELS])
+            results = Results(series[nodes[r] : nodes[r + 1]], final)
+            step(tables, memory, scratch, at, times_ns, 0, 1, results)
     return wanted
 
 
 @kernel
-def _take_in_with_windows(
-    plan: Integers, constants: Floats, sample: Floats, numbers: Floats, whole: Integers, channels: int,
-    time_ns: int, series: Floats,
-) -> int:  # fmt: skip
+def _take_in_with_windows(frame_at: int, sample_at: int, length: int, time_ns: int) -> int:
     """`_take_in` for any programs."""
-    leaves = leaves_of_plan(PackedPlan(plan, constants), sample)
+    frame = integers_at(frame_at, _FRAME)
+    plan = PackedPlan(
+        integers_at(frame[_PLAN], frame[_PLAN + 1]), floats_at(frame[_CONSTANTS], frame[_CONSTANTS + 1])
+    )
+    leaves = leaves_of_plan(plan, floats_at(sample_at, length))
+    numbers = floats_at(frame[_NUMBERS], frame[_NUMBERS + 1])
+    whole = integers_at(frame[_WHOLE], frame[_WHOLE + 1])
+    series = floats_at(frame[_SERIES], frame[_SERIES + 1]).reshape((-1, 4, 1))
     layout, own, nodes = _layout_of(whole)
-    wanted = _wanted(whole, layout, leaves, channels)
+    wanted = _wanted(numbers, whole, layout, leaves, frame[_CHANNELS])
     if wanted == 0:
-        times_ns = np.empty(1, np.int64)
+        times_ns = frame[_TIME:]
         times_ns[0] = time_ns
         for r in range(layout.shape[0]):
             tables, memory, scratch, final = _run_at(numbers, whole, layout[r])
-            of_run = series[nodes[r] : nodes[r + 1]].reshape((nodes[r + 1] - nodes[r], 4, 1))
-            at = _own_leaves(leaves, own[r], own[r + 1], channels)
-            step_with_windows(tables, memory, scratch, at, times_ns, 0, 1, Results(of_run, final))
+            at = _own_leaves(leaves, own[r], own[r + 1], frame[_CHANNELS])
+            results = Results(series[nodes[r] : nodes[r + 1]], final)
+            step_with_windows(tables, memory, scratch, at, times_ns, 0, 1, results)
     return wanted
 
 
@@ -223,11 +238,14 @@ class LiveRuns:
         self._runs = [OnlineRun(program, room=ROOM, tile=1) for program in programs]
         self._channels = 1
         has_windows = any(run.has_windows for run in self._runs)
-        self._take_in: Callable[..., int] = direct(_take_in_with_windows if has_windows else _take_in)
+        self._take_in = by_address(_take_in_with_windows if has_windows else _take_in)
         self._leaves = starts_from_counts([len(program.leaves) for program in programs])
         self._nodes = starts_from_counts([len(program.reports) for program in programs])
-        self._node_count = int(self._nodes[-1])
         self._buffers = _joined(self._runs, self._leaves, self._nodes)
+        self._plan: PackedPlan | None = None
+        self._series = np.empty((int(self._nodes[-1]), 4))
+        self._frame = np.zeros(_FRAME, np.int64)
+        self._frame_at = self._frame.ctypes.data
 
     @property
     def finals(self) -> list[Floats | None]:
@@ -235,14 +253,16 @@ class LiveRuns:
         before the first sample."""
         return [run.final if len(run) else None for run in self._runs]
 
-    def extend(self, plan: PackedPlan, sample: Floats, time_ns: int) -> Floats:
-        """Add a sample, as `leaves_of_sample` takes it.
+    def extend(self, plan: PackedPlan, sample: bytes, time_ns: int) -> Floats:
+        """Add a sample, as the bytes of what `leaves_of_sample` takes.
 
         Returns:
             (N, 4): value, now, lower and upper of the nodes of all formulas, one formula after the other.
         """
-        series = np.empty((self._node_count, 4))
-        while wanted := self._take_in(*plan, sample, *self._buffers, self._channels, time_ns, series):
+        if plan is not self._plan:
+            self._plan = plan
+            self._fill_frame()
+        while wanted := self._take_in(self._frame_at, sample, len(sample) // 8, time_ns):
             for run in self._runs:
                 if wanted == _NO_ROOM:
                     run.make_room(1)
@@ -250,7 +270,7 @@ class LiveRuns:
                     run.widen(wanted)
             self._channels = max(self._channels, wanted)
             self._join()
-        return series
+        return self._series.copy()
 
     def extend_with(self, leaves: Floats, time_ns: int) -> Floats:
         """Add a sample of which the leaves (C, A, 1) are known; return what `extend` does."""
@@ -268,6 +288,14 @@ class LiveRuns:
         stamps = (run.arrays[_MEMORY_AT.stamps] for run in self._runs)
         if any(each.base is not self._buffers.whole for each in stamps):
             self._buffers = _joined(self._runs, self._leaves, self._nodes)
+        self._fill_frame()
+
+    def _fill_frame(self) -> None:
+        """Enter where all arrays are."""
+        if self._plan is not None:
+            arrays = (*self._plan, *self._buffers, self._series)
+            self._frame[:_CHANNELS] = [number for each in arrays for number in (each.ctypes.data, each.size)]
+        self._frame[_CHANNELS] = self._channels
 
 
 def _joined(runs: Sequence[OnlineRun], leaves: Integers, nodes: Integers) -> Buffers:

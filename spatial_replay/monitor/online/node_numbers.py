@@ -29,6 +29,18 @@ class Results(NamedTuple):
 
 
 @inlined
+def _columns_of(reports: Integers, n: int) -> tuple[int, int, int, int, int]:
+    """Return the code of a node, its index and rule, and where its operands begin and end."""
+    return (
+        reports[n, codes.REPORT_CODE],
+        reports[n, codes.REPORT_INDEX],
+        reports[n, codes.REPORT_RULE],
+        reports[n, codes.REPORT_FIRST],
+        reports[n, codes.REPORT_END],
+    )
+
+
+@inlined
 def _combine_low(code: int, low: float, high: float, other_low: float, other_high: float) -> float:
     """Return the lower end of a Boolean operator over two intervals; the upper end is its mirror image."""
     if code == codes.REPORT_AND:
@@ -154,12 +166,7 @@ def _report_known(
     series = results.series
     room = np.empty(count)
     for n in range(reports.shape[0] - 1, -1, -1):
-        code, index, rule = (
-            reports[n, codes.REPORT_CODE],
-            reports[n, codes.REPORT_INDEX],
-            reports[n, codes.REPORT_RULE],
-        )
-        start, stop = reports[n, codes.REPORT_FIRST], reports[n, codes.REPORT_END]
+        code, index, rule, start, stop = _columns_of(reports, n)
         value, now = _row(series, n, 0, t, count), _row(series, n, 1, t, count)
         lower, upper = _row(series, n, 2, t, count), _row(series, n, 3, t, count)
         if code == codes.REPORT_SIGNAL:
@@ -225,12 +232,7 @@ def report(
     wide_high = wide_low + nominal_high
     numbers = scratch.nodes
     for n in range(reports.shape[0] - 1, -1, -1):
-        code, index, rule = (
-            reports[n, codes.REPORT_CODE],
-            reports[n, codes.REPORT_INDEX],
-            reports[n, codes.REPORT_RULE],
-        )
-        start, stop = reports[n, codes.REPORT_FIRST], reports[n, codes.REPORT_END]
+        code, index, rule, start, stop = _columns_of(reports, n)
         rows = numbers[n]
         if code == codes.REPORT_SIGNAL:  # settled by the first sample
             if count == 1:

@@ -42,6 +42,16 @@ class Look(NamedTuple):
     corner: int
 
 
+@inlined
+def look_of(which: int, channels: int) -> Look:
+    """Return how a part is seen for one of its numbers."""
+    nominal_high = 1 if channels > 1 else 0
+    wide_low = 2 if channels > 2 else 0
+    channel = (0 if which < 2 else wide_low) + (nominal_high if which % 2 else 0)
+    mode = codes.OPEN_LOW if which == 4 else codes.OPEN_HIGH if which == 5 else codes.OPEN_END
+    return Look(channel, channel ^ nominal_high, mode, 0)
+
+
 class Recent(NamedTuple):
     """What is known of the recent samples, and room to work in: arrays of `Memory` and `Scratch`."""
 
@@ -112,16 +122,6 @@ def join(is_greatest: bool, first: Floats, second: Floats, target: Floats) -> No
     else:
         for k in range(len(target)):
             target[k] = min(first[k], second[k])
-
-
-@uncounted
-def join_with(is_greatest: bool, target: Floats, value: float) -> None:
-    if is_greatest:
-        for k in range(len(target)):
-            target[k] = max(target[k], value)
-    else:
-        for k in range(len(target)):
-            target[k] = min(target[k], value)
 
 
 @uncounted
@@ -396,7 +396,7 @@ def bring_up(
                 begin = _first_up_to(node, codes.NODE_HIGH, recent, offset, last, begin)
             begin = max(begin, lowest)
             if is_joined:
-                _join_samples(node, columns[a], target, begin, lowest, recent, offset, last, since)
+                begin = _join_samples(node, columns[a], target, begin, lowest, recent, offset, last, since)
             else:
                 run_window(node, columns[a], target, begin, end, look.mode, recent, offset, last)
         changed[d - first] = begin
@@ -441,15 +441,33 @@ def _run_running(
 def _join_samples(
     node: Integers, source: Floats, target: Floats, begin: int, lowest: int, recent: Recent, offset: int,
     last: int, since: int,
-) -> None:  # fmt: skip
-    """Join the new samples with the open windows that hold them, the first of which is that of `begin`."""
-    is_greatest = node[codes.NODE_CODE] == codes.PART_WINDOW_MAX
+) -> int:  # fmt: skip
+    """Join the new samples with the open windows that hold them, the first of which is that of `begin`.
+
+    These windows all end with the sample, so that the later one begins, the less it holds: where one changes,
+    so do those after it, and the first is searched by halves.
+
+    Returns:
+        The first position that changes.
+    """
+    is_greatest, changed = node[codes.NODE_CODE] == codes.PART_WINDOW_MAX, since
     for position in range(since, last + 1):
+        value = source[position - offset]
         target[position - offset] = -np.inf if is_greatest else np.inf
-        oldest, after = begin, position + 1
+        low, after = begin, position + 1
         if position > since:
-            oldest = max(_first_up_to(node, codes.NODE_HIGH, recent, offset, last, position), lowest)
+            low = max(_first_up_to(node, codes.NODE_HIGH, recent, offset, last, position), lowest)
         if node[codes.NODE_LOW] > 0:
             after = 1 + behind(recent.stamps, offset, position, node[codes.NODE_UNIT], node[codes.NODE_LOW])
-        if oldest < after:
-            join_with(is_greatest, target[oldest - offset : after - offset], source[position - offset])
+        high = max(after, low)
+        while low < high:
+            middle = (low + high) >> 1
+            held = target[middle - offset]
+            if held < value if is_greatest else held > value:
+                high = middle
+            else:
+                low = middle + 1
+        if low < after:
+            fill(target[low - offset : after - offset], value)
+            changed = min(changed, low)
+    return changed

@@ -194,14 +194,6 @@ def _know_no_columns(memory: Memory) -> None:
     memory.window_next[:] = -1
 
 
-def forget(memory: Memory, moved: int, used: int, channels: int) -> None:
-    """Drop the oldest `moved` of `used` recent samples, in the channels in use."""
-    memory.stamps[: used - moved] = memory.stamps[moved:used].copy()
-    history = memory.history[:channels]
-    history[:, :, : used - moved] = history[:, :, moved:used].copy()
-    _know_no_columns(memory)
-
-
 def doubled(memory: Memory, channels: int) -> Memory:
     """Return the memory with twice the room for recent samples; only channels in use take up memory."""
     old = len(memory.stamps)

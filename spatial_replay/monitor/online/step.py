@@ -31,13 +31,12 @@ from spatial_replay.monitor.online.state import (
     Scratch,
     doubled,
     first_memory,
-    forget,
     has_windows,
     scratch_for,
     widen,
 )
 from spatial_replay.monitor.online.tables import step_tables
-from spatial_replay.monitor.online.windows import kept_from, step_windows
+from spatial_replay.monitor.online.windows import forget, step_windows
 
 AnyArray: TypeAlias = NDArray[Any]
 
@@ -215,10 +214,8 @@ class OnlineRun:
         used = position - offset
         if used + wanted > room:
             signals, nodes, parts = self._program.signals, self._program.nodes, self._program.parts
-            keep = kept_from(signals, nodes, parts, self._memory, self._scratch, offset, position - 1)
-            if 2 * (keep - offset) >= room:
-                forget(self._memory, keep - offset, used, self._channels)
-                clock[OFFSET] = offset = keep
+            if forget(signals, nodes, parts, self._memory, self._scratch, self._channels):
+                offset = int(clock[OFFSET])
             elif used == room:
                 self._memory = doubled(self._memory, self._channels)
                 self._scratch = scratch_for(self._program, 2 * room, self._tile)

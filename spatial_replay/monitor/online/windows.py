@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from spatial_replay.compiled import inlined, kernel, uncounted
+from spatial_replay.compiled import inlined, kernel, piece, uncounted
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.open_windows import (
@@ -25,12 +25,15 @@ from spatial_replay.monitor.online.open_windows import (
     enter_samples,
     extremum,
     join,
+    look_of,
     recent_of,
     run_shift,
     run_window,
 )
 from spatial_replay.monitor.online.state import (
     NUMBERS,
+    OFFSET,
+    POSITION,
     Memory,
     Scratch,
     ahead,
@@ -213,16 +216,6 @@ def _run_dependent(
 
 
 @inlined
-def _look_of(which: int, channels: int) -> Look:
-    """Return how a part is seen for one of its numbers."""
-    nominal_high = 1 if channels > 1 else 0
-    wide_low = 2 if channels > 2 else 0
-    channel = (0 if which < 2 else wide_low) + (nominal_high if which % 2 else 0)
-    mode = codes.OPEN_LOW if which == 4 else codes.OPEN_HIGH if which == 5 else codes.OPEN_END
-    return Look(channel, channel ^ nominal_high, mode, 0)
-
-
-@inlined
 def _bring_columns_up(
     nodes: Integers, part: Integers, number: int, which: int, look: Look, memory: Memory, scratch: Scratch,
     offset: int, last: int,
@@ -247,7 +240,7 @@ def _bring_looks_up(
     """Bring the columns for one number of each channel up to the last sample."""
     for channel in range(channels):
         which = channel if channel < 2 else channel + 2
-        look = _look_of(which, channels)
+        look = look_of(which, channels)
         _bring_columns_up(nodes, part, number, which, look, memory, scratch, offset, last)
 
 
@@ -289,7 +282,7 @@ def _value_at_first(
     scratch: Scratch, offset: int, last: int,
 ) -> float:  # fmt: skip
     """Return one of a part's numbers at the first sample."""
-    look = _look_of(which, channels)
+    look = look_of(which, channels)
     base, variables = memory.cells[part[codes.PART_CELL_START]], part[codes.PART_VARIABLES]
     tables = memory.tables[look.channel, part[codes.PART_TABLE_START] : _tables_end(part)]
     at = which if which < 2 else which - 2
@@ -448,7 +441,7 @@ def step_windows(
         last = position + k
         if _is_settled(part, memory):
             for which in range(NUMBERS):
-                channel = _look_of(which, channels).channel
+                channel = look_of(which, channels).channel
                 numbers[which, k] = memory.tables[channel, part[codes.PART_TABLE_START]]
             continue
         if len(memory.window_next):
@@ -477,8 +470,8 @@ def step_windows(
             _absorb(nodes, part, number, memory, scratch, channels, offset, last)
 
 
-@kernel
-def kept_from(
+@piece
+def _kept_from(
     signals: Integers, nodes: Integers, parts: Integers, memory: Memory, scratch: Scratch, offset: int,
     last: int,
 ) -> int:  # fmt: skip
@@ -498,3 +491,30 @@ def kept_from(
             for d in range(part[codes.PART_END] - part[codes.PART_FIRST]):
                 keep = min(keep, scratch.low[d])
     return max(keep, offset)
+
+
+@kernel
+def forget(
+    signals: Integers, nodes: Integers, parts: Integers, memory: Memory, scratch: Scratch, channels: int
+) -> bool:
+    """Drop the oldest samples, which nothing looks at again, if these are half of those there is room for.
+
+    Returns:
+        Whether any were dropped.
+    """
+    position, offset = memory.clock[POSITION], memory.clock[OFFSET]
+    keep = _kept_from(signals, nodes, parts, memory, scratch, offset, position - 1)
+    moved, kept = keep - offset, position - keep
+    if 2 * moved < len(memory.stamps):
+        return False
+    for k in range(kept):
+        memory.stamps[k] = memory.stamps[k + moved]
+    for channel in range(channels):
+        for s in range(len(signals)):
+            for k in range(kept):
+                memory.history[channel, s, k] = memory.history[channel, s, k + moved]
+    # positions have moved
+    memory.known[:] = -1
+    memory.window_next[:] = -1
+    memory.clock[OFFSET] = keep
+    return True
