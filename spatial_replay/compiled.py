@@ -120,10 +120,9 @@ def by_address(function: Callable[[int, int, int, int], int]) -> Callable[[int, 
     Looking at what a call is given takes as long as many a kernel: a quarter of a microsecond for each array.
     What it is given here is not looked at, and has to stay where it is as long as the call lasts.
     """
-    kernel = cast("_Kernel[[int, int, int, int], int]", function)
     if _process.only == "interpreted":
-        run = kernel.interpreted()
-        return lambda frame, given, *rest: run(frame, np.frombuffer(given, np.uint8).ctypes.data, *rest)
+        return lambda frame, given, *rest: function(frame, np.frombuffer(given, np.uint8).ctypes.data, *rest)
+    kernel = cast("_Kernel[[int, int, int, int], int]", function)
     return kernel.entry()
 
 
