@@ -152,6 +152,11 @@ def requirement_text(identifier: str | None, title: str | None) -> str:
     return ": ".join(each for each in (identifier, title) if each)
 
 
+def names_of(title: str, requirement: str | None) -> tuple[str, ...]:
+    """Return what a reader may call a result or node: by its title, or with the id of its requirement."""
+    return (title,) if requirement is None else (title, f"{requirement} {title}", f"{title} [{requirement}]")
+
+
 def nearest_hint(name: str, known: Iterable[str]) -> str:
     """Return "did you mean …?" with the known name closest to `name`, or ""."""
     if len(name) > _LONGEST_NAME:

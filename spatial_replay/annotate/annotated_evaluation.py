@@ -83,7 +83,7 @@ class AnnotatedEvaluation:
         self.streams = [stream for evaluation in self._evaluations for stream in evaluation.streams]
         self.trees = reported_trees(files, instances)
         titles = [tree.title for tree in self.trees]
-        if arrow and arrow not in titles:
+        if arrow and not any(tree.is_called(arrow) for tree in self.trees):
             hint = nearest_hint(arrow, titles) or f"there are: {', '.join(titles[:_MOST_NAMED])}"
             raise UsageError(f"there is no result {arrow!r} for the arrow to point at; {hint}")
         self._extent: SceneBounds | None = None

@@ -101,7 +101,7 @@ class Annotator:
         self._since_ns = [np.full(len(own), LATEST_NS) for own in self._requirements]
         self._automata = [each.automaton for each in automata]
         self._names = [[node.name for _, _, node in iter_nodes(tree.formula)] for tree in trees]
-        chosen = [tree for tree in trees if tree.title == arrow] or trees
+        chosen = [tree for tree in trees if tree.is_called(arrow)] or trees
         self._leaf_pairs = [
             leaf_pairs(instance, requirements, files[tree.file].regions, files[tree.file].relations)
             if tree in chosen

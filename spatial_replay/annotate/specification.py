@@ -34,6 +34,7 @@ from spatial_replay.spec.formula import (
 )
 from spatial_replay.spec.relations import RELATION_NAMES
 from spatial_replay.spec.tokens import written_name
+from spatial_replay.text import names_of
 
 if TYPE_CHECKING:
     from spatial_replay.automata.automaton import Automaton
@@ -73,6 +74,11 @@ class ReportedTree(NamedTuple):
         """What a reader knows it by: "REQ-12 calm(bike)"."""
         title = self.name if self.object is None else f"{self.name}({self.object})"
         return title if self.requirement is None else f"{self.requirement} {title}"
+
+    def is_called(self, name: str) -> bool:
+        """Say whether a reader calls this result so: by its title, with the requirement's id or without."""
+        title = self.name if self.object is None else f"{self.name}({self.object})"
+        return name in names_of(title, self.requirement)
 
     def named(self, text: str) -> str:
         """Return a text about the formula with the object in place of the template's parameter."""

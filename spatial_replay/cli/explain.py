@@ -86,7 +86,8 @@ def explain(
     counts = ""
     if not as_json and object_name is None:
         fitting = [each for each in replayed.results if verdict_of(each, node, goes_on=goes_on) is not None]
-        shown: Sequence[SpecResult] = worst_of(replayed.results)[0]
+        # where none fits, the nearest name is looked for among all
+        shown: Sequence[SpecResult] = worst_of(fitting)[0] if fitting else replayed.results
         if len(fitting) > MANY:
             verdicts_of_all = [verdict_of(each, node, goes_on=goes_on) for each in fitting]
             counts = f"{len(fitting):,} results: {counts_text(map(str, verdicts_of_all))}"

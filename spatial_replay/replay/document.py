@@ -17,7 +17,7 @@ from spatial_replay.monitor.witness.atom import Measured
 from spatial_replay.monitor.witness.witness import Witness
 from spatial_replay.replay.engine import Replayed
 from spatial_replay.spec.formula import iter_nodes
-from spatial_replay.text import Sentence, json_number
+from spatial_replay.text import Sentence, json_number, names_of
 
 
 def document_from_replay(
@@ -258,11 +258,13 @@ def explain_results(
 
 
 def _nodes_named(result: SpecResult, name: str | None) -> Iterator[int]:
-    if name is None or name == result.name:
+    own = result.spec.id
+    if name is None or name in (*names_of(result.name, own), *names_of(result.title, own)):
         yield 0
         return
     for identifier, _, each in iter_nodes(result.formula):
-        if each.name == name:
+        spec = result.evidence.instance.named.get(each.name or "")
+        if each.name and name in names_of(each.name, None if spec is None else spec.id):
             yield identifier
             return
 

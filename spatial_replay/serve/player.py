@@ -134,8 +134,9 @@ class Player:
 
     def _point_at(self, arrow: str) -> bool:
         """Choose the result that the arrow is about; say whether there is such a one."""
-        titles = [tree.title for tree in self._playback.evaluated.evaluation.trees]
-        if arrow and arrow not in titles:
+        trees = self._playback.evaluated.evaluation.trees
+        if arrow and not any(tree.is_called(arrow) for tree in trees):
+            titles = [tree.title for tree in trees]
             named = ", ".join(titles[:_MOST_NAMED]) + (", …" if len(titles) > _MOST_NAMED else "")
             hint = nearest_hint(arrow, titles) or f"the results are: {named}"
             self._viewers.send_note(Note(ARROW, Level.ERROR, f"there is no result {arrow!r}; {hint}"))

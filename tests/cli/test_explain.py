@@ -93,6 +93,18 @@ def test_many_results_are_counted_with_those_that_are_pending(
     assert text.splitlines()[-1] == "… and 12 more: 12 pending; --json has all"
 
 
+def test_any_of_many_results_is_found_by_its_name_with_the_id_of_its_requirement_or_without(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lines = [f"spec s{k} = G (battery >= {k / 100})" for k in range(24)]
+    lines.append('spec respond "R-1: it responds" = F (battery >= 0)')
+    (folder / "run.spatial").write_text("\n".join(lines), encoding="utf-8")
+    for name in ("respond", "R-1 respond", "respond [R-1]"):
+        assert "`respond` is satisfied" in said(capsys, *EXPLAIN, "--node", name)[1]
+    assert run_in_process([*EXPLAIN, "--node", "respnd"]) == 2
+    assert "did you mean 'respond'?" in capsys.readouterr().err
+
+
 def test_options_that_cannot_be_explained_are_refused_by_name(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -338,7 +338,7 @@ def test_a_log_is_replayed_with_its_own_specification(folder: Path) -> None:
 def test_the_arrow_of_an_annotated_log_points_at_the_result_that_is_chosen(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    text = 'spec near = G "cup 物" closeto[0] cube\nspec apart = G "cup 物" farfrom[99] cube'
+    text = 'spec near = G "cup 物" closeto[0] cube\nspec apart "R-9: off" = G "cup 物" farfrom[99] cube'
     (folder / "two.spatial").write_text(text, encoding="utf-8")
     command = ["replay", "run.jsonl", "--spec", "two.spatial"]
 
@@ -351,12 +351,15 @@ def test_the_arrow_of_an_annotated_log_points_at_the_result_that_is_chosen(
 
     assert run_in_process([*command, "-o", "first.mcap"]) == 1
     assert run_in_process([*command, "-o", "chosen.mcap", "--arrow", "apart"]) == 1
+    for number, called in enumerate(("R-9 apart", "apart [R-9]")):
+        assert run_in_process([*command, "-o", f"{number}.mcap", "--arrow", called]) == 1
+        assert pointed_at(f"{number}.mcap") == pointed_at("chosen.mcap")
     assert pointed_at("first.mcap") == '"cup 物" closeto[0] cube'
     assert pointed_at("chosen.mcap") == '"cup 物" farfrom[99] cube'
     # the choice is part of the log, and its certificate is computed again with it
     assert run_in_process(["verify", "chosen.mcap"]) == 0
     capsys.readouterr()
     assert run_in_process([*command, "-o", "other.mcap", "--arrow", "apat"]) == 2
-    assert "did you mean 'apart'?" in capsys.readouterr().err
+    assert "did you mean 'R-9 apart'?" in capsys.readouterr().err
     assert run_in_process([*command, "--arrow", "apart"]) == 2
     assert "add -o FILE" in capsys.readouterr().err
