@@ -17,6 +17,7 @@ from spatial_replay.monitor.witness.atom import Measured
 from spatial_replay.monitor.witness.witness import Witness
 from spatial_replay.replay.engine import Replayed
 from spatial_replay.spec.formula import iter_nodes
+from spatial_replay.spec.units import units_of, units_text
 from spatial_replay.text import Sentence, json_number, names_of
 
 
@@ -300,6 +301,9 @@ def explain_node(result: SpecResult, node: int = 0, *, first_ns: int, goes_on: b
         sentences = result.sentences_about(node, causes, first_ns)
     vacuous = result.vacuous if node == 0 and not is_open else ()
     sentences += tuple(each.message for each in vacuous)
+    formula = next(each for identifier, _, each in iter_nodes(result.formula) if identifier == node)
+    if words := units_text(units_of(formula)):
+        sentences += (Sentence(words),)
     verdict = Verdict.PENDING if is_open else about.verdict
     decided = witness_document(witness, first_ns)
     document = {

@@ -26,7 +26,7 @@ from spatial_replay.report.contents import MANY, ReportedResult, RunReport
 from spatial_replay.report.data import page_data
 from spatial_replay.report.tree_panel import final_text
 from spatial_replay.spec.formula import iter_nodes
-from spatial_replay.spec.units import declared_unit, is_mixed
+from spatial_replay.spec.units import declared_unit, units_text
 from spatial_replay.text import Instant, Sentence, counted, printable
 
 _CALENDAR_NS: Final = 500_000_000 * 10**9
@@ -213,10 +213,7 @@ def _specs(each: ReportedResult, first_ns: int) -> Html:
             element("li", chip(node.verdict), *_requirement(about[0], node.name or "", about[1]), line)
         )
     parts = [element("ul", *rows, **{"class": "specs"})] if rows else []
-    if len(each.units) > 1:
-        *others, last = map(str, each.units)
-        what = "different units" if is_mixed(each.units) else "units made comparable"
-        words = f"Its robustness is the least of numbers in {what}: {', '.join(others)} and {last}."
+    if words := units_text(each.units):
         parts.append(element("p", text(words), **{"class": "units"}))
     return element("div", *parts)
 

@@ -76,6 +76,15 @@ def is_mixed(units: Sequence[Unit]) -> bool:
     return len(units) > 1 and any(unit.divisor is None and unit.kind != "orientation" for unit in units)
 
 
+def units_text(units: Sequence[Unit]) -> str:
+    """Return a sentence on the units of what a robustness is the least of; "" if it is one."""
+    if len(units) < 2:
+        return ""
+    *others, last = map(str, units)
+    what = "different units" if is_mixed(units) else "units made comparable"
+    return f"Its robustness is the least of numbers in {what}: {', '.join(others)} and {last}."
+
+
 def scaled(expression: Expression, scales: Sequence[Scale]) -> Expression:
     """Return what an atom computes, divided if there is a scale for the one unit of what it measures."""
     units = _units(expression)

@@ -56,6 +56,7 @@ def test_every_result_is_explained_in_a_few_sentences(
         "What decides is `battery >= 0.3`, which holds by 0.1 at 0.500 s "
         "(its least within `charged`): battery is 0.4.",
         "It would be violated with anything above 0.4 in place of 0.3 in `battery >= 0.3`.",
+        "Its robustness is the least of numbers in different units: lengths and battery.",
     ]
     assert "`met` is violated" in met
     assert "cube and cup are 1 apart" in met
