@@ -32,6 +32,8 @@ _MESSAGE = np.dtype(
 )
 _HEAD: Final = _MESSAGE.itemsize
 _NONE: Final = np.empty(0, np.int64)
+_PADDING: Final = bytes(9)
+"""Makes two words or more of a buffer that is nearly empty, so that kernels are compiled for one layout."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -172,7 +174,7 @@ def _written(content: memoryview, ranges: Sequence[MessageRange], shifts: Sequen
     payloads = batch.payloads
     part, row, begin = payloads.part[own], payloads.row[own], start + _HEAD
     filled: list[tuple[Integers, Filled, Integers]] = []
-    columns = _columns(b"", _NONE, _NONE, _NONE)
+    columns = _columns(_PADDING, _NONE, _NONE, _NONE)
     for places in equal_places(part):
         of_part, rows = payloads.parts[part[places[0]]], row[places]
         if isinstance(of_part, Filled):
@@ -231,7 +233,7 @@ def _joined(filled: Sequence[tuple[Integers, Filled, Integers]]) -> _Templates:
     for _, each, rows in filled:
         word = _take(each.words, rows, words, word)
         mark = _take(each.marks, rows, marks, mark)
-    pattern = np.frombuffer(bytearray().join([each.pattern for each in templates]), np.uint8)
+    pattern = np.frombuffer(bytearray().join([*(each.pattern for each in templates), _PADDING]), np.uint8)
     return _Templates(
         np.concatenate([_NONE, *(places for places, _, _ in filled)]),
         starts_from_counts([len(places) for places, _, _ in filled]),
@@ -256,7 +258,7 @@ def _take(columns: NDArray[Any], rows: Integers, joined: NDArray[Any], begin: in
 
 
 def _columns(data: bytes, begin: Integers, end: Integers, place: Integers) -> _Columns:
-    view = np.frombuffer(data, np.uint8)
+    view = np.frombuffer(data.ljust(len(_PADDING), b"\0"), np.uint8)
     # one kind of array, whatever the buffer is: a kernel is compiled for each
     view.flags.writeable = False
     return _Columns(view, _words(view), begin, end, place)
