@@ -38,6 +38,13 @@ class Rings(NamedTuple):
             rings.append(self.points[begin:end])
         return tuple(rings)
 
+    def points_from(self, footprints: Integers, count: int) -> Floats:
+        """Return (K, count, 2), as many points from the first one of each footprint (K,) on."""
+        points = np.ascontiguousarray(self.points)
+        runs = len(points) - count + 1
+        anywhere = np.ndarray((max(runs, 0), 2 * count), np.float64, points, 0, (16, 8))
+        return np.asarray(anywhere[self.start[footprints]].reshape(-1, count, 2))
+
 
 class Form(NamedTuple):
     """The primitives of a footprint: the lengths of its rings, and whether it has a height."""
@@ -78,14 +85,33 @@ def extents(footprints: FootprintBatch) -> Floats:
     """Return (R,) the longer side of each footprint's bounding box."""
     if not len(footprints):
         return np.empty(0)
-    below = above = footprints.vertices
+    start = footprints.vertex_start[footprints.part_start]
     if footprints.radius.any():
         radius = np.repeat(footprints.radius, np.diff(footprints.vertex_start))[:, None]
-        below, above = below - radius, above + radius
-    begins = footprints.vertex_start[footprints.part_start[:-1]]
-    low, high = np.minimum.reduceat(below, begins), np.maximum.reduceat(above, begins)
-    sides = high - low
+        sides = boxes(footprints.vertices + radius, start)[1] - boxes(footprints.vertices - radius, start)[0]
+    else:
+        low, high = boxes(footprints.vertices, start)
+        sides = high - low
     return np.asarray(np.maximum(sides[:, 0], sides[:, 1]))
+
+
+def boxes(points: Floats, start: Integers) -> tuple[Floats, Floats]:
+    """Return the least and the greatest coordinates, (R, 2) each, of rows of points.
+
+    Args:
+        points: (P, 2).
+        start: (R + 1,), where each row begins and the last one ends; none is empty.
+    """
+    if len(start) < 2:
+        return np.empty((0, 2)), np.empty((0, 2))
+    count = int(start[1] - start[0])
+    if count > ROUND or (np.diff(start) != count).any():
+        return np.minimum.reduceat(points, start[:-1]), np.maximum.reduceat(points, start[:-1])
+    corners = points[start[0] : start[-1]].reshape(-1, count, 2)
+    low, high = corners[:, 0], corners[:, 0]
+    for corner in range(1, count):
+        low, high = np.minimum(low, corners[:, corner]), np.maximum(high, corners[:, corner])
+    return low, high
 
 
 _ANGLES = np.arange(ROUND) * (2.0 * np.pi / ROUND)

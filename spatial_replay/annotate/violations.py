@@ -314,19 +314,19 @@ def _locate(
     """Fill in the points of the samples `here` (H,), whose leaves are given, and the atoms of quantifiers."""
     if result.leaf_pairs is None:
         return
-    leaf = found.leaf[here]
+    leaf, scene = found.leaf[here], TraceScene(trace, result.leaf_pairs.regions)
     for index in np.unique(leaf[leaf >= 0]).tolist():
         there = here[leaf == index]
         pair = result.leaf_pairs.pairs[index]
         if pair is not None:
-            _point_at(result.leaf_pairs, pair, trace, samples, there, found)
+            _point_at(scene, pair, samples, there, found)
         for body, those in _bound(result, index, trace.times_ns[samples[there]]):
             of_body = pair_of(body)
             those = there[those][found.moment_ns[there[those]] < 0]
             if of_body is not None and len(those):
                 found.atom[those] = len(found.atoms)
                 found.atoms.append(result.leaf_pairs.text_of(body))
-                _point_at(result.leaf_pairs, of_body, trace, samples, those, found)
+                _point_at(scene, of_body, samples, those, found)
 
 
 def _bound(result: EvaluatedResult, leaf: int, times_ns: Integers) -> Iterator[tuple[Formula, Integers]]:
@@ -342,11 +342,8 @@ def _bound(result: EvaluatedResult, leaf: int, times_ns: Integers) -> Iterator[t
             yield shades[0].bodies[which], np.flatnonzero(worst == which)
 
 
-def _point_at(
-    pairs: LeafPairs, pair: Pair, trace: Trace, samples: Integers, there: Integers, found: Violations
-) -> None:
+def _point_at(scene: TraceScene, pair: Pair, samples: Integers, there: Integers, found: Violations) -> None:
     """Fill in the points of some samples between which an atom is shown."""
-    scene = TraceScene(trace, pairs.regions)
     operands = [scene.resolve(term).operand for term in (pair.first, pair.second)]
     first, second = (Operand(each.rows[samples[there]], each.enlargement) for each in operands)
     numbers = contacts(scene.batch, first, second, is_protrusion=pair.is_protrusion)

@@ -117,18 +117,30 @@ class Template(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Filled:
-    """Messages of one template: their words (n, W) and marks (n, K)."""
+    """Messages of one template.
+
+    Attributes:
+        template: its W words and K marks are to be filled in.
+        words: (n, N) of each message.
+        marks: (n, K).
+        order: (W,) which of them each word of the template is; without it N is W, and they are in order.
+    """
 
     template: Template
     words: Words
     marks: Bytes
+    order: Integers | None = None
 
     def __len__(self) -> int:
         return len(self.words)
 
+    def words_of(self, rows: Integers | slice) -> Words:
+        """Return (k, W) the words of some of the messages."""
+        return self.words[rows] if self.order is None else self.words[rows].take(self.order, axis=1)
+
     def encoded(self, rows: Integers | slice) -> Bytes:
         """Encode some of the messages, (k, L) uint8."""
-        return self.template.fill(self.words[rows], self.marks[rows])
+        return self.template.fill(self.words_of(rows), self.marks[rows])
 
 
 Part: TypeAlias = "Filled | Sequence[bytes]"

@@ -65,7 +65,7 @@ def draw(
 ) -> None:
     """Add outlines, filled faces and the label to an entity; every colour but the label's is to be filled in.
 
-    `words_of_object` fills in the numbers in this order.
+    `scene_template` fills in the numbers in this order.
 
     Args:
         name: what the label says; None leaves it out.

@@ -21,6 +21,10 @@ from spatial_replay.palette import NEGATIVE, NEUTRAL, POSITIVE
 _LEAST: Final = 0.4
 """How far the colour of the slightest robustness is from grey, so that its sign shows."""
 
+_FROM_GREY: Final = np.subtract((NEGATIVE, POSITIVE), NEUTRAL)
+_FROM_GREY.flags.writeable = False
+"""What is added to grey in full colours."""
+
 _OPACITY: Final = 0.6
 """Of a map's cells, so that the scene above them stays visible."""
 
@@ -31,12 +35,17 @@ def colours(robustness: ArrayLike, scale: ArrayLike) -> Floats:
     Args:
         scale: above 0, in the unit of the robustness; one, or an array that goes with it.
     """
-    values = np.asarray(robustness, np.float64)[..., None]
-    share = _LEAST + (1.0 - _LEAST) * np.minimum(np.abs(values) / np.asarray(scale)[..., None], 1.0)
-    hue = np.where(values >= 0.0, POSITIVE, NEGATIVE)
-    mixed = np.where(np.isnan(values), NEUTRAL, NEUTRAL + share * (hue - NEUTRAL))
+    values = np.asarray(robustness, np.float64)
+    share = _LEAST + (1.0 - _LEAST) * np.minimum(np.abs(values) / np.asarray(scale), 1.0)
+    share = np.where(np.isnan(values), 0.0, share)
+    mixed = _FROM_GREY.take((values >= 0.0).astype(np.intp), axis=0)
+    mixed *= share[..., None]
+    mixed += NEUTRAL
     # the steps of a screen: finer ones are invisible and compress badly
-    return np.asarray(np.round(mixed * 255.0) / 255.0)
+    mixed *= 255.0
+    np.round(mixed, out=mixed)
+    mixed /= 255.0
+    return np.asarray(mixed)
 
 
 def shade_codes(robustness: Floats, scale: ArrayLike) -> NDArray[np.uint8]:
@@ -218,7 +227,8 @@ class SceneContent(NamedTuple):
         rows: (S, names), rows of the trace; below 0 where an object is absent.
         forms: (S, names), `ABSENT`, `DELETED`, or from `FIRST_FORM` on the number of its form.
         styles: (S, names), its level, and whether it has a label as the last bit; -1 where it is absent.
-        observations: (S, names), rows of `rings` and `footprints`.
+        observations: (S, names), rows of `rings`, `footprints` and `middles`.
+        middles: (R, 2), of the boxes around the rings.
         violations: of the S samples.
         arrow: (S,), the same as `forms` for the arrow at the worst violation; its forms are `causes`.
         causes: what decides violations, in words.
@@ -233,6 +243,7 @@ class SceneContent(NamedTuple):
     observations: Integers
     footprints: FootprintBatch
     rings: Rings
+    middles: Floats
     violations: Violations
     arrow: Integers
     causes: tuple[CauseText, ...]

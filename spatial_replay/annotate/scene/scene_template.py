@@ -107,6 +107,11 @@ class SceneLayout(NamedTuple):
     witness: CauseText | Literal["deleted"] | None = None
     banner: Banner | None = None
 
+    @property
+    def has_heights(self) -> bool:
+        """Whether any object has a height."""
+        return any(drawn.form.has_height for drawn in self.objects)
+
 
 class Region(NamedTuple):
     """A region as it is drawn.
@@ -132,22 +137,26 @@ class SceneTemplate:
     """Messages of one layout, but for their times, coordinates and colours.
 
     Attributes:
-        template: its words are to be filled in: numbers, and after them two for each timestamp.
-        stamps: how many timestamps there are.
+        template: its words are to be filled in.
+        order: (W,) which of a message's numbers each word is; most numbers are in several places.
     """
 
     template: WireTemplate
-    stamps: int
+    order: Integers
 
     def filled(self, times_ns: Integers, columns: Sequence[Floats]) -> Filled:
         """Return messages with times (S,) and numbers: columns (S, n), one after the other."""
-        stamps = np.tile(_encoded_stamps(times_ns).view(np.float64), self.stamps)
-        words = np.concatenate([*columns, stamps], axis=1).view(np.uint64)
-        return Filled(self.template, words, np.empty((len(words), 0), np.uint8))
+        stamps = _encoded_stamps(times_ns).view(np.float64)
+        words = np.concatenate([stamps, *columns], axis=1).view(np.uint64)
+        return Filled(self.template, words, np.empty((len(words), 0), np.uint8), self.order)
 
 
 def make_template(layout: SceneLayout, regions: tuple[Region, ...], lift: float) -> SceneTemplate:
     """Return the template of a layout.
+
+    The numbers of a message are, each once: its timestamp (2), the colours of the regions (3 each), the
+    points of all objects (2 each), their colours (3 each), the middles where names are (2 each), if any has
+    a height their tops, bottoms, heights and those of their names (4 each), and those of the arrow.
 
     Args:
         lift: height of flat objects above the plane, so that they cover regions.
@@ -166,10 +175,14 @@ def make_template(layout: SceneLayout, regions: tuple[Region, ...], lift: float)
         _add_object(_add_entity(message, OBJECT + drawn.name), drawn, lift)
     if layout.banner is not None:
         _add_banner(_add_entity(message, BANNER), layout.banner, lift)
-    number = ""
+    places, end = _places(layout, len(regions))
+    number, order = "", _order_of_regions(regions)
+    for drawn, own in zip(layout.objects, places, strict=True):
+        order += _order_of_object(drawn, own)
     if isinstance(layout.witness, CauseText):
         number = "#" * (8 * layout.witness.words)
         point_at(_add_entity(message, WITNESS), layout.witness.text + number, lift)
+        order += range(end, end + _ARROW_NUMBERS + layout.witness.words)
     encoded = message.SerializeToString(deterministic=True)
     slots = _offsets(encoded, SLOT_BYTES)
     if number:
@@ -180,13 +193,7 @@ def make_template(layout: SceneLayout, regions: tuple[Region, ...], lift: float)
     payload = np.frombuffer(encoded.replace(SLOT_BYTES, bytes(8)), np.uint8)
     words = [*slots, *(begin + at for begin in stamps for at in _STAMP_WORDS)]
     template = WireTemplate(payload, np.array(words, np.int64), np.empty(0, np.int64))
-    return SceneTemplate(template, len(stamps))
-
-
-def words_of_region(region: Region, colour: Floats) -> list[Floats]:
-    """Return what to fill in for a region: the colours (S, 3) of its lines and faces."""
-    primitives = _region_entity(region)
-    return [colour] * (len(primitives.lines) + len(primitives.triangles))
+    return SceneTemplate(template, np.array(order + [0, 1] * len(stamps), np.int64))
 
 
 def border_of(region: Region) -> list[Floats]:
@@ -194,42 +201,76 @@ def border_of(region: Region) -> list[Floats]:
     return list(region.rings) if region.outline.is_disc else [np.array(region.outline.vertices, np.float64)]
 
 
-def words_of_object(
-    drawn: DrawnObject, points: Floats, bottom: Floats, top: Floats, colour: Floats, lift: float
-) -> list[Floats]:
-    """Return what to fill in for an object, in the order of its primitives' fields.
+class _Places(NamedTuple):
+    """Where an object's numbers begin among those of a message, see `make_template`."""
 
-    Args:
-        points: (S, P, 2), its rings, one after the other.
-        bottom, top: (S,) its height interval, if it has one.
-        colour: (S, 3).
-        lift: height of the name above the top.
+    points: int
+    colour: int
+    middle: int
+    heights: int
 
-    Returns:
-        columns (S, n), each of one or more words.
-    """
-    form = drawn.form
-    rings = _split(points, form.rings)
-    upper = [top[:, None]] if form.has_height else []
-    words = []
-    for ring in rings:
-        words += [*upper, _flat(ring), colour]
-    for ring in rings:
-        if ring.shape[1] > 2:
-            words += [*upper, _flat(ring), colour]
+
+def _places(layout: SceneLayout, regions: int) -> tuple[list[_Places], int]:
+    """Return where the numbers of each object begin, and where those of the arrow."""
+    counts = [2 * sum(drawn.form.rings) for drawn in layout.objects]
+    points = len(_STAMP_WORDS) + 3 * regions
+    colours = points + sum(counts)
+    middles = colours + 3 * len(counts)
+    heights = middles + 2 * len(counts)
+    end = heights + (4 * len(counts) if layout.has_heights else 0)
+    return [
+        _Places(points + sum(counts[:index]), colours + 3 * index, middles + 2 * index, heights + 4 * index)
+        for index in range(len(counts))
+    ], end
+
+
+def _order_of_object(drawn: DrawnObject, begin: _Places) -> list[int]:
+    """Return which numbers an object's fields have, in the order of its primitives."""
+    rings, form = _corners(drawn.form.rings, begin.points), drawn.form
+    colour = list(range(begin.colour, begin.colour + 3))
+    top, bottom, height, label = range(begin.heights, begin.heights + 4)
+    upper = [top] if form.has_height else []
+    flat = [[at for corner in ring for at in corner] for ring in rings]
+    order = []
+    for points in flat:
+        order += [*upper, *points, *colour]
+    for points in flat:
+        if len(points) > 4:
+            order += [*upper, *points, *colour]
     if form.has_height:
-        for ring in rings:
-            if ring.shape[1] > 1:
-                words += [bottom[:, None], _flat(ring), _raised(ring, top - bottom), colour]
-    if not drawn.has_label:
-        return words
-    # half the sum of the ends does not depend on the order in which points are added up
-    corners = np.ascontiguousarray(points.transpose(1, 0, 2))
-    words.append((corners.min(axis=0) + corners.max(axis=0)) / 2.0)
-    return words + [height + lift for height in upper]
+        for ring, points in zip(rings, flat, strict=True):
+            if len(ring) > 1:
+                raised = [at for x, y in ring for at in (x, y, height)]
+                order += [bottom, *points, *raised, *colour]
+    if drawn.has_label:
+        order += [begin.middle, begin.middle + 1, *([label] if form.has_height else [])]
+    return order
 
 
-def words_of_witness(
+def _corners(rings: tuple[int, ...], begin: int) -> list[list[tuple[int, int]]]:
+    """Return the places of the coordinates of each ring's points."""
+    ends = np.cumsum(rings).tolist()
+    return [
+        [(begin + 2 * at, begin + 2 * at + 1) for at in range(end - length, end)]
+        for end, length in zip(ends, rings, strict=True)
+    ]
+
+
+def _order_of_regions(regions: Sequence[Region]) -> list[int]:
+    """Return which numbers the regions' fields have: the colours of lines and faces."""
+    order = []
+    for number, region in enumerate(regions):
+        entity = _region_entity(region)
+        at = len(_STAMP_WORDS) + 3 * number
+        order += [at, at + 1, at + 2] * (len(entity.lines) + len(entity.triangles))
+    return order
+
+
+_ARROW_NUMBERS: Final = 10
+"""Of `numbers_of_witness`, but for its text."""
+
+
+def numbers_of_witness(
     points: Floats, z: Floats, scale: float, labels: Sequence[bytes], words: int
 ) -> list[Floats]:
     """Return what to fill in for the arrow at the worst violation.
@@ -304,21 +345,6 @@ def _add_banner(entity: SceneEntity, banner: Banner, lift: float) -> None:
     )
     text.pose.position.x, text.pose.position.y = banner.place
     text.color.r, text.color.g, text.color.b, text.color.a = *banner.colour, 1.0
-
-
-def _split(points: Floats, lengths: tuple[int, ...]) -> list[Floats]:
-    ends = np.cumsum(lengths).tolist()
-    return [points[:, end - length : end] for end, length in zip(ends, lengths, strict=True)]
-
-
-def _flat(ring: Floats) -> Floats:
-    return ring.reshape(len(ring), -1)
-
-
-def _raised(ring: Floats, height: Floats) -> Floats:
-    """Return points (S, n, 2) at heights (S,) as (S, 3 n): x, y, z, x, y, z …"""
-    z = np.broadcast_to(height[:, None, None], (*ring.shape[:2], 1))
-    return _flat(np.concatenate([ring, z], axis=2))
 
 
 # ------------------------------------------------------------------------------------------- timestamps

@@ -82,8 +82,11 @@ def banners_of(
         now = standing_codes(result.block.series[:1], final=result.is_final)[0, at]
         codes[:, column] = np.where((own_ns[at] == times_ns) | result.is_final, now, 0)
     codes[:first] = 0
-    kinds, which = np.unique(codes, axis=0, return_inverse=True)
-    return which.reshape(-1), tuple(_banner(titled, kind, place) for kind in kinds)
+    banners, which = list[Banner | None](), np.zeros(len(times_ns), np.int64)
+    for places in equal_places(combined(codes.T, len(codes))):
+        which[places] = len(banners)
+        banners.append(_banner(titled, codes[places[0]], place))
+    return which, tuple(banners)
 
 
 def _banner(

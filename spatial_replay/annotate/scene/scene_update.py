@@ -15,7 +15,7 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spatial_replay.annotate.rings import extents, outlines_of, rings_of
+from spatial_replay.annotate.rings import boxes, extents, outlines_of, rings_of
 from spatial_replay.annotate.scene.scene_frames import (
     ABSENT,
     DELETED,
@@ -35,9 +35,7 @@ from spatial_replay.annotate.scene.scene_template import (
     SceneLayout,
     SceneTemplate,
     make_template,
-    words_of_object,
-    words_of_region,
-    words_of_witness,
+    numbers_of_witness,
 )
 from spatial_replay.annotate.scene.scene_text import ArrowTexts, arrow_texts, banners_of, labelled_objects
 from spatial_replay.annotate.violations import (
@@ -171,8 +169,8 @@ class SceneEncoder:
         for layout, samples in _by_layout(content):
             if layout not in templates:
                 templates[layout] = make_template(layout, self._drawn, _LIFT * scale)
-            words = self._words(layout, samples, content, *shades, scale)
-            filled.append((samples, templates[layout].filled(times_ns[samples], words)))
+            numbers = self._numbers(layout, samples, content, *shades, scale)
+            filled.append((samples, templates[layout].filled(times_ns[samples], numbers)))
         last = content.forms[-1] >= FIRST_FORM
         after = SceneState(
             first_ns=state.first_ns,
@@ -216,7 +214,7 @@ class SceneEncoder:
         (left, low), (right, high) = points.min(axis=0).tolist(), points.max(axis=0).tolist()
         return (left + right) / 2.0, high + max(_BANNER_LIFT * (high - low), scale)
 
-    def _words(
+    def _numbers(
         self,
         layout: SceneLayout,
         samples: Integers,
@@ -225,21 +223,23 @@ class SceneEncoder:
         regions: Floats,
         scale: float,
     ) -> list[Floats]:
-        """Return what to fill in the layout's template, as columns (S, n)."""
-        columns = []
-        for index, region in enumerate(self._drawn):
-            columns += words_of_region(region, regions[samples, index])
-        for drawn in layout.objects:
-            column = content.names.index(drawn.name)
-            rows = content.observations[samples, column]
-            corners = np.arange(sum(drawn.form.rings))
-            points = content.rings.points[content.rings.start[rows][:, None] + corners]
-            bottom, top = content.footprints.bottom[rows], content.footprints.top[rows]
-            colour = objects[samples, column]
-            columns += words_of_object(drawn, points, bottom, top, colour, _LIFT * scale)
+        """Return what to fill in the layout's template, as columns (S, n), each number once."""
+        columns = [regions[samples].reshape(len(samples), -1)]
+        shown = [content.names.index(drawn.name) for drawn in layout.objects]
+        if shown:
+            rows = content.observations[samples][:, shown]
+            of_all = [
+                content.rings.points_from(rows[:, 0], sum(sum(drawn.form.rings) for drawn in layout.objects)),
+                objects[samples][:, shown],
+                content.middles[rows],
+            ]
+            if layout.has_heights:
+                top, bottom = content.footprints.top[rows], content.footprints.bottom[rows]
+                of_all.append(np.stack([top, bottom, top - bottom, top + _LIFT * scale], axis=-1))
+            columns += [each.reshape(len(samples), -1) for each in of_all]
         if isinstance(layout.witness, CauseText):
             numbers = [content.numbers[index] for index in samples.tolist()]
-            columns += _words_of_arrow(content.violations, samples, scale, numbers, layout.witness.words)
+            columns += _numbers_of_arrow(content.violations, samples, scale, numbers, layout.witness.words)
         return columns
 
 
@@ -282,11 +282,11 @@ def _shades_of(
     return of_objects, of_regions
 
 
-def _words_of_arrow(
+def _numbers_of_arrow(
     found: Violations, samples: Integers, scale: float, numbers: Sequence[bytes], words: int
 ) -> list[Floats]:
     z = np.fmax(found.top[samples], 0.0) + 3.0 * _LIFT * scale
-    return words_of_witness(found.points[samples], z, scale, numbers, words)
+    return numbers_of_witness(found.points[samples], z, scale, numbers, words)
 
 
 def _region(name: str, outline: Outline) -> Region:
@@ -348,7 +348,10 @@ def _content(
     was_pointing = np.append(before.is_pointing, found.is_shown[:-1])
     witness = np.where(found.is_shown, FIRST_FORM + arrows.cause, np.where(was_pointing, DELETED, ABSENT))
     said = witness, arrows.causes, arrows.numbers
-    return SceneContent(names, rows, forms, styles, observations, footprints, rings, found, *said, *banners)
+    low, high = boxes(rings.points, rings.start)
+    # half the sum of the ends does not depend on the order in which points are added up
+    drawn = observations, footprints, rings, (low + high) / 2.0
+    return SceneContent(names, rows, forms, styles, *drawn, found, *said, *banners)
 
 
 def _levels(sizes: Floats, scale: float) -> Integers:

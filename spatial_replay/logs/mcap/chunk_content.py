@@ -227,11 +227,11 @@ class _Templates(NamedTuple):
 def _joined(filled: Sequence[tuple[Integers, Filled, Integers]]) -> _Templates:
     """Join what is to be filled in: places, messages of a template, and which of them."""
     templates = [each.template for _, each, _ in filled]
-    words = np.empty(sum(len(rows) * each.words.shape[1] for _, each, rows in filled), np.uint64)
+    words = np.empty(sum(len(rows) * len(each.template.word_offsets) for _, each, rows in filled), np.uint64)
     marks = np.empty(sum(len(rows) * each.marks.shape[1] for _, each, rows in filled), np.uint8)
     word = mark = 0
     for _, each, rows in filled:
-        word = _take(each.words, rows, words, word)
+        word = _take_words(each, rows, words, word)
         mark = _take(each.marks, rows, marks, mark)
     pattern = np.frombuffer(bytearray().join([*(each.pattern for each in templates), _PADDING]), np.uint8)
     return _Templates(
@@ -247,6 +247,16 @@ def _joined(filled: Sequence[tuple[Integers, Filled, Integers]]) -> _Templates:
         words,
         marks,
     )
+
+
+def _take_words(filled: Filled, rows: Integers, joined: Words, begin: int) -> int:
+    """Copy the words of some messages, one after the other; return where they end."""
+    if filled.order is None:
+        return _take(filled.words, rows, joined, begin)
+    end = begin + len(filled.order) * len(rows)
+    target = joined[begin:end].reshape(len(rows), -1)
+    np.take(filled.words[rows], filled.order, axis=1, out=target, mode="clip")
+    return end
 
 
 def _take(columns: NDArray[Any], rows: Integers, joined: NDArray[Any], begin: int) -> int:
