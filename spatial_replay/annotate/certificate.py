@@ -9,8 +9,9 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from typing import cast
 
 import numpy as np
@@ -19,39 +20,39 @@ from numpy.typing import NDArray
 from spatial_replay import __version__
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.messages import Messages
-from spatial_replay.logs.payloads import side_by_side
+from spatial_replay.logs.payloads import columns_of, side_by_side
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.spec.format import format_specification
 from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.trace import ABSENT, Trace
 
-_MOST_WAITING = 64
-_MOST_WAITING_BYTES = 256 * 2**20
-"""Buffers, and bytes of them, that may wait to be hashed, so that memory stays bounded."""
+_MOST_WAITING = 8
+_MOST_WAITING_BYTES = 64 * 2**20
+"""Pieces of an evaluation, and bytes of them, that may wait to be hashed, so that memory stays bounded."""
 
 
 class Hashing:
-    """Hashes buffers in their order on a thread of its own.
+    """Hashes pieces of an evaluation in their order on a thread of its own.
 
-    `hashlib` releases the interpreter lock while it hashes a large buffer, so that on two cores a replay does
-    not wait for its certificate.
+    `hashlib` and copies of columns release the interpreter lock, so that on two cores a replay does not wait
+    for its certificate.
     """
 
     def __init__(self) -> None:
         self._thread = ThreadPoolExecutor(1, "hashing")
-        self._waiting: deque[tuple[int, Future[None]]] = deque()
+        self._waiting: deque[tuple[int, Future[object]]] = deque()
         self._waiting_bytes = 0
 
-    def update(self, hashed: hashlib._Hash, buffer: bytes | memoryview | NDArray[np.generic]) -> None:
-        """Take a buffer, which must not change afterwards, into a hash."""
-        size = buffer.nbytes if isinstance(buffer, np.ndarray) else len(buffer)
+    def take(self, size: int, add: Callable[[], object]) -> None:
+        """Call `add` for a piece of so many bytes, which must not change afterwards."""
         while self._waiting and (
-            len(self._waiting) >= _MOST_WAITING or self._waiting_bytes + size > _MOST_WAITING_BYTES
+            self._waiting[0][1].done()
+            or len(self._waiting) >= _MOST_WAITING
+            or self._waiting_bytes + size > _MOST_WAITING_BYTES
         ):
             self._await_first()
         self._waiting_bytes += size
-        # an array is a buffer, though its type does not say so
-        self._waiting.append((size, self._thread.submit(hashed.update, cast(bytes, buffer))))
+        self._waiting.append((size, self._thread.submit(add)))
 
     def finish(self) -> None:
         """Wait until everything was taken in."""
@@ -67,15 +68,14 @@ class Hashing:
 class SampleHash:
     """SHA-256 of samples: every column of every object and signal, in the order of their names."""
 
-    def __init__(self, hashing: Hashing | None = None) -> None:
-        self._hashing = hashing or Hashing()
+    def __init__(self) -> None:
         self._times = hashlib.sha256()
         self._objects: dict[str, list[hashlib._Hash]] = {}
         self._signals: dict[str, hashlib._Hash] = {}
 
     def add(self, trace: Trace) -> None:
         """Take in the next samples."""
-        self._hashing.update(self._times, _integers(trace.times_ns))
+        _take_in(self._times, _integers(trace.times_ns))
         classes = np.array([list(hashlib.sha256(_text(name)).digest()) for name in trace.classes], np.uint8)
         for name, rows in zip(trace.names, trace.rows.T, strict=True):
             seen = np.flatnonzero(rows != ABSENT)
@@ -97,16 +97,15 @@ class SampleHash:
             )
             hashes = self._objects.setdefault(name, [hashlib.sha256() for _ in columns])
             for hashed, column in zip(hashes, columns, strict=True):
-                self._hashing.update(hashed, column)
+                _take_in(hashed, column)
         for name, values in trace.signals.items():
             known = np.flatnonzero(~np.isnan(values))
             if len(known):
                 hashed = self._signals.setdefault(name, hashlib.sha256())
                 pairs = np.rec.fromarrays([trace.times_ns[known], values[known]])
-                self._hashing.update(hashed, pairs.tobytes())
+                _take_in(hashed, pairs.tobytes())
 
     def hexdigest(self) -> str:
-        self._hashing.finish()
         total = hashlib.sha256(self._times.digest())
         for name in sorted(self._objects):
             total.update(_text(name))
@@ -124,8 +123,7 @@ class MessageHash:
     later ones of one topic when those of another arrive.
     """
 
-    def __init__(self, hashing: Hashing | None = None) -> None:
-        self._hashing = hashing or Hashing()
+    def __init__(self) -> None:
         # one hash per column, so that many messages are hashed at once however they are cut into blocks
         self._topics: dict[str, tuple[hashlib._Hash, hashlib._Hash, hashlib._Hash]] = {}
 
@@ -144,12 +142,11 @@ class MessageHash:
             hashes = self._topics.setdefault(
                 topics[code], (hashlib.sha256(), hashlib.sha256(), hashlib.sha256())
             )
-            self._hashing.update(hashes[0], _integers(messages.log_time_ns[rows]))
-            self._hashing.update(hashes[1], _integers(lengths))
-            self._hashing.update(hashes[2], payloads)
+            _take_in(hashes[0], _integers(messages.log_time_ns[rows]))
+            _take_in(hashes[1], _integers(lengths))
+            _take_in(hashes[2], payloads)
 
     def hexdigest(self) -> str:
-        self._hashing.finish()
         total = hashlib.sha256()
         for topic in sorted(self._topics):
             total.update(_text(topic))
@@ -161,17 +158,15 @@ class MessageHash:
 class ResultHash:
     """SHA-256 of results: of each one's numbers as little-endian bytes, sample by sample, node by node."""
 
-    def __init__(self, names: Sequence[tuple[str, str | None]], hashing: Hashing | None = None) -> None:
-        self._hashing = hashing or Hashing()
+    def __init__(self, names: Sequence[tuple[str, str | None]]) -> None:
         self._names = names
         self._hashes = [hashlib.sha256() for _ in names]
 
     def add(self, index: int, series: Floats) -> None:
         """Take in the next numbers, (N, 4, T), of result `index`."""
-        self._hashing.update(self._hashes[index], _floats(series.transpose(2, 0, 1)))
+        _take_in(self._hashes[index], _floats(series.transpose(2, 0, 1)))
 
     def hexdigest(self) -> str:
-        self._hashing.finish()
         total = hashlib.sha256()
         for (name, object), hashed in zip(self._names, self._hashes, strict=True):
             total.update(_text(name) + _text(object) + hashed.digest())
@@ -211,9 +206,8 @@ class EvaluationHashes:
 
     def __init__(self, names: Sequence[tuple[str, str | None]]) -> None:
         """Start before the first sample; each result has a name and, of a template, an object."""
-        hashing = Hashing()
-        self._samples, self._messages = SampleHash(hashing), MessageHash(hashing)
-        self._results = ResultHash(names, hashing)
+        self._samples, self._messages, self._results = SampleHash(), MessageHash(), ResultHash(names)
+        self._hashing = Hashing()
 
     def add(self, trace: Trace, own: Messages, results: Sequence[SeriesBlock]) -> None:
         """Take in the next samples, the log's own messages, and the numbers of each result."""
@@ -222,13 +216,13 @@ class EvaluationHashes:
 
     def add_samples(self, trace: Trace, own: Messages) -> None:
         """Take in the next samples and the log's own messages; their results follow, in any pieces."""
-        self._samples.add(trace)
-        self._messages.add(own)
+        size = trace.nbytes + int(columns_of(own.payloads).sizes.sum())
+        self._hashing.take(size, lambda: (self._samples.add(trace), self._messages.add(own)))
 
     def add_results(self, results: Sequence[SeriesBlock]) -> None:
         """Take in the next numbers of each result."""
         for index, block in enumerate(results):
-            self._results.add(index, block.series)
+            self._hashing.take(block.series.nbytes, partial(self._results.add, index, block.series))
 
     def certificate(
         self, files: Sequence[Specification], plan: Mapping[str, str] | None = None
@@ -238,6 +232,7 @@ class EvaluationHashes:
         Args:
             plan: the metadata of a planned run.
         """
+        self._hashing.finish()
         return {
             "samples_sha256": self._samples.hexdigest(),
             "messages_sha256": self._messages.hexdigest(),
@@ -248,18 +243,21 @@ class EvaluationHashes:
         }
 
 
+def _take_in(hashed: hashlib._Hash, buffer: bytes | memoryview | NDArray[np.generic]) -> None:
+    # an array is a buffer, though its type does not say so
+    hashed.update(cast(bytes, buffer))
+
+
 def _integers(values: Integers) -> NDArray[np.generic]:
-    """Return a little-endian copy."""
-    return np.array(values, "<i8", order="C")
+    """Return little-endian values side by side, without a copy where they are that already."""
+    return np.ascontiguousarray(values, "<i8")
 
 
 def _floats(values: Floats) -> NDArray[np.generic]:
-    """Return a little-endian copy in which every NaN is the same one."""
-    copy = np.array(values, "<f8", order="C")
-    unknown = np.isnan(copy)
-    if unknown.any():
-        copy[unknown] = np.nan
-    return copy
+    """Return the same of doubles, in which every NaN is the same one."""
+    ordered = np.ascontiguousarray(values, "<f8")
+    unknown = np.isnan(ordered)
+    return np.where(unknown, np.nan, ordered) if unknown.any() else ordered
 
 
 def _text(text: str | None) -> bytes:

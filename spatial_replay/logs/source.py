@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Protocol, cast
+from typing import Any, Protocol, TypeVar, cast
 
 from spatial_replay.errors import LogError
 from spatial_replay.geometry.footprint import Concave
@@ -18,6 +18,8 @@ from spatial_replay.trace.axes import OUR_AXES, Axes
 from spatial_replay.trace.declared_units import signal_units_metadata
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace, within
+
+_Read = TypeVar("_Read")
 
 
 class Source(Protocol):
@@ -181,7 +183,7 @@ def read_blocks(
         raise LogError(f"{source.name} could not be read: {reason}; copy it to another disk") from error
 
 
-def read_ahead(blocks: Generator[Block, None, None]) -> Iterator[Block]:
+def read_ahead(blocks: Generator[_Read, None, None]) -> Iterator[_Read]:
     """Yield the same blocks, each read on its own thread while the previous one is processed.
 
     Reading mostly runs without the interpreter lock, so on two cores it takes a replay little extra time.

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 from spatial_replay import __version__
 from spatial_replay.annotate.certificate import specifications_json
 from spatial_replay.errors import UsageError
-from spatial_replay.logs.messages import Sink
+from spatial_replay.logs.messages import Messages, Sink
 from spatial_replay.logs.source import Source, reading_options, units_metadata
 from spatial_replay.logs.topics import (
     AUTOMATA,
@@ -87,7 +88,8 @@ def run_replay(
     with ExitStack() as stack:
         sink = stack.enter_context(LogWriter(stack.enter_context(replacing(output, inputs))))
         _begin(sink, source, replay, options, layer=layer)
-        replayed = replay.run(sink.write_messages, layer=layer, advance=advance)
+        with _behind(sink.write_messages) as write:
+            replayed = replay.run(write, layer=layer, advance=advance)
         layout = replay.layout()
         sink.add_attachment(layout.name, layout.media_type, layout.data)
         texts = {
@@ -97,6 +99,24 @@ def run_replay(
         sink.add_metadata(VERDICTS, texts)
         sink.add_metadata(CERTIFICATE, replayed.certificate)
     return replayed
+
+
+@contextmanager
+def _behind(write: Callable[[Messages], None]) -> Iterator[Callable[[Messages], None]]:
+    """Give what writes messages on a thread of its own, in order, while the next ones are made."""
+    waiting: Future[None] | None = None
+    with ThreadPoolExecutor(1, "writing") as thread:
+
+        def write_behind(messages: Messages) -> None:
+            nonlocal waiting
+            if waiting is not None:
+                # no more than these wait, so that memory stays bounded
+                waiting.result()
+            waiting = thread.submit(write, messages)
+
+        yield write_behind
+        if waiting is not None:
+            waiting.result()
 
 
 def load_files(

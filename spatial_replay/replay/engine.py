@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -15,8 +16,8 @@ from spatial_replay.annotate.specification import (
     logged_specifications,
     specification_attachments,
 )
-from spatial_replay.logs.messages import Attachment, Messages, merge
-from spatial_replay.logs.source import Source, axes_of, units_of
+from spatial_replay.logs.messages import Attachment, Block, Messages, merge
+from spatial_replay.logs.source import Source, axes_of, read_ahead, units_of
 from spatial_replay.logs.topics import PLAN_METADATA, REPLAYED_PREFIX, image_topics
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.semantics import Semantics
@@ -161,8 +162,8 @@ class Replay:
             SpecificationError: names that the log never has, if names are strict.
         """
         needs_messages = write is not None or self._hashes is not None
-        for block, trace in self._selection.iter_blocks(messages=needs_messages):
-            stretches = self._evaluation.extend(trace)
+        # on the thread that reads: the next block is evaluated while messages of this one are made
+        for block, trace, stretches in read_ahead(self._evaluated(messages=needs_messages)):
             self._traces.add(trace)
             inside = self._selection.inside(trace)
             own = Messages()
@@ -200,6 +201,12 @@ class Replay:
     def layout(self) -> Attachment:
         """Return the viewer layout of the annotated log; call it after `run`."""
         return self._evaluation.layout(self._topics, axes_of(self._source), self._images)
+
+    def _evaluated(self, *, messages: bool) -> Generator[tuple[Block, Trace, list[SeriesBlock]], None, None]:
+        """Yield each block with its samples and their evaluation."""
+        with closing(self._selection.read_blocks(messages=messages)) as blocks:
+            for block, trace in blocks:
+                yield block, trace, self._evaluation.extend(trace)
 
     def _add(self, trace: Trace, own: Messages, stretches: Sequence[SeriesBlock]) -> None:
         self._faults += trace.faults

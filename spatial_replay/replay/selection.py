@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from types import MappingProxyType
@@ -160,7 +160,11 @@ class Selection:
     def window(self) -> Window:
         return self.options.window
 
-    def iter_blocks(self, *, messages: bool = True) -> Iterator[tuple[Block, Trace]]:
+    def iter_blocks(self) -> Iterator[tuple[Block, Trace]]:
+        """Read what `read_blocks` does, each block while the previous one is processed."""
+        return read_ahead(self.read_blocks())
+
+    def read_blocks(self, *, messages: bool = True) -> Generator[tuple[Block, Trace], None, None]:
         """Read each block, with its samples in the window, and before it if a specification looks back.
 
         Args:
@@ -171,8 +175,7 @@ class Selection:
         from_start = look_before(self.files) or window.every > 1
         read = 0
         source = self.source if messages else samples_only(self.source)
-        blocks = read_blocks(source, None if from_start else window.start_ns, window.end_ns)
-        for block in read_ahead(blocks):
+        for block in read_blocks(source, None if from_start else window.start_ns, window.end_ns):
             trace = block.trace
             if window.every > 1:
                 chosen = np.arange(-read % window.every, len(trace), window.every, dtype=np.int64)
@@ -182,7 +185,7 @@ class Selection:
 
     def iter_traces(self) -> Iterator[Trace]:
         """Read the samples of `iter_blocks`."""
-        for _, trace in self.iter_blocks(messages=False):
+        for _, trace in read_ahead(self.read_blocks(messages=False)):
             yield trace
 
     def trace(self, advance: Callable[[int], None] = lambda samples: None) -> Trace:

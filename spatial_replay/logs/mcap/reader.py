@@ -48,6 +48,9 @@ from spatial_replay.trace.declared_units import signal_units_from_metadata
 from spatial_replay.trace.sample import LATEST_NS
 from spatial_replay.trace.trace import Trace, within
 
+FIRST_SAMPLES = 1_024
+"""Samples of the first block; each one after it has twice as many, up to those of a block. Other threads wait
+for the first."""
 BLOCK_BYTES = 64 * 2**20
 """A block of messages is closed when it holds this much, however few its samples are."""
 AFTER_ALL_NS = 2**64
@@ -240,6 +243,7 @@ def _blocks(
     ]
     waiting: list[RawMessages] = []
     size = samples = number = 0
+    enough = FIRST_SAMPLES
     for several, messages in walk.iter_messages(places, is_wanted):
         number += len(several)
         if declared < len(walk.channels):
@@ -256,12 +260,13 @@ def _blocks(
         waiting.append(messages)
         size += len(messages.payloads.data) if messages.channel >= 0 else messages.payloads.nbytes
         samples += _count(messages, objects)
-        if number < len(places) and (size >= BLOCK_BYTES or samples >= BLOCK_SAMPLES):
+        if number < len(places) and (size >= BLOCK_BYTES or samples >= enough):
             ordered = _in_order(waiting)
             ready = int(np.searchsorted(ordered.heads["log_time"], places[number].start_ns))
             waiting = [ordered]
             if ready:
                 yield ordered[:ready]
+                enough = min(2 * enough, BLOCK_SAMPLES)
                 # not the whole buffer for the few that are left
                 rest = ordered[ready:].compact()
                 waiting, size, samples = [rest], rest.payloads.nbytes, _count(rest, objects)
