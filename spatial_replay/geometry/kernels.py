@@ -57,9 +57,14 @@ def _fill_edges(vertices: Floats, edges: Floats, start: int, stop: int) -> None:
 @inlined
 def fill_row(rows: Rows, row: int) -> None:
     """Compute the edges of a row, which `rows_distance` reads."""
+    # where rows have one part each, nothing is saved by knowing which parts are far from each other
+    is_one_each = len(rows.radius) == len(rows.bottom)
     for p in range(rows.part_start[row], rows.part_start[row + 1]):
         start, stop = rows.vertex_start[p], rows.vertex_start[p + 1]
         _fill_edges(rows.vertices, rows.edges, start, stop)
+        if is_one_each:
+            rows.edges[start, 3] = np.inf
+            continue
         squared = 0.0
         for i in range(start + 1, stop):
             dx, dy = (
@@ -201,7 +206,7 @@ def rows_distance(rows: Rows, a: int, b: int, enlargement: float) -> float:
         for q in range(rows.part_start[b], rows.part_start[b + 1]):
             # grouped so that swapping p and q cannot change a bit
             grown = (rows.radius[p] + rows.radius[q]) + enlargement
-            if _is_farther(rows, p, q, least + grown):
+            if least < np.inf and _is_farther(rows, p, q, least + grown):
                 continue
             distance = _convex_distance(
                 rows.vertices, rows.edges, start[p], start[p + 1], start[q], start[q + 1]
@@ -222,7 +227,8 @@ def _part_protrusion(rows: Rows, a: int, p: int, b: int, enlargement: float) -> 
     least = np.inf
     for q in range(rows.part_start[b], rows.part_start[b + 1]):
         # some vertex of p sticks out as far as p is from q
-        if _is_farther(rows, p, q, least - (radius[p] - radius[q]) - enlargement):
+        reach = least - (radius[p] - radius[q]) - enlargement
+        if least < np.inf and _is_farther(rows, p, q, reach):
             continue
         planar = _convex_protrusion(rows.vertices, rows.edges, start[p], start[p + 1], start[q], start[q + 1])
         least = min(least, planar + (radius[p] - radius[q]) + enlargement)
