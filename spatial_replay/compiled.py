@@ -66,9 +66,11 @@ def long_kernel(function: Callable[_Arguments, _Result]) -> Callable[_Arguments,
     return _Kernel(function, {"nogil": True}, times=_LONG)
 
 
-def copying_kernel(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """Return a long kernel that copies bytes and takes whole slices, which the interpreter does as fast."""
-    return _Kernel(function, {"nogil": True}, times=_COPYING)
+def copying_kernel(
+    interpreted: Callable[_Arguments, _Result],
+) -> Callable[[Callable[_Arguments, _Result]], Callable[_Arguments, _Result]]:
+    """Return what makes a long kernel that copies bytes; interpreted, it is another function."""
+    return lambda function: _Kernel(function, {"nogil": True}, times=_COPYING, interpreted_as=interpreted)
 
 
 def elementwise(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
@@ -198,12 +200,14 @@ class _Kernel(Generic[_Arguments, _Result]):
         *,
         is_elementwise: bool = False,
         times: float = 1.0,
+        interpreted_as: Callable[_Arguments, _Result] | None = None,
     ) -> None:
         self.__wrapped__ = function
         self.__name__ = function.__name__
         self.__doc__ = function.__doc__
         self.__module__ = function.__module__
         self.options, self.times = options, times
+        self._interpreted_as = interpreted_as or function
         self._is_elementwise = is_elementwise
         self._compiled: Callable[_Arguments, _Result] | None = None
         self._interpreted: Callable[_Arguments, _Result] | None = None
@@ -253,7 +257,7 @@ class _Kernel(Generic[_Arguments, _Result]):
     def interpreted(self) -> Callable[_Arguments, _Result]:
         """Return the function as it stands, calling others as they stand."""
         if self._interpreted is None:
-            self._interpreted = _linked(self.__wrapped__, methodcaller("interpreted"))
+            self._interpreted = _linked(self._interpreted_as, methodcaller("interpreted"))
         return self._interpreted
 
     def entry(self) -> Callable[..., Any]:
@@ -325,7 +329,7 @@ class _ArrayAt(_Kernel[[int, int], Any]):
         self._kind = kind
 
     def interpreted(self) -> Callable[[int, int], Any]:
-        kind: Any = ctypes.c_double if self._kind is np.float64 else ctypes.c_int64
+        kind: Any = _C_TYPES[self._kind]
         return lambda address, count: np.frombuffer(
             (kind * int(count)).from_address(int(address)), self._kind
         )
@@ -336,9 +340,16 @@ class _ArrayAt(_Kernel[[int, int], Any]):
         return self._compiled
 
 
+_C_TYPES: Final[dict[type, Any]] = {
+    np.float64: ctypes.c_double,
+    np.int64: ctypes.c_int64,
+    np.uint8: ctypes.c_uint8,
+}
+
 floats_at: Final = _ArrayAt("floats_at", np.float64)
 integers_at: Final = _ArrayAt("integers_at", np.int64)
-"""Within kernels that are called by address alone."""
+bytes_at: Final = _ArrayAt("bytes_at", np.uint8)
+"""Within kernels that are given addresses; numbers need not be aligned."""
 
 
 class _Process:

@@ -40,10 +40,10 @@ class Hashing:
 
     def __init__(self) -> None:
         self._thread = ThreadPoolExecutor(1, "hashing")
-        self._waiting: deque[tuple[int, Future[object]]] = deque()
+        self._waiting: deque[tuple[int, Future[None]]] = deque()
         self._waiting_bytes = 0
 
-    def take(self, size: int, add: Callable[[], object]) -> None:
+    def take(self, size: int, add: Callable[[], None]) -> None:
         """Call `add` for a piece of so many bytes, which must not change afterwards."""
         while self._waiting and (
             self._waiting[0][1].done()
@@ -217,7 +217,11 @@ class EvaluationHashes:
     def add_samples(self, trace: Trace, own: Messages) -> None:
         """Take in the next samples and the log's own messages; their results follow, in any pieces."""
         size = trace.nbytes + int(columns_of(own.payloads).sizes.sum())
-        self._hashing.take(size, lambda: (self._samples.add(trace), self._messages.add(own)))
+        self._hashing.take(size, partial(self._take_in, trace, own))
+
+    def _take_in(self, trace: Trace, own: Messages) -> None:
+        self._samples.add(trace)
+        self._messages.add(own)
 
     def add_results(self, results: Sequence[SeriesBlock]) -> None:
         """Take in the next numbers of each result."""

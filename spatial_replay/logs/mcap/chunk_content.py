@@ -14,11 +14,18 @@ import numpy as np
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from spatial_replay.compiled import copying_kernel, elementwise, kernel, merged
+from spatial_replay.compiled import (
+    bytes_at,
+    copying_kernel,
+    elementwise,
+    integers_at,
+    kernel,
+    merged,
+)
 from spatial_replay.geometry.arrays import Integers, equal_places, starts_from_counts
 from spatial_replay.logs.mcap.chunk_records import RECORD_HEAD
 from spatial_replay.logs.messages import Messages
-from spatial_replay.logs.payloads import Bytes, Filled, MixedPayloads, Payloads, Words, columns_of
+from spatial_replay.logs.payloads import Bytes, Filled, MixedPayloads, Part, Payloads, columns_of
 
 _MESSAGE = np.dtype(
     [
@@ -32,8 +39,76 @@ _MESSAGE = np.dtype(
 )
 _HEAD: Final = _MESSAGE.itemsize
 _NONE: Final = np.empty(0, np.int64)
-_PADDING: Final = bytes(9)
-"""Makes two words or more of a buffer that is nearly empty, so that kernels are compiled for one layout."""
+
+
+class _Parts(NamedTuple):
+    """The parts of payloads as kernels take them.
+
+    Attributes:
+        table: (P, 10) int64, of each part what `_FILLED` and `_BUFFERED` say, by addresses.
+        slots: (S, 2) int64, of all templates: where a word is in a message, and which one of its part it is.
+        marked: (K,) int64, of all templates: where marks are.
+        listed: numbers of the parts that are lists of messages, which kernels leave out.
+        kept: what is at the addresses.
+    """
+
+    table: Integers
+    slots: Integers
+    marked: Integers
+    listed: list[int]
+    kept: list[object]
+
+    @classmethod
+    def of(cls, parts: Sequence[Part]) -> _Parts:
+        """Return the parts of some payloads."""
+        table = np.zeros((len(parts), _COLUMNS), np.int64)
+        slots, marked = [np.empty((0, 2), np.int64)], [_NONE]
+        slot = mark = 0
+        listed, kept = list[int](), list[object]()
+        for row, part in zip(table, parts, strict=True):
+            if isinstance(part, Filled):
+                template = part.template
+                pattern = np.frombuffer(template.pattern, np.uint8)
+                words, marks = np.ascontiguousarray(part.words), np.ascontiguousarray(part.marks)
+                offsets = template.word_offsets
+                order = np.arange(len(offsets)) if part.order is None else part.order
+                row[: _MARKS + 1] = (
+                    _FILLED,
+                    _at(pattern),
+                    len(pattern),
+                    _at(words),
+                    words.shape[1],
+                    _at(marks),
+                )
+                row[_MARKS + 1 :] = slot, slot + len(offsets), mark, mark + marks.shape[1]
+                slots.append(np.stack([offsets, order], axis=1))
+                marked.append(template.mark_offsets)
+                slot, mark = slot + len(offsets), mark + marks.shape[1]
+                kept += [template, pattern, words, marks]
+            elif isinstance(part, Payloads):
+                data = np.frombuffer(part.data, np.uint8)
+                begin, end = np.ascontiguousarray(part.begin), np.ascontiguousarray(part.end)
+                row[: _END + 1] = _BUFFERED, _at(data), _at(begin), _at(end)
+                kept += [data, begin, end]
+            else:
+                row[_KIND] = _LISTED
+        listed = np.flatnonzero(table[:, _KIND] == _LISTED).tolist()
+        return cls(table, np.concatenate(slots), np.concatenate(marked), listed, kept)
+
+
+_KIND, _PATTERN, _LENGTH, _WORDS, _WIDTH, _MARKS, _SLOT, _LAST_SLOT, _MARK, _LAST_MARK = range(10)
+_COLUMNS: Final = 10
+_FILLED: Final = 0
+"""A part of one template: its pattern and how long that is, words (n, N) and N, marks (n, K), and which of
+all slots and marked places are its own."""
+_DATA, _BEGIN, _END = 1, 2, 3
+_BUFFERED: Final = 1
+"""A part in a buffer: this, and where its messages begin and end."""
+_LISTED: Final = 2
+
+
+def _at(array: NDArray[Any]) -> int:
+    return array.ctypes.data
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,6 +118,7 @@ class Batch:
     Attributes:
         heads: (M, 31), the encoded heads.
         payloads: what follows them.
+        parts: those of the payloads.
         start: (M + 1,) int64, where each begins and the last one ends, side by side.
         times_ns: (M,) int64, their log times.
         numbers: (M,) int64, the numbers of their channels; and as a list `channels`.
@@ -50,6 +126,7 @@ class Batch:
 
     heads: Bytes
     payloads: MixedPayloads
+    parts: _Parts
     start: Integers
     times_ns: Integers
     numbers: Integers
@@ -68,8 +145,8 @@ class Batch:
         heads["log_time"] = messages.log_time_ns
         heads["publish_time"] = messages.publish_time_ns
         encoded = heads.view(np.uint8).reshape(len(heads), _HEAD)
-        start = starts_from_counts(sizes + _HEAD)
-        return cls(encoded, payloads, start, messages.log_time_ns, numbers, numbers.tolist())
+        start, parts = starts_from_counts(sizes + _HEAD), _Parts.of(payloads.parts)
+        return cls(encoded, payloads, parts, start, messages.log_time_ns, numbers, numbers.tolist())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -171,161 +248,103 @@ def _written(content: memoryview, ranges: Sequence[MessageRange], shifts: Sequen
     """
     batch, own = ranges[0].batch, slice(ranges[0].begin, ranges[-1].stop)
     start = batch.start[own] + np.repeat(np.array(shifts, np.int64), [len(each) for each in ranges])
-    payloads = batch.payloads
-    part, row, begin = payloads.part[own], payloads.row[own], start + _HEAD
-    filled: list[tuple[Integers, Filled, Integers]] = []
-    columns = _columns(_PADDING, _NONE, _NONE, _NONE)
-    for places in equal_places(part):
-        of_part, rows = payloads.parts[part[places[0]]], row[places]
-        if isinstance(of_part, Filled):
-            filled.append((begin[places], of_part, rows))
-        elif isinstance(of_part, Payloads) and not len(columns.place):
-            columns = _columns(of_part.data, of_part.begin[rows], of_part.end[rows], begin[places])
-        else:
-            for place, each in zip(begin[places].tolist(), rows.tolist(), strict=True):
-                payload = of_part[each]
-                content[place : place + len(payload)] = payload
-    heads = batch.heads[own].reshape(-1)
-    target = np.frombuffer(content, np.uint8)
-    _write(target, _words(content), start, heads, _words(heads), columns, _joined(filled))
+    payloads, parts = batch.payloads, batch.parts
+    part, row = payloads.part[own], payloads.row[own]
+    for number in parts.listed:
+        for message in np.flatnonzero(part == number).tolist():
+            payload, place = payloads[own.start + message], int(start[message]) + _HEAD
+            content[place : place + len(payload)] = payload
+    content_at, heads_at = _at(np.frombuffer(content, np.uint8)), _at(batch.heads[own])
+    _write(content_at, len(content), heads_at, start, part, row, parts.table, parts.slots, parts.marked)
     return start
 
 
-class _Columns(NamedTuple):
-    """Payloads in a buffer, from `begin` (m,) to `end` (m,), and the places (m,) that they are copied to."""
-
-    data: Bytes
-    words: Words
-    begin: Integers
-    end: Integers
-    place: Integers
-
-
-class _Templates(NamedTuple):
-    """Payloads of T templates, those of one template together.
-
-    Attributes:
-        place: (n,) where they are written; those of a template are from `first` (T + 1,) on.
-        pattern, pattern_words, offsets, marked: of all templates, from `pattern_start`, `offsets_start` and
-            `marked_start` (T + 1,) on: their bytes, and where words and marks are in them.
-        words, marks: to be filled in, message by message.
-    """
-
-    place: Integers
-    first: Integers
-    pattern: Bytes
-    pattern_words: Words
-    pattern_start: Integers
-    offsets: Integers
-    offsets_start: Integers
-    marked: Integers
-    marked_start: Integers
-    words: Words
-    marks: Bytes
-
-
-def _joined(filled: Sequence[tuple[Integers, Filled, Integers]]) -> _Templates:
-    """Join what is to be filled in: places, messages of a template, and which of them."""
-    templates = [each.template for _, each, _ in filled]
-    words = np.empty(sum(len(rows) * len(each.template.word_offsets) for _, each, rows in filled), np.uint64)
-    marks = np.empty(sum(len(rows) * each.marks.shape[1] for _, each, rows in filled), np.uint8)
-    word = mark = 0
-    for _, each, rows in filled:
-        word = _take_words(each, rows, words, word)
-        mark = _take(each.marks, rows, marks, mark)
-    pattern = np.frombuffer(bytearray().join([*(each.pattern for each in templates), _PADDING]), np.uint8)
-    return _Templates(
-        np.concatenate([_NONE, *(places for places, _, _ in filled)]),
-        starts_from_counts([len(places) for places, _, _ in filled]),
-        pattern,
-        _words(pattern),
-        starts_from_counts(list(map(len, templates))),
-        np.concatenate([_NONE, *(each.word_offsets for each in templates)]),
-        starts_from_counts([len(each.word_offsets) for each in templates]),
-        np.concatenate([_NONE, *(each.mark_offsets for each in templates)]),
-        starts_from_counts([len(each.mark_offsets) for each in templates]),
-        words,
-        marks,
-    )
-
-
-def _take_words(filled: Filled, rows: Integers, joined: Words, begin: int) -> int:
-    """Copy the words of some messages, one after the other; return where they end."""
-    if filled.order is None:
-        return _take(filled.words, rows, joined, begin)
-    end = begin + len(filled.order) * len(rows)
-    target = joined[begin:end].reshape(len(rows), -1)
-    np.take(filled.words[rows], filled.order, axis=1, out=target, mode="clip")
-    return end
-
-
-def _take(columns: NDArray[Any], rows: Integers, joined: NDArray[Any], begin: int) -> int:
-    """Copy rows, one after the other; return where they end."""
-    end = begin + columns[:1].size * len(rows)
-    # whatever the mode, rows are within bounds; only this one fills the target at once
-    np.take(columns, rows, axis=0, out=joined[begin:end].reshape(len(rows), -1), mode="clip")
-    return end
-
-
-def _columns(data: bytes, begin: Integers, end: Integers, place: Integers) -> _Columns:
-    view = np.frombuffer(data.ljust(len(_PADDING), b"\0"), np.uint8)
-    # one kind of array, whatever the buffer is: a kernel is compiled for each
-    view.flags.writeable = False
-    return _Columns(view, _words(view), begin, end, place)
-
-
-def _words(buffer: memoryview | Bytes) -> Words:
-    """Return every 8 bytes of a buffer as a word, at whatever place they begin."""
-    return np.ndarray((max(len(buffer) - 7, 0),), "<u8", buffer, 0, (1,))
-
-
-@copying_kernel
-def _write(
-    content: Bytes,
-    anywhere: Words,
+def _write_by_part(
+    content_at: int,
+    size: int,
+    heads_at: int,
     start: Integers,
-    heads: Bytes,
-    head_words: Words,
-    columns: _Columns,
-    templates: _Templates,
+    part: Integers,
+    row: Integers,
+    table: Integers,
+    slots: Integers,
+    marked: Integers,
 ) -> None:
-    """Write records: heads (m, 31), side by side, at `start` (m,), and payloads.
+    """Do what `_write` does, the messages of a part together."""
+    content = bytes_at(content_at, size)
+    content[start[:, None] + np.arange(_HEAD)] = bytes_at(heads_at, _HEAD * len(start)).reshape(-1, _HEAD)
+    for places in equal_places(part):
+        about, rows, begin = table[part[places[0]]].tolist(), row[places], start[places] + _HEAD
+        most = int(rows.max()) + 1
+        if about[_KIND] == _FILLED:
+            encoded = np.empty((len(rows), about[_LENGTH]), np.uint8)
+            encoded[:] = bytes_at(about[_PATTERN], about[_LENGTH])
+            if about[_SLOT] < about[_LAST_SLOT]:
+                words = integers_at(about[_WORDS], most * about[_WIDTH]).reshape(most, -1)
+                offsets, order = slots[about[_SLOT] : about[_LAST_SLOT]].T
+                shape = len(rows), about[_LENGTH] - 7
+                anywhere = np.ndarray(shape, np.int64, encoded, 0, (about[_LENGTH], 1))
+                anywhere[:, offsets] = words[rows][:, order]
+            if about[_MARK] < about[_LAST_MARK]:
+                marks = bytes_at(about[_MARKS], most * (about[_LAST_MARK] - about[_MARK])).reshape(most, -1)
+                encoded[:, marked[about[_MARK] : about[_LAST_MARK]]] = marks[rows]
+            content[begin[:, None] + np.arange(about[_LENGTH])] = encoded
+        elif about[_KIND] == _BUFFERED:
+            first, last = integers_at(about[_BEGIN], most)[rows], integers_at(about[_END], most)[rows]
+            data = bytes_at(about[_DATA], int(last.max()))
+            for place, low, high in zip(begin.tolist(), first.tolist(), last.tolist(), strict=True):
+                content[place : place + high - low] = data[low:high]
+
+
+@copying_kernel(_write_by_part)
+def _write(
+    content_at: int,
+    size: int,
+    heads_at: int,
+    start: Integers,
+    part: Integers,
+    row: Integers,
+    table: Integers,
+    slots: Integers,
+    marked: Integers,
+) -> None:
+    """Write records: heads (m, 31), side by side, at `start` (m,), and payloads, as `_Parts` has them.
 
     Args:
-        anywhere, head_words: the content, and the heads, as `_words` gives them.
+        content_at, size: where the content is, and how many bytes there are.
+        heads_at: where the heads are.
     """
     for i in range(start.shape[0]):
-        _copy(content, anywhere, start[i], heads, head_words, i * _HEAD, _HEAD)
-    for i in range(columns.place.shape[0]):
-        begin = columns.begin[i]
-        _copy(content, anywhere, columns.place[i], columns.data, columns.words, begin, columns.end[i] - begin)
-    word = mark = 0
-    for t in range(templates.first.shape[0] - 1):
-        pattern, size = (
-            templates.pattern_start[t],
-            templates.pattern_start[t + 1] - templates.pattern_start[t],
-        )
-        offsets = templates.offsets[templates.offsets_start[t] : templates.offsets_start[t + 1]]
-        marked = templates.marked[templates.marked_start[t] : templates.marked_start[t + 1]]
-        for i in range(templates.first[t], templates.first[t + 1]):
-            place = templates.place[i]
-            _copy(content, anywhere, place, templates.pattern, templates.pattern_words, pattern, size)
-            anywhere[place + offsets] = templates.words[word : word + offsets.shape[0]]
-            word += offsets.shape[0]
-            content[place + marked] = templates.marks[mark : mark + marked.shape[0]]
-            mark += marked.shape[0]
+        at = content_at + start[i]
+        _copy(at, heads_at + i * _HEAD, _HEAD)
+        at += _HEAD
+        about, r = table[part[i]], row[i]
+        if about[_KIND] == _FILLED:
+            _copy(at, about[_PATTERN], about[_LENGTH])
+            words = integers_at(about[_WORDS] + 8 * about[_WIDTH] * r, about[_WIDTH])
+            for k in range(about[_SLOT], about[_LAST_SLOT]):
+                integers_at(at + slots[k, 0], 1)[0] = words[slots[k, 1]]
+            count = about[_LAST_MARK] - about[_MARK]
+            marks = bytes_at(about[_MARKS] + count * r, count)
+            for k in range(count):
+                bytes_at(at + marked[about[_MARK] + k], 1)[0] = marks[k]
+        elif about[_KIND] == _BUFFERED:
+            begin, end = integers_at(about[_BEGIN] + 8 * r, 1)[0], integers_at(about[_END] + 8 * r, 1)[0]
+            _copy(at, about[_DATA] + begin, end - begin)
 
 
 @merged
-def _copy(
-    content: Bytes, anywhere: Words, place: int, source: Bytes, source_words: Words, begin: int, size: int
-) -> None:
-    """Copy bytes, eight at a time, the last eight once more if need be."""
+def _copy(target_at: int, source_at: int, size: int) -> None:
+    """Copy bytes between addresses, eight at a time, the last eight once more if need be."""
     if size < 8:
-        content[place : place + size] = source[begin : begin + size]
+        some, others = bytes_at(target_at, size), bytes_at(source_at, size)
+        for k in range(size):
+            some[k] = others[k]
         return
-    anywhere[place : place + size - 7 : 8] = source_words[begin : begin + size - 7 : 8]
-    anywhere[place + size - 8] = source_words[begin + size - 8]
+    target, source = integers_at(target_at, size // 8), integers_at(source_at, size // 8)
+    for k in range(size // 8):
+        target[k] = source[k]
+    integers_at(target_at + size - 8, 1)[0] = integers_at(source_at + size - 8, 1)[0]
 
 
 @elementwise
