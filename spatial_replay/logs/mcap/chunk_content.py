@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from spatial_replay.compiled import (
     bytes_at,
     copying_kernel,
-    elementwise,
     integers_at,
     kernel,
     merged,
@@ -38,6 +37,10 @@ _MESSAGE = np.dtype(
     ]
 )
 _HEAD: Final = _MESSAGE.itemsize
+INDEX_HEAD: Final = 15
+INDEX_ENTRY: Final = 16
+"""Bytes of a record that indexes the messages of a channel, without its entries, and of one of these."""
+_MESSAGE_INDEX: Final = int(Opcode.MESSAGE_INDEX)
 _NONE: Final = np.empty(0, np.int64)
 
 
@@ -132,6 +135,9 @@ class Batch:
     numbers: Integers
     channels: list[int]
 
+    def __len__(self) -> int:
+        return len(self.heads)
+
     @classmethod
     def of(cls, messages: Messages, numbers: Integers) -> Batch:
         """Return messages as records, with channel numbers (M,)."""
@@ -194,15 +200,17 @@ class LaidOut(NamedTuple):
     Attributes:
         begin: (C + 1,) int64, where each begins and the last one ends.
         low_ns, high_ns: (C,) int64, log times of the first and the last message.
-        entries: (M, 2) int64, the time and the place in its chunk of each message, by chunk and channel.
         counts: (C, K) int64, how many messages of each channel there are.
+        indexes: the records that index the messages, by chunk and channel.
+        index_begin: (C + 1,) int64, where those of each chunk begin and the last ones end.
     """
 
     begin: Integers
     low_ns: Integers
     high_ns: Integers
-    entries: Integers
     counts: Integers
+    indexes: memoryview
+    index_begin: Integers
 
 
 def lay_out(chunks: Sequence[OpenChunk], content: memoryview) -> LaidOut:
@@ -225,9 +233,13 @@ def lay_out(chunks: Sequence[OpenChunk], content: memoryview) -> LaidOut:
     times_ns = np.concatenate([each.batch.times_ns[each.begin : each.stop] for each in ranges])
     counts = np.zeros((len(chunks), int(numbers.max()) + 1), np.int64)
     low_ns, high_ns = np.empty(len(chunks), np.int64), np.empty(len(chunks), np.int64)
-    entries = np.empty((len(numbers), 2), np.int64)
-    _index(first, begin, np.concatenate(starts), numbers, times_ns, counts, low_ns, high_ns, entries)
-    return LaidOut(begin, low_ns, high_ns, entries, counts)
+    index = bytearray(INDEX_ENTRY * len(numbers) + INDEX_HEAD * min(counts.size, len(numbers)) + 8)
+    # every 8 bytes of it as a word, at whatever place they begin
+    words = np.ndarray((len(index) - 7,), np.int64, index, 0, (1,))
+    index_begin, cursor = np.zeros(len(begin), np.int64), np.empty(counts.shape[1], np.int64)
+    chunks_of = first, begin, index_begin, low_ns, high_ns
+    _index(*chunks_of, np.concatenate(starts), numbers, times_ns, counts, cursor, words)
+    return LaidOut(begin, low_ns, high_ns, counts, memoryview(index), index_begin)
 
 
 def _of_one_batch(ranges: Sequence[MessageRange]) -> list[tuple[int, int]]:
@@ -347,39 +359,47 @@ def _copy(target_at: int, source_at: int, size: int) -> None:
     integers_at(target_at + size - 8, 1)[0] = integers_at(source_at + size - 8, 1)[0]
 
 
-@elementwise
 @kernel
 def _index(
     first: Integers,
     begin: Integers,
+    index_begin: Integers,
+    low_ns: Integers,
+    high_ns: Integers,
     start: Integers,
     numbers: Integers,
     times_ns: Integers,
     counts: Integers,
-    low_ns: Integers,
-    high_ns: Integers,
-    entries: Integers,
+    cursor: Integers,
+    words: Integers,
 ) -> None:
-    """Fill in counts, bounds of times and entries, as `LaidOut` has them.
+    """Fill in bounds of times, counts and the index, as `LaidOut` has them.
 
     Args:
         first: (C + 1,) where the messages of each chunk begin.
         begin: (C + 1,) where its content begins.
         start: (M,) where each message's record begins.
+        cursor: (K,), used while it runs.
+        words: the index, every 8 bytes of it.
     """
     for c in range(first.shape[0] - 1):
         low_ns[c] = high_ns[c] = times_ns[first[c]]
         for i in range(first[c], first[c + 1]):
             counts[c, numbers[i]] += 1
             low_ns[c], high_ns[c] = min(low_ns[c], times_ns[i]), max(high_ns[c], times_ns[i])
-        # where the entries of each channel begin, moved on to where they end
-        at = first[c]
+        at = index_begin[c]
         for k in range(counts.shape[1]):
-            at, counts[c, k] = at + counts[c, k], at
+            if counts[c, k] > 0:
+                size = INDEX_ENTRY * counts[c, k]
+                # opcode, length, channel, size: each word overwrites what the one before has too much
+                words[at] = _MESSAGE_INDEX
+                words[at + 1] = size + 6
+                words[at + 9] = k | size << 16
+                cursor[k] = at + INDEX_HEAD
+                at += INDEX_HEAD + size
+        index_begin[c + 1] = at
         for i in range(first[c], first[c + 1]):
-            at = counts[c, numbers[i]]
-            entries[at, 0], entries[at, 1] = times_ns[i], start[i] - begin[c]
-            counts[c, numbers[i]] = at + 1
-        end = first[c]
-        for k in range(counts.shape[1]):
-            end, counts[c, k] = counts[c, k], counts[c, k] - end
+            at = cursor[numbers[i]]
+            words[at] = times_ns[i]
+            words[at + 8] = start[i] - begin[c]
+            cursor[numbers[i]] = at + INDEX_ENTRY

@@ -9,52 +9,61 @@ from __future__ import annotations
 
 import struct
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from itertools import pairwise
-from typing import Final, cast
+from typing import Any, Final, NamedTuple, cast
 
 import zstandard
 from mcap import records
 from mcap.opcode import Opcode
 
 from spatial_replay.logs.checksums import crc32
-from spatial_replay.logs.mcap.chunk_content import OpenChunk, lay_out
+from spatial_replay.logs.mcap.chunk_content import INDEX_ENTRY, INDEX_HEAD, OpenChunk, lay_out
 from spatial_replay.logs.mcap.chunk_records import RECORD_HEAD, encoded
 from spatial_replay.trace.sample import FOREVER
 
-_INDEX_ENTRY: Final = 16
 _ZSTD: Final = b"zstd"
 _CHUNK: Final = struct.Struct("<BQQQQII4sQ")
-_INDEX: Final = struct.Struct("<BQHI")
 _MOST_KEPT: Final = 2**22
 """A thread keeps room for so many bytes of chunks."""
 COMPRESSION_LEVEL: Final = 1
 """Coordinates hardly shrink further at higher levels, which take several times as long."""
 
 
-@dataclass(frozen=True, slots=True)
-class PackedChunk:
-    """A chunk ready to be written, with what the summary says of it.
+class PackedChunk(NamedTuple):
+    """What the summary says of a chunk.
 
     Attributes:
-        parts: the chunk's record, followed by its index of messages.
-        record_bytes, index_bytes: how long both are.
-        index_offsets: for each channel, where its entries begin in the index.
+        record_bytes, index_bytes: how long its record is, and its index of messages, which follows.
+        index_offsets: channels with their places in both, one after the other.
     """
 
-    parts: Sequence[bytes | memoryview]
     record_bytes: int
     index_bytes: int
-    index_offsets: Mapping[int, int]
+    index_offsets: Sequence[int]
     compressed_size: int
     uncompressed_size: int
-    counts: Mapping[int, int]
     start_ns: int
     end_ns: int
 
 
-def pack(chunks: Sequence[OpenChunk]) -> list[PackedChunk]:
+class PackedChunks(NamedTuple):
+    """Chunks ready to be written.
+
+    Attributes:
+        data: their records and indexes.
+        chunks: what the summary says of each.
+        counts: how many messages there are, by channel.
+    """
+
+    data: bytes
+    chunks: Sequence[PackedChunk]
+    counts: Sequence[int]
+
+
+def pack(chunks: Sequence[OpenChunk]) -> PackedChunks:
     """Pack messages into compressed chunks, each with its index.
 
     Several chunks are laid out in one buffer, and compressed together, so that this thread seldom waits for
@@ -66,27 +75,29 @@ def pack(chunks: Sequence[OpenChunk]) -> list[PackedChunk]:
         content[begin:end] for begin, end in pairwise(laid_out.begin.tolist())
     ]
     compressed = _compressor().multi_compress_to_buffer(contents)
-    entries, at = memoryview(laid_out.entries.astype("<i8", copy=False).tobytes()), 0
-    low_ns, high_ns = laid_out.low_ns.tolist(), laid_out.high_ns.tolist()
+    about = zip(
+        contents,
+        laid_out.counts.tolist(),
+        laid_out.low_ns.tolist(),
+        laid_out.high_ns.tolist(),
+        pairwise(laid_out.index_begin.tolist()),
+        strict=True,
+    )
+    parts: list[Any] = []
     packed = []
-    for number, (own, counts) in enumerate(zip(contents, laid_out.counts.tolist(), strict=True)):
-        data = compressed[number].tobytes()
-        about = low_ns[number], high_ns[number], len(own), crc32(own)
+    for number, (own, counts, start_ns, end_ns, (begin, end)) in enumerate(about):
+        data, span = compressed[number], (start_ns, end_ns)
         length = _CHUNK.size - RECORD_HEAD.size + len(data)
-        head = _CHUNK.pack(Opcode.CHUNK, length, *about, len(_ZSTD), _ZSTD, len(data))
-        parts: list[bytes | memoryview] = [head, data]
-        offsets, size = dict[int, int](), 0
-        numbers = {channel: count for channel, count in enumerate(counts) if count}
-        for channel, count in numbers.items():
-            listed = entries[at : at + count * _INDEX_ENTRY]
-            offsets[channel] = size
-            parts += [_INDEX.pack(Opcode.MESSAGE_INDEX, len(listed) + 6, channel, len(listed)), listed]
-            size += _INDEX.size + len(listed)
-            at += len(listed)
-        sizes = len(data), len(own)
-        record_bytes = RECORD_HEAD.size + length
-        packed.append(PackedChunk(parts, record_bytes, size, offsets, *sizes, numbers, *about[:2]))
-    return packed
+        head = _CHUNK.pack(Opcode.CHUNK, length, *span, len(own), crc32(own), len(_ZSTD), _ZSTD, len(data))
+        parts += head, data, laid_out.indexes[begin:end]
+        record_bytes = at = RECORD_HEAD.size + length
+        offsets = list[int]()
+        for channel, count in enumerate(counts):
+            if count:
+                offsets += channel, at
+                at += INDEX_HEAD + count * INDEX_ENTRY
+        packed.append(PackedChunk(record_bytes, end - begin, offsets, len(data), len(own), *span))
+    return PackedChunks(b"".join(parts), packed, laid_out.counts.sum(axis=0).tolist())
 
 
 _local = threading.local()
@@ -121,12 +132,19 @@ class McapSummary:
     start_ns: int = FOREVER
     end_ns: int = 0
 
-    def add_chunk(self, chunk: PackedChunk, offset: int) -> None:
-        """Take in a chunk that is written at a place in the file."""
-        self.chunks.append(_chunk_index(chunk, offset))
-        self.start_ns, self.end_ns = min(self.start_ns, chunk.start_ns), max(self.end_ns, chunk.end_ns)
-        for channel, count in chunk.counts.items():
-            self.counts[channel] = self.counts.get(channel, 0) + count
+    def add(self, packed: PackedChunks, offset: int) -> None:
+        """Take in chunks that are written at a place in the file, one after the other."""
+        for chunk in packed.chunks:
+            self.chunks.append(_chunk_index(chunk, offset))
+            offset += chunk.record_bytes + chunk.index_bytes
+            for channel in chunk.index_offsets[::2]:
+                # in the order of the chunks that they are in first
+                self.counts.setdefault(channel, 0)
+        self.start_ns = min(self.start_ns, *(chunk.start_ns for chunk in packed.chunks))
+        self.end_ns = max(self.end_ns, *(chunk.end_ns for chunk in packed.chunks))
+        for channel, count in enumerate(packed.counts):
+            if count:
+                self.counts[channel] += count
 
     def section(self, offset: int) -> bytes:
         """Encode the section and the footer for a place in the file."""
@@ -161,17 +179,19 @@ class McapSummary:
         )
 
 
-_CHUNK_INDEX: Final = struct.Struct("<BQQQQQI")
-_CHUNK_SIZES: Final = struct.Struct("<QI4sQQ")
+_CHUNK_INDEX: Final = "<BQQQQQI{}QI4sQQ"
 
 
 def _chunk_index(chunk: PackedChunk, offset: int) -> bytes:
     """Encode the index of a chunk as `encoded` does, in a tenth of the time: long logs have very many."""
-    following = offset + chunk.record_bytes
-    places = [each for number, at in chunk.index_offsets.items() for each in (number, following + at)]
-    offsets = struct.pack("<" + "HQ" * (len(places) // 2), *places)
+    record = _chunk_index_record(len(chunk.index_offsets) // 2)
+    places = list(chunk.index_offsets)
+    places[1::2] = [offset + at for at in places[1::2]]
+    about = chunk.start_ns, chunk.end_ns, offset, chunk.record_bytes, len(places) // 2 * 10
     sizes = chunk.index_bytes, len(_ZSTD), _ZSTD, chunk.compressed_size, chunk.uncompressed_size
-    length = _CHUNK_INDEX.size - RECORD_HEAD.size + len(offsets) + _CHUNK_SIZES.size
-    about = chunk.start_ns, chunk.end_ns, offset, chunk.record_bytes
-    head = _CHUNK_INDEX.pack(Opcode.CHUNK_INDEX, length, *about, len(offsets))
-    return head + offsets + _CHUNK_SIZES.pack(*sizes)
+    return record.pack(Opcode.CHUNK_INDEX, record.size - RECORD_HEAD.size, *about, *places, *sizes)
+
+
+@cache
+def _chunk_index_record(channels: int) -> struct.Struct:
+    return struct.Struct(_CHUNK_INDEX.format("HQ" * channels))

@@ -8,24 +8,23 @@ broken, and the others can be read without it.
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO, Self, TypeAlias
+from typing import Any, BinaryIO, Self
 
 import numpy as np
 from mcap import records
 
-from spatial_replay.compiled import cores
+from spatial_replay.compiled import cores, elementwise, long_kernel
 from spatial_replay.errors import OutputError
-from spatial_replay.geometry.arrays import Integers
+from spatial_replay.geometry.arrays import Integers, counts_from_starts
 from spatial_replay.logs.mcap.chunk_content import Batch, MessageRange, OpenChunk
 from spatial_replay.logs.mcap.chunk_records import encoded
-from spatial_replay.logs.mcap.packing import McapSummary, PackedChunk, pack
+from spatial_replay.logs.mcap.packing import McapSummary, PackedChunks, pack
 from spatial_replay.logs.messages import Channel, Messages, Schema, messages_of, select
 from spatial_replay.logs.output_file import output_error
 from spatial_replay.logs.topics import LIBRARY, MAGIC, OWN_PREFIX
@@ -46,17 +45,12 @@ THREADS = 4
 """The most threads that pack chunks, if there are so many processors."""
 
 
-_Closing: TypeAlias = tuple[int, int, list[MessageRange], int]
-"""A chunk that ends: at which message of a call, 0 for before it or 1 for after it; its messages and size."""
-
-
 @dataclass(slots=True)
 class _Lane:
-    """The open chunk of some topics."""
+    """The open chunk of some topics: its messages, their bytes, and when it began by the clock."""
 
     open: list[MessageRange] = field(default_factory=list)
     open_bytes: int = 0
-    began_ns: int = 0
     began_s: float = 0.0
 
 
@@ -104,8 +98,10 @@ class LogWriter:
         self._schemas: dict[Schema, int] = {}
         self._declarations: dict[int, _Declaration] = {}
         self._lanes = (_Lane(), _Lane())
+        self._began_ns = np.zeros(len(self._lanes), np.int64)
+        self._undue: tuple[frozenset[int], int] = frozenset(), 0
         self._workers = ThreadPoolExecutor(min(THREADS, cores()), "chunk-packing")
-        self._packing: deque[tuple[int, Future[list[PackedChunk]]]] = deque()
+        self._packing: deque[tuple[int, Future[PackedChunks]]] = deque()
         self._packing_bytes = 0
         self._closed = False
         self._write(MAGIC)
@@ -131,18 +127,37 @@ class LogWriter:
         if not len(messages):
             return
         numbers, lanes = self._numbers(messages)
-        closings: list[_Closing] = []
-        for number, lane in enumerate(self._lanes):
+        closed = [_closed(lane) for lane in self._lanes if lane.open and self._is_over(lane)]
+        batches = []
+        for number in range(len(self._lanes)):
             places = np.flatnonzero(lanes == number)
-            if not len(places):
-                closings += self._overtaken(lane, messages.log_time_ns)
-                continue
             own = messages if len(places) == len(messages) else select(messages, places)
-            batch = Batch.of(own, numbers[places])
-            closings += self._divide(lane, batch, places, messages.log_time_ns)
-        # in the order of the messages at which they close, however these were divided among calls
-        closings.sort(key=lambda closing: closing[:2])
-        self._pack([(ranges, size) for _, _, ranges, size in closings])
+            batches.append(Batch.of(own, numbers[places]) if len(places) else None)
+        sizes = np.empty(len(messages), np.int64)
+        for number, batch in enumerate(batches):
+            if batch is not None:
+                sizes[lanes == number] = counts_from_starts(batch.start)
+        open_bytes = np.array([lane.open_bytes if lane.open else -1 for lane in self._lanes], np.int64)
+        ends = np.empty((len(messages) + len(self._lanes), 2), np.int64)
+        count = _divide(messages.log_time_ns, sizes, lanes, self._began_ns, open_bytes, ends)
+        taken = [0] * len(self._lanes)
+        for number, stop in ends[:count].tolist():
+            self._extend(number, batches[number], taken[number], stop)
+            closed.append(_closed(self._lanes[number]))
+            taken[number] = stop
+        for number, batch in enumerate(batches):
+            if batch is not None:
+                self._extend(number, batch, taken[number], len(batch))
+        self._pack(closed)
+
+    def _extend(self, number: int, batch: Batch | None, begin: int, stop: int) -> None:
+        """Add messages of a batch to the open chunk of a lane."""
+        if batch is not None and stop > begin:
+            lane = self._lanes[number]
+            if not lane.open and self._clock:
+                lane.began_s = self._clock()
+            lane.open.append(MessageRange(batch, begin, stop))
+            lane.open_bytes += lane.open[-1].size
 
     def add_metadata(self, name: str, data: Mapping[str, str]) -> None:
         """Add a metadata record, its keys in the order given, after closing the chunk."""
@@ -217,52 +232,6 @@ class LogWriter:
         self._summary.channels.append(declared)
         self._declarations[declared.id] = _Declaration(described, encoded(declared))
 
-    def _divide(self, lane: _Lane, batch: Batch, places: Integers, times_ns: Integers) -> Iterator[_Closing]:
-        """Cut the messages of a lane where chunks end.
-
-        A late message of the other lane closes a chunk, too, so that none waits for long.
-
-        Args:
-            places: (m,) which of the M messages of the call are of this lane.
-            times_ns: (M,) of all of them.
-
-        Yields:
-            Each chunk that ends.
-        """
-        # lists, in which a place is found in a tenth of the time
-        ends, listed = batch.start[1:].tolist(), places.tolist()
-        latest: list[int] = np.maximum.accumulate(times_ns).tolist()
-        begin = at = 0
-        if lane.open and self._is_over(lane):
-            yield 0, 0, *_closed(lane)
-        while lane.open or begin < len(listed):
-            if not lane.open:
-                at = listed[begin]
-                lane.began_ns = int(times_ns[at])
-                lane.began_s = self._clock() if self._clock else 0.0
-            late = _first_from(times_ns, latest, lane.began_ns + CHUNK_NS, at if lane.open else at + 1)
-            written = ends[begin - 1] if begin else 0
-            full = bisect_left(ends, written + CHUNK_BYTES - lane.open_bytes) + 1
-            stop = min(full, bisect_left(listed, late), len(listed))
-            if stop > begin:
-                lane.open.append(MessageRange(batch, begin, stop))
-                lane.open_bytes += ends[stop - 1] - written
-                begin, at = stop, listed[stop - 1] + 1
-            if lane.open_bytes >= CHUNK_BYTES:
-                yield at - 1, 1, *_closed(lane)
-            elif late < len(times_ns):
-                at = late
-                yield late, 0, *_closed(lane)
-            else:
-                return
-
-    def _overtaken(self, lane: _Lane, times_ns: Integers) -> Iterator[_Closing]:
-        """Yield what `_divide` does if all messages of a call are of the other lane."""
-        if lane.open:
-            late = (times_ns >= lane.began_ns + CHUNK_NS) | self._is_over(lane)
-            if late.any():
-                yield int(late.argmax()), 0, *_closed(lane)
-
     def _is_over(self, lane: _Lane) -> bool:
         """Return whether a second of the clock has passed since a chunk began."""
         return self._clock is not None and (self._clock() - lane.began_s) * 1e9 >= CHUNK_NS
@@ -282,23 +251,25 @@ class LogWriter:
     def _declaring(self, ranges: Sequence[MessageRange]) -> bytes:
         """Return the declarations that a chunk begins with; each schema is in it once."""
         start_ns = ranges[0].start_ns
-        declarations = self._declarations
-        numbers = {each for own in ranges for each in own.channels if start_ns >= declarations[each].due_ns}
-        due = [declarations[number] for number in sorted(numbers)]
+        numbers = frozenset[int]().union(*(own.channels for own in ranges))
+        undue, until_ns = self._undue
+        if start_ns < until_ns and numbers <= undue:
+            return b""
+        own = [self._declarations[number] for number in sorted(numbers)]
+        due = [each for each in own if start_ns >= each.due_ns]
         for each in due:
             each.count += 1
             each.due_ns = -FOREVER if each.count < 2 else start_ns + REPEAT_NS
+        self._undue = numbers, min(each.due_ns for each in own)
         return b"".join([*dict.fromkeys(each.schema for each in due), *(each.channel for each in due)])
 
     def _write_packed(self, waiting_bytes: int) -> None:
         """Write chunks in their order until no more bytes are waiting, and those that are ready."""
         while self._packing and (self._packing_bytes > waiting_bytes or self._packing[0][1].done()):
             size, packing = self._packing.popleft()
-            chunks, place = packing.result(), self._offset
-            for chunk in chunks:
-                self._summary.add_chunk(chunk, place)
-                place += chunk.record_bytes + chunk.index_bytes
-            self._write(b"".join([part for chunk in chunks for part in chunk.parts]))
+            packed = packing.result()
+            self._summary.add(packed, self._offset)
+            self._write(packed.data)
             self._packing_bytes -= size
             self._flush_stream()
 
@@ -322,21 +293,49 @@ class LogWriter:
             raise output_error(self._path, error) from error
 
 
-def _first_from(times_ns: Integers, latest: list[int], limit_ns: int, begin: int) -> int:
-    """Return the first message from `begin` on that is not before a time; their number if there is none.
-
-    Args:
-        latest: M times, the latest so far, by which it is found at once where times do not go back.
-    """
-    first = bisect_left(latest, limit_ns, begin)
-    if first < len(times_ns) and times_ns[first] < limit_ns:
-        found = np.flatnonzero(times_ns[first:] >= limit_ns)
-        return first + int(found[0]) if len(found) else len(times_ns)
-    return first
-
-
 def _closed(lane: _Lane) -> tuple[list[MessageRange], int]:
     """Return the messages of an open chunk and their bytes, and begin an empty one."""
     closed = lane.open, lane.open_bytes
     lane.open, lane.open_bytes = [], 0
     return closed
+
+
+@elementwise
+@long_kernel
+def _divide(
+    times_ns: Integers,
+    sizes: Integers,
+    lanes: Integers,
+    began_ns: Integers,
+    open_bytes: Integers,
+    ends: Integers,
+) -> int:
+    """Find where chunks end: each that is full, or that a late message of whatever lane comes after.
+
+    Args:
+        times_ns, sizes, lanes: (M,) of each message: its log time, the bytes of its record, its lane.
+        began_ns: (L,) when the open chunk of each lane began.
+        open_bytes: (L,) how much is in it, negative where none is open.
+        ends: (M + L, 2), to be filled in: the lane of each chunk that ends, after how many of its messages.
+
+    Returns:
+        How many chunks end.
+    """
+    count = 0
+    taken = np.zeros(open_bytes.shape[0], np.int64)
+    for i in range(times_ns.shape[0]):
+        for lane in range(open_bytes.shape[0]):
+            if open_bytes[lane] >= 0 and times_ns[i] - began_ns[lane] >= CHUNK_NS:
+                ends[count, 0], ends[count, 1] = lane, taken[lane]
+                open_bytes[lane] = -1
+                count += 1
+        lane = lanes[i]
+        if open_bytes[lane] < 0:
+            open_bytes[lane], began_ns[lane] = 0, times_ns[i]
+        open_bytes[lane] += sizes[i]
+        taken[lane] += 1
+        if open_bytes[lane] >= CHUNK_BYTES:
+            ends[count, 0], ends[count, 1] = lane, taken[lane]
+            open_bytes[lane] = -1
+            count += 1
+    return count
