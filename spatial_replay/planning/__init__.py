@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from spatial_replay.logs.topics import PLAN_METADATA
     from spatial_replay.planning.decision_log import BlackBox, plan_metadata
     from spatial_replay.planning.decisions import Candidate, Executor, Outcome, Reason, Step, Target
+    from spatial_replay.planning.edges import MOST_MOTIONS
     from spatial_replay.planning.map_layers import MapLayers, map_layers
     from spatial_replay.planning.map_messages import map_fields
     from spatial_replay.planning.maps import (
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
         proposition_maps,
     )
     from spatial_replay.planning.paths import shortest_path
-    from spatial_replay.planning.planner import MOST_MOTIONS, Planner
+    from spatial_replay.planning.planner import Planner
     from spatial_replay.planning.read import LoggedStep, planner_of, read_decisions, read_steps
     from spatial_replay.planning.recompute import recompute_decisions
     from spatial_replay.planning.redo import Redone, redo_decisions
@@ -84,9 +85,10 @@ __getattr__, __dir__ = loaded_when_used(
         "decisions": ("Candidate", "Executor", "Outcome", "Reason", "Step", "Target"),
         "map_layers": ("MapLayers", "map_layers"),
         "map_messages": ("map_fields",),
+        "edges": ("MOST_MOTIONS",),
         "maps": ("FREE", "GradientMap", "centre_of", "gradient_map", "moved_object", "proposition_maps"),
         "paths": ("shortest_path",),
-        "planner": ("MOST_MOTIONS", "Planner"),
+        "planner": ("Planner",),
         "read": ("PLAN_METADATA", "LoggedStep", "planner_of", "read_decisions", "read_steps"),
         "recompute": ("recompute_decisions",),
         "redo": ("Redone", "redo_decisions"),

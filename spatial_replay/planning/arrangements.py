@@ -21,7 +21,7 @@ import numpy as np
 from spatial_replay.geometry.arrays import Booleans, Floats
 from spatial_replay.geometry.footprint import TrackedObject
 from spatial_replay.planning.demands import Budget, Demand, surplus, values_in, with_moved
-from spatial_replay.planning.maps import centre_of, concerns, moved_object, proposition_maps
+from spatial_replay.planning.maps import centre_of, concerns, moved_object, proposition_maps, radius_of
 from spatial_replay.planning.settings import Settings
 from spatial_replay.planning.workspace import Grid, Workspace
 from spatial_replay.spec.formula import Atom, Formula, Outline, Quantified, SignedDistance, TrackedName
@@ -248,7 +248,7 @@ class Arranger:
         size, grid = self._grid.cell_size, self._grid
         supports = self._settings.workspace.supports
         apart = first not in supports and second not in supports
-        reach = (_radius(one) + _radius(two) + self._settings.workspace.clearance) / size + 1.0
+        reach = (radius_of(one) + radius_of(two) + self._settings.workspace.clearance) / size + 1.0
         half = max(grid.shape) - 1 if demands else min(math.ceil(reach), max(grid.shape) - 1)
         turns, side = self._fields[first].turns, 2 * half + 1
         cells = side * side * int(used[first].sum()) * int(used[second].sum())
@@ -413,9 +413,3 @@ def _is_of(formula: Formula, names: Sequence[str]) -> bool:
             if not (isinstance(base, TrackedName) and base.name in names):
                 return False
     return True
-
-
-def _radius(tracked: TrackedObject) -> float:
-    """Return the distance from an object's centre to its farthest point."""
-    centre = np.array(centre_of(tracked.footprint))
-    return max(float(np.hypot(*(p.vertices - centre).T).max()) + p.radius for p in tracked.footprint.parts)

@@ -19,6 +19,7 @@ from spatial_replay.geometry.arrays import Booleans, Floats
 from spatial_replay.geometry.footprint import TrackedObject
 from spatial_replay.planning.decisions import Candidate, Consideration, Guards, Reason, Target
 from spatial_replay.planning.demands import Pose, with_moved
+from spatial_replay.planning.edges import Attempts
 from spatial_replay.planning.map_layers import avoided_cells
 from spatial_replay.planning.maps import (
     CONSTRAINED,
@@ -35,14 +36,17 @@ from spatial_replay.planning.maps import (
     gradient_map,
     moved_object,
     proposition_maps,
+    radius_of,
 )
 from spatial_replay.planning.paths import Path, shortest_path
-from spatial_replay.planning.refining import refined
+from spatial_replay.planning.refining import is_repeated, refined, tried
 from spatial_replay.planning.settings import Settings
 from spatial_replay.planning.workspace import Grid, Workspace
 from spatial_replay.spec.formula import Formula, Outline
 from spatial_replay.trace.sample import Sample
 
+_ASIDE: Final = math.radians(35.0)
+"""How far aside another push begins from a direction in which one failed at once."""
 _SWEPT: Final = math.radians(10.0)
 """The widest angle between orientations that are looked at while an object turns on the spot."""
 
@@ -53,6 +57,7 @@ def find_target(
     settings: Settings,
     room: Floats,
     failed: Collection[tuple[float, float]] = (),
+    failures: Sequence[Target] = (),
 ) -> Target | str:
     """Return the target for an object, or why there is none.
 
@@ -61,18 +66,26 @@ def find_target(
         tracked: the object before the motion.
         room: (A, rows, columns), the distance to what room is kept from.
         failed: places (x, y) where earlier attempts failed.
+        failures: targets for which motions failed while everything stood as it does.
     """
     holds = (gradient.blocked == FREE) & (gradient.robustness >= settings.margin)
     good = holds & ~avoided_cells(gradient, settings, failed)
     if not good.any():
         return _why_nowhere(gradient, settings, bool(failed))
     if settings.skill == "place":
+        # near a cell that was tried, a refined target may still be another one
+        untried = good & ~tried(gradient, failures, settings)
+        good = untried if untried.any() else good
         return _best_cell(gradient, good & (room >= settings.room), good, tracked)
-    return _nearest_cell(gradient, good, tracked, settings)
+    return _nearest_cell(gradient, good, tracked, settings, failures)
 
 
 def target_in(
-    gradient: GradientMap, tracked: TrackedObject, settings: Settings, pose: tuple[float, float, float]
+    gradient: GradientMap,
+    tracked: TrackedObject,
+    settings: Settings,
+    pose: tuple[float, float, float],
+    failures: Sequence[Target] = (),
 ) -> Target | str:
     """Return the target for an object at one pose (x, y, turn) of a map, or why it cannot get there."""
     place = gradient.cell_of(*pose)
@@ -82,17 +95,21 @@ def target_in(
     only[place] = True
     if settings.skill == "place":
         return _target(gradient, tracked, place, (centre_of(tracked.footprint), pose[:2]))
-    return _nearest_cell(gradient, only, tracked, settings)
+    return _nearest_cell(gradient, only, tracked, settings, failures)
 
 
 def nearest_target(
-    gradient: GradientMap, good: np.ndarray, tracked: TrackedObject, settings: Settings
+    gradient: GradientMap,
+    good: np.ndarray,
+    tracked: TrackedObject,
+    settings: Settings,
+    failures: Sequence[Target] = (),
 ) -> Target | str:
     """Return the target in the nearest of some cells (A, rows, columns), or why there is none."""
     if not good.any():
         return "there is no place for it"
     if settings.skill == "push":
-        return _nearest_cell(gradient, good, tracked, settings)
+        return _nearest_cell(gradient, good, tracked, settings, failures)
     here = centre_of(tracked.footprint)
     away = np.hypot(*(gradient.grid.centres() - np.array(here)).T).reshape(gradient.grid.shape)
     values = np.where(good, -away, -np.inf)
@@ -116,17 +133,22 @@ def _best_cell(gradient: GradientMap, roomy: np.ndarray, good: np.ndarray, track
 
 
 def _nearest_cell(
-    gradient: GradientMap, good: np.ndarray, tracked: TrackedObject, settings: Settings
+    gradient: GradientMap,
+    good: np.ndarray,
+    tracked: TrackedObject,
+    settings: Settings,
+    failures: Sequence[Target],
 ) -> Target | str:
     here = centre_of(tracked.footprint)
     if not gradient.grid.contains(np.array(here)):
         return "it lies too far outside the workspace"
     cell = gradient.grid.cell(*here)
-    entry = _path_into_reach(gradient, cell, settings)
+    towards = _failed_directions(gradient.grid, tracked, failures)
+    entry = _path_into_reach(gradient, cell, settings, towards)
     if entry is None:
-        return "no free path leads into reach"
+        return "no free path leads into reach" + _but_for(failures)
     row, column = entry.cells[-1].tolist()
-    free = gradient.blocked[0] == FREE
+    free = (gradient.blocked[0] == FREE) & ~towards
     path, turned = shortest_path(free, (row, column), good[0]), 0
     if path is None:
         # it is turned at the end of its path, and only if that is needed
@@ -136,7 +158,7 @@ def _nearest_cell(
             if other is not None and (path is None or other.length < path.length):
                 path, turned = other, layer
     if path is None:
-        return "no free path leads to a good place"
+        return "no free path leads to a good place" + _but_for(failures)
     cells = [(row, column) for row, column in (*entry.cells.tolist(), *path.cells[1:].tolist())]
     # an object off the middle of its cell need not visit that middle first
     first = 1 if cells[0] == cell and len(cells) > 1 else 0
@@ -175,7 +197,33 @@ def can_turn_in(grid: Grid, gradient: GradientMap, turn: float, settings: Settin
     return np.asarray(((maps.clearance > workspace.clearance) & is_kept).all(axis=0))
 
 
-def _path_into_reach(gradient: GradientMap, cell: tuple[int, int], settings: Settings) -> Path | None:
+def _but_for(failures: Sequence[Target]) -> str:
+    return ", other than by motions that failed" if failures else ""
+
+
+def _failed_directions(grid: Grid, tracked: TrackedObject, failures: Sequence[Target]) -> Booleans:
+    """Return (rows, columns): where a path would begin in about a direction in which a push failed."""
+    towards = np.zeros(grid.shape, np.bool_)
+    here, radius = centre_of(tracked.footprint), radius_of(tracked)
+    offsets = (grid.centres() - np.array(here)).reshape(*grid.shape, 2)
+    away = np.hypot(offsets[..., 0], offsets[..., 1])
+    for each in failures:
+        angle = _beginning(each, radius)
+        along = offsets @ np.array([math.cos(angle), math.sin(angle)])
+        towards |= (away > grid.cell_size) & (away <= radius) & (along >= math.cos(_ASIDE) * away)
+    return towards
+
+
+def _beginning(target: Target, distance: float) -> float:
+    """Return the angle in which a way begins: that to its first point at a distance, or to its end."""
+    begin, points = target.waypoints[0], points_along(target.waypoints, distance / 8.0)
+    x, y = next((each for each in points if math.dist(each, begin) >= distance), target.waypoints[-1])
+    return math.atan2(y - begin[1], x - begin[0])
+
+
+def _path_into_reach(
+    gradient: GradientMap, cell: tuple[int, int], settings: Settings, towards: Booleans
+) -> Path | None:
     """Return the path to the nearest free cell.
 
     Cells out of reach may be crossed only if the path starts in one. From a cell where a constraint would
@@ -188,6 +236,7 @@ def _path_into_reach(gradient: GradientMap, cell: tuple[int, int], settings: Set
     if not passable[cell]:
         empty = gradient.clearance[0] > settings.workspace.clearance
         passable = passable | (empty & (gradient.blocked[0] == CONSTRAINED))
+    passable = passable & ~towards
     return shortest_path(passable, cell if passable[cell] else _nearest(passable, cell), free)
 
 
@@ -235,9 +284,10 @@ class Movables:
         regions: Mapping[str, Outline],
         sample: Sample,
         settings: Settings,
+        attempts: Attempts,
     ) -> None:
         self._propositions, self._regions = propositions, regions
-        self._sample, self._settings = sample, settings
+        self._sample, self._settings, self._attempts = sample, settings, attempts
         self._maps: dict[str, PropositionMaps] = {}
 
     @property
@@ -282,14 +332,33 @@ class Movables:
         cubes = consideration.progress.cubes, consideration.constraints.cubes
         gradient = gradient_map(maps, *cubes, settings.workspace, settings.constraint_margin)
         room_from = None if settings.room_from == "all" or name in later else later
-        target = find_target(gradient, tracked, settings, maps.room(room_from), failed)
+        target = find_target(
+            gradient, tracked, settings, maps.room(room_from), failed, self.failed_here(name)
+        )
         if isinstance(target, Target) and refine:
             target = self.refined(target, consideration, room_from)
         if isinstance(target, Target):
             target = self.with_way(target, consideration.constraints.cubes)
+        if isinstance(target, Target) and self.is_repeated(target):
+            target = "it was tried wherever it would hold, and nothing has changed since"
         kept_from = None if room_from is None else tuple(room_from)
         found, why = (None, target) if isinstance(target, str) else (target, "")
         return Candidate(name, gradient, found, why, failed=tuple(failed), room_from=kept_from)
+
+    def failed_here(self, name: str) -> tuple[Target, ...]:
+        """Return the targets for which motions of an object failed while everything stood as it does."""
+        return self._attempts.failed_here(name, self._sample, self._settings)
+
+    def is_repeated(self, target: Target) -> bool:
+        """Return whether a motion to a target would repeat one that failed while everything stood as now."""
+        failures = self.failed_here(target.name)
+        if self._settings.skill == "place":
+            return is_repeated(target, failures, self._settings)
+        # pushes that begin in another direction are others
+        radius = radius_of(self._tracked(target.name))
+        begins = _beginning(target, radius)
+        turned = (math.remainder(begins - _beginning(each, radius), math.tau) for each in failures)
+        return any(abs(each) < _ASIDE / 2.0 for each in turned)
 
     def refined(
         self,
@@ -321,7 +390,8 @@ class Movables:
             gradient.blocked[after.clearance <= settings.workspace.clearance] = OCCUPIED
             return gradient, np.minimum(now.room(room_from), after.room(room_from))
 
-        found = refined(target, self._tracked(name), settings, measured)
+        failures = () if settings.skill == "push" else self.failed_here(name)
+        found = refined(target, self._tracked(name), settings, measured, failures)
         return found if settings.skill == "place" or self._is_pushed_to(found, constraints) else target
 
     def _is_pushed_to(self, target: Target, constraints: Cubes) -> bool:

@@ -89,9 +89,11 @@ class Budget:
 
 def with_moved(sample: Sample, poses: Mapping[str, Pose]) -> Sample:
     """Return a sample with objects moved to poses (x, y, turn)."""
-    objects = dict(sample.objects)
-    for name, (x, y, turn) in poses.items():
-        tracked = objects[name]
-        if isinstance(tracked, TrackedObject):
-            objects[name] = moved_object(tracked, x, y, turn)
-    return Sample(sample.time_ns, objects, sample.signals, sample.unknown)
+    tracked = {name: sample.objects[name] for name in poses}
+    moved = {name: each for name, each in tracked.items() if isinstance(each, TrackedObject)}
+    return with_objects(sample, {name: moved_object(each, *poses[name]) for name, each in moved.items()})
+
+
+def with_objects(sample: Sample, objects: Mapping[str, TrackedObject]) -> Sample:
+    """Return a sample with some objects in place of those that it has."""
+    return Sample(sample.time_ns, {**sample.objects, **objects}, sample.signals, sample.unknown)

@@ -1,4 +1,4 @@
-"""Edges of an automaton for a planner: progress and constraint sets, idle transitions, reasons for no path.
+"""Edges of an automaton for a planner: progress and constraint sets, idle transitions, motions tried.
 
 Idle transitions are those that the automaton takes while all propositions keep their values: `X` and bounds
 in samples count samples, so time alone moves the automaton.
@@ -6,6 +6,8 @@ in samples count samples, so time alone moves the automaton.
 
 from __future__ import annotations
 
+import math
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from itertools import pairwise, takewhile
 from typing import Any, Final, NamedTuple, TypeAlias
@@ -13,15 +15,23 @@ from typing import Any, Final, NamedTuple, TypeAlias
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.guards import MAX_CUBES, Transition
 from spatial_replay.errors import NoAutomatonError, UsageError
+from spatial_replay.geometry.footprint import TrackedObject
 from spatial_replay.monitor.atoms.live import SampleLeaves
-from spatial_replay.planning.decisions import Consideration, Edge, Guards, Reason
-from spatial_replay.planning.maps import concerns
+from spatial_replay.planning.decisions import Consideration, Edge, Guards, Outcome, Reason, Target
+from spatial_replay.planning.maps import Cubes, centre_of, concerns, radius_of
+from spatial_replay.planning.settings import Settings
 from spatial_replay.spec.formula import Formula, Outline, Specification
 from spatial_replay.trace.sample import Sample
 
 Symbol: TypeAlias = tuple[bool | None, ...]
 """The value of each proposition; None if it is unknown."""
 
+MOST_MOTIONS: Final = 100
+"""The most motions for an edge, successful ones included."""
+_TURNED: Final = math.radians(10.0)
+"""By how much an object that stands as before may be turned."""
+BESIDE: Final = 1.5
+"""How near an object stands to another one that may keep it from being pushed, in radii of that one."""
 _LISTED: Final = 4
 """The most edges that a reason names; the others are counted."""
 LATER: Final = "what has to come after it cannot be done"
@@ -218,3 +228,125 @@ def why_no_path(automaton: Automaton, state: int, pruned: Mapping[Edge, Reason])
 def _listed(edges: Sequence[str]) -> str:
     more = f" and {len(edges) - _LISTED} more" if len(edges) > _LISTED else ""
     return ", ".join(edges[:_LISTED]) + more
+
+
+# ------------------------------------------------------------------------------------------------ attempts
+
+
+class FailedMotion(NamedTuple):
+    """A motion that failed.
+
+    Attributes:
+        target: what it was for.
+        before: the newest sample when it began.
+        stayed: whether its object stayed where it was.
+    """
+
+    target: Target
+    before: Sample
+    stayed: bool
+
+
+class Attempts:
+    """The motions of a run, by the edge that they were for."""
+
+    def __init__(self) -> None:
+        """Begin with none."""
+        self._failed: Counter[Edge] = Counter()
+        self._total: Counter[Edge] = Counter()
+        self._places: dict[tuple[Cubes, str], tuple[tuple[float, float], ...]] = {}
+        self._left: dict[Edge, int] = {}
+        self._motions: list[FailedMotion] = []
+        self._begin: tuple[Sample, Settings] | None = None
+
+    def why_exhausted(self, edge: Edge, most_failed: int) -> Reason | None:
+        """Return why an edge is not tried again; None if it may be."""
+        if self._failed[edge] >= most_failed:
+            return Reason(f"tried {self._failed[edge]} times")
+        # a motion that succeeds clears the failures, so that G F … would go on without end
+        return Reason(f"tried {MOST_MOTIONS} times in all") if self._total[edge] >= MOST_MOTIONS else None
+
+    def begin(self, edge: Edge, sample: Sample, settings: Settings) -> None:
+        """Count a motion for an edge, as failed until it is concluded."""
+        self._failed[edge] += 1
+        self._total[edge] += 1
+        self._begin = sample, settings
+
+    def conclude(
+        self, aim: Consideration, target: Target, outcome: Outcome, states: Sequence[int], sample: Sample
+    ) -> None:
+        """Take the outcome of a motion, and the automaton's states and the newest sample after it."""
+        if not outcome.succeeded:
+            if not self._failed_at_once(target, sample):
+                key = (aim.progress.cubes, target.name)
+                self._places[key] = (*self._places.get(key, ()), (target.x, target.y))
+        elif tuple(states) == aim.edge[1:]:
+            del self._failed[aim.edge]
+        elif aim.is_joint and len(aim.motions) < self._left.get(aim.edge, MOST_MOTIONS):
+            # one of several motions, and fewer are left than ever before
+            self._left[aim.edge] = len(aim.motions)
+            self._failed[aim.edge] -= 1
+
+    def _failed_at_once(self, target: Target, sample: Sample) -> bool:
+        """Keep a motion that failed; return whether its object was not even pushed away."""
+        if self._begin is None or self._begin[1].rules < 4:
+            return False
+        before, settings = self._begin
+        stayed = _stands(target.name, before, sample, settings)
+        self._motions.append(FailedMotion(target, before, stayed))
+        return stayed and settings.skill == "push"
+
+    def places_of(self, name: str) -> tuple[tuple[float, float], ...]:
+        """Return the places (x, y) where moving an object failed, whatever it was for."""
+        return tuple(place for (_, moved), each in self._places.items() if moved == name for place in each)
+
+    def failed_places(self, aim: Consideration, name: str) -> tuple[tuple[float, float], ...]:
+        """Return the places (x, y) where moving an object for the same progress failed."""
+        return self._places.get((aim.progress.cubes, name), ())
+
+    def failed_here(self, name: str, sample: Sample, settings: Settings) -> tuple[Target, ...]:
+        """Return the targets for which motions of an object failed while everything stood as in a sample.
+
+        Of a push that left its object where it was, this asks only for what stands beside that.
+        """
+        return tuple(
+            each.target
+            for each in self._motions
+            if each.target.name == name and _is_same_scene(each, sample, settings)
+        )
+
+
+def _is_same_scene(motion: FailedMotion, sample: Sample, settings: Settings) -> bool:
+    """Return whether nothing that a failed motion began with is elsewhere in a sample."""
+    name, before = motion.target.name, motion.before
+    tracked = before.objects[name]
+    names = list(dict.fromkeys([name, *before.objects, *sample.objects]))
+    if settings.skill == "push":
+        if not motion.stayed:
+            return False
+        near = BESIDE * radius_of(tracked) if isinstance(tracked, TrackedObject) else math.inf
+        names = [
+            each
+            for each in names
+            if min(_away(tracked, one.objects.get(each)) for one in (before, sample)) <= near
+        ]
+    return all(_stands(each, before, sample, settings) for each in names)
+
+
+def _away(tracked: object, other: object) -> float:
+    """Return about how far two objects are from each other; infinite if one of them is not seen."""
+    if not (isinstance(tracked, TrackedObject) and isinstance(other, TrackedObject)):
+        return math.inf
+    centres = math.dist(centre_of(tracked.footprint), centre_of(other.footprint))
+    return centres - radius_of(tracked) - radius_of(other)
+
+
+def _stands(name: str, before: Sample, sample: Sample, settings: Settings) -> bool:
+    """Return whether an object is where it was in an earlier sample, or is in neither."""
+    was, now = before.objects.get(name), sample.objects.get(name)
+    if not (isinstance(was, TrackedObject) and isinstance(now, TrackedObject)):
+        return was == now
+    moved = math.dist(centre_of(was.footprint), centre_of(now.footprint))
+    turned = math.remainder((now.yaw or 0.0) - (was.yaw or 0.0), math.tau)
+    allowed = settings.workspace.grid.cell_size + was.uncertainty + now.uncertainty
+    return moved <= allowed and abs(turned) <= _TURNED

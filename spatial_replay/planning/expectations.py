@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Final, NamedTuple
 
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.planning.candidates import Movables
 from spatial_replay.planning.decisions import Target
 from spatial_replay.planning.demands import Budget, Pose, values_in, with_moved
-from spatial_replay.planning.edges import IdleTransitions, Symbol, idle_transitions
+from spatial_replay.planning.edges import Attempts, IdleTransitions, Symbol, idle_transitions
 from spatial_replay.planning.maps import Cubes
 from spatial_replay.planning.settings import Settings
 from spatial_replay.spec.formula import Formula, Outline
 from spatial_replay.trace.sample import Sample
+
+_MOST_ASIDE: Final = 48
+"""The most maps that are computed to bring objects aside for one decision."""
 
 
 class Foreseen(NamedTuple):
@@ -40,8 +43,8 @@ class Expectations:
 
     Attributes:
         automaton, formulas, regions, settings: of the planner; `formulas` are the automaton's propositions.
-        failed: gives the places where an object could not be brought.
-        budget: the maps that may still be computed.
+        attempts: the motions of the run so far.
+        budget, aside_budget: the maps that may still be computed, those for what goes aside apart.
     """
 
     def __init__(
@@ -50,12 +53,13 @@ class Expectations:
         formulas: Sequence[Formula],
         regions: Mapping[str, Outline],
         settings: Settings,
-        failed: Callable[[str], Collection[tuple[float, float]]],
+        attempts: Attempts,
         budget: Budget,
     ) -> None:
         """Begin with no scene."""
         self.automaton, self.formulas, self.regions = automaton, formulas, regions
-        self.settings, self.failed, self.budget = settings, failed, budget
+        self.settings, self.attempts, self.budget = settings, attempts, budget
+        self.aside_budget = Budget(_MOST_ASIDE)
         self._movables: dict[tuple[tuple[str, Pose], ...], Movables] = {}
         self._symbols: dict[tuple[tuple[str, Pose], ...], Symbol] = {}
 
@@ -80,7 +84,7 @@ class Expectations:
     def movables(self, scene: Foreseen) -> Movables:
         """Return the movable objects of a scene."""
         if scene.moved not in self._movables:
-            about = self.formulas, self.regions, scene.sample, self.settings
+            about = self.formulas, self.regions, scene.sample, self.settings, self.attempts
             self._movables[scene.moved] = Movables(*about)
         return self._movables[scene.moved]
 

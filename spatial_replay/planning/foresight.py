@@ -7,7 +7,7 @@ arranged together.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from itertools import combinations, islice, product
@@ -28,6 +28,7 @@ from spatial_replay.planning.demands import (
 )
 from spatial_replay.planning.edges import (
     LATER,
+    Attempts,
     Symbol,
     consideration_of,
     equivalent_edges,
@@ -61,16 +62,16 @@ class Foresight:
         formulas: Sequence[Formula],
         regions: Mapping[str, Outline],
         settings: Settings,
-        failed: Callable[[str], Collection[tuple[float, float]]],
+        attempts: Attempts,
     ) -> None:
         """Begin with what is known about a run.
 
         Args:
-            failed: gives the places where an object could not be brought.
+            attempts: the motions so far.
         """
-        self._expected = Expectations(automaton, formulas, regions, settings, failed, Budget(MOST_MAPS))
+        self._expected = Expectations(automaton, formulas, regions, settings, attempts, Budget(MOST_MAPS))
         self._automaton, self._formulas, self._regions = automaton, formulas, regions
-        self._settings, self._failed = settings, failed
+        self._settings, self._attempts = settings, attempts
         self._pruned: set[Edge] = set()
         self._known: dict[tuple[int, tuple[tuple[str, Pose], ...]], tuple[Target, ...] | None] = {}
         self._first: Foreseen | None = None
@@ -162,7 +163,7 @@ class Foresight:
         for name in movables.names_for(consideration.progress):
             if not self._expected.budget.spend():
                 return
-            candidates.append(movables.candidate(name, consideration, self._failed(name), later))
+            candidates.append(movables.candidate(name, consideration, self._attempts.places_of(name), later))
         for number in by_cost(candidates, self._settings):
             target = candidates[number].target
             if target is not None:
@@ -280,7 +281,9 @@ class Foresight:
         near = AVOIDED_CELLS * self._settings.workspace.grid.cell_size
         poses = ((name, about.pose(name, cell)) for name, cell in cells.items())
         return any(
-            (x - u) ** 2 + (y - v) ** 2 <= near**2 for name, (x, y, _) in poses for u, v in self._failed(name)
+            (x - u) ** 2 + (y - v) ** 2 <= near**2
+            for name, (x, y, _) in poses
+            for u, v in self._attempts.places_of(name)
         )
 
     def _ordered_from(
@@ -345,7 +348,7 @@ class Foresight:
         way = way if self._settings.skill == "push" else []
         found = movables.refined(replace(target, waypoints=(here, *way, there)), consideration, None, poses)
         ways = movables.with_way(found, consideration.constraints.cubes)
-        if isinstance(ways, str) or found.robustness <= target.robustness:
+        if isinstance(ways, str) or movables.is_repeated(ways) or found.robustness <= target.robustness:
             return target
         state = consideration.edge[0]
         before, after = (self._states_along((each, *rest), state) for each in (target, ways))

@@ -368,6 +368,12 @@ def centre_of(footprint: Footprint) -> tuple[float, float]:
     return x, y
 
 
+def radius_of(tracked: TrackedObject) -> float:
+    """Return the distance from an object's centre to its farthest point."""
+    centre = np.array(centre_of(tracked.footprint))
+    return max(float(np.hypot(*(p.vertices - centre).T).max()) + p.radius for p in tracked.footprint.parts)
+
+
 def moved_object(tracked: TrackedObject, x: float, y: float, turn: float = 0.0) -> TrackedObject:
     """Return the object with its centre at (x, y), turned by an angle in radians; heights stay."""
     footprint = tracked.footprint

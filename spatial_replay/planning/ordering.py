@@ -6,7 +6,7 @@ later. So two objects change places, and a pushed one gets past others.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Final, NamedTuple
 
@@ -16,14 +16,29 @@ from spatial_replay.automata.guards import Transition
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
 from spatial_replay.planning.candidates import nearest_target, points_along, target_in
 from spatial_replay.planning.decisions import Consideration, Target
-from spatial_replay.planning.demands import Pose, with_moved
+from spatial_replay.planning.demands import Budget, Demand, Pose, demands_of, with_moved, with_objects
+from spatial_replay.planning.edges import BESIDE
 from spatial_replay.planning.expectations import Expectations, Foreseen
-from spatial_replay.planning.maps import FREE, Cubes, centre_of, gradient_map, moved_object, proposition_maps
+from spatial_replay.planning.map_layers import distance_to
+from spatial_replay.planning.maps import (
+    FREE,
+    Cubes,
+    centre_of,
+    concerns,
+    danger_of,
+    gradient_map,
+    moved_object,
+    proposition_maps,
+    radius_of,
+)
 from spatial_replay.spec.formula import Atom, SignedDistance, TrackedName
-from spatial_replay.trace.sample import Sample
 
 _MOST_PARKED: Final = 2
 """The most objects that are brought aside for others."""
+_MOST_PLACES: Final = 4
+"""The most places that are tried for an object that is brought aside."""
+_MOST_MAPS: Final = 24
+"""The most maps that are computed to bring objects aside for one arrangement."""
 
 
 class Ordered(NamedTuple):
@@ -59,10 +74,21 @@ class MotionOrder:
         self._robustness = robustness
         self._dead: set[tuple[frozenset[str], tuple[tuple[str, Pose], ...]]] = set()
         self._idle = set(expected.idle(scene, aims[0].source).states)
+        self._is_careful = expected.settings.rules > 3
+        self._targets: dict[tuple[tuple[tuple[str, Pose], ...], int, str], Target | None] = {}
+        self._most_parked = _MOST_PARKED
+        self._aside_maps = Budget(_MOST_MAPS)
 
     def found(self) -> Ordered | None:
-        """Return the first order found; None without one."""
-        return self._motions(self._begin, self._aims[0].source, frozenset(self._places))
+        """Return the first order found, with as few objects brought aside as possible; None without one."""
+        if not self._is_careful:
+            return self._motions(self._begin, self._aims[0].source, frozenset(self._places))
+        for self._most_parked in range(_MOST_PARKED + 1):
+            self._dead.clear()
+            found = self._motions(self._begin, self._aims[0].source, frozenset(self._places))
+            if found is not None:
+                return found
+        return None
 
     def _motions(
         self, scene: Foreseen, state: int, left: frozenset[str], parked: tuple[str, ...] = ()
@@ -74,12 +100,15 @@ class MotionOrder:
             return None
         is_first = len(left) == len(self._places)
         for name in sorted(left):
-            target = self._target(scene, state, name, is_first)
+            key = scene.moved, state, name
+            if key not in self._targets:
+                self._targets[key] = self._target(scene, state, name, parked, is_first)
+            target = self._targets[key]
             if (found := self._on(scene, state, target, left - {name}, parked, is_first)) is not None:
                 return found
-        if self._expected.settings.rules > 1 and len(parked) < _MOST_PARKED:
+        if self._expected.settings.rules > 1 and len(parked) < self._most_parked:
             for name in sorted(left):
-                for other, target in self._aside(scene, state, name, left, is_first):
+                for other, target in self._aside(scene, state, name, left, parked, is_first):
                     more = (*parked, other)
                     if other not in parked and (
                         found := self._on(scene, state, target, left, more, is_first)
@@ -140,7 +169,15 @@ class MotionOrder:
         is_strict = is_first or len(self._aims) == 1
         return self._constraints if is_strict else self._expected.traps(state)
 
-    def _target(self, scene: Foreseen, state: int, name: str, is_first: bool) -> Target | None:
+    def _spend(self, parked: Sequence[str], maps: int = 1) -> bool:
+        """Count maps; return whether there are any left. Those for what goes aside are counted apart."""
+        if not (self._is_careful and parked):
+            return self._expected.budget.spend(maps)
+        return self._aside_maps.spend(maps) and self._expected.aside_budget.spend(maps)
+
+    def _target(
+        self, scene: Foreseen, state: int, name: str, parked: tuple[str, ...], is_first: bool
+    ) -> Target | None:
         """Return the motion of an object to its place; None if it is not possible now."""
         settings, constraints = self._expected.settings, self._constraints_at(state, is_first)
         tracked = scene.sample.objects[name]
@@ -148,17 +185,21 @@ class MotionOrder:
             return None
         if settings.skill == "place" and not is_first:
             return self._placed(scene, name, tracked, constraints)
-        if not self._expected.budget.spend():
+        if not self._spend(parked):
             return None
         movables = self._expected.movables(scene)
         cubes = self._aims[0].guard, constraints
         gradient = gradient_map(
             movables.maps_of(name), *cubes, settings.workspace, settings.constraint_margin
         )
-        found = target_in(gradient, tracked, settings, self._place_of(scene, name))
+        found = target_in(
+            gradient, tracked, settings, self._place_of(scene, name), movables.failed_here(name)
+        )
         if isinstance(found, Target):
             found = movables.with_way(found, constraints)
-        return None if isinstance(found, str) else replace(found, robustness=self._robustness)
+        if isinstance(found, str) or movables.is_repeated(found):
+            return None
+        return replace(found, robustness=self._robustness)
 
     def _placed(
         self, scene: Foreseen, name: str, tracked: TrackedObject, constraints: Cubes
@@ -183,41 +224,64 @@ class MotionOrder:
     # ---------------------------------------------------------------------------------------- in the way
 
     def _aside(
-        self, scene: Foreseen, state: int, name: str, left: frozenset[str], is_first: bool
+        self,
+        scene: Foreseen,
+        state: int,
+        name: str,
+        left: frozenset[str],
+        parked: tuple[str, ...],
+        is_first: bool,
     ) -> Iterator[tuple[str, Target]]:
         """Yield motions that bring aside what is in the way of an object, or on its place."""
-        way = self._way_past(scene, state, name, is_first)
-        movables = self._expected.movables(scene)
-        for other in (each for each in movables.names if each != name and way is not None):
-            tracked = scene.sample.objects[other]
-            if not (isinstance(tracked, TrackedObject) and way is not None):
+        constraints, settings = self._constraints_at(state, is_first), self._expected.settings
+        names = [each for each in self._expected.movables(scene).names if each != name]
+        if self._is_careful:
+            names = [each for each in names if each in left or each not in {*parked, *self._places}]
+        aside = (*parked, name)
+        if settings.skill == "push" and not self._spend(aside):
+            return
+        way = self._way_past(scene, name, names, constraints)
+        if way is None:
+            return
+        bound = self._bound_by(scene, {name: way}, constraints) if self._is_careful else set()
+        beside = self._beside(scene, name, names)
+        for other in names:
+            if not isinstance(scene.sample.objects[other], TrackedObject):
                 continue
-            if self._clearance(scene, {name: way}, other) > self._expected.settings.workspace.clearance:
-                continue
-            if (target := self._parked(scene, state, other, {name: way}, left, is_first)) is not None:
-                yield other, target
+            clearance = self._clearance(scene, {name: way}, other)
+            in_way = other in bound | beside or clearance <= settings.workspace.clearance
+            if in_way and self._spend(aside, 2):
+                for target in self._parked(scene, state, other, {name: way}, left, is_first, other in beside):
+                    yield other, target
 
-    def _way_past(self, scene: Foreseen, state: int, name: str, is_first: bool) -> TrackedObject | None:
-        """Return all that an object covers on its way as if nothing that can be moved was in it."""
+    def _way_past(
+        self, scene: Foreseen, name: str, others: Sequence[str], constraints: Cubes
+    ) -> TrackedObject | None:
+        """Return all that an object covers on its way as if none of some others was in it."""
         settings, tracked = self._expected.settings, scene.sample.objects[name]
         place = self._place_of(scene, name)
         if not isinstance(tracked, TrackedObject):
             return None
         if settings.skill == "place":
             return moved_object(tracked, *place)
-        if not self._expected.budget.spend():
-            return None
-        movables = self._expected.movables(scene)
-        workspace = settings.workspace
-        free = replace(workspace, supports=workspace.supports | set(movables.names))
-        about = self._expected.formulas, self._expected.regions, scene.sample, name, free
-        maps = proposition_maps(*about, movables.maps_of(name).grid)
-        cubes = self._aims[0].guard, self._constraints_at(state, is_first)
-        gradient = gradient_map(maps, *cubes, workspace, settings.constraint_margin)
+        formulas, workspace = self._expected.formulas, settings.workspace
+        if self._is_careful:
+            ways = [each for each in self._ways_to_hold(constraints) if not _concerned(each, others)]
+            formulas = list(dict.fromkeys(each.formula for way in ways for each in way))
+            constraints = tuple(
+                tuple((formulas.index(each.formula), each.wanted) for each in way) for way in ways
+            )
+        free = replace(workspace, supports=workspace.supports.union(others))
+        about = formulas, self._expected.regions, scene.sample, name, free
+        maps = proposition_maps(*about, self._expected.movables(scene).maps_of(name).grid)
+        gradient = gradient_map(maps, ((),), constraints, workspace, settings.constraint_margin)
         target = target_in(gradient, tracked, settings, place)
         if isinstance(target, str):
             return None
         step = workspace.grid.cell_size
+        if self._is_careful:
+            # footprints that overlap by half leave no gap in which another object could stand
+            step = max(step, radius_of(tracked) / 2.0)
         parts = [
             part
             for x, y in points_along(target.waypoints, step)
@@ -226,13 +290,41 @@ class MotionOrder:
         parts += moved_object(tracked, target.x, target.y, target.turn).footprint.parts
         return replace(tracked, footprint=Footprint(tuple(parts)))
 
+    def _ways_to_hold(self, constraints: Cubes) -> list[tuple[Demand, ...]]:
+        """Return relations of which no conjunction must hold."""
+        return [each for cube in constraints for each in demands_of(cube, self._expected.formulas, 0.0)]
+
+    def _bound_by(
+        self, scene: Foreseen, covered: Mapping[str, TrackedObject], constraints: Cubes
+    ) -> set[str]:
+        """Return the objects because of which a constraint would hold with another one where it is to go."""
+        ((name, way),) = covered.items()
+        ways = [each for each in self._ways_to_hold(constraints) if _concerned(each, [name])]
+        relations = list(dict.fromkeys(each.formula for one in ways for each in one))
+        lower, upper = self._expected.values(with_objects(scene.sample, {name: way}), relations)
+        first = len(self._expected.formulas)
+        numbers = {each: first + place for place, each in enumerate(relations)}
+        bound: set[str] = set()
+        for one in ways:
+            ends = ((numbers[each.formula], each.wanted) for each in one)
+            danger = min((upper[n] if wanted else -lower[n] for n, wanted in ends), default=0.0)
+            if danger >= -self._expected.settings.constraint_margin:
+                bound |= _concerned(one, scene.sample.objects)
+        return bound
+
+    def _beside(self, scene: Foreseen, name: str, others: Sequence[str]) -> set[str]:
+        """Return the objects so near to one that could not be moved that they may be why."""
+        tracked = scene.sample.objects[name]
+        if not (isinstance(tracked, TrackedObject) and self._expected.movables(scene).failed_here(name)):
+            return set()
+        near = BESIDE * radius_of(tracked)
+        return {each for each in others if self._clearance(scene, {name: tracked}, each) <= near}
+
     def _clearance(self, scene: Foreseen, covered: Mapping[str, TrackedObject], other: str) -> float:
         """Return the distance of an object to what another one covers."""
-        objects = {**scene.sample.objects, **covered}
-        sample = Sample(scene.sample.time_ns, objects, scene.sample.signals, scene.sample.unknown)
         (name,) = covered
         apart = Atom("", "dist", SignedDistance(TrackedName(name), TrackedName(other)))
-        return self._expected.values(sample, [apart])[0][-1]
+        return self._expected.values(with_objects(scene.sample, covered), [apart])[0][-1]
 
     def _parked(
         self,
@@ -242,29 +334,51 @@ class MotionOrder:
         covered: Mapping[str, TrackedObject],
         left: frozenset[str],
         is_first: bool,
-    ) -> Target | None:
-        """Return the motion of an object to the nearest place where it is in no one's way, if any."""
+        is_beside: bool,
+    ) -> Iterator[Target]:
+        """Yield motions of an object to places where it is in no one's way, the nearest first.
+
+        There, nothing that must not hold does, neither now nor with the others where they are to go. What
+        stands beside an object that could not be moved goes away from it.
+        """
         settings, constraints = self._expected.settings, self._constraints_at(state, is_first)
         tracked = scene.sample.objects[name]
-        if not (isinstance(tracked, TrackedObject) and self._expected.budget.spend(2)):
-            return None
+        if not isinstance(tracked, TrackedObject):
+            return
         movables = self._expected.movables(scene)
-        now = movables.maps_of(name)
-        gradient = gradient_map(
-            now, self._aims[0].guard, constraints, settings.workspace, settings.constraint_margin
-        )
+        now, workspace = movables.maps_of(name), settings.workspace
+        gradient = gradient_map(now, self._aims[0].guard, constraints, workspace, settings.constraint_margin)
         places = {each: self._place_of(scene, each) for each in left if each != name}
-        there = with_moved(scene.sample, places)
-        objects = {**there.objects, **covered}
-        later = Sample(there.time_ns, objects, there.signals, there.unknown)
-        workspace, about = settings.workspace, (self._expected.regions, later, name)
-        clearance = proposition_maps((), *about, workspace, now.grid).clearance
-        good = (gradient.blocked == FREE) & (clearance > workspace.clearance)
-        if settings.skill == "place":
-            # what is picked up again needs room
-            roomy = good & (np.minimum(clearance, gradient.clearance) >= settings.room)
-            good = roomy if roomy.any() else good
-        target = nearest_target(gradient, good, tracked, settings)
-        if isinstance(target, Target):
-            target = movables.with_way(target, constraints)
-        return None if isinstance(target, str) else target
+        later = with_objects(with_moved(scene.sample, places), covered)
+        formulas = self._expected.formulas if self._is_careful else ()
+        maps = proposition_maps(formulas, self._expected.regions, later, name, workspace, now.grid)
+        good = (gradient.blocked == FREE) & (maps.clearance > workspace.clearance)
+        if self._is_careful:
+            danger = danger_of(maps, self._constraints_at(state, is_first=False))
+            good &= danger < -settings.constraint_margin
+        # what is picked up or pushed again needs room
+        room = np.minimum(maps.clearance, gradient.clearance)
+        roomy = good & (room >= settings.room)
+        if settings.skill == "push" and not self._is_careful:
+            roomy = good
+        (blocked,) = covered
+        beside = scene.sample.objects[blocked]
+        if is_beside and isinstance(beside, TrackedObject):
+            good &= distance_to([centre_of(tracked.footprint)], now.grid) > 2.0 * now.grid.cell_size
+            far = good & (now.room([blocked]) > BESIDE * radius_of(beside))
+            roomy = roomy & far if (roomy & far).any() else far
+        for _ in range(_MOST_PLACES if self._is_careful else 1):
+            among = roomy if roomy.any() else good
+            target = nearest_target(gradient, among, tracked, settings, movables.failed_here(name))
+            if isinstance(target, str):
+                return
+            found = movables.with_way(target, constraints)
+            if isinstance(found, Target) and not movables.is_repeated(found):
+                yield found
+            away = distance_to([(target.x, target.y)], gradient.grid) > 2.0 * radius_of(tracked)
+            good, roomy = good & away, roomy & away
+
+
+def _concerned(demands: Sequence[Demand], names: Iterable[str]) -> set[str]:
+    """Return which of some objects demands are about."""
+    return {name for name in names if any(concerns(each.formula, name) for each in demands)}

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import replace
-from typing import Final
 
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.compile import automaton as automaton_of
@@ -24,9 +22,9 @@ from spatial_replay.planning.decisions import (
     Outcome,
     Reason,
     Step,
-    Target,
 )
 from spatial_replay.planning.edges import (
+    Attempts,
     Observer,
     Symbol,
     consideration_of,
@@ -39,15 +37,12 @@ from spatial_replay.planning.edges import (
     worst_state,
 )
 from spatial_replay.planning.foresight import Foresight
-from spatial_replay.planning.maps import Cubes, centre_of, moved_object, refuse_delays, refuse_unknown
+from spatial_replay.planning.maps import centre_of, moved_object, refuse_delays, refuse_unknown
 from spatial_replay.planning.settings import Settings
 from spatial_replay.planning.workspace import Workspace, kind_faults, refuse_faults
 from spatial_replay.spec.formula import Specification
 from spatial_replay.text import counted, times_apart
 from spatial_replay.trace.sample import Sample
-
-MOST_MOTIONS: Final = 100
-"""The most motions for an edge, successful ones included."""
 
 
 class Planner:
@@ -115,7 +110,7 @@ class Planner:
         self._stop_reason = ""
         self._lost: Loss | None = None
         self._pruned: dict[Edge, Reason] = {}
-        self._attempts = _Attempts()
+        self._attempts = Attempts()
         self._running: Step | None = None
         self._waiting: Step | None = None
         self._ahead: tuple[int, ...] = ()
@@ -257,7 +252,7 @@ class Planner:
         if step is None or step.target is None or step.aim is None:
             raise UsageError("no step is being executed; call next_step() first")
         self._running = None
-        self._attempts.conclude(step.aim, step.target, outcome, self.states)
+        self._attempts.conclude(step.aim, step.target, outcome, self.states, self._newest())
 
     def _waits_on(self, step: Step) -> bool:
         return bool(self._ahead) if step.ahead else self._is_blind()
@@ -283,10 +278,10 @@ class Planner:
     def _step_from(self, state: int) -> Step:
         """Return the step for the first edge, over the paths by length, that can be taken."""
         idle = idle_transitions(self.automaton, state, self._symbol)
-        movables = Movables(self._formulas, self._regions, self._newest(), self.settings)
+        movables = Movables(self._formulas, self._regions, self._newest(), self.settings, self._attempts)
         considered: list[Consideration] = []
         about = self.automaton, self._formulas, self._regions, self.settings
-        foresight = Foresight(*about, self._attempts.places_of) if self.settings.motions > 1 else None
+        foresight = Foresight(*about, self._attempts) if self.settings.motions > 1 else None
         # time takes idle transitions without any object being moved, so they stay possible
         pruned = set(self._pruned) - idle.edges
         while (path := next(self.automaton.paths(state, pruned), None)) is not None:
@@ -331,7 +326,7 @@ class Planner:
         (target,) = [each.target for each in aim.candidates if each.is_chosen]
         if target is None:
             raise UsageError("the chosen object has no target")
-        self._attempts.begin(aim.edge)
+        self._attempts.begin(aim.edge, self._newest(), self.settings)
         verb = "push" if self.settings.skill == "push" else "place"
         edge = f"{aim.edge[0]} -> {aim.edge[1]}: {aim.progress}"
         which = f", the first of {len(aim.motions)} motions," if aim.is_joint and len(aim.motions) > 1 else ""
@@ -355,45 +350,3 @@ class Planner:
         propositions = self.automaton.propositions
         labels = zip(propositions, self._symbol, strict=True)
         return ", ".join(each.label for each, value in labels if value is None)
-
-
-class _Attempts:
-    """The motions of a run, by the edge that they were for."""
-
-    def __init__(self) -> None:
-        self._failed: Counter[Edge] = Counter()
-        self._total: Counter[Edge] = Counter()
-        self._places: dict[tuple[Cubes, str], tuple[tuple[float, float], ...]] = {}
-        self._left: dict[Edge, int] = {}
-
-    def why_exhausted(self, edge: Edge, most_failed: int) -> Reason | None:
-        """Return why an edge is not tried again; None if it may be."""
-        if self._failed[edge] >= most_failed:
-            return Reason(f"tried {self._failed[edge]} times")
-        # a motion that succeeds clears the failures, so that G F … would go on without end
-        return Reason(f"tried {MOST_MOTIONS} times in all") if self._total[edge] >= MOST_MOTIONS else None
-
-    def begin(self, edge: Edge) -> None:
-        """Count a motion for an edge, as failed until it is concluded."""
-        self._failed[edge] += 1
-        self._total[edge] += 1
-
-    def conclude(self, aim: Consideration, target: Target, outcome: Outcome, states: Sequence[int]) -> None:
-        """Take the outcome of a motion, and the automaton's states after it."""
-        if not outcome.succeeded:
-            key = (aim.progress.cubes, target.name)
-            self._places[key] = (*self._places.get(key, ()), (target.x, target.y))
-        elif tuple(states) == aim.edge[1:]:
-            del self._failed[aim.edge]
-        elif aim.is_joint and len(aim.motions) < self._left.get(aim.edge, MOST_MOTIONS):
-            # one of several motions, and fewer are left than ever before
-            self._left[aim.edge] = len(aim.motions)
-            self._failed[aim.edge] -= 1
-
-    def places_of(self, name: str) -> tuple[tuple[float, float], ...]:
-        """Return the places (x, y) where moving an object failed, whatever it was for."""
-        return tuple(place for (_, moved), each in self._places.items() if moved == name for place in each)
-
-    def failed_places(self, aim: Consideration, name: str) -> tuple[tuple[float, float], ...]:
-        """Return the places (x, y) where moving an object for the same progress failed."""
-        return self._places.get((aim.progress.cubes, name), ())

@@ -74,9 +74,10 @@ class Settings:
             to the robot.
         refine: whether targets are refined near their cell, and, between several orientations, to turns in
             between; without it, they are middles of cells.
-        rules: 3, or those of earlier versions, so that their logs can be recomputed. 2: targets of pushes are
-            not refined. 1: also no motions that only make room, and an object is never brought near a place
-            where that failed before.
+        rules: 4, or those of earlier versions, so that their logs can be recomputed. 3: what only makes room
+            goes to the nearest place, whatever has to be kept there later, and a motion that failed may be
+            made again while nothing has changed. 2: targets of pushes are not refined, either. 1: also no
+            motions that only make room, and an object is never brought near a place where that failed before.
 
     Raises:
         UsageError: invalid values, all of them reported.
@@ -93,7 +94,7 @@ class Settings:
     motions: int = 6
     lift: float | None = 0.0
     refine: bool = True
-    rules: int = 3
+    rules: int = 4
 
     def __post_init__(self) -> None:
         refuse_faults(self._faults())
@@ -114,8 +115,8 @@ class Settings:
         if self.room_from not in _ROOM_FROM:
             yield f"room_from is {self.room_from!r}; give {' or '.join(_ROOM_FROM)}"
         yield from kind_faults("refine", self.refine, bool, "True or False")
-        if self.rules not in (1, 2, 3):
-            yield f"rules is {self.rules!r}; give 3, or 1 or 2 for the rules of earlier versions"
+        if self.rules not in (1, 2, 3, 4):
+            yield f"rules is {self.rules!r}; give 4, or 1 to 3 for the rules of earlier versions"
 
 
 def text_from_settings(settings: Settings) -> str:

@@ -64,9 +64,9 @@ class _Preset:
 
 _PRESETS: MappingProxyType[Skill, _Preset] = MappingProxyType(
     {
-        # a pushed block stops within a centimetre of its target
+        # a pushed block stops within a centimetre of its target; fingers need room behind it
         "push": _Preset(
-            cell_size=0.005, margin=0.012, constraint_margin=0.008, clearance=0.0, room=0.0, lift=0.0
+            cell_size=0.005, margin=0.012, constraint_margin=0.008, clearance=0.0, room=0.04, lift=0.0
         ),
         # fingers need room beside what they hold, and the hand beside taller things
         "place": _Preset(
