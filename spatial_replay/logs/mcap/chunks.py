@@ -186,7 +186,7 @@ _Found: TypeAlias = "list[tuple[Sequence[ChunkPlace], Records | DamageError]]"
 
 
 class _GroupReader:
-    """Reads groups of chunks on several threads, each with a buffer that serves again and again."""
+    """Reads groups of chunks on several threads, each with buffers that serve again and again."""
 
     def __init__(self, stream: BinaryIO, passed_over: Collection[int]) -> None:
         self._stream, self._passed_over = stream, passed_over
@@ -197,7 +197,7 @@ class _GroupReader:
         """Return the records in all places, or in each, with its damage."""
         with self._reading:
             read = _read_places(self._stream, places)
-        decompressor, splitter = zstandard.ZstdDecompressor(), Splitter(self._passed_over)
+        decompressor, splitter = zstandard.ZstdDecompressor(), self._splitter()
         if (content := self._content(places, read, decompressor)) is not None:
             records = splitter.split(*content)
             if records.damage is None:
@@ -247,6 +247,13 @@ class _GroupReader:
         if crc32(whole) != joined_checksum(checksums, sizes):
             return None
         return whole, sizes
+
+    def _splitter(self) -> Splitter:
+        """Return the splitter of this thread: new memory costs as much as filling it."""
+        splitter: Splitter | None = getattr(self._own, "splitter", None)
+        if splitter is None:
+            self._own.splitter = splitter = Splitter(self._passed_over)
+        return splitter
 
     def _buffer(self, size: int) -> memoryview:
         buffer: bytearray | None = getattr(self._own, "buffer", None)

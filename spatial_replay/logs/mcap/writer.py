@@ -37,7 +37,7 @@ CHUNK_NS = 10**9
 REPEAT_NS = 5 * 10**9
 """A channel is declared again in the second chunk with its messages, and in one this much after the last that
 declares it. In every chunk, schemas would add 15 % to an annotated log; so they add up to 5 %."""
-TOGETHER_BYTES = 8 * CHUNK_BYTES
+TOGETHER_BYTES = 16 * CHUNK_BYTES
 """So much is packed at once: messages are encoded together, and stay in the cache of the processor."""
 WAITING_BYTES = 256 * 2**20
 """Bytes of chunks that may wait for their compression: pictures and clouds of points make large ones."""
