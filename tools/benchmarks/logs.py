@@ -159,6 +159,8 @@ def bench_annotating(measure: Any) -> None:
         per_sample: Any = {"per": count, "unit": "sample", "runs": 5}
 
         def annotate(_: object) -> None:
+            # a file that is there is replaced once the disk has the new one
+            annotated.unlink(missing_ok=True)
             run_replay(open_source(log), files, keep_leaves=True, output=annotated)
 
         processor_s: list[float] = []
