@@ -16,8 +16,8 @@ import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
-from mcap.records import Chunk, MessageIndex
-from mcap.stream_reader import StreamReader
+from mcap.records import Chunk, Message, MessageIndex
+from mcap.stream_reader import StreamReader, breakup_chunk
 
 from laws.strategies_trace import traces
 from spatial_replay import LogError, Sample, Trace, read_trace
@@ -262,6 +262,41 @@ def test_a_copy_has_each_message_where_the_index_says(written, form):
             for time_ns, place in record.records:
                 _, _, number, _, log_time_ns = struct.unpack_from("<BQHIQ", content, place)
                 assert (number, log_time_ns) == (record.channel_id, time_ns)
+
+
+@settings(max_examples=30)
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from(["/spatial/a", "/spatial/b", "/camera"]),
+            st.sampled_from([0, 10**7, 10**9 - 1, 10**9, -(10**9)]),
+            st.sampled_from([0, 500, 40_000, 130_000]),
+        ),
+        min_size=1,
+        max_size=40,
+    ),
+    st.lists(st.integers(0, 40)),
+    st.sampled_from(["compiled", "interpreted"]),
+)
+def test_chunks_end_at_the_same_messages_however_these_are_divided_among_calls(given_ones, cuts, form):
+    topics = sorted({topic for topic, _, _ in given_ones})
+    channels = {number: Channel(topic, "json", None) for number, topic in enumerate(topics)}
+    numbers = np.array([topics.index(topic) for topic, _, _ in given_ones])
+    times_ns = np.maximum(np.cumsum([step for _, step, _ in given_ones]), 0)
+    payloads = [bytes(size) for _, _, size in given_ones]
+    whole, pieces = io.BytesIO(), io.BytesIO()
+    for stream, ends in ((whole, []), (pieces, sorted(cut for cut in cuts if cut < len(payloads)))):
+        with only(form), LogWriter(stream) as writer:
+            for begin, end in pairwise([0, *ends, len(payloads)]):
+                own = slice(begin, end)
+                given_at = np.arange(begin, end), times_ns[own], times_ns[own], payloads[own]
+                writer.write_messages(Messages(channels, numbers[own], *given_at))
+    assert pieces.getvalue() == whole.getvalue()
+    for record in StreamReader(io.BytesIO(whole.getvalue()), emit_chunks=True).records:
+        if isinstance(record, Chunk):
+            messages = [each for each in breakup_chunk(record) if isinstance(each, Message)]
+            assert all(each.log_time < messages[0].log_time + 10**9 for each in messages)
+            assert sum(len(each.data) + 31 for each in messages[:-1]) < 128 * 2**10
 
 
 @given(st.lists(st.binary(max_size=200), max_size=6), st.sampled_from(["compiled", "interpreted"]))
