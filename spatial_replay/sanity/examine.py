@@ -10,10 +10,11 @@ from typing import Final, Literal, TypeAlias
 
 from spatial_replay.errors import NoAutomatonError, SpecificationError
 from spatial_replay.lazy import Displayed
+from spatial_replay.sanity.bounded_words import Side
 from spatial_replay.sanity.conditions import FactDiagrams
 from spatial_replay.sanity.examples import Example, shortest_example
 from spatial_replay.sanity.readings import SpecReading, automaton_of, loosened, reading_of
-from spatial_replay.sanity.shortest_words import Answer, Side, UndecidedError, WordSearch
+from spatial_replay.sanity.shortest_words import Answer, Runs, UndecidedError, Word, WordSearch, joint
 from spatial_replay.sanity.sums import is_solid, members
 from spatial_replay.spec.diagnostics import Diagnostic, SourceText
 from spatial_replay.spec.format import format_formula
@@ -226,15 +227,15 @@ class _Examiner:
         key = part.name, satisfied
         if key not in self._answers:
             reading = self._reading(part)
-            side = reading.satisfying if satisfied else reading.violating
+            runs = reading.satisfying if satisfied else reading.violating
             what = "whether a run satisfies it" if satisfied else "whether a run violates it"
-            self._answers[key] = self._asked(part.name, what, *([] if side is None else [side]))
+            self._answers[key] = self._asked(part.name, what, *([] if runs is None else [runs]))
         return self._answers[key]
 
-    def _asked(self, name: str, what: str, *sides: Side) -> Answer | None:
+    def _asked(self, name: str, what: str, *runs: Runs) -> Answer | None:
         try:
-            if sides:
-                return self._search.shortest(*sides)
+            if runs:
+                return self._search.shortest(*runs)
         except UndecidedError:
             pass
         self._undecided.setdefault(name, []).append(what)
@@ -260,7 +261,7 @@ class _Examiner:
         implications = {
             node.span: node for node in nodes if isinstance(node, Boolean) and node.operator == "->"
         }
-        possible: dict[Boolean, Side] = {}
+        possible: dict[Boolean, Runs] = {}
         for node in list(implications.values())[:MAX_ANTECEDENTS]:
             if (ever := self._sometime(part, node.operands[0])) is None:
                 continue
@@ -288,11 +289,11 @@ class _Examiner:
         message = f"`{text}` never holds{where}, so this implication checks nothing"
         self._add("idle antecedent", (part.name,), node.span, found, message, _IDLE)
 
-    def _sometime(self, part: _Part, formula: Formula) -> Side | None:
+    def _sometime(self, part: _Part, formula: Formula) -> Runs | None:
         """Return the runs in which a part of a spec holds in some sample; None without an automaton."""
         wanted = loosened(Temporal("F", (formula,)))
         try:
-            return Side(automaton_of(self._specification, part.name, wanted))
+            return ((Side(automaton_of(self._specification, part.name, wanted)),),)
         except NoAutomatonError:
             return None
 
@@ -316,9 +317,8 @@ class _Examiner:
             leads = before is not None and before.word is None
             if follows and leads:
                 message = f"{other.name} says the same as {one.name}"
-                self._add(
-                    "implied", (other.name, one.name), other.span, _joint(after, before), message, _SAME
-                )
+                found = joint([each for each in (after, before) if each is not None])
+                self._add("implied", (other.name, one.name), other.span, found, message, _SAME)
             elif follows:
                 message = f"{other.name} follows from {one.name}"
                 self._add("implied", (other.name, one.name), other.span, after, message, _IMPLIED)
@@ -326,9 +326,9 @@ class _Examiner:
                 message = f"{one.name} follows from {other.name}"
                 self._add("implied", (one.name, other.name), one.span, before, message, _IMPLIED)
 
-    def _compared(self, one: _Part, verb: str, other: _Part, *sides: Side | None) -> Answer | None:
-        given = [side for side in sides if side is not None]
-        if len(given) < len(sides):
+    def _compared(self, one: _Part, verb: str, other: _Part, *runs: Runs | None) -> Answer | None:
+        given = [each for each in runs if each is not None]
+        if len(given) < len(runs):
             return None
         return self._asked(one.name, f"whether it {verb} {other.name}", *given)
 
@@ -344,21 +344,26 @@ class _Examiner:
         diagnostic = self._source.diagnostic("warning", span, f"{message}: {reason}", hint)
         self._findings.append(Finding(kind, specs, reason, found.exclusions, diagnostic))
 
+    def _example(self, spec: NamedSpec, part: _Part, satisfied: bool, word: Word) -> Example | None:
+        reading = self._reading(part)
+        wanted = reading.satisfying if satisfied else reading.violating
+        return shortest_example(
+            self._specification,
+            spec,
+            self._search,
+            word,
+            satisfied,
+            is_exact=not reading.reason,
+            another=lambda avoided: self._search.another(len(word), avoided, *([wanted] if wanted else [])),
+        )
+
     def _described(self, spec: NamedSpec, examples: bool) -> SpecExamination:
         part = _Part(spec.name, spec.formula, spec.span)
         runs: list[Example | None] = []
         for satisfied in (True, False):
             answer = self._answer(part, satisfied)
             word = None if answer is None else answer.word
-            if word is None or not examples:
-                runs.append(None)
-            else:
-                is_exact = not self._reading(part).reason
-                runs.append(
-                    shortest_example(
-                        self._specification, spec, self._search, word, satisfied, is_exact=is_exact
-                    )
-                )
+            runs.append(self._example(spec, part, satisfied, word) if word is not None and examples else None)
         undecided = tuple(self._undecided.get(spec.name, ()))
         return SpecExamination(
             spec.name, self._reading(part).reason, undecided, tuple(_unrelated(spec.formula)), *runs
@@ -371,15 +376,6 @@ _IDLE: Final = "look for a relation that is the wrong way round, or for missing 
 _CONTRADICTION: Final = "one of them is violated in every log"
 _IMPLIED: Final = "it adds nothing; leave it out, or make it stricter"
 _SAME: Final = "leave one of them out"
-
-
-def _joint(one: Answer | None, other: Answer | None) -> Answer:
-    found = [each for each in (one, other) if each is not None]
-    exclusions = dict.fromkeys(exclusion for each in found for exclusion in each.exclusions)
-    opposites = dict.fromkeys(opposite for each in found for opposite in each.opposites)
-    equals = dict.fromkeys(equal for each in found for equal in each.equals)
-    by_logic = all(each.by_logic for each in found)
-    return Answer(None, by_logic, tuple(exclusions), tuple(opposites), tuple(equals))
 
 
 def _reason(found: Answer) -> str:

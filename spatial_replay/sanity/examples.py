@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, Literal
 
 from spatial_replay.errors import SpatialReplayError
 from spatial_replay.geometry.footprint import TrackedObject
-from spatial_replay.monitor.evaluate import evaluate
+from spatial_replay.monitor.evaluate import Evaluation, evaluate
 from spatial_replay.sanity.conditions import Fact
-from spatial_replay.sanity.placement import MAX_TURNED, CannotPlaceError, Setting, place
+from spatial_replay.sanity.placement import MAX_TURNED, CannotPlaceError, Placements, Setting
+from spatial_replay.sanity.readings import conjuncts
 from spatial_replay.sanity.shortest_words import Word, WordSearch
 from spatial_replay.spec.checks import object_names, signal_names
 from spatial_replay.spec.formula import (
     Atom,
+    Formula,
     Misalignment,
     NamedSpec,
     Projection,
@@ -29,6 +31,9 @@ from spatial_replay.trace.trace import Trace
 
 MAX_SAMPLES: Final = 40
 """Longer runs are shown in words only."""
+
+MAX_WORDS: Final = 20
+"""How many runs of one length are tried until one can be placed."""
 
 _SECOND_NS: Final = 10**9
 _TENTH_NS: Final = 10**8
@@ -71,52 +76,114 @@ def shortest_example(
     satisfied: bool,
     *,
     is_exact: bool = True,
+    another: Callable[[Sequence[Word]], Word | None] = lambda avoided: None,
 ) -> Example | None:
     """Return a run with what has to hold in its samples, placed if it can be.
 
     Args:
         is_exact: otherwise the word is only a guess: without a placement that confirms it, there is no run.
+        another: returns a word that is as short, and has nothing of what could not be placed.
     """
     verdict: Literal["satisfied", "violated"] = "satisfied" if satisfied else "violated"
-    facts = [[(search.fact(number), value) for number, value in sorted(cube.items())] for cube in word]
-    sentences = tuple(
-        # two facts of one quantity may read the same
-        " and ".join(dict.fromkeys(fact.texts[0 if value else 1] for fact, value in each)) or "any sample"
-        for each in facts
-    )
-    words = Example(verdict, sentences)
+    first: Example | None = None
+    avoided: list[Word] = []
+    while len(avoided) < MAX_WORDS:
+        facts = [[(search.fact(number), value) for number, value in sorted(cube.items())] for cube in word]
+        sentences = tuple(
+            # two facts of one quantity may read the same
+            " and ".join(dict.fromkeys(fact.texts[0 if value else 1] for fact, value in each)) or "any sample"
+            for each in facts
+        )
+        placing = _Placing(specification, spec, facts, verdict)
+        try:
+            found = placing.placed(is_exact=is_exact)
+        except CannotPlaceError as reason:
+            found, first = None, first or Example(verdict, sentences, note=str(reason))
+        if found is not None:
+            return Example(verdict, sentences, *found)
+        first = first or Example(verdict, sentences, note="no placement of boxes was found")
+        if placing.core is None:
+            break
+        numbers = [sorted(cube) for cube in word]
+        blamed = tuple(
+            {
+                numbers[index][place]: word[index][numbers[index][place]]
+                for at, place in placing.core
+                if at == index
+            }
+            for index in range(len(word))
+        )
+        avoided.append(tuple(filter(None, blamed)) if sum(map(bool, blamed)) == 1 else blamed)
+        following = another(avoided)
+        if following is None:
+            break
+        word = following
+    return first if is_exact else None
+
+
+class _Placing:
+    """One word that is placed.
+
+    Attributes:
+        core: facts, by sample and place, that cannot be placed together; None if that is not known.
+    """
+
+    core: frozenset[tuple[int, int]] | None = None
+
+    def __init__(
+        self,
+        specification: Specification,
+        spec: NamedSpec,
+        facts: Sequence[Sequence[tuple[Fact, bool]]],
+        verdict: str,
+    ) -> None:
+        self._specification, self._spec, self._facts, self._verdict = specification, spec, facts, verdict
+
+    def placed(self, *, is_exact: bool) -> tuple[tuple[Sample, ...], float] | None:
+        """Return samples that evaluate to the verdict, and their robustness; None if none are found.
+
+        Raises:
+            CannotPlaceError: there is something that is not placed, or cannot be evaluated.
+        """
+        if self._spec.parameter is not None:
+            raise CannotPlaceError("a template is about the objects of a log")
+        if len(self._facts) > MAX_SAMPLES:
+            raise CannotPlaceError(f"it takes {len(self._facts)} samples")
+        setting, reason = _setting(self._specification, self._spec), None
+        for period_ns in (_SECOND_NS,) if is_exact else (_SECOND_NS, _TENTH_NS):
+            placements = Placements(setting, self._facts, period_ns)
+            for samples in placements:
+                try:
+                    found, robustness = _evaluated(
+                        self._specification, self._spec, Trace.from_samples(samples)
+                    )
+                except SpatialReplayError as error:
+                    reason = error
+                    continue
+                if found == self._verdict:
+                    return samples, robustness
+                reason = None
+            self.core = placements.core
+        if reason is not None:
+            raise CannotPlaceError(f"it cannot be evaluated: {reason}")
+        return None
+
+
+def _evaluated(specification: Specification, spec: NamedSpec, trace: Trace) -> tuple[str, float]:
+    """Return the verdict and the robustness of a spec; of its parts, where it nests too much for a whole."""
+
+    def evaluated(*formulas: Formula) -> Evaluation:
+        specs = [
+            replace(spec, name=f"{spec.name}_{number}", formula=each, is_result=True)
+            for number, each in enumerate(formulas)
+        ]
+        return evaluate(replace(specification, specs=tuple(specs)), trace)
+
     try:
-        found = _placed(specification, spec, facts, verdict, is_exact=is_exact)
-    except CannotPlaceError as reason:
-        return replace(words, note=str(reason)) if is_exact else None
-    if found is not None:
-        return replace(words, samples=found[0], robustness=found[1])
-    return replace(words, note="no placement of boxes was found") if is_exact else None
-
-
-def _placed(
-    specification: Specification,
-    spec: NamedSpec,
-    facts: Sequence[Sequence[tuple[Fact, bool]]],
-    verdict: str,
-    *,
-    is_exact: bool,
-) -> tuple[tuple[Sample, ...], float] | None:
-    if spec.parameter is not None:
-        raise CannotPlaceError("a template is about the objects of a log")
-    if len(facts) > MAX_SAMPLES:
-        raise CannotPlaceError(f"it takes {len(facts)} samples")
-    alone = replace(specification, specs=(replace(spec, is_result=True),))
-    setting = _setting(specification, spec)
-    for period_ns in (_SECOND_NS,) if is_exact else (_SECOND_NS, _TENTH_NS):
-        for samples in place(setting, facts, period_ns):
-            try:
-                result = evaluate(alone, Trace.from_samples(samples)).results[0]
-            except SpatialReplayError:
-                continue
-            if result.verdict == verdict and result.robustness is not None:
-                return samples, result.robustness
-    return None
+        evaluation = evaluated(spec.formula)
+    except SpatialReplayError:
+        evaluation = evaluated(*conjuncts(spec.formula))
+    return str(evaluation.verdict), min(each.robustness for each in evaluation)
 
 
 def _setting(specification: Specification, spec: NamedSpec) -> Setting:

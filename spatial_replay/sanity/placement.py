@@ -39,6 +39,9 @@ MAX_SOLUTIONS: Final = 300
 MAX_TURNED: Final = 5
 """How many objects are turned towards each other at most."""
 
+_TOLERANCE: Final = 1e-9
+"""By how much a bound may be missed."""
+
 _DIGITS: Final = 9
 """Significant digits of coordinates, so that a file says the same."""
 
@@ -108,30 +111,57 @@ class Setting:
         return self._boxes[key]
 
 
-def place(
-    setting: Setting, facts: Sequence[Sequence[tuple[Fact, bool]]], period_ns: int
-) -> Iterator[tuple[Sample, ...]]:
-    """Yield placements in which facts have some values, sample by sample; the roomiest first.
+class Placements:
+    """Placements in which facts have some values, sample by sample; the roomiest first.
 
-    Raises:
-        CannotPlaceError: a fact is about something that is not placed.
+    Attributes:
+        core: where there is none with the least room: facts, by sample and place, that exclude each other.
+            None before that is known, or if it takes too long.
     """
-    unit = _unit(setting, facts)
-    turns = [_turns(setting, each) for each in facts]
-    for margin, spread in ((0.2, 2.0), (0.04, 4.0), (0.04, 20.0), (0.005, 50.0)):
-        attempt = _Attempt(setting, unit, margin * unit, spread)
-        required: list[Inequality] = list(attempt.sizes())
-        choices: list[Ways] = []
-        for index, sample in enumerate(facts):
-            for fact, value in sample:
-                ways = attempt.ways(fact, value, index)
+
+    core: frozenset[tuple[int, int]] | None = None
+
+    def __init__(
+        self, setting: Setting, facts: Sequence[Sequence[tuple[Fact, bool]]], period_ns: int
+    ) -> None:
+        """Begin.
+
+        Args:
+            facts: of each sample, with their values.
+        """
+        self._setting, self._facts, self._period_ns = setting, facts, period_ns
+
+    def __iter__(self) -> Iterator[tuple[Sample, ...]]:
+        """Yield placements.
+
+        Raises:
+            CannotPlaceError: a fact is about something that is not placed.
+        """
+        setting, facts = self._setting, self._facts
+        unit = _unit(setting, facts)
+        turns = [_turns(setting, each) for each in facts]
+        places = [(index, place) for index, sample in enumerate(facts) for place in range(len(sample))]
+        for margin, spread in ((0.2, 2.0), (0.04, 4.0), (0.04, 20.0), (0.005, 50.0)):
+            attempt = _Attempt(setting, unit, margin * unit, spread)
+            required: list[Inequality] = list(attempt.sizes())
+            choices: list[Ways] = []
+            for label, (index, place) in enumerate(places):
+                fact, value = facts[index][place]
+                ways = [
+                    [each._replace(label=label) for each in way] for way in attempt.ways(fact, value, index)
+                ]
                 if len(ways) == 1:
                     required += ways[0]
                 elif ways:
                     choices.append(ways)
-        found = attempt.solve(required, choices, len(facts))
-        if found is not None:
-            yield tuple(attempt.sample(found, index, turns[index], period_ns) for index in range(len(facts)))
+            found = attempt.solve(required, choices, len(facts))
+            self.core = None
+            if not isinstance(found, frozenset):
+                yield tuple(
+                    attempt.sample(found, index, turns[index], self._period_ns) for index in range(len(facts))
+                )
+            elif attempt.is_finished:
+                self.core = frozenset(places[label] for label in found)
 
 
 def _unit(setting: Setting, facts: Sequence[Sequence[tuple[Fact, bool]]]) -> float:
@@ -202,24 +232,40 @@ class _Attempt:
             ]
         raise CannotPlaceError(f"`{fact.texts[0]}` compares several distances")
 
+    @property
+    def is_finished(self) -> bool:
+        """Whether all ways were tried that matter."""
+        return self._left > 0
+
     def solve(
-        self, required: list[Inequality], choices: list[Ways], samples: int
-    ) -> Mapping[Any, float] | None:
-        """Return values of the unknowns, choice after choice; None if none are found."""
+        self, required: list[Inequality], choices: Sequence[Ways], samples: int
+    ) -> Mapping[Any, float] | frozenset[int]:
+        """Return values of the unknowns, or the labels of what excludes each other.
+
+        Of the choices, the first is made that the values so far do not keep. Where what excludes each other
+        is not about a choice, another way does not help.
+        """
         self._left -= 1
         start = self._start(samples)
-        found = solve(required, exact=False, start=start).values
-        if found is None or not choices:
-            return None if found is None else {**start, **{key: float(value) for key, value in found.items()}}
-        values = {**start, **found}
-        ways, *others = choices
-        for way in sorted(ways, key=lambda way: not all(_holds(each, values) for each in way)):
+        solution = solve(required, exact=False, start=start)
+        if solution.values is None:
+            if solution.conflict is None:
+                self._left = 0
+            return solution.conflict or frozenset()
+        values = {**start, **{key: float(value) for key, value in solution.values.items()}}
+        ways = next((ways for ways in choices if not any(_all_hold(way, values) for way in ways)), None)
+        if ways is None:
+            return values
+        label = ways[0][0].label
+        conflicts: frozenset[int] = frozenset()
+        for way in sorted(ways, key=lambda way: _missing(way, values)):
             if self._left <= 0:
-                return None
-            solution = self.solve([*required, *way], others, samples)
-            if solution is not None:
-                return solution
-        return None
+                break
+            found = self.solve([*required, *way], choices, samples)
+            if not isinstance(found, frozenset) or label not in found:
+                return found
+            conflicts |= found
+        return conflicts
 
     def sample(
         self, values: Mapping[Any, float], index: int, turns: Mapping[str, float], period_ns: int
@@ -356,9 +402,14 @@ def _is_turned(fact: Fact, value: bool, turns: Mapping[str, float]) -> bool:
     return total > float(fact.threshold) if rises else total < float(fact.threshold)
 
 
-def _holds(inequality: Inequality, values: Mapping[Any, Any]) -> bool:
-    total = sum(weight * values[key] for key, weight in inequality.coefficients)
-    return bool(total <= inequality.bound)
+def _all_hold(way: Sequence[Inequality], values: Mapping[Any, float]) -> bool:
+    return _missing(way, values) <= _TOLERANCE
+
+
+def _missing(way: Sequence[Inequality], values: Mapping[Any, float]) -> float:
+    """Return by how much values miss the bounds of inequalities."""
+    sums = (sum(weight * values[key] for key, weight in each.coefficients) - each.bound for each in way)
+    return float(max(0.0, *sums)) if len(way) > 1 else float(max(0.0, next(sums)))
 
 
 def _rounded(value: float) -> float:

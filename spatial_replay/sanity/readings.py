@@ -8,7 +8,8 @@ from typing import Literal
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.compile import automaton
 from spatial_replay.errors import NoAutomatonError
-from spatial_replay.sanity.shortest_words import Side
+from spatial_replay.sanity.bounded_words import Side
+from spatial_replay.sanity.shortest_words import Runs
 from spatial_replay.spec.formula import (
     PAST_OPERATORS,
     Boolean,
@@ -28,36 +29,62 @@ class SpecReading:
 
     Attributes:
         satisfying, violating: None where not even a looser reading has an automaton.
-        reason: why the formula itself has none; "" if it has one.
+        reason: why a part of the formula has none; "" if all have.
     """
 
-    satisfying: Side | None
-    violating: Side | None
+    satisfying: Runs | None
+    violating: Runs | None
     reason: str = ""
-
-    @property
-    def sides(self) -> tuple[Side, ...]:
-        """The automata that there are."""
-        return tuple(side for side in (self.satisfying, self.violating) if side is not None)
 
 
 def reading_of(specification: Specification, name: str, formula: Formula) -> SpecReading:
-    """Return the automata that decide on a formula.
+    """Return the automata that decide on a formula: one for each of the parts that have to hold together.
 
     What an automaton cannot follow is read loosely: a bounded `F` as one without a bound, a past operator as
     one that may hold or not. Runs are only ever added, so that what the looser reading excludes is excluded.
     """
-    try:
-        own = automaton_of(specification, name, formula)
-    except NoAutomatonError as error:
-        reason = error.reason
-    else:
-        return SpecReading(Side(own), Side(own, False))
+    reasons: list[str] = []
+    satisfying: list[Side] = []
+    violating: list[Side | None] = []
+    for part in conjuncts(formula):
+        try:
+            own = automaton_of(specification, name, part)
+        except NoAutomatonError as error:
+            reasons.append(error.reason)
+            looser = _loosely(specification, name, part, positive=True)
+            satisfying += [] if looser is None else [looser]
+            violating.append(_loosely(specification, name, part, positive=False))
+        else:
+            satisfying.append(Side(own))
+            violating.append(Side(own, False))
+
+    options = tuple((side,) for side in violating if side is not None)
     return SpecReading(
-        _loosely(specification, name, formula, positive=True),
-        _loosely(specification, name, formula, positive=False),
-        reason,
+        (tuple(satisfying),) if satisfying else None,
+        options if len(options) == len(violating) else None,
+        reasons[0] if reasons else "",
     )
+
+
+def conjuncts(formula: Formula) -> tuple[Formula, ...]:
+    """Return formulas that hold together exactly where a formula does: `G (a and b)` is `(G a) and (G b)`."""
+    match formula:
+        case Boolean(operator="and" | "spec"):
+            return tuple(part for each in formula.operands for part in conjuncts(each))
+        case Temporal(operator="G"):
+            parts = conjuncts(formula.operands[0])
+            return tuple(
+                # what holds from each sample on holds from each later one on
+                part
+                if formula.bound is None and isinstance(part, Temporal) and _is_always(part)
+                else replace(formula, operands=(part,))
+                for part in parts
+            )
+    return (formula,)
+
+
+def _is_always(formula: Temporal) -> bool:
+    return formula.operator == "G" and formula.bound is None
 
 
 def automaton_of(specification: Specification, name: str, formula: Formula) -> Automaton:

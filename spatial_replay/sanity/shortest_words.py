@@ -5,32 +5,37 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from heapq import heappop, heappush
-from itertools import count
-from typing import Final, NamedTuple, TypeAlias
+from itertools import chain, combinations, count, islice, product
+from typing import Final, TypeAlias
 
 from spatial_replay.automata.automaton import Automaton
-from spatial_replay.automata.diagrams import LEAF, NO, YES
+from spatial_replay.automata.diagrams import LEAF, NO, YES, Diagrams
 from spatial_replay.errors import NoAutomatonError
+from spatial_replay.sanity.bounded_words import (
+    MAX_NODES,
+    Cube,
+    Side,
+    TooManyConflictsError,
+    agreements,
+    clause,
+    first_cube,
+    necessary,
+    word_of_length,
+)
 from spatial_replay.sanity.conditions import Fact, FactDiagrams, is_negated
 from spatial_replay.sanity.laws import laws
 from spatial_replay.sanity.linear import solve
 from spatial_replay.sanity.sums import terms_in
 from spatial_replay.spec.formula import Protrusion, Signal
 
-Cube: TypeAlias = dict[int, bool]
-"""Facts by number that have to be true, or false, in one sample."""
-
 Word: TypeAlias = tuple[Cube, ...]
 """What has to hold in each sample of a run; whatever it leaves open, the end is the same."""
 
-MAX_STEPS: Final = 200_000
+MAX_STEPS: Final = 100_000
 """How many steps one question takes, each a decision of a diagram that is visited."""
 
-MAX_ALL_STEPS: Final = 800_000
+MAX_ALL_STEPS: Final = 400_000
 """How many steps all questions about one specification take together."""
-
-_STEPS_AT_ONCE: Final = 150_000
-"""How many steps a question takes whose answer would spare others."""
 
 _STEPS_OF_GEOMETRY: Final = 50
 """How many steps asking geometry counts as."""
@@ -39,11 +44,17 @@ MAX_CONFLICTS: Final = 2000
 """How many combinations of facts geometry excludes at most before an answer is given up."""
 
 
-class Side(NamedTuple):
-    """An automaton, and whether it has to accept the run or to reject it."""
+MAX_LENGTHS: Final = 4
+"""How many lengths are tried for all automata at once, from the least that they allow."""
 
-    automaton: Automaton
-    accepts: bool = True
+MAX_SHORT: Final = 12
+"""The longest run that is looked for so."""
+
+MAX_PAIRS: Final = 200
+"""How many pairs of automata are looked at for two that exclude each other."""
+
+Runs: TypeAlias = tuple[tuple[Side, ...], ...]
+"""Options: those runs that all sides of at least one of them agree with."""
 
 
 class UndecidedError(Exception):
@@ -86,42 +97,121 @@ class WordSearch:
         self._open: dict[tuple[int, int], set[int]] = {}
         self._steps = self._all_steps = 0
 
-    def shortest(self, *sides: Side) -> Answer:
-        """Return the shortest run that all sides agree with.
+    def shortest(self, *runs: Runs) -> Answer:
+        """Return the shortest run that belongs to all of some runs.
 
         Raises:
             UndecidedError: it takes too many steps.
         """
         self._steps = 0
+        options = _together(runs)
         try:
-            word = self._search(sides, geometry=True)
-            if word is not None:
+            word = self._short(options)
+            if word is not None and any(word):
                 return Answer(word)
-            if self._search(sides, geometry=False) is None:
-                numbers = sorted(self._read(sides))
-                facts = [self.fact(number) for number in numbers]
-                # what is compared by "==" and not has no opposites that need to be named
-                opposites = [
-                    each.texts for each in facts if each.side == ">" and not any(map(is_negated, each.texts))
-                ]
-                equals = [pair for number in numbers for pair in self._conditions.equal_texts(number)]
-                return Answer(None, True, opposites=tuple(opposites), equals=tuple(equals))
+            answers = [self._refined(sides) for sides in options]
         except (NoAutomatonError, RecursionError) as error:
             raise UndecidedError from error
-        return Answer(None, exclusions=tuple(self._texts_of(each) for each in self._about(sides)))
+        words = [each for each in answers if each.word is not None]
+        return min(words, key=lambda each: len(each.word or ()), default=joint(answers))
 
-    def is_found(self, *sides: Side) -> bool:
-        """Return whether a run that all sides agree with is found at once; if not, there may be one."""
-        self._steps = MAX_STEPS - _STEPS_AT_ONCE
-        exclusions, allowed, all_steps = len(self._exclusions), self._allowed, self._all_steps
+    def is_found(self, *runs: Runs) -> bool:
+        """Return whether a run that belongs to all is found at once; if not, there may be one."""
+        return self._short(_together(runs)) is not None
+
+    def another(self, length: int, avoided: Sequence[Word], *runs: Runs) -> Word | None:
+        """Return a run of some length that belongs to all of some runs; None if none is found.
+
+        Args:
+            avoided: what it may not have, as in `word_of_length`.
+        """
+        for sides in _together(runs):
+            try:
+                word = self._of_length(sides, length, avoided)
+            except (NoAutomatonError, RecursionError, TooManyConflictsError):
+                continue
+            if word is not None:
+                return word
+        return None
+
+    def _of_length(self, sides: Sequence[Side], length: int, avoided: Sequence[Word] = ()) -> Word | None:
+        diagrams = Diagrams(MAX_NODES)
         try:
-            return self._search(sides, geometry=True) is not None
-        except (NoAutomatonError, RecursionError, UndecidedError):
-            return False
+            return word_of_length(
+                sides, length, self._diagrams, diagrams, self._conditions_of, self._conflicts, avoided
+            )
         finally:
-            # answers name the exclusions that they need, not those of other questions
-            del self._exclusions[exclusions:]
-            self._allowed, self._all_steps = allowed, all_steps
+            self._all_steps += len(diagrams)
+
+    def _short(self, options: Sequence[Sequence[Side]]) -> Word | None:
+        """Return the shortest run of a few samples; None if none is found."""
+        least = [
+            max([1, *(side.least_left(side.automaton.initial) for side in sides)])
+            for sides in options
+            if all(side.may_agree(side.automaton.initial) for side in sides)
+        ]
+        first, left = min(least, default=MAX_SHORT), list(options)
+        lengths = 1 if self._all_steps > MAX_ALL_STEPS else MAX_LENGTHS
+        for length in range(first, min(first + lengths, MAX_SHORT + 1)):
+            anything = None
+            for sides in tuple(left):
+                try:
+                    word = self._of_length(sides, length)
+                except (NoAutomatonError, RecursionError, TooManyConflictsError):
+                    # longer runs take more
+                    left.remove(sides)
+                    continue
+                # what has to hold says more than that every run of this length will do
+                if word is not None and any(word):
+                    return word
+                anything = anything or word
+            if anything is not None or not left:
+                return anything
+        return None
+
+    def _refined(self, sides: Sequence[Side]) -> Answer:
+        """Return the answer for all sides by that for a few: a run of these shows which one is missing."""
+        pairs = combinations(sides, 2) if len(sides) > 2 else ()
+        for pair in islice(pairs, MAX_PAIRS):
+            if self._short([pair]) is None and (answer := self._decided(pair)).word is None:
+                return answer
+        chosen = list(sides[-1:])
+        while True:
+            answer = self._decided(chosen)
+            other = None if answer.word is None else self._disagreeing(sides, answer.word)
+            if other is None:
+                return answer
+            chosen.append(other)
+
+    def _disagreeing(self, sides: Sequence[Side], word: Word) -> Side | None:
+        """Return a side that may disagree with a run, of those that certainly do if there are any."""
+        diagrams = Diagrams(MAX_NODES)
+        found = agreements(sides, word, self._diagrams, diagrams, self._conditions_of)
+        partly = [side for side, (_, is_whole) in zip(sides, found, strict=True) if not is_whole]
+        wholly = [side for side, (is_any, _) in zip(sides, found, strict=True) if not is_any]
+        return next(iter([*wholly, *partly]), None)
+
+    def _decided(self, sides: Sequence[Side]) -> Answer:
+        word = self._search(sides, geometry=True)
+        if word is not None:
+            return Answer(word)
+        if self._search(sides, geometry=False) is not None:
+            return Answer(None, exclusions=tuple(self._texts_of(each) for each in self._about(sides)))
+        numbers = sorted(self._read(sides))
+        facts = [self.fact(number) for number in numbers]
+        # what is compared by "==" and not has no opposites that need to be named
+        opposites = [
+            each.texts for each in facts if each.side == ">" and not any(map(is_negated, each.texts))
+        ]
+        equals = [pair for number in numbers for pair in self._conditions.equal_texts(number)]
+        return Answer(None, True, opposites=tuple(opposites), equals=tuple(equals))
+
+    def _conditions_of(self, automaton: Automaton) -> list[int]:
+        return [self._conditions.of(each.formula) for each in automaton.propositions]
+
+    def _conflicts(self, cube: Cube) -> list[Cube]:
+        """Return the fewest facts of a cube that geometry excludes together, of each part that has some."""
+        return list(filter(None, map(self._conflict, self._parts(cube))))
 
     def _search(self, sides: Sequence[Side], *, geometry: bool) -> Word | None:
         """Return the shortest run by A*: automata say how many samples it takes at least from here on."""
@@ -133,9 +223,9 @@ class WordSearch:
         def put_in(moves: int, leaves: Sequence[int], length: int, source: tuple[int, ...] | None) -> None:
             for leaf in leaves:
                 after = self._tuples[leaf]
-                if after not in before and all(map(_may_agree, sides, after)):
+                if after not in before and all(map(Side.may_agree, sides, after)):
                     # of equals, those first that need least for the last side: what has to hold once
-                    left = tuple(map(_least_left, sides, after))
+                    left = tuple(map(Side.least_left, sides, after))
                     key = length + max(left), left[::-1], -length
                     heappush(waiting, (key, next(order), moves, leaf, source))
 
@@ -150,7 +240,7 @@ class WordSearch:
             if cube is None:
                 continue
             before[after] = source, cube
-            if all(map(_agrees, sides, after)):
+            if all(map(Side.agrees, sides, after)):
                 return tuple(reversed(list(_back(after, before))))
             put_in(*self._joined(sides, after), 1 - length, after)
         return None
@@ -211,7 +301,7 @@ class WordSearch:
     def _composed(self, automaton: Automaton, state: int) -> int:
         """Return the moves from a state as a diagram over facts, with states as leaves."""
         self._automata[id(automaton)] = automaton
-        conditions = [self._conditions.of(each.formula) for each in automaton.propositions]
+        conditions = self._conditions_of(automaton)
 
         def node(place: int) -> int:
             if place < 0:
@@ -248,52 +338,14 @@ class WordSearch:
             open_ = self._diagrams.both(condition, self._allowed)
             if open_ == NO:
                 return None
-            cube = self._first(open_)
-            # facts on the way that do not matter are left out
-            for fact in sorted(cube, reverse=True):
-                less = {each: value for each, value in cube.items() if each != fact}
-                if self._is_certain(condition, less):
-                    cube = less
-            conflicts = list(filter(None, map(self._conflict, self._parts(cube))))
+            cube = necessary(self._diagrams, condition, first_cube(self._diagrams, open_))
+            conflicts = self._conflicts(cube)
             if not conflicts:
                 return cube
             for conflict in conflicts:
                 self._exclusions.append(frozenset(conflict.items()))
-                self._allowed = self._diagrams.both(self._allowed, self._clause(conflict))
+                self._allowed = self._diagrams.both(self._allowed, clause(self._diagrams, conflict))
         raise UndecidedError
-
-    def _first(self, node: int) -> Cube:
-        """Return decisions that lead to true."""
-        cube: Cube = {}
-        while node != YES:
-            variable, low, high = self._diagrams[node]
-            cube[variable] = low == NO
-            node = high if low == NO else low
-        return cube
-
-    def _is_certain(self, node: int, cube: Cube) -> bool:
-        """Return whether a function is true wherever some facts have their values."""
-        waiting, visited = [node], {node}
-        while waiting:
-            each = waiting.pop()
-            if each == NO:
-                return False
-            if each == YES:
-                continue
-            variable, low, high = self._diagrams[each]
-            value = cube.get(variable)
-            for after in (low, high) if value is None else (high,) if value else (low,):
-                if after not in visited:
-                    visited.add(after)
-                    waiting.append(after)
-        return True
-
-    def _clause(self, cube: Cube) -> int:
-        """Return where facts do not all have their values."""
-        node = NO
-        for fact in sorted(cube, reverse=True):
-            node = self._diagrams.decide(fact, *((YES, node) if cube[fact] else (node, YES)))
-        return node
 
     def _conflict(self, cube: Cube) -> Cube | None:
         """Return the fewest of some facts that geometry excludes together; None if it allows them all."""
@@ -385,17 +437,18 @@ class WordSearch:
         return self._conditions.facts[number]
 
 
-def _agrees(side: Side, state: int) -> bool:
-    return (state in side.automaton.accepting) == side.accepts
+def _together(runs: Sequence[Runs]) -> list[tuple[Side, ...]]:
+    """Return the options of what belongs to all of some runs."""
+    return [tuple(chain.from_iterable(each)) for each in product(*runs)]
 
 
-def _may_agree(side: Side, state: int) -> bool:
-    return state in (side.automaton.can_accept if side.accepts else side.automaton.can_reject)
-
-
-def _least_left(side: Side, state: int) -> int:
-    """Return how many samples it takes at least to end as a side has to."""
-    return side.automaton.distances[state] if side.accepts else int(not _agrees(side, state))
+def joint(answers: Sequence[Answer]) -> Answer:
+    """Return the answers that there is no run, of several questions, as one."""
+    exclusions = dict.fromkeys(exclusion for each in answers for exclusion in each.exclusions)
+    opposites = dict.fromkeys(opposite for each in answers for opposite in each.opposites)
+    equals = dict.fromkeys(equal for each in answers for equal in each.equals)
+    by_logic = all(each.by_logic for each in answers)
+    return Answer(None, by_logic, tuple(exclusions), tuple(opposites), tuple(equals))
 
 
 def _back(

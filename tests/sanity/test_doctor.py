@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import spatial_replay as sr
 from pages import shown
@@ -233,6 +235,83 @@ def test_shortest_runs_show_what_has_to_hold_in_each_sample() -> None:
     )
     assert spec.violated.sentences == ("not (battery >= 0.2)",)
     assert len(spec.satisfied.rows) == 3
+
+
+def shown_runs(text: str) -> list[sr.Example]:
+    """The shortest runs of the one result of a text, each evaluated again from its samples."""
+    specification = sr.parse_specification(text)
+    (spec,) = sr.doctor(specification).specs
+    assert spec.undecided == ()
+    runs = [run for run in (spec.satisfied, spec.violated) if run is not None]
+    for run in runs:
+        assert run.samples is not None, run.note
+        assert sr.evaluate(specification, sr.Trace.from_samples(run.samples)).verdict == run.verdict
+    return runs
+
+
+@pytest.mark.parametrize("deadline", ["", "[0, 3]"])
+def test_runs_of_many_responses_about_the_same_objects_are_placed(deadline: str) -> None:
+    relations = ["{} leftof {}", "{} ovlp {}", "{} dist {} >= 0.2", "{} above {}", "{} dist {} <= 0.1"]
+    pairs = [(f"o{one}", f"o{other}") for one in range(5) for other in range(5) if one != other]
+    atoms = [relations[n % 5].format(*pairs[7 * n % 20]) for n in range(28)]
+    responses = [
+        f"(G ({before} -> F{deadline} {after}))" for before, after in zip(atoms[:14], atoms[14:], strict=True)
+    ]
+    text = " and ".join(responses)
+    assert [len(run.sentences) for run in shown_runs(text)] == [1, 1]
+    # it begins with what is asked for two samples later, which takes three of them
+    begun = f"{text} and (o0 ovlp o1) and (X X o0 dist o1 >= 0.3)"
+    assert [len(run.sentences) for run in shown_runs(begun)] == [3, 1]
+
+
+def test_of_many_specs_that_hold_together_the_two_that_contradict_each_other_are_named() -> None:
+    goals = [f"(F (a{n} enclosedin left_bin))" for n in range(14)]
+    specification = sr.parse_specification(
+        f"{REGIONS}spec s = {' and '.join(goals)} and G not (a9 ovlp left_bin)"
+    )
+    (finding,) = sr.doctor(specification, examples=False).findings
+    assert finding.kind == "unsatisfiable"
+    assert finding.exclusions == (("a9 enclosedin left_bin", "not (a9 ovlp left_bin)"),)
+
+
+def test_what_nests_too_much_for_one_evaluation_is_shown_in_parts() -> None:
+    # without brackets each G reaches over all that follow
+    text = " and ".join(f"G (o{n} leftof o{n + 1} -> F o{n + 1} leftof o{n})" for n in range(9))
+    (spec,) = sr.doctor(sr.parse_specification(text)).specs
+    for run in (spec.satisfied, spec.violated):
+        assert run is not None
+        assert run.samples is not None
+        assert run.robustness is not None
+        assert (run.robustness > 0) == (run.verdict == "satisfied")
+
+
+ATOMS = ("a leftof b", "a ovlp b", "b leftof a", "a dist b >= 0.2", "a dist c <= 0.1", "c leftof b", "p >= 1")
+parts = st.one_of(
+    st.builds("F {}".format, st.sampled_from(ATOMS)),
+    st.builds("G not ({})".format, st.sampled_from(ATOMS)),
+    st.builds("X {}".format, st.sampled_from(ATOMS)),
+    st.builds("G ({} -> F[1, 2] {})".format, st.sampled_from(ATOMS), st.sampled_from(ATOMS)),
+    st.builds("({}) U ({})".format, st.sampled_from(ATOMS), st.sampled_from(ATOMS)),
+)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(parts, min_size=2, max_size=5))
+def test_formulas_that_hold_together_are_decided_as_one_formula_is(formulas: list[str]) -> None:
+    together = " and ".join(f"({each})" for each in formulas)
+    # which is not taken apart
+    one = f"not ({' or '.join(f'(not ({each}))' for each in formulas)})"
+    lengths = []
+    for text in (together, one):
+        (spec,) = sr.doctor(sr.parse_specification(text)).specs
+        assert spec.undecided == ()
+        runs = (spec.satisfied, spec.violated)
+        lengths.append([None if run is None else len(run.sentences) for run in runs])
+        for run in runs:
+            if run is not None and run.samples is not None:
+                trace = sr.Trace.from_samples(run.samples)
+                assert sr.evaluate(sr.parse_specification(one), trace).verdict == run.verdict
+    assert lengths[0] == lengths[1]
 
 
 def test_a_template_is_examined_about_any_object() -> None:

@@ -71,6 +71,10 @@ def bench_doctor(measure: Any) -> None:
     deadline = "G (a leftof b -> F[0, 1000] a ovlp b)"
     row = " and ".join(f"a{n} leftof a{n + 1}" for n in range(30))
     tasks = {"pick-place": PICK_PLACE, "12 responses": spatial, "12 specs": several, "1000 samples": deadline}
+    shared = [
+        f"(G (o{n % 5} leftof o{(n + 2) % 5} -> F[0, 3] o{n % 4} ovlp o{(3 * n + 1) % 4}))" for n in range(14)
+    ]
+    tasks["14 responses about 5 objects"] = " and ".join(shared)
     tasks["31 objects in a row, or in a ring"] = f"(F ({row})) or (F ({row} and a30 leftof a0))"
     for name, text in tasks.items():
         specification = sr.parse_specification(text)
