@@ -121,6 +121,13 @@ def planning_command(scenario: str) -> click.Command:
         help="Specification to plan for.  [default: the scenario's own]",
     )
     @click.option("--of", metavar="NAME", help="Result to plan for, if SPEC has several.")
+    @click.option(
+        "--also",
+        metavar="SPEC",
+        multiple=True,
+        type=LogPath(),
+        help="Specification to evaluate, of which the planner knows nothing; repeat for several.",
+    )
     @constants_option
     @profile_option
     @simulation_options
@@ -135,6 +142,7 @@ def planning_command(scenario: str) -> click.Command:
         durability: Durability,
         spec: LogFile | None,
         of: str | None,
+        also: tuple[LogFile, ...],
         constants: Mapping[str, float | str],
         profile: str | None,
         simulation: SimulationArguments,
@@ -145,9 +153,10 @@ def planning_command(scenario: str) -> click.Command:
         from spatial_replay.runs.planned import record_plan
         from spatial_replay.simulation.worlds import default_specification
 
-        named = [] if spec is None else [spec]
+        named = [*([] if spec is None else [spec]), *also]
         files = load_spec_options(named, profile, constants, lambda: default_specification(scenario))
-        file = next(iter(files), None)
+        # constants alone are values of the scenario's own specification
+        file = files.pop(0) if files and (spec is not None or not also) else None
         if file is not None:
             require_choice(file, of)
         with progress("samples") as advance:
@@ -167,6 +176,7 @@ def planning_command(scenario: str) -> click.Command:
                 durability=durability,
                 changes=changes,
                 timings=timings,
+                also=files,
             )
         show(
             f"wrote {output}: {counted(planned.samples, 'sample')} over {planned.seconds:.3f} s; "
@@ -181,6 +191,8 @@ def planning_command(scenario: str) -> click.Command:
             command_line = shlex.join(["spatial-replay", "info", str(output), "--decisions"])
             show(f"  {command_line} shows what was tried, and why it was given up")
         show(f"the log: {planned.name} is {planned.verdict}")
+        for name, verdict in planned.others.items():
+            show(f"  {name}, of which the planner knew nothing, is {verdict}")
         # a planner that timed out ended the run: an unreached goal is then no violation
         return exit_code_from_verdicts(["unknown" if planned.ended == "wait" else planned.verdict])
 

@@ -253,15 +253,21 @@ class ScenarioRuns:
             options += ["--inject", str(each)]
         for start in given.starts:
             options += ["--start", str(start)]
-        verb = ["plan", self.name] if self.is_planned else ["record", self.name, *self.spec_options]
+        # what the planner knows nothing of
+        others = ["--also" if word == "--spec" else word for word in self.spec_options]
+        verb = ["plan", self.name, *others] if self.is_planned else ["record", self.name, *self.spec_options]
         words = ["spatial-replay", *verb, "-o", "again.mcap", *options]
         return shlex.join(words)
 
     def _plan(self, given: _Conditions) -> SimulatedCase:
         own = default_specification(self.name)
+        task, also = own, [each for each in self.files if each != own]
+        if self.spec_options and "--spec" not in self.spec_options:
+            # values of the constants of the scenario's own specification
+            (task,), also = self.files, []
         with TemporaryDirectory() as folder:
             log = Path(folder, "run.mcap")
-            record_plan(self.name, log, also=[each for each in self.files if each != own], **given._asdict())
+            record_plan(self.name, log, task, also=also, **given._asdict())
             trace, data = read_trace(log), log.read_bytes()
 
         def write(output: Path) -> None:

@@ -9,7 +9,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
@@ -239,6 +239,7 @@ class PlannedRun:
         planning_s: time spent planning, in seconds of real time.
         bounds: how many samples the bounds in seconds are, in words; empty without any.
         yaws: to which yaws objects may be turned since the specification compares some, in words.
+        others: verdicts of the specifications of which the planner knew nothing, by name.
     """
 
     samples: int
@@ -252,6 +253,7 @@ class PlannedRun:
     planning_s: float
     bounds: str = ""
     yaws: str = ""
+    others: Mapping[str, Verdict] = field(default_factory=dict)
 
     @property
     def satisfied(self) -> bool:
@@ -331,7 +333,7 @@ def record_plan(
 
             world.attach(observe, lambda tick: loop.log_tick(tick, world.time_ns))
             end = run_plan(loop, WorldExecutor(world, planner.settings).execute, world.step)
-        last = end.last
+        last, own = end.last, {spec.name for spec in kept.results}
         return PlannedRun(
             samples=log.samples,
             seconds=log.seconds,
@@ -344,6 +346,7 @@ def record_plan(
             planning_s=loop.planning_s,
             bounds=planner.bounds,
             yaws="" if world.workspace.yaws or "yaws" in changes else _yaws_text(settings.workspace.yaws),
+            others={name: each for name, each in log.verdicts.items() if name not in own},
         )
 
 

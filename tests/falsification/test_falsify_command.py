@@ -98,16 +98,24 @@ def test_times_after_the_end_of_the_run_are_pointed_out(
     assert " s: from there on nothing happens" in said
 
 
-def test_a_planner_is_searched_as_a_script_is(tmp_path: Path) -> None:
+def test_a_planner_is_searched_as_a_script_is_and_its_run_repeated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("low.spatial").write_text("const least = 1\nspec low = G (tool_z >= least)\n")
+    watched = ["--spec", "low.spatial", "--const", "least=5.0"]
     # so much noise that it sees nothing to do
-    vary = ["noise=0.2:0.3"]
-    never = sr.parse_specification("spec low = G (tool_z >= 5)")
-    found = sr.falsify("push", never, output=tmp_path / "found", vary=vary, planned=True)
-    (failure,) = found.failures
-    assert failure.command == "spatial-replay plan push -o again.mcap --seed 0 --noise 0.2"
-    results = {result.name: str(result.verdict) for result in sr.replay_log(failure.log).results}
+    assert run(["falsify", "push", *watched, "--planned", "-o", "found", "--vary", "noise=0.2:0.3"]) == 1
+    *_, repeated = capsys.readouterr().out.splitlines()
+    again = "plan push --also low.spatial --const least=5.0 -o again.mcap --seed 0 --noise 0.2"
+    assert repeated.endswith(f": spatial-replay {again}")
+    log = Path("found/runs/run-0001.mcap")
+    results = {result.name: str(result.verdict) for result in sr.replay_log(log).results}
     assert results == {"push": "unknown", "low": "violated"}
-    assert not sr.verify(failure.log).differences
+    assert not sr.verify(log).differences
+    assert run(shlex.split(again)) == 4
+    assert "  low, of which the planner knew nothing, is violated\n" in capsys.readouterr().out
+    assert Path("again.mcap").read_bytes() == log.read_bytes()
 
 
 @pytest.mark.parametrize(
