@@ -139,7 +139,8 @@ class LogWriter:
                 sizes[lanes == number] = counts_from_starts(batch.start)
         open_bytes = np.array([lane.open_bytes if lane.open else -1 for lane in self._lanes], np.int64)
         ends = np.empty((len(messages) + len(self._lanes), 2), np.int64)
-        count = _divide(messages.log_time_ns, sizes, lanes, self._began_ns, open_bytes, ends)
+        # a copy, since a kernel is compiled again for arrays that are read-only
+        count = _divide(messages.log_time_ns.copy(), sizes, lanes, self._began_ns, open_bytes, ends)
         taken = [0] * len(self._lanes)
         for number, stop in ends[:count].tolist():
             self._extend(number, batches[number], taken[number], stop)
