@@ -186,12 +186,13 @@ class MixedPayloads(Sequence[bytes]):
     @cached_property
     def sizes(self) -> Integers:
         """(M,) how many bytes each message has."""
-        sizes = np.empty(len(self), np.int64)
+        alike = [len(part.template) if isinstance(part, Filled) else 0 for part in self.parts]
+        sizes = np.array(alike, np.int64)[self.part]
         for number, part in enumerate(self.parts):
-            own = self.part == number
             if isinstance(part, Filled):
-                sizes[own] = len(part.template)
-            elif isinstance(part, Payloads):
+                continue
+            own = self.part == number
+            if isinstance(part, Payloads):
                 sizes[own] = part.lengths[self.row[own]]
             else:
                 sizes[own] = np.fromiter(map(len, part), np.int64, len(part))[self.row[own]]
