@@ -7,31 +7,29 @@ small, and compiled once that has cost about as much time as compiling it would.
 Both ways give the same bits: kernels use sums, products, quotients, square roots, sines and cosines of IEEE
 doubles (no fast-math, no fused contraction), and nothing else whose result depends on who computes it.
 
-Machine code is kept on disk, in a folder named after a digest of all sources of the package, so a changed
-kernel is never mistaken for the one before. `SPATIAL_REPLAY_CACHE` names another place for it;
-`SPATIAL_REPLAY_KERNELS` is `compiled` or `interpreted` to have only one of the two ways.
+Machine code is kept on disk (see `code_cache`). `SPATIAL_REPLAY_KERNELS` is `compiled` or `interpreted` to
+have only one of the two ways.
 """
 
 from __future__ import annotations
 
 import ctypes
-import hashlib
+import math
 import os
-import shutil
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
-from functools import cache, cached_property, partial
+from contextlib import contextmanager
+from functools import cached_property, partial
 from operator import methodcaller
 from pathlib import Path
 from types import FunctionType
 from typing import Any, Final, Generic, Literal, ParamSpec, TypeVar, cast
 
 import numpy as np
+
+from spatial_replay.code_cache import cache_folder
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
@@ -49,8 +47,6 @@ _COPYING: Final = 0.01
 """The same of a kernel that copies bytes: it takes many at once."""
 _CALL: Final = 32
 """As many elements take as long as what a call costs anyway."""
-_STALE_S: Final = 7 * 24 * 3600.0
-_PACKAGE: Final = Path(__file__).parent
 
 
 def kernel(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
@@ -116,16 +112,31 @@ def inlined(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Re
     return _Kernel(function, options)
 
 
-def by_address(function: Callable[[int, int, int, int], int]) -> Callable[[int, bytes, int, int], int]:
-    """Return a kernel of an address, of bytes, and of two more integers, that a call reaches directly.
+def apart(function: Callable[..., int]) -> Callable[..., int]:
+    """Return a kernel of integers whose machine code never becomes part of that of its callers.
+
+    What a kernel calls is otherwise optimised again with it, and again with what calls that. It gets arrays
+    by their addresses (`floats_at`), and allocates none. Python code gives it arrays for addresses.
+    """
+    return _Apart(function, {"_nrt": False})
+
+
+def allocating_apart(function: Callable[..., int]) -> Callable[..., int]:
+    """Return a kernel as `apart` does, which may allocate arrays."""
+    return _Apart(function, {})
+
+
+def by_address(function: Callable[..., int]) -> Callable[[int, bytes, int, int], int]:
+    """Return a kernel compiled apart as a function of an address, of bytes, and of two more integers.
 
     Looking at what a call is given takes as long as many a kernel: a quarter of a microsecond for each array.
     What it is given here is not looked at, and has to stay where it is as long as the call lasts.
     """
     if _process.only == "interpreted":
-        return lambda frame, given, *rest: function(frame, np.frombuffer(given, np.uint8).ctypes.data, *rest)
-    kernel = cast("_Kernel[[int, int, int, int], int]", function)
-    return kernel.entry()
+        return lambda places, given, *rest: function(
+            places, np.frombuffer(given, np.uint8).ctypes.data, *rest
+        )
+    return cast(Callable[[int, bytes, int, int], int], cast("_Apart", function).entry())
 
 
 def compile_ahead() -> None:
@@ -152,32 +163,6 @@ def only(form: Literal["compiled", "interpreted"]) -> Iterator[None]:
         yield
     finally:
         _process.only = before
-
-
-def cores() -> int:
-    """Return how many cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def over_cores(
-    used: Callable[..., object], run: Callable[[int, int], object], count: int, least: int
-) -> None:
-    """Call `run(begin, end)` for shares that make up range(count), each share on a core of its own.
-
-    Args:
-        used: the long kernel that `run` calls; all is one share until it is compiled.
-        least: the least length of a share, which takes at least about a millisecond.
-    """
-    shares = min(cores(), count // max(least, 1)) if getattr(used, "is_compiled", False) else 1
-    if shares < 2:
-        run(0, count)
-        return
-    ends = [count * share // shares for share in range(shares + 1)]
-    with ThreadPoolExecutor(shares - 1, "sharing") as threads:
-        others = [threads.submit(run, *ends[share : share + 2]) for share in range(1, shares)]
-        run(0, ends[1])
-        for each in others:
-            each.result()
 
 
 @contextmanager
@@ -211,7 +196,6 @@ class _Kernel(Generic[_Arguments, _Result]):
         self._is_elementwise = is_elementwise
         self._compiled: Callable[_Arguments, _Result] | None = None
         self._interpreted: Callable[_Arguments, _Result] | None = None
-        self._entry: Callable[..., Any] | None = None
         self._spent_s = 0.0
         self._element_s: float | None = None
 
@@ -223,7 +207,7 @@ class _Kernel(Generic[_Arguments, _Result]):
             return self.compiled()(*arguments, **named)
         run = cast(Callable[..., _Result], self.interpreted())
         begin = time.thread_time()
-        taken = tuple(map(_view, arguments)) if self._is_elementwise else arguments
+        taken = self._taken(arguments)
         # as in machine code: a quotient by zero or a product out of range is no error and no warning
         with np.errstate(all="ignore"):
             result = run(*taken, **named)
@@ -240,7 +224,7 @@ class _Kernel(Generic[_Arguments, _Result]):
     @property
     def is_compiled(self) -> bool:
         """Whether there is machine code for the arguments of at least one call."""
-        return self._entry is not None or bool(getattr(self._compiled, "signatures", ()))
+        return bool(getattr(self._compiled, "signatures", ()))
 
     def _may_interpret(self, elements: int) -> bool:
         if _process.only is not None:
@@ -254,25 +238,25 @@ class _Kernel(Generic[_Arguments, _Result]):
         # asked last, since looking for the cache takes its time, too
         return cost <= _WARM_S or (cost <= _COLD_S and not _process.holds(self))
 
+    def _taken(self, arguments: tuple[Any, ...]) -> tuple[Any, ...]:
+        """Return what the interpreter runs the function with."""
+        return tuple(map(_view, arguments)) if self._is_elementwise else arguments
+
     def interpreted(self) -> Callable[_Arguments, _Result]:
         """Return the function as it stands, calling others as they stand."""
         if self._interpreted is None:
             self._interpreted = _linked(self._interpreted_as, methodcaller("interpreted"))
         return self._interpreted
 
-    def entry(self) -> Callable[..., Any]:
-        """Return the machine code of a function of four integers, to be called without looking at these."""
-        if self._entry is None:
-            self._entry = _process.compile_entry(_linked(self.__wrapped__, methodcaller("compiled")))
-        return self._entry
-
     def compiled(self) -> Callable[_Arguments, _Result]:
         """Return the function as machine code, calling machine code."""
         if self._compiled is None:
-            self._compiled = _process.compile(
-                _linked(self.__wrapped__, methodcaller("compiled")), self.options
-            )
+            self._compiled = _process.compile(_linked(self.__wrapped__, methodcaller("linked")), self.options)
         return self._compiled
+
+    def linked(self) -> Callable[_Arguments, _Result]:
+        """Return what the machine code of other kernels calls."""
+        return self.compiled()
 
 
 def _linked(
@@ -320,21 +304,57 @@ def _view(value: Any) -> object:
     return memoryview(cast(bytes, value)) if isinstance(value, np.ndarray) else value
 
 
-class _ArrayAt(_Kernel[[int, int], Any]):
-    """An array of so many numbers that begins at an address."""
+class _Apart(_Kernel[..., int]):
+    """A function of integers that is compiled once, for Python and for other kernels."""
+
+    _entry: Any = None
+    _called: Any = None
+
+    @property
+    def is_compiled(self) -> bool:
+        return self._entry is not None
+
+    def _taken(self, arguments: tuple[Any, ...]) -> tuple[Any, ...]:
+        return tuple([each.ctypes.data if isinstance(each, np.ndarray) else each for each in arguments])
+
+    def entry(self) -> Any:
+        """Return the machine code, as a function of integers alone, or of bytes for their address."""
+        if self._entry is None:
+            function = cast(FunctionType, _linked(self.__wrapped__, methodcaller("linked")))
+            self._entry = _process.compile_entry(function, self.options)
+        return self._entry
+
+    def compiled(self) -> Callable[..., int]:
+        if self._compiled is None:
+            entry = self.entry()
+            self._compiled = lambda *arguments: cast(int, entry(*self._taken(arguments)))
+        return self._compiled
+
+    def linked(self) -> Callable[..., int]:
+        if self._called is None:
+            self._called = _process.call_of(f"{self.__module__}.{self.__name__}", self.entry())
+        return cast(Callable[..., int], self._called)
+
+
+class _ArrayAt(_Kernel[[int, Any], Any]):
+    """An array of numbers that begins at an address, given its length or shape."""
 
     def __init__(self, name: str, kind: type) -> None:
-        super().__init__(lambda address, count: None, {"no_cpython_wrapper": True})
+        super().__init__(lambda address, shape: None, {"no_cpython_wrapper": True})
         self.__name__ = name
         self._kind = kind
 
-    def interpreted(self) -> Callable[[int, int], Any]:
+    def interpreted(self) -> Callable[[int, Any], Any]:
         kind: Any = _C_TYPES[self._kind]
-        return lambda address, count: np.frombuffer(
-            (kind * int(count)).from_address(int(address)), self._kind
-        )
 
-    def compiled(self) -> Callable[[int, int], Any]:
+        def array_at(address: int, shape: Any) -> Any:
+            count = math.prod(shape) if isinstance(shape, tuple) else shape
+            numbers: Any = np.frombuffer((kind * int(count)).from_address(int(address)), self._kind)
+            return numbers.reshape(shape)
+
+        return array_at
+
+    def compiled(self) -> Callable[[int, Any], Any]:
         if self._compiled is None:
             self._compiled = _process.array_at(self._kind)
         return self._compiled
@@ -384,38 +404,78 @@ class _Process:
         return "numba" in sys.modules
 
     def compile(self, function: Callable[..., Any], options: dict[str, Any]) -> Any:
-        """Return a function that is compiled for the types of its arguments when it is called."""
-        return self._compile(lambda numba: numba.njit, function, options)
+        """Return a function that is compiled for the types of its arguments when it is called.
 
-    def compile_entry(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        """Compile a function of four integers; return it as what takes bytes for the second of them."""
+        What only kernels call is optimised with these, and not before, which takes a third of the time.
+        """
+        from numba.core.compiler_lock import global_compiler_lock
+
+        made = self._compile(lambda numba: numba.njit, function, options)
+        settings, compile_it = self._compiler.config, made.compile
+        level = type(settings.OPT)(1) if "no_cpython_wrapper" in options else settings.OPT
+
+        def compile_at_level(signature: object) -> object:
+            with cast(Any, global_compiler_lock):
+                before, settings.OPT = settings.OPT, level
+                try:
+                    return compile_it(signature)
+                finally:
+                    settings.OPT = before
+
+        made.compile = compile_at_level
+        return made
+
+    def compile_entry(self, function: FunctionType, options: dict[str, Any]) -> Any:
+        """Compile a function of integers; return it as what takes bytes, too, for the address of these."""
+        count = function.__code__.co_argcount
         made = self._compile(
-            lambda numba: partial(numba.cfunc, "int64(int64, int64, int64, int64)"), function, {}
+            lambda numba: partial(numba.cfunc, numba.int64(*[numba.int64] * count)), function, options
         )
-        integer = ctypes.c_int64
-        call = ctypes.PYFUNCTYPE(integer, integer, ctypes.c_char_p, integer, integer)(made.address)
-        call.code = made  # type: ignore[attr-defined]  # lives as long as the function
-        return cast(Callable[..., Any], call)
+        call = ctypes.PYFUNCTYPE(ctypes.c_int64, *[ctypes.c_void_p] * count)(made.address)
+        call.machine_code = made  # type: ignore[attr-defined]  # lives as long as the function
+        return call
+
+    def call_of(self, symbol: str, function: Any) -> Any:
+        """Return what machine code calls to reach a function of integers that is compiled apart."""
+        import llvmlite.binding  # type: ignore[import-untyped]
+        from numba.core import types
+
+        # by its name, since it lies elsewhere in the next process, which finds its callers in the cache
+        llvmlite.binding.add_symbol(symbol, function.machine_code.address)
+        return types.ExternalFunction(symbol, function.machine_code._sig)
 
     def array_at(self, kind: type) -> Any:
-        """Return a function of an address and a count, compiled into every kernel that calls it."""
-        import numba
+        """Return what machine code calls to see numbers at an address as an array."""
         from numba.core import cgutils, types
         from numba.extending import intrinsic
+        from numba.np import arrayobj
+
+        tools, arrays = cast(Any, cgutils), cast(Any, arrayobj)
+        number: Any = getattr(types, kind.__name__)
 
         @intrinsic
-        def pointer_to(_context, address):  # type: ignore[no-untyped-def]
-            def generate(_context, builder, _signature, arguments):  # type: ignore[no-untyped-def]
-                return builder.inttoptr(arguments[0], cgutils.voidptr_t)
+        def array_at(_context, address, shape):  # type: ignore[no-untyped-def]
+            dimensions = len(shape) if isinstance(shape, types.BaseTuple) else 1
+            made = types.Array(number, dimensions, "C")
 
-            return types.voidptr(address), generate
+            def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+                at, extent = arguments
+                lengths = [extent] if dimensions == 1 else tools.unpack_tuple(builder, extent)
+                kinds = signature.args[1:] if dimensions == 1 else signature.args[1]
+                lengths = [
+                    context.cast(builder, *each, types.intp) for each in zip(lengths, kinds, strict=True)
+                ]
+                strides = [context.get_constant(types.intp, np.dtype(kind).itemsize)]
+                for length in lengths[:0:-1]:
+                    strides.insert(0, builder.mul(strides[0], length))
+                array = arrays.make_array(made)(context, builder)
+                data = builder.inttoptr(at, array.data.type)
+                arrays.populate_array(array, data, lengths, strides, strides[-1], meminfo=None)
+                return array._getvalue()
 
-        carray, pointer_at = cast(Any, numba).carray, cast(Any, pointer_to)
+            return made(address, shape), generate
 
-        def array_at(address, count):  # type: ignore[no-untyped-def]
-            return carray(pointer_at(address), (count,), dtype=kind)
-
-        return self._compile(lambda numba: numba.njit, array_at, {"forceinline": True})
+        return array_at
 
     def _compile(
         self, form: Callable[[Any], Callable[..., Any]], function: Callable[..., Any], options: dict[str, Any]
@@ -453,67 +513,6 @@ class _Process:
 def _required_form() -> str | None:
     value = os.environ.get("SPATIAL_REPLAY_KERNELS")
     return value if value in ("compiled", "interpreted") else None
-
-
-def cache_folder() -> Path | None:
-    """Return the folder for machine code of these sources, made if need be; None if none can be written.
-
-    Code in it is loaded as it is, so it lies where only the user, or who installed the package, writes.
-    """
-    name = f"kernels-{source_digest()}"
-    shipped: Path | None = None
-    for parent in _cache_parents():
-        folder = parent / name
-        try:
-            is_new = not folder.exists()
-            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            with tempfile.TemporaryFile(dir=folder):
-                pass
-        except OSError:
-            # code that was compiled when an image was built, and is read-only now
-            shipped = shipped or (folder if _holds_code(folder) else None)
-            continue
-        if is_new:
-            _remove_stale(parent, keep=name)
-            if shipped is not None:
-                with suppress(OSError):
-                    shutil.copytree(shipped, folder, dirs_exist_ok=True)
-        return folder
-    return None
-
-
-def _cache_parents() -> Iterator[Path]:
-    for name in ("SPATIAL_REPLAY_CACHE", "NUMBA_CACHE_DIR"):
-        if value := os.environ.get(name):
-            yield Path(value)
-    yield _PACKAGE / "__pycache__"
-    if value := os.environ.get("XDG_CACHE_HOME"):
-        yield Path(value) / "spatial-replay"
-    # a user without a home folder
-    with suppress(RuntimeError):
-        yield Path.home() / ".cache" / "spatial-replay"
-
-
-def _holds_code(folder: Path) -> bool:
-    return any(folder.rglob("*.nbi"))
-
-
-def _remove_stale(parent: Path, keep: str) -> None:
-    """Remove machine code of other sources that no process has added to for a while."""
-    oldest = time.time() - _STALE_S
-    for folder in parent.glob("kernels-*"):
-        with suppress(OSError):
-            if folder.name != keep and folder.stat().st_mtime < oldest:
-                shutil.rmtree(folder, ignore_errors=True)
-
-
-@cache
-def source_digest() -> str:
-    """Return a digest of the sources of the package: kernels take constants from anywhere in it."""
-    digest = hashlib.sha256()
-    for path in sorted(_PACKAGE.rglob("*.py")):
-        digest.update(path.relative_to(_PACKAGE).as_posix().encode() + b"\0" + path.read_bytes())
-    return digest.hexdigest()[:16]
 
 
 _process: Final = _Process()

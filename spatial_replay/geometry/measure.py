@@ -10,7 +10,8 @@ from typing import Literal, TypeAlias, get_args
 
 import numpy as np
 
-from spatial_replay.compiled import inlined, kernel, over_cores
+from spatial_replay.compiled import inlined, kernel
+from spatial_replay.cores import over_cores
 from spatial_replay.errors import GeometryError
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.geometry.batch import FootprintBatch

@@ -22,7 +22,7 @@ from typing import Any, BinaryIO, Final, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from spatial_replay.compiled import source_digest
+from spatial_replay.code_cache import source_digest
 from spatial_replay.errors import SpatialReplayError
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.logs.checksums import crc32

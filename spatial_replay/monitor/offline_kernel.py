@@ -138,7 +138,9 @@ def run_offline(
             mirror = channel ^ 1 if channels > 1 else channel
             target = columns[channel, row[codes.OFFLINE_TARGET]]
             if code == codes.LEAF:
-                target[begin:end] = leaves[channel, row[1], begin:end]
+                # element by element: what says that two slices differ in length takes seconds to compile
+                for k in range(begin, end):
+                    target[k] = leaves[channel, row[1], k]
                 continue
             source = columns[channel, row[1]]
             if past < codes.ONCE:

@@ -15,8 +15,9 @@ from pathlib import Path
 from types import MappingProxyType
 
 from spatial_replay.bags.ros1_index import record_table
+from spatial_replay.code_cache import cache_folder
 from spatial_replay.compare.runs import diff_sources
-from spatial_replay.compiled import cache_folder, compile_ahead
+from spatial_replay.compiled import compile_ahead
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
 from spatial_replay.logs.source import MemorySource
 from spatial_replay.monitor.evaluate import evaluate

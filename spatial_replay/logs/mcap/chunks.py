@@ -17,7 +17,7 @@ from typing import BinaryIO, NamedTuple, TypeAlias
 import lz4.frame
 import zstandard
 
-from spatial_replay.compiled import cores
+from spatial_replay.cores import cores
 from spatial_replay.logs.byte_ranges import is_planned, plan_reads
 from spatial_replay.logs.checksums import crc32, joined_checksum
 from spatial_replay.logs.mcap.chunk_records import (

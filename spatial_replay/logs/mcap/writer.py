@@ -19,7 +19,8 @@ from typing import Any, BinaryIO, Self
 import numpy as np
 from mcap import records
 
-from spatial_replay.compiled import cores, elementwise, long_kernel
+from spatial_replay.compiled import elementwise, long_kernel
+from spatial_replay.cores import cores
 from spatial_replay.errors import OutputError
 from spatial_replay.geometry.arrays import Integers, counts_from_starts
 from spatial_replay.logs.mcap.chunk_content import Batch, MessageRange, OpenChunk

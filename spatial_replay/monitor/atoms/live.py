@@ -16,13 +16,14 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import chain, zip_longest
 from math import nan
+from struct import Struct
 from types import MappingProxyType
 from typing import Any, TypeAlias, cast
 
 import numpy as np
 
 from spatial_replay.errors import UsageError
-from spatial_replay.geometry.arrays import Floats, Integers, starts_from_counts
+from spatial_replay.geometry.arrays import Floats, Integers, places_of, starts_from_counts
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.footprint import TrackedObject
 from spatial_replay.geometry.measure import QUANTITY_CODES
@@ -30,10 +31,9 @@ from spatial_replay.monitor.atoms.delays import NO_DELAY, RecentSamples, iter_de
 from spatial_replay.monitor.atoms.instructions import LeafCode
 from spatial_replay.monitor.atoms.live_kernel import (
     ABSENT,
-    PackedPlan,
+    PlacedPlan,
     PlanArrays,
     leaves_of_sample,
-    packed,
 )
 from spatial_replay.monitor.atoms.live_rows import (
     Leaves,
@@ -71,26 +71,29 @@ class LeafPlan:
         rows = PlanRows(frame, members)
         code = LeafCode(rows)
         outputs = [number for leaves in frame.leaves for number in code.add_leaves(leaves, {})]
-        self.arrays = packed(_arrays(frame, rows, code, outputs))
+        arrays = _arrays(frame, rows, code, outputs)
+        self.placed = PlacedPlan(arrays, places_of(arrays))
         self._places = tuple(rows.places)
         self._signals = tuple(code.signals)
+        is_plain = not self._places and len(frame.delays) == 1
+        self._pack_signals = Struct(f"={1 + len(self._signals)}d").pack if is_plain else None
 
     @property
     def nbytes(self) -> int:
         """The memory of its arrays."""
-        return sum(array.nbytes for array in self.arrays)
+        return sum(array.nbytes for array in self.placed.arrays)
 
     def numbers(self, samples: Sequence[Sample | None], stands_for: Mapping[str, str]) -> bytes:
-        """Flatten samples for `leaves_of_sample`, as the bytes of doubles.
+        """Flatten samples for `measure_sample`, as the bytes of doubles.
 
         Args:
             samples: the one at each of the frame's delays; None before the first.
             stands_for: the objects that go by another name among the plan's members.
         """
-        numbers: list[float] = [ABSENT if sample is None else 0 for sample in samples]
-        if not self._places:
+        if self._pack_signals is not None:
             signals = cast(Sample, samples[0]).signals
-            return array("d", numbers + [signals.get(name, nan) for name in self._signals]).tobytes()
+            return self._pack_signals(0.0, *[signals.get(name, nan) for name in self._signals])
+        numbers: list[float] = [ABSENT if sample is None else 0 for sample in samples]
         parts: list[float] = []
         vertices: list[bytes] = []
         classes = self._classes
@@ -252,10 +255,10 @@ class SampleLeaves:
         if planned is None:
             return self._values_with_unknown()
         plan, numbers = planned
-        return leaves_of_sample(plan, np.frombuffer(numbers))
+        return leaves_of_sample(plan, numbers)
 
-    def planned(self, samples: Sequence[Sample | None]) -> tuple[PackedPlan, bytes] | None:
-        """Return what `leaves_of_sample` takes, as bytes; None if `values` alone can compute the leaves.
+    def planned(self, samples: Sequence[Sample | None]) -> tuple[PlacedPlan, bytes] | None:
+        """Return what `measure_sample` takes, as bytes; None if `values` alone can compute the leaves.
 
         Raises:
             UsageError: more bindings than `MAX_BINDINGS`.
@@ -266,7 +269,7 @@ class SampleLeaves:
             if any(sample is not None and sample.unknown for sample in samples):
                 return None
             plan, stands_for = self._fitting_plan(samples)
-        return plan.arrays, plan.numbers(samples, stands_for)
+        return plan.placed, plan.numbers(samples, stands_for)
 
     def _fitting_plan(self, samples: Sequence[Sample | None]) -> tuple[LeafPlan, Mapping[str, str]]:
         """Return a plan for the members of open groups in some samples, and their names in it."""

@@ -11,8 +11,8 @@ from typing import Any, Final, NamedTuple, cast
 
 import numpy as np
 
-from spatial_replay.compiled import inlined, kernel, merged
-from spatial_replay.geometry.arrays import Flags, Floats, Integers
+from spatial_replay.compiled import allocating_apart, floats_at, inlined, integers_at, merged
+from spatial_replay.geometry.arrays import PLACE, Flags, Floats, Integers, shape_2
 from spatial_replay.geometry.closest import closest_rows
 from spatial_replay.geometry.kernels import measure_rows
 from spatial_replay.geometry.measure import misalignment_of
@@ -21,6 +21,9 @@ from spatial_replay.monitor.atoms.instructions import run_instructions
 ABSENT = -1
 ANY = -1
 """The required class if any class matches."""
+
+MOST_CHANNELS = 4
+"""As many as leaves may be in (see `online.codes`)."""
 
 CLASS, PARTS, BOTTOM, TOP, YAW, UNCERTAINTY = range(6)
 """What a sample says of a place: bottom, top and yaw are NaN where there is none."""
@@ -78,76 +81,49 @@ class PlanArrays(NamedTuple):
     outputs: Integers
 
 
-class PackedPlan(NamedTuple):
-    """A plan's arrays in two, since each array costs a call something.
+class PlacedPlan(NamedTuple):
+    """A plan's arrays, and the table of where they lie."""
 
-    Attributes:
-        whole, numbers: the arrays of integers and of floats, flat, one after the other. The former begin with
-            where each array begins and ends in one of these, in the order of `PlanArrays`.
-    """
-
-    whole: Integers
-    numbers: Floats
-
-
-def packed(plan: PlanArrays) -> PackedPlan:
-    """Pack arrays, for `_unpacked` to find."""
-    ends = {"i": 2 * len(plan), "f": 0}
-    starts = list[int]()
-    for array in plan:
-        starts += [ends[array.dtype.kind], ends[array.dtype.kind] + array.size]
-        ends[array.dtype.kind] += array.size
-    whole, numbers = (
-        np.concatenate([np.ravel(array) for array in plan if array.dtype.kind == kind]) for kind in ends
-    )
-    return PackedPlan(np.concatenate([np.array(starts, np.int64), whole]), numbers)
+    arrays: PlanArrays
+    table: Integers
 
 
 _AT: Final[Any] = PlanArrays(*cast(Any, range(len(PlanArrays._fields))))
 """The number of each array."""
 
 
-@merged
-def _integers(plan: PackedPlan, number: int) -> Integers:
-    return plan.whole[plan.whole[2 * number] : plan.whole[2 * number + 1]]
-
-
-@merged
-def _floats(plan: PackedPlan, number: int) -> Floats:
-    return plan.numbers[plan.whole[2 * number] : plan.whole[2 * number + 1]]
-
-
-@merged
-def _unpacked(plan: PackedPlan) -> PlanArrays:
+@inlined
+def _plan_at(table_at: int) -> PlanArrays:
+    at = integers_at(table_at, (len(_AT), PLACE))
     return PlanArrays(
-        extent=_integers(plan, _AT.extent),
-        region_parts=_integers(plan, _AT.region_parts),
-        region_sizes=_integers(plan, _AT.region_sizes),
-        region_radius=_floats(plan, _AT.region_radius),
-        region_vertices=_floats(plan, _AT.region_vertices),
-        region_heights=_floats(plan, _AT.region_heights).reshape((-1, 2)),
-        operand_start=_integers(plan, _AT.operand_start),
-        operand_rows=_integers(plan, _AT.operand_rows),
-        operand_classes=_integers(plan, _AT.operand_classes),
-        enlargement=_floats(plan, _AT.enlargement),
-        geometric=_integers(plan, _AT.geometric),
-        quantity=_integers(plan, _AT.quantity),
-        first=_integers(plan, _AT.first),
-        second=_integers(plan, _AT.second),
-        yaws=_integers(plan, _AT.yaws).reshape((-1, 3)),
-        required_start=_integers(plan, _AT.required_start),
-        required=_integers(plan, _AT.required),
-        closest_start=_integers(plan, _AT.closest_start),
-        closest_rows=_integers(plan, _AT.closest_rows),
-        closest_classes=_integers(plan, _AT.closest_classes),
-        closest_enlargement=_floats(plan, _AT.closest_enlargement),
-        member_start=_integers(plan, _AT.member_start),
-        member_rows=_integers(plan, _AT.member_rows),
-        member_classes=_integers(plan, _AT.member_classes),
-        is_group=_integers(plan, _AT.is_group),
-        code=_integers(plan, _AT.code).reshape((-1, 4)),
-        constants=_floats(plan, _AT.constants),
-        outputs=_integers(plan, _AT.outputs),
+        extent=integers_at(at[_AT.extent, 0], at[_AT.extent, 1]),
+        region_parts=integers_at(at[_AT.region_parts, 0], at[_AT.region_parts, 1]),
+        region_sizes=integers_at(at[_AT.region_sizes, 0], at[_AT.region_sizes, 1]),
+        region_radius=floats_at(at[_AT.region_radius, 0], at[_AT.region_radius, 1]),
+        region_vertices=floats_at(at[_AT.region_vertices, 0], at[_AT.region_vertices, 1]),
+        region_heights=floats_at(at[_AT.region_heights, 0], shape_2(at, _AT.region_heights)),
+        operand_start=integers_at(at[_AT.operand_start, 0], at[_AT.operand_start, 1]),
+        operand_rows=integers_at(at[_AT.operand_rows, 0], at[_AT.operand_rows, 1]),
+        operand_classes=integers_at(at[_AT.operand_classes, 0], at[_AT.operand_classes, 1]),
+        enlargement=floats_at(at[_AT.enlargement, 0], at[_AT.enlargement, 1]),
+        geometric=integers_at(at[_AT.geometric, 0], at[_AT.geometric, 1]),
+        quantity=integers_at(at[_AT.quantity, 0], at[_AT.quantity, 1]),
+        first=integers_at(at[_AT.first, 0], at[_AT.first, 1]),
+        second=integers_at(at[_AT.second, 0], at[_AT.second, 1]),
+        yaws=integers_at(at[_AT.yaws, 0], shape_2(at, _AT.yaws)),
+        required_start=integers_at(at[_AT.required_start, 0], at[_AT.required_start, 1]),
+        required=integers_at(at[_AT.required, 0], at[_AT.required, 1]),
+        closest_start=integers_at(at[_AT.closest_start, 0], at[_AT.closest_start, 1]),
+        closest_rows=integers_at(at[_AT.closest_rows, 0], at[_AT.closest_rows, 1]),
+        closest_classes=integers_at(at[_AT.closest_classes, 0], at[_AT.closest_classes, 1]),
+        closest_enlargement=floats_at(at[_AT.closest_enlargement, 0], at[_AT.closest_enlargement, 1]),
+        member_start=integers_at(at[_AT.member_start, 0], at[_AT.member_start, 1]),
+        member_rows=integers_at(at[_AT.member_rows, 0], at[_AT.member_rows, 1]),
+        member_classes=integers_at(at[_AT.member_classes, 0], at[_AT.member_classes, 1]),
+        is_group=integers_at(at[_AT.is_group, 0], at[_AT.is_group, 1]),
+        code=integers_at(at[_AT.code, 0], shape_2(at, _AT.code)),
+        constants=floats_at(at[_AT.constants, 0], at[_AT.constants, 1]),
+        outputs=integers_at(at[_AT.outputs, 0], at[_AT.outputs, 1]),
     )
 
 
@@ -171,49 +147,50 @@ class SampleRows(NamedTuple):
 
 
 @merged
-def _rows_of_sample(plan: PlanArrays, numbers: Floats) -> SampleRows:
-    """Lay the regions and the objects of a sample out in rows; `numbers` as for `leaves_of_sample`."""
+def _rows_of_sample(plan: PlanArrays, sample_at: int, length: int) -> SampleRows:
+    """Lay the regions and the objects of a sample out in rows; its numbers are those of `measure_sample`."""
+    numbers = floats_at(sample_at, length)
     samples, regions, places, signals = plan.extent[0], plan.extent[1], plan.extent[2], plan.extent[3]
-    here = samples + regions
+    here, known = samples + regions, len(plan.region_radius)
+    of_places = floats_at(sample_at + 8 * samples, (places, NUMBERS_OF_PLACE))
     at = samples + NUMBERS_OF_PLACE * places
-    of_places = numbers[samples:at].reshape((places, NUMBERS_OF_PLACE))
-    classes = np.zeros(here + places, np.int64)
-    part_start = np.zeros(here + places + 1, np.int64)
-    bottom, top = np.empty(here + places), np.empty(here + places)
+    rows, parts, corners = here + places, known, len(plan.region_vertices) // 2
+    for k in range(places):
+        parts += int(of_places[k, PARTS])
+    for p in range(parts - known):
+        corners += int(numbers[at + 2 * p])
+    whole, room = np.empty(2 * rows + 1 + parts + 1, np.int64), np.empty(2 * rows + parts)
+    classes, part_start, vertex_start = whole[:rows], whole[rows : 2 * rows + 1], whole[2 * rows + 1 :]
+    bottom, top, radius = room[:rows], room[rows : 2 * rows], room[2 * rows :]
+    part_start[0] = vertex_start[0] = 0
     for k in range(samples):
-        classes[k] = int(numbers[k])
+        classes[k], part_start[k + 1] = int(numbers[k]), 0
         bottom[k] = top[k] = np.nan
     for k in range(regions):
-        part_start[samples + k + 1] = part_start[samples + k] + plan.region_parts[k]
-        bottom[samples + k], top[samples + k] = plan.region_heights[k, 0], plan.region_heights[k, 1]
+        row = samples + k
+        classes[row], part_start[row + 1] = 0, part_start[row] + plan.region_parts[k]
+        bottom[row], top[row] = plan.region_heights[k, 0], plan.region_heights[k, 1]
     for k in range(places):
-        classes[here + k] = int(of_places[k, CLASS])
-        part_start[here + k + 1] = part_start[here + k] + int(of_places[k, PARTS])
-        bottom[here + k], top[here + k] = of_places[k, BOTTOM], of_places[k, TOP]
-    known, parts = len(plan.region_radius), part_start[here + places]
-    vertex_start, radius = np.zeros(parts + 1, np.int64), np.empty(parts)
+        row = here + k
+        classes[row], part_start[row + 1] = (
+            int(of_places[k, CLASS]),
+            part_start[row] + int(of_places[k, PARTS]),
+        )
+        bottom[row], top[row] = of_places[k, BOTTOM], of_places[k, TOP]
     for p in range(known):
         vertex_start[p + 1], radius[p] = vertex_start[p] + plan.region_sizes[p], plan.region_radius[p]
     for p in range(known, parts):
         vertex_start[p + 1], radius[p] = vertex_start[p] + int(numbers[at]), numbers[at + 1]
         at += 2
-    of_regions, following = len(plan.region_vertices), at + signals
-    vertices = np.empty(2 * vertex_start[parts])
+    of_regions = len(plan.region_vertices) // 2
+    following = at + signals - 2 * of_regions
+    vertices = np.empty((corners, 2))
     for k in range(of_regions):
-        vertices[k] = plan.region_vertices[k]
-    for k in range(of_regions, len(vertices)):
-        vertices[k] = numbers[following + k - of_regions]
-    return SampleRows(
-        classes,
-        part_start,
-        vertex_start,
-        vertices.reshape((-1, 2)),
-        radius,
-        bottom,
-        top,
-        of_places,
-        numbers[at:following].reshape((signals, 1)),
-    )
+        vertices[k, 0], vertices[k, 1] = plan.region_vertices[2 * k], plan.region_vertices[2 * k + 1]
+    for k in range(of_regions, corners):
+        vertices[k, 0], vertices[k, 1] = numbers[following + 2 * k], numbers[following + 2 * k + 1]
+    of_signals = floats_at(sample_at + 8 * at, (signals, 1))
+    return SampleRows(classes, part_start, vertex_start, vertices, radius, bottom, top, of_places, of_signals)
 
 
 @inlined
@@ -356,49 +333,40 @@ def _channels_of(values: Floats, spreads: Floats, signals: Floats, closest: Floa
     return channels
 
 
-@merged
-def _leaves_of_signals(plan: PlanArrays, numbers: Floats) -> Floats:
-    """Compute the leaves where there are no regions and no objects, with few arrays."""
-    samples, count = plan.extent[0], plan.extent[3]
-    signals = numbers[samples : samples + count].reshape((count, 1))
-    nothing = numbers[:0].reshape((0, 1))
-    closest, members = numbers[:0].reshape((0, 4, 1)), np.empty((0, 1), np.int8)
-    leaves = np.empty((_channels_of(nothing, nothing, signals, closest, members), len(plan.outputs), 1))
-    run_instructions(
-        plan.code, plan.constants, nothing, nothing, signals, closest, members, plan.outputs, leaves, 0, 1
-    )
-    return leaves
+@allocating_apart
+def measure_sample(plan_at: int, sample_at: int, length: int, leaves_at: int) -> int:
+    """Compute the leaves of one sample, (C, A, 1), as `leaf_values` does.
 
+    Args:
+        plan_at: address of the table of a plan's arrays.
+        sample_at, length: address of these numbers, and their count: for each sample looked at 0, or
+            `ABSENT`; `NUMBERS_OF_PLACE` of each place; how many vertices each part has, and its radius; the
+            value of each signal; x and y of each vertex of all parts.
+        leaves_at: address of room for all channels of the leaves.
 
-@merged
-def leaves_of_plan(packed_plan: PackedPlan, numbers: Floats) -> Floats:
-    """Compute `leaves_of_sample`, within another kernel."""
-    plan = _unpacked(packed_plan)
-    measured = len(plan.required_start) - 1 + len(plan.closest_enlargement)
-    if plan.extent[1] + plan.extent[2] + len(plan.is_group) + measured == 0:
-        return _leaves_of_signals(plan, numbers)
-    rows = _rows_of_sample(plan, numbers)
-    values = np.empty((len(plan.required_start) - 1, 1))
-    spreads = np.empty((len(plan.required_start) - 1, 1))
+    Returns:
+        C, in how many channels they are.
+    """
+    plan = _plan_at(plan_at)
+    rows = _rows_of_sample(plan, sample_at, length)
+    count = len(plan.required_start) - 1
+    values, spreads = np.empty((count, 1)), np.empty((count, 1))
     _measure(plan, rows, values, spreads)
     members = np.empty((len(plan.is_group), 1), np.int8)
     _members(plan, rows.classes, members)
     closest = np.empty((len(plan.closest_enlargement), 4, 1))
     _closest(plan, rows, closest)
     channels = _channels_of(values, spreads, rows.signals, closest, members)
-    leaves = np.empty((channels, len(plan.outputs), 1))
+    leaves = floats_at(leaves_at, (channels, len(plan.outputs), 1))
     run_instructions(
         plan.code, plan.constants, values, spreads, rows.signals, closest, members, plan.outputs, leaves, 0, 1
     )
-    return leaves
+    return channels
 
 
-@kernel
-def leaves_of_sample(packed_plan: PackedPlan, numbers: Floats) -> Floats:
-    """Compute the leaves of one sample, (C, A, 1), as `leaf_values` does.
-
-    Args:
-        numbers: for each sample looked at 0, or `ABSENT`; `NUMBERS_OF_PLACE` of each place; how many vertices
-            each part has, and its radius; the value of each signal; x and y of each vertex of all parts.
-    """
-    return leaves_of_plan(packed_plan, numbers)
+def leaves_of_sample(plan: PlacedPlan, sample: bytes) -> Floats:
+    """Return the leaves of one sample, (C, A, 1), from the bytes of what `measure_sample` takes."""
+    count = len(plan.arrays.outputs)
+    leaves = np.empty(MOST_CHANNELS * count)
+    channels = measure_sample(plan.table, np.frombuffer(sample), len(sample) // 8, leaves)
+    return leaves[: channels * count].reshape(channels, count, 1)

@@ -6,7 +6,7 @@ from collections.abc import Hashable, Sequence
 
 import numpy as np
 
-from spatial_replay.compiled import over_cores
+from spatial_replay.cores import over_cores
 from spatial_replay.geometry.arrays import Flags, Floats
 from spatial_replay.geometry.closest import closest_pairs
 from spatial_replay.geometry.measure import MeasureRequest, Operand, Quantity, measure, misalignment

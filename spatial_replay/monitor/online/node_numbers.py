@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from spatial_replay.compiled import inlined, merged, piece
+from spatial_replay.compiled import inlined, uncounted
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.state import NUMBERS, Memory, Scratch
@@ -54,7 +54,7 @@ def _combine_low(code: int, low: float, high: float, other_low: float, other_hig
     return min(max(-high, other_low), max(-other_high, low))
 
 
-@merged
+@inlined
 def _combine(code: int, into: Floats, other: Floats, count: int) -> None:
     for pair in range(0, NUMBERS, 2):
         low, high, other_low, other_high = into[pair], into[pair + 1], other[pair], other[pair + 1]
@@ -72,13 +72,15 @@ def _combine(code: int, into: Floats, other: Floats, count: int) -> None:
                 )
 
 
-@piece
+@uncounted
 def _copy(source: Floats, target: Floats) -> None:
     """Copy one row of numbers to the beginning of another."""
-    target[: len(source)] = source
+    # element by element: what says that two slices differ in length takes seconds to compile
+    for k in range(len(source)):
+        target[k] = source[k]
 
 
-@merged
+@inlined
 def _copy_numbers(source: Floats, target: Floats, count: int) -> None:
     """Copy the numbers of one node, (NUMBERS, count)."""
     for number in range(NUMBERS):
@@ -88,7 +90,7 @@ def _copy_numbers(source: Floats, target: Floats, count: int) -> None:
             _copy(source[number, :count], target[number])
 
 
-@merged
+@inlined
 def _set_now(rule: int, into: Floats, first: Floats, last: Floats, count: int) -> None:
     """Compute what a part is now, from what its first and its last operand are."""
     for number in (2, 3):
@@ -103,7 +105,7 @@ def _set_now(rule: int, into: Floats, first: Floats, last: Floats, count: int) -
                 into[number, k] = -np.inf
 
 
-@merged
+@inlined
 def _write_series(numbers: Floats, t: int, count: int, series: Floats) -> None:
     """Write value, now, lower and upper of every node; NaN where the ends of value or now differ.
 
@@ -120,20 +122,20 @@ def _write_series(numbers: Floats, t: int, count: int, series: Floats) -> None:
                 series[n, 2 + which, t + k] = end[k] + 0.0
 
 
-@piece
+@uncounted
 def _copy_known(source: Floats, target: Floats) -> None:
     """Copy numbers; adding zero turns -0.0 into 0.0, so that equal numbers are equal bits."""
     for k in range(len(target)):
         target[k] = source[k] + 0.0
 
 
-@piece
+@uncounted
 def _oppose_known(source: Floats, target: Floats) -> None:
     for k in range(len(target)):
         target[k] = -source[k] + 0.0
 
 
-@piece
+@uncounted
 def _combine_known(
     code: int, into: Floats, low: Floats, high: Floats, other_low: Floats, other_high: Floats
 ) -> None:
@@ -152,60 +154,55 @@ def _combine_known(
             into[k] = _combine_low(code, low[k], high[k], other_low[k], other_high[k]) + 0.0
 
 
-@merged
-def _row(series: Floats, node: int, which: int, t: int, count: int) -> Floats:
-    return series[node, which, t : t + count]
-
-
-@piece
+@uncounted
 def _report_known(
     reports: Integers, operands: Integers, memory: Memory, scratch: Scratch, begin: int, count: int, t: int,
     results: Results,
 ) -> None:  # fmt: skip
     """Run `report` where everything is known: half of the numbers are equal to others, and left out."""
-    series = results.series
-    room = np.empty(count)
+    series, end, room = results.series, t + count, scratch.series[0, :count]
     for n in range(reports.shape[0] - 1, -1, -1):
         code, index, rule, start, stop = _columns_of(reports, n)
-        value, now = _row(series, n, 0, t, count), _row(series, n, 1, t, count)
-        lower, upper = _row(series, n, 2, t, count), _row(series, n, 3, t, count)
+        value, now = series[n, 0, t:end], series[n, 1, t:end]
+        lower, upper = series[n, 2, t:end], series[n, 3, t:end]
         if code == codes.REPORT_SIGNAL:
-            value[:] = memory.firsts[0, index] + 0.0
-            lower[:] = value[0]
-            upper[:] = value[0]
+            for which in (0, 2, 3):
+                for k in range(t, end):
+                    series[n, which, k] = memory.firsts[0, index] + 0.0
             _copy_known(memory.history[0, index, begin : begin + count], now)
         elif code == codes.REPORT_PART:
             part = scratch.parts[index]
             _copy_known(part[0, :count], value)
             _copy_known(part[4, :count], lower)
             _copy_known(part[5, :count], upper)
-            last = _row(series, operands[stop - 1], 1, t, count)
+            last = series[operands[stop - 1], 1, t:end]
             if rule == codes.NOW_OF_PART:
                 _copy_known(part[2, :count], now)
             elif rule == codes.NOW_LAST_OPERAND:
                 _copy_known(last, now)
             elif rule == codes.NOW_EITHER:
-                first = _row(series, operands[start], 1, t, count)
+                first = series[operands[start], 1, t:end]
                 _combine_known(codes.REPORT_OR, now, first, first, last, last)
             else:
-                now[:] = np.inf if rule == codes.NOW_TRUE else -np.inf
+                for k in range(count):
+                    now[k] = np.inf if rule == codes.NOW_TRUE else -np.inf
         elif code == codes.REPORT_NOT:
             of = operands[start]
-            _oppose_known(_row(series, of, 0, t, count), value)
-            _oppose_known(_row(series, of, 1, t, count), now)
-            _oppose_known(_row(series, of, 3, t, count), lower)
-            _oppose_known(_row(series, of, 2, t, count), upper)
+            _oppose_known(series[of, 0, t:end], value)
+            _oppose_known(series[of, 1, t:end], now)
+            _oppose_known(series[of, 3, t:end], lower)
+            _oppose_known(series[of, 2, t:end], upper)
         else:
             for which in range(4):
-                of = _row(series, operands[start], which, t, count)
-                _copy_known(of, _row(series, n, which, t, count))
+                of = series[operands[start], which, t:end]
+                _copy_known(of, series[n, which, t:end])
             for each in range(start + 1, stop):
                 for which in range(2):
-                    into = _row(series, n, which, t, count)
-                    of = _row(series, operands[each], which, t, count)
+                    into = series[n, which, t:end]
+                    of = series[operands[each], which, t:end]
                     _combine_known(code, into, into, into, of, of)
-                least = _row(series, operands[each], 2, t, count)
-                most = _row(series, operands[each], 3, t, count)
+                least = series[operands[each], 2, t:end]
+                most = series[operands[each], 3, t:end]
                 _copy_known(lower, room)
                 _combine_known(code, lower, lower, upper, least, most)
                 _combine_known(code, upper, upper, room, most, least)
@@ -213,7 +210,7 @@ def _report_known(
         results.final[n, 0] = results.final[n, 1] = series[n, 0, t + count - 1]
 
 
-@merged
+@uncounted
 def report(
     reports: Integers, operands: Integers, memory: Memory, scratch: Scratch, channels: int, begin: int,
     count: int, t: int, results: Results,

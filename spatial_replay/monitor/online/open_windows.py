@@ -13,16 +13,36 @@ from typing import NamedTuple
 
 import numpy as np
 
-from spatial_replay.compiled import inlined, uncounted
+from spatial_replay.compiled import apart, inlined, uncounted
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
+from spatial_replay.monitor.online.run_arrays import arrays_at
+from spatial_replay.monitor.online.sliding import (
+    Recent,
+    beyond,
+    copy,
+    fill,
+    is_decided,
+    join,
+    looks_ahead,
+    oppose,
+    recent_of,
+    run_shift,
+    run_window,
+)
 from spatial_replay.monitor.online.state import (
+    OFFSET,
     Memory,
     Scratch,
+    ahead,
     behind,
     first_behind,
+    is_closed,
+    last_ahead,
 )
 
+NEAR = 16
+"""So far behind the last sample, what a window in seconds begins with is found by walking back."""
 FEW = 8
 """So many new samples are joined with open windows one by one; of more, windows are computed again."""
 
@@ -33,13 +53,11 @@ class Look(NamedTuple):
     Attributes:
         channel, mirror: the channel whose values it takes, and the one that negation takes them from.
         mode: what lies beyond the last sample.
-        corner: where mode is `OPEN_CORNER`, the values that the variables have there.
     """
 
     channel: int
     mirror: int
     mode: int
-    corner: int
 
 
 @inlined
@@ -49,317 +67,128 @@ def look_of(which: int, channels: int) -> Look:
     wide_low = 2 if channels > 2 else 0
     channel = (0 if which < 2 else wide_low) + (nominal_high if which % 2 else 0)
     mode = codes.OPEN_LOW if which == 4 else codes.OPEN_HIGH if which == 5 else codes.OPEN_END
-    return Look(channel, channel ^ nominal_high, mode, 0)
-
-
-class Recent(NamedTuple):
-    """What is known of the recent samples, and room to work in: arrays of `Memory` and `Scratch`."""
-
-    history: Floats
-    stamps: Integers
-    lows: Integers
-    window_ends: Integers
-    window_next: Integers
-    changed: Integers
-    extrema: Floats
-    ends: Integers
+    return Look(channel, channel ^ nominal_high, mode)
 
 
 @inlined
-def recent_of(memory: Memory, scratch: Scratch) -> Recent:
-    return Recent(
-        memory.history,
-        memory.stamps,
-        memory.lows,
-        memory.window_ends,
-        memory.window_next,
-        scratch.changed,
-        scratch.extrema,
-        scratch.ends,
-    )
-
-
-class Stretch(NamedTuple):
-    """The recent samples, and the first of them that a column does not know yet."""
-
-    offset: int
-    last: int
-    since: int
+def columns_number(which: int) -> int:
+    """Return which of the columns of `Memory` belong to one of a part's numbers."""
+    return which if which < 2 else which - 2
 
 
 @inlined
-def beyond(mode: int, weak: int) -> float:
-    """Return the value an operator that is still open takes from beyond the last sample."""
-    if mode == codes.OPEN_END:
-        return np.inf if weak else -np.inf
-    return np.inf if mode == codes.OPEN_HIGH else -np.inf
+def cells_of(part: Integers) -> tuple[int, int, int]:
+    """Return where a part's cells hold its base, its variables' positions and its tables' positions."""
+    base = part[codes.PART_CELL_START]
+    return base, base + 1, base + 1 + part[codes.PART_VARIABLES]
 
 
 @uncounted
-def copy(source: Floats, target: Floats) -> None:
-    for k in range(len(target)):
-        target[k] = source[k]
-
-
-@uncounted
-def oppose(source: Floats, target: Floats) -> None:
-    for k in range(len(target)):
-        target[k] = -source[k]
-
-
-@uncounted
-def fill(target: Floats, value: float) -> None:
-    for k in range(len(target)):
-        target[k] = value
-
-
-@uncounted
-def join(is_greatest: bool, first: Floats, second: Floats, target: Floats) -> None:
-    """Take the greater, or the lesser, of each two numbers."""
-    if is_greatest:
-        for k in range(len(target)):
-            target[k] = max(first[k], second[k])
-    else:
-        for k in range(len(target)):
-            target[k] = min(first[k], second[k])
-
-
-@uncounted
-def extremum(is_greatest: bool, source: Floats, start: float) -> float:
-    """Return the greatest or least number and `start`, in four strands that need not wait for each other."""
-    a = b = c = d = start
-    count = len(source)
-    whole = count - count % 4
-    if is_greatest:
-        for k in range(0, whole, 4):
-            a, b = max(a, source[k]), max(b, source[k + 1])
-            c, d = max(c, source[k + 2]), max(d, source[k + 3])
-        for k in range(whole, count):
-            a = max(a, source[k])
-        return max(max(a, b), max(c, d))
-    for k in range(0, whole, 4):
-        a, b = min(a, source[k]), min(b, source[k + 1])
-        c, d = min(c, source[k + 2]), min(d, source[k + 3])
-    for k in range(whole, count):
-        a = min(a, source[k])
-    return min(min(a, b), min(c, d))
-
-
-# ------------------------------------------------------------------------------------- windows in seconds
-
-
-@uncounted
-def enter_samples(
-    nodes: Integers, part: Integers, stamps: Integers, window_ends: Integers, window_next: Integers,
+def reach(
+    nodes: Integers, part: Integers, memory: Memory, scratch: Scratch, root_low: int, root_high: int,
     offset: int, last: int,
-) -> None:  # fmt: skip
-    """Note, for each window in seconds, which positions' windows begin with the new samples, and end before.
+) -> bool:  # fmt: skip
+    """Compute which positions of each node matter for the root at root_low … root_high.
 
-    So each end is searched once, however often the window is looked through.
+    Returns whether every window that they look through has closed. `plain` holds the lower ends before
+    they are widened to what the tables start from.
     """
-    for d in range(part[codes.PART_FIRST], part[codes.PART_END]):
-        timed, near, far = nodes[d, codes.NODE_TIMED], nodes[d, codes.NODE_LOW], nodes[d, codes.NODE_HIGH]
-        if timed < 0:
+    first, end = part[codes.PART_FIRST], part[codes.PART_END]
+    base, boundaries, states = cells_of(part)
+    cells, low, high = memory.cells, scratch.low, scratch.high
+    for d in range(end - first):
+        low[d] = np.iinfo(np.int64).max
+        high[d] = -1
+    low[end - 1 - first], high[end - 1 - first] = root_low, root_high
+    closed = True
+    for d in range(end - 1, first - 1, -1):
+        node = nodes[d]
+        a, b = node[codes.NODE_A], node[codes.NODE_B]
+        scratch.plain[d - first] = low[d - first]
+        if node[codes.NODE_VARIABLE] >= 0 and cells[base] > 0:
+            low[d - first] = min(low[d - first], cells[boundaries + node[codes.NODE_VARIABLE]])
+        if node[codes.NODE_TABLE] >= 0:
+            low[d - first] = min(low[d - first], cells[states + node[codes.NODE_TABLE]] + 1)
+        if node[codes.NODE_CODE] == codes.LITERAL:
             continue
-        is_window = nodes[d, codes.NODE_CODE] != codes.SHIFT
-        starts, afters = window_ends[timed, 0], window_ends[timed, 1]
-        newest = max(window_next[timed, 0], offset)
-        begun, closed = max(window_next[timed, 1], offset), max(window_next[timed, 2], offset)
-        for position in range(newest, last + 1):
-            time_ns = stamps[position - offset]
-            while begun <= position and time_ns - stamps[begun - offset] >= near:
-                starts[begun - offset] = position
-                begun += 1
-            while is_window and closed < position and time_ns - stamps[closed - offset] > far:
-                afters[closed - offset] = position
-                closed += 1
-        window_next[timed, 0] = last + 1
-        window_next[timed, 1], window_next[timed, 2] = begun, closed
-
-
-@inlined
-def _is_decided(node: Integers, mode: int) -> bool:
-    """Return whether what may come outdoes all that an open window holds."""
-    is_greatest = node[codes.NODE_CODE] == codes.PART_WINDOW_MAX
-    return mode != codes.OPEN_END and (mode == codes.OPEN_HIGH) == is_greatest
-
-
-@inlined
-def looks_ahead(code: int) -> bool:
-    return code in (codes.PART_WINDOW_MAX, codes.PART_WINDOW_MIN)
-
-
-@inlined
-def _first_open(node: Integers, recent: Recent, offset: int, last: int) -> int:
-    """Return the first position whose window ahead a later sample may fall into."""
-    if node[codes.NODE_UNIT] == codes.SAMPLES:
-        return int(max(last - node[codes.NODE_HIGH] + 1, offset))
-    first = recent.window_next[node[codes.NODE_TIMED], 2]
-    if recent.stamps[last - offset] - recent.stamps[first - offset] == node[codes.NODE_HIGH]:
-        first += 1
-    return int(first)
-
-
-# -------------------------------------------------------------------------------------- sliding extrema
-
-
-@inlined
-def _slide(
-    node: Integers, source: Floats, target: Floats, begin: int, end: int, recent: Recent,
-    offset: int, last: int,
-) -> None:  # fmt: skip
-    """Compute the extremum of `source` over the windows of the positions begin … end - 1, up to `last`."""
-    code = node[codes.NODE_CODE]
-    is_greatest = code in (codes.PART_WINDOW_MAX, codes.PAST_WINDOW_MAX)
-    if node[codes.NODE_UNIT] == codes.SAMPLES:
-        near, width = node[codes.NODE_LOW], node[codes.NODE_HIGH] - node[codes.NODE_LOW] + 1
-        if looks_ahead(code):
-            width = min(width, last - (begin + near) + 1)
-            first = begin + near
-        else:
-            width = min(width, end - 1 - near - offset + 1)
-            first = begin - near - width + 1
-        _slide_evenly(is_greatest, source, target, begin, end, first, width, recent.extrema, offset, last)
-    else:
-        _find_ends(
-            node, begin, end, recent.stamps, recent.window_ends, recent.window_next, recent.ends, offset, last
+        child_low, child_high, child_closed = _operands_reach(
+            node, low[d - first], high[d - first], memory.stamps, offset, last
         )
-        _slide_unevenly(is_greatest, source, target, begin, end, recent.ends, recent.extrema, offset)
-
-
-@uncounted
-def _slide_evenly(
-    is_greatest: bool, source: Floats, target: Floats, begin: int, end: int, first: int, width: int,
-    extrema: Floats, offset: int, last: int,
-) -> None:  # fmt: skip
-    """Slide over windows of one width, that of `begin` from `first` on, nothing outside of the samples."""
-    nothing = -np.inf if is_greatest else np.inf
-    if width <= 0:
-        fill(target[begin - offset : end - offset], nothing)
-        return
-    numbers, other = extrema[0], extrema[1]
-    size = end - begin + width - 1
-    inside, beyond_last = max(offset, first), min(first + size, last + 1)
-    fill(numbers[: inside - first], nothing)
-    copy(source[inside - offset : beyond_last - offset], numbers[inside - first : beyond_last - first])
-    fill(numbers[beyond_last - first : size], nothing)
-    step = 1
-    while 2 * step <= width:
-        size -= step
-        join(is_greatest, numbers[:size], numbers[step : size + step], other[:size])
-        numbers, other = other, numbers
-        step *= 2
-    count, late = end - begin, width - step
-    join(is_greatest, numbers[:count], numbers[late : late + count], target[begin - offset : end - offset])
-
-
-@uncounted
-def _find_ends(
-    node: Integers, begin: int, end: int, stamps: Integers, window_ends: Integers, window_next: Integers,
-    ends: Integers, offset: int, last: int,
-) -> None:  # fmt: skip
-    """Put where the windows in seconds of begin … end - 1 start, and what comes after them, into `ends`."""
-    starts, afters = ends[0], ends[1]
-    unit, near, far = node[codes.NODE_UNIT], node[codes.NODE_LOW], node[codes.NODE_HIGH]
-    if not looks_ahead(node[codes.NODE_CODE]):
-        for position in range(begin, end):
-            starts[position - begin] = first_behind(stamps, offset, position, unit, far)
-            afters[position - begin] = behind(stamps, offset, position, unit, near) + 1
-        return
-    timed = node[codes.NODE_TIMED]
-    begun, closed = window_next[timed, 1], window_next[timed, 2]
-    for k in range(end - begin):
-        starts[k] = window_ends[timed, 0, begin + k - offset] if begin + k < begun else last + 1
-        afters[k] = window_ends[timed, 1, begin + k - offset] if begin + k < closed else last + 1
-
-
-@uncounted
-def _slide_unevenly(
-    is_greatest: bool, source: Floats, target: Floats, begin: int, end: int, ends: Integers,
-    extrema: Floats, offset: int,
-) -> None:  # fmt: skip
-    """Slide over windows with the given ends, over all that are about as wide at a time."""
-    nothing = -np.inf if is_greatest else np.inf
-    starts, afters, count = ends[0], ends[1], end - begin
-    narrowest, widest = np.iinfo(np.int64).max, 0
-    for k in range(count):
-        width = afters[k] - starts[k]
-        if width > 0:
-            narrowest, widest = min(narrowest, width), max(widest, width)
-        else:
-            target[begin + k - offset] = nothing
-    if widest == 0:
-        return
-    numbers, other = extrema[0], extrema[1]
-    first, size = starts[0], afters[count - 1] - starts[0]
-    copy(source[first - offset : first + size - offset], numbers[:size])
-    step = 1
-    while True:
-        if 2 * step > narrowest:
-            for k in range(count):
-                if step <= afters[k] - starts[k] < 2 * step:
-                    one, two = numbers[starts[k] - first], numbers[afters[k] - step - first]
-                    target[begin + k - offset] = max(one, two) if is_greatest else min(one, two)
-        if 2 * step > widest:
-            return
-        size -= step
-        join(is_greatest, numbers[:size], numbers[step : size + step], other[:size])
-        numbers, other = other, numbers
-        step *= 2
+        closed = closed and child_closed
+        if a >= 0:
+            low[a] = min(low[a], child_low)
+            high[a] = max(high[a], child_high, high[d - first])
+        if node[codes.NODE_CODE] in (
+            codes.PART_AND,
+            codes.PART_OR,
+            codes.UNTIL,
+            codes.RELEASE,
+            codes.PAST_SINCE,
+            codes.PAST_TRIGGER,
+        ):
+            low[b] = min(low[b], child_low)
+            high[b] = max(high[b], child_high)
+    return closed
 
 
 @inlined
-def run_window(
-    node: Integers, source: Floats, target: Floats, begin: int, end: int, mode: int, recent: Recent,
-    offset: int, last: int,
-) -> None:  # fmt: skip
-    """Compute a bounded operator at begin … end - 1 from its operand."""
-    if looks_ahead(node[codes.NODE_CODE]) and _is_decided(node, mode):
-        first = min(max(_first_open(node, recent, offset, last), begin), end)
-        fill(target[first - offset : end - offset], beyond(mode, node[codes.NODE_WEAK]))
-        end = first
-    if begin < end:
-        _slide(node, source, target, begin, end, recent, offset, last)
+def _operands_reach(
+    node: Integers, low: int, high: int, stamps: Integers, offset: int, last: int
+) -> tuple[int, int, bool]:
+    """Return the operands' positions a node looks at from low … high, and whether all of them are known."""
+    code, unit, near, far = (
+        node[codes.NODE_CODE],
+        node[codes.NODE_UNIT],
+        node[codes.NODE_LOW],
+        node[codes.NODE_HIGH],
+    )
+    if code in (codes.PART_WINDOW_MAX, codes.PART_WINDOW_MIN):
+        closed = is_closed(stamps, offset, last, high, unit, far)
+        return low, last_ahead(stamps, offset, last, high, unit, far), closed
+    if code == codes.SHIFT:
+        shifted = ahead(stamps, offset, last, high, unit, near)
+        wanted = last_ahead(stamps, offset, last, high, unit, far) if far >= 0 else shifted
+        return low, min(max(shifted, wanted), last), shifted <= last
+    if code in (codes.PAST_WINDOW_MAX, codes.PAST_WINDOW_MIN):
+        return first_behind(stamps, offset, min(low, last), unit, far), high, True
+    if code == codes.PAST_DELAY:
+        return max(behind(stamps, offset, min(low, last), unit, near), offset), high, True
+    return low, high, True
 
 
 @uncounted
-def run_shift(
-    node: Integers, source: Floats, target: Floats, begin: int, end: int, mode: int, stamps: Integers,
-    window_ends: Integers, window_next: Integers, offset: int, last: int,
-) -> None:  # fmt: skip
-    """Compute a shift or a delay at begin … end - 1: `source` at a distance ahead or behind."""
-    unit, distance, timed = node[codes.NODE_UNIT], node[codes.NODE_LOW], node[codes.NODE_TIMED]
-    is_ahead = node[codes.NODE_CODE] == codes.SHIFT
-    missing = beyond(mode if is_ahead else codes.OPEN_END, node[codes.NODE_WEAK])
-    for position in range(begin, end):
-        if not is_ahead:
-            at = behind(stamps, offset, position, unit, distance)
-        elif unit == codes.SAMPLES:
-            at = position + distance
-        elif position < window_next[timed, 1]:
-            at = window_ends[timed, 0, position - offset]
-        else:
-            at = last + 1
-        target[position - offset] = source[at - offset] if offset <= at <= last else missing
+def find_lows(
+    nodes: Integers, part: Integers, memory: Memory, scratch: Scratch, offset: int, last: int
+) -> None:
+    """Enter the first position of each node that still matters."""
+    base = min(memory.cells[part[codes.PART_CELL_START]], last)
+    reach(nodes, part, memory, scratch, base, last, offset, last)
+    for d in range(part[codes.PART_FIRST], part[codes.PART_END]):
+        memory.lows[d] = scratch.low[d - part[codes.PART_FIRST]]
 
 
-# ------------------------------------------------------------------------------------- brought up to date
+@apart
+def bring_columns_up(table_at: int, number: int, which: int, channels: int, last: int) -> int:
+    """Bring the columns of a part's nodes for one of its numbers up to the last sample.
 
-
-@uncounted
-def bring_up(
-    nodes: Integers, part: Integers, columns: Floats, look: Look, recent: Recent,
-    stretch: Stretch,
-) -> None:  # fmt: skip
-    """Bring the columns of all nodes that depend on no variable up to the last sample.
+    Those are the nodes that depend on no variable.
 
     Args:
-        columns: (D, room), those of one look, which know the samples before `stretch.since`.
+        number: of the part.
     """
-    first, offset, last, since = part[codes.PART_FIRST], stretch.offset, stretch.last, stretch.since
-    changed, end = recent.changed, last + 1
+    tables, memory, scratch, _ = arrays_at(table_at)
+    nodes, part, at = tables.nodes, tables.parts[number], columns_number(which)
+    offset, known = memory.clock[OFFSET], memory.known[number, at]
+    if known < 0:
+        find_lows(nodes, part, memory, scratch, offset, last)
+    if known >= last:
+        return 0
+    memory.known[number, at] = last
+    look, recent, changed = look_of(which, channels), recent_of(memory, scratch), scratch.changed
+    first, since, end = part[codes.PART_FIRST], max(known + 1, offset), last + 1
+    columns = memory.columns[at, first : part[codes.PART_END]]
     for d in range(first, part[codes.PART_END]):
-        node, lowest = nodes[d], recent.lows[d]
+        node, lowest = nodes[d], memory.lows[d]
         if node[codes.NODE_DEPENDS]:
             continue
         code, a, b, target = node[codes.NODE_CODE], node[codes.NODE_A], node[codes.NODE_B], columns[d - first]
@@ -367,9 +196,9 @@ def bring_up(
             begin = max(since, lowest)
             into = target[begin - offset : end - offset]
             if b:
-                oppose(recent.history[look.mirror, a, begin - offset : end - offset], into)
+                oppose(memory.history[look.mirror, a, begin - offset : end - offset], into)
             else:
-                copy(recent.history[look.channel, a, begin - offset : end - offset], into)
+                copy(memory.history[look.channel, a, begin - offset : end - offset], into)
         elif code in (codes.PART_AND, codes.PART_OR):
             begin = max(min(changed[a], changed[b]), lowest)
             one, two = columns[a, begin - offset : end - offset], columns[b, begin - offset : end - offset]
@@ -381,15 +210,12 @@ def bring_up(
             if code == codes.SHIFT:  # positions that look between two samples look at the second one
                 begin = _first_up_to(node, codes.NODE_LOW, recent, offset, last, max(begin - 1, offset))
             begin = max(begin, lowest)
-            run_shift(
-                node, columns[a], target, begin, end, look.mode, recent.stamps, recent.window_ends,
-                recent.window_next, offset, last,
-            )  # fmt: skip
+            run_shift(node, columns[a], target, begin, end, look.mode, recent, offset, last)
         else:
             begin = changed[a]
             is_joined = False
             if looks_ahead(code):
-                is_joined = not _is_decided(node, look.mode)
+                is_joined = not is_decided(node, look.mode)
                 if not is_joined:  # those that have closed have changed, too
                     begin = max(min(begin, since - 1), offset)
                 is_joined = is_joined and since <= changed[a] and since > offset and last - since < FEW
@@ -400,15 +226,21 @@ def bring_up(
             else:
                 run_window(node, columns[a], target, begin, end, look.mode, recent, offset, last)
         changed[d - first] = begin
+    return 0
 
 
-@inlined
+@uncounted
 def _first_up_to(node: Integers, distance: int, recent: Recent, offset: int, last: int, position: int) -> int:
     """Return the first position that is at most the distance in a column of its node before another one."""
     if node[codes.NODE_UNIT] == codes.SAMPLES:
         return int(max(position - node[distance], offset))
-    if position == last and distance == codes.NODE_HIGH:
-        return int(recent.window_next[node[codes.NODE_TIMED], 2])
+    if distance == codes.NODE_HIGH and position > last - NEAR:
+        # of those whose windows have closed, the newest are the only ones that may hold it
+        timed = node[codes.NODE_TIMED]
+        first, afters = recent.window_next[timed, 2], recent.window_ends[timed, 1]
+        while first > offset and afters[first - 1 - offset] > position:
+            first -= 1
+        return int(first)
     return first_behind(recent.stamps, offset, position, node[codes.NODE_UNIT], node[distance])
 
 

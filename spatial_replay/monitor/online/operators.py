@@ -6,7 +6,7 @@ negation normal form over signals, so that its value is monotone in all its oper
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial, reduce
 
 import numpy as np
@@ -80,12 +80,23 @@ class SignalTable:
         """Whether any row looks at more than the newest sample."""
         return any(row[0] in codes.RINGS or row[0] == codes.DELAY for row in self._rows)
 
-    def array(self) -> Integers:
-        """Return the table (S, SIGNAL_WIDTH), with its rings numbered: first those with numbers beside."""
+    def array(self, kept: Iterable[int]) -> Integers:
+        """Return the table (S, SIGNAL_WIDTH), with its rings numbered: first those with numbers beside.
+
+        Args:
+            kept: the rows that parts look at behind the newest sample.
+        """
         rings = [row for row in self._rows if row[0] in codes.RINGS]
         rings.sort(key=lambda row: row[0] not in codes.BEGUN)
         numbers = {row: number for number, row in enumerate(rings)}
-        rows = [(*row, numbers.get(row, NOTHING)) for row in self._rows]
+        looked_at = set(kept)
+        for code, a, b, *_ in self._rows:
+            if code == codes.DELAY or code in codes.RINGS:
+                looked_at.update((a, b) if code in (*codes.BEGUN, *codes.CLOSED) else (a,))
+        rows = [
+            (*row, numbers.get(row, NOTHING), int(number in looked_at))
+            for number, row in enumerate(self._rows)
+        ]
         return array_of_rows(rows, codes.SIGNAL_WIDTH)
 
     def add(self, formula: Formula) -> int:

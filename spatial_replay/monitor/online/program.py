@@ -87,7 +87,7 @@ def compile_formula(formula: Formula) -> Program:
             reports.append((codes.REPORT_PART, number, _now_rule(node, part), *ends))
     return Program(
         leaves=tuple(signals.leaves),
-        signals=signals.array(),
+        signals=signals.array(parts.literals),
         nodes=array_of_rows(parts.node_rows, codes.NODE_WIDTH),
         parts=array_of_rows(parts.part_rows, codes.PART_WIDTH),
         reports=array_of_rows(reports, codes.REPORT_WIDTH),
@@ -101,7 +101,11 @@ def compile_formula(formula: Formula) -> Program:
 
 
 class _Parts:
-    """The parts of a formula, one after the other; equal ones share a place."""
+    """The parts of a formula, one after the other; equal ones share a place.
+
+    Attributes:
+        literals: the signals that parts with windows look at.
+    """
 
     def __init__(self) -> None:
         self.part_rows: list[Row] = []
@@ -110,6 +114,7 @@ class _Parts:
         self.cells = 0
         self.timed = 0
         self.keeps_history = False
+        self.literals = set[int]()
         self._built: dict[tuple[Row, ...] | Row, int] = {}
 
     def add_clauses(self, clauses: Clauses) -> int:
@@ -148,6 +153,8 @@ class _Parts:
         for row in rows:
             is_timed = row[codes.NODE_CODE] in codes.AHEAD_OF and row[codes.NODE_UNIT] != codes.SAMPLES
             self.node_rows.append((*row, self.timed if is_timed else NOTHING))
+            if row[codes.NODE_CODE] == codes.LITERAL and not part.is_flat:
+                self.literals.add(row[codes.NODE_A])
             self.timed += is_timed
         self.table_size += part.tables << part.variables
         self.cells += 1 + part.variables + part.tables

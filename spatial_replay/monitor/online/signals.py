@@ -9,22 +9,22 @@ from __future__ import annotations
 
 import numpy as np
 
-from spatial_replay.compiled import inlined, piece
+from spatial_replay.compiled import inlined, uncounted
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.state import Memory, behind, first_behind, is_closed, past_value
 
 
-@piece
+@uncounted
 def step_signals(
-    signals: Integers, leaves: Floats, t: int, count: int, position: int, offset: int, memory: Memory
+    signals: Integers, leaves: Floats, t: int, count: int, position: int, begin: int, memory: Memory
 ) -> None:
     """Add all signals over the samples t … t + count - 1 of `leaves`, in every channel, to the history.
 
     Args:
-        position: of the first of these samples in the run; it stands at position - offset in the history.
+        position: of the first of these samples in the run; it stands at `begin` in the history.
     """  # fmt: skip
-    begin = position - offset
+    offset = position - begin
     history, stamps, running, wedge_next = memory.history, memory.stamps, memory.running, memory.wedge_next
     channels = leaves.shape[0]
     for s in range(signals.shape[0]):
@@ -86,7 +86,7 @@ def step_signals(
             wedge_next[signals[s, 6]] = max(wedge_next[signals[s, 6]], newest + 1)
 
 
-@piece
+@uncounted
 def _run_past(code: int, first: Floats, second: Floats, target: Floats, before: float, starts: bool) -> None:
     """Run an unbounded once, historically or since, from its value at the previous sample."""
     value = before
@@ -97,7 +97,7 @@ def _run_past(code: int, first: Floats, second: Floats, target: Floats, before: 
         target[k] = value
 
 
-@piece
+@uncounted
 def _slide(
     signal: Integers,
     source: Floats,
@@ -139,7 +139,7 @@ def _apart(stamps: Integers, offset: int, unit: int, position: int, later: int) 
     return later - position if unit == codes.SAMPLES else stamps[later - offset] - stamps[position - offset]
 
 
-@piece
+@uncounted
 def _gather_closed(
     signal: Integers, conditions: Floats, source: Floats, target: Floats, position: int, offset: int,
     count: int, stamps: Integers, wedge: Integers, state: Integers, before: float,
@@ -180,7 +180,7 @@ def _gather_closed(
     state[0], state[1], state[2], state[3] = head, tail, asking, entering
 
 
-@piece
+@uncounted
 def _gather_begun(
     signal: Integers, conditions: Floats, source: Floats, target: Floats, position: int, offset: int,
     count: int, stamps: Integers, wedge: Integers, heights: Floats, state: Integers,

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from spatial_replay.compiled import inlined, piece
+from spatial_replay.compiled import inlined, uncounted
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online.codes import (
     BEGUN,
@@ -229,7 +229,7 @@ def past_value(code: int, first: float, second: float, before: float) -> float:
     return max(second, min(first, before))
 
 
-@piece
+@uncounted
 def first_after(stamps: Integers, offset: int, last: int, position: int, distance: int) -> int:
     """Return the first position, offset … last, at least `distance` ns after another; else last + 1.
 
@@ -246,7 +246,7 @@ def first_after(stamps: Integers, offset: int, last: int, position: int, distanc
     return offset + low
 
 
-@piece
+@uncounted
 def ahead(stamps: Integers, offset: int, last: int, position: int, unit: int, distance: int) -> int:
     """Return the first position at least a distance ahead (it may lie after `last`)."""
     if unit == SAMPLES:
@@ -256,7 +256,7 @@ def ahead(stamps: Integers, offset: int, last: int, position: int, unit: int, di
     return first_after(stamps, offset, last, position, distance)
 
 
-@piece
+@uncounted
 def last_ahead(stamps: Integers, offset: int, last: int, position: int, unit: int, distance: int) -> int:
     """Return the last known position at most a distance ahead: `last` at most."""
     if unit == SAMPLES:
@@ -266,7 +266,7 @@ def last_ahead(stamps: Integers, offset: int, last: int, position: int, unit: in
     return first_after(stamps, offset, last, position, distance + 1) - 1
 
 
-@piece
+@uncounted
 def is_closed(stamps: Integers, offset: int, last: int, position: int, unit: int, distance: int) -> bool:
     """Return whether no later sample can fall into the window that ends a distance ahead of a position."""
     if position > last:
@@ -276,7 +276,7 @@ def is_closed(stamps: Integers, offset: int, last: int, position: int, unit: int
     return bool(stamps[last - offset] - stamps[position - offset] >= distance)
 
 
-@piece
+@uncounted
 def behind(stamps: Integers, offset: int, position: int, unit: int, distance: int) -> int:
     """Return the last position at least a distance behind; before `offset` if there is none."""
     if unit == SAMPLES:
@@ -284,7 +284,7 @@ def behind(stamps: Integers, offset: int, position: int, unit: int, distance: in
     return first_after(stamps, offset, position, position, 1 - distance) - 1
 
 
-@piece
+@uncounted
 def first_behind(stamps: Integers, offset: int, position: int, unit: int, distance: int) -> int:
     """Return the first position at most a distance behind, `offset` at least."""
     if unit == SAMPLES:

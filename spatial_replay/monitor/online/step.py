@@ -7,18 +7,14 @@ same bits, because the only arithmetic is minima, maxima and negation.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple, TypeAlias
-
 import numpy as np
-from numpy.typing import NDArray
 
-from spatial_replay.compiled import elementwise, inlined, kernel
+from spatial_replay.compiled import apart, floats_at, inlined, integers_at
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.codes import in_channels
 from spatial_replay.monitor.online.node_numbers import Results, report
 from spatial_replay.monitor.online.program import Program
+from spatial_replay.monitor.online.run_arrays import RunArrays, Tables, arrays_at, table_of
 from spatial_replay.monitor.online.signals import step_signals
 from spatial_replay.monitor.online.state import (
     KEEPS,
@@ -28,7 +24,6 @@ from spatial_replay.monitor.online.state import (
     START_NS,
     TILE,
     Memory,
-    Scratch,
     doubled,
     first_memory,
     has_windows,
@@ -36,69 +31,10 @@ from spatial_replay.monitor.online.state import (
     widen,
 )
 from spatial_replay.monitor.online.tables import step_tables
-from spatial_replay.monitor.online.windows import forget, step_windows
-
-AnyArray: TypeAlias = NDArray[Any]
-
+from spatial_replay.monitor.online.windows import forget, run_windows
 
 _MANY_TILES = 8
 """So many long tiles of samples that come together are worth more room to work in."""
-
-
-class Tables(NamedTuple):
-    """A program's tables (see `Program`)."""
-
-    signals: Integers
-    nodes: Integers
-    parts: Integers
-    reports: Integers
-    operands: Integers
-
-    @classmethod
-    def of(cls, program: Program) -> Tables:
-        return cls(program.signals, program.nodes, program.parts, program.reports, program.operands)
-
-
-@elementwise
-@kernel
-def step(
-    tables: Tables, memory: Memory, scratch: Scratch, leaves: Floats, times_ns: Integers, t: int, count: int,
-    results: Results,
-) -> None:  # fmt: skip
-    """Run the samples t … t + count - 1 of `leaves` through a program without windows under its parts.
-
-    Args:
-        leaves: (C, A, T), for as many channels as the run has.
-    """  # fmt: skip
-    channels, position, begin = leaves.shape[0], memory.clock[POSITION], _begin(memory, times_ns, t, count)
-    step_signals(tables.signals, leaves, t, count, position, position - begin, memory)
-    step_tables(
-        tables.nodes, tables.parts, memory, scratch, channels, position, memory.clock[START_NS], begin, count
-    )
-    report(tables.reports, tables.operands, memory, scratch, channels, begin, count, t, results)
-    memory.clock[POSITION] = position + count
-
-
-@kernel
-def step_with_windows(
-    tables: Tables, memory: Memory, scratch: Scratch, leaves: Floats, times_ns: Integers, t: int, count: int,
-    results: Results,
-) -> None:  # fmt: skip
-    """`step` for any program; apart from it because it is much more to compile and to load."""
-    channels, position, begin = leaves.shape[0], memory.clock[POSITION], _begin(memory, times_ns, t, count)
-    offset = position - begin
-    step_signals(tables.signals, leaves, t, count, position, offset, memory)
-    step_tables(
-        tables.nodes, tables.parts, memory, scratch, channels, position, memory.clock[START_NS], begin, count
-    )
-    for p in range(len(tables.parts)):
-        part = tables.parts[p]
-        if part[codes.PART_KIND] == codes.WINDOWED:
-            step_windows(
-                tables.nodes, part, p, memory, scratch, channels, position, offset, count, scratch.parts[p]
-            )
-    report(tables.reports, tables.operands, memory, scratch, channels, begin, count, t, results)
-    memory.clock[POSITION] = position + count
 
 
 @inlined
@@ -115,10 +51,65 @@ def _begin(memory: Memory, times_ns: Integers, t: int, count: int) -> int:
     return int(begin)
 
 
+@inlined
+def begin_step(
+    table_at: int, leaves_at: int, channels: int, width: int, times_at: int, length: int, t: int, count: int
+) -> None:
+    """Run the samples t … t + count - 1 through the signals, and through the parts without windows.
+
+    Args:
+        table_at: that of the run's arrays (see `run_arrays`).
+        leaves_at: (channels, width, length), the leaves of all samples, the run's own first; for as many
+            channels as the run has.
+        times_at: (length,), the times of all samples.
+    """
+    tables, memory, scratch, _ = arrays_at(table_at)
+    position, begin = memory.clock[POSITION], _begin(memory, integers_at(times_at, length), t, count)
+    leaves = floats_at(leaves_at, (channels, width, length))
+    step_signals(tables.signals, leaves, t, count, position, begin, memory)
+    step_tables(tables.nodes, tables.parts, memory, scratch, channels, position, begin, count)
+
+
+@inlined
+def end_step(table_at: int, channels: int, series_at: int, length: int, t: int, count: int) -> None:
+    """Enter the numbers of every node into the series, (N, 4, length)."""
+    tables, memory, scratch, final = arrays_at(table_at)
+    begin = memory.clock[POSITION] - memory.clock[OFFSET]
+    results = Results(floats_at(series_at, (len(final), 4, length)), final)
+    report(tables.reports, tables.operands, memory, scratch, channels, begin, count, t, results)
+    memory.clock[POSITION] += count
+
+
+@apart
+def step(
+    table_at: int, leaves_at: int, channels: int, width: int, times_at: int, series_at: int, length: int,
+    t: int, count: int,
+) -> int:  # fmt: skip
+    """Run samples through a program without windows under its parts (see `begin_step`, `end_step`)."""
+    begin_step(table_at, leaves_at, channels, width, times_at, length, t, count)
+    end_step(table_at, channels, series_at, length, t, count)
+    return 0
+
+
+@apart
+def step_with_windows(
+    table_at: int, leaves_at: int, channels: int, width: int, times_at: int, series_at: int, length: int,
+    t: int, count: int,
+) -> int:  # fmt: skip
+    """`step` for any program; apart from it because windows are much more to compile and to load."""
+    begin_step(table_at, leaves_at, channels, width, times_at, length, t, count)
+    run_windows(table_at, channels, count)
+    end_step(table_at, channels, series_at, length, t, count)
+    return 0
+
+
 class OnlineRun:
     """The state that a compiled formula carries from sample to sample.
 
     Its size depends on the formula and on how many samples its windows span, not on the length of the stream.
+
+    Attributes:
+        step: the kernel that runs its samples.
     """
 
     def __init__(self, program: Program, *, room: int = 2 * TILE, tile: int = TILE) -> None:
@@ -130,6 +121,7 @@ class OnlineRun:
                 since the numbers worked with then lie closer together.
         """
         self._program = program
+        self.step = step_with_windows if has_windows(program) else step
         self._tile = tile
         if not program.keeps_history:
             room = tile
@@ -137,30 +129,17 @@ class OnlineRun:
         self._scratch = scratch_for(program, room, tile)
         self._final = np.zeros((len(program.reports), 2))
         self._tables = Tables.of(program)
-        self._take_in = step_with_windows if self.has_windows else step
         self._channels = 1
+        self._find_arrays()
 
     def __len__(self) -> int:
         """Return how many samples were added."""
         return int(self._memory.clock[POSITION])
 
     @property
-    def has_windows(self) -> bool:
-        """Whether `step_with_windows` runs it."""
-        return has_windows(self._program)
-
-    @property
-    def arrays(self) -> list[AnyArray]:
-        """All it works with: `Tables`, `Memory`, `Scratch` and `final`."""
-        return [*self._tables, *self._memory, *self._scratch, self._final]
-
-    def work_with(self, arrays: Sequence[AnyArray]) -> None:
-        """Go on with copies of all `arrays`."""
-        memory, scratch = len(Tables._fields), len(Tables._fields) + len(Memory._fields)
-        self._tables = Tables(*arrays[:memory])
-        self._memory = Memory(*arrays[memory:scratch])
-        self._scratch = Scratch(*arrays[scratch:-1])
-        self._final = arrays[-1]
+    def table_at(self) -> int:
+        """The address of the table of its arrays, until samples are added or room is made for them."""
+        return self._table_at
 
     @property
     def final(self) -> Floats:
@@ -187,8 +166,7 @@ class OnlineRun:
         done = 0
         while done < len(times_ns):
             count = self.make_room(min(self._tile, len(times_ns) - done))
-            results = Results(series, self._final)
-            self._take_in(self._tables, self._memory, self._scratch, leaves, times_ns, done, count, results)
+            self.step(self._table_at, leaves, *leaves.shape[:2], times_ns, series, len(times_ns), done, count)
             done += count
         return series
 
@@ -204,6 +182,11 @@ class OnlineRun:
         while len(self._memory.stamps) < (2 if self._program.keeps_history else 1) * LONG_TILE:
             self._memory = doubled(self._memory, self._channels)
         self._scratch = scratch_for(self._program, len(self._memory.stamps), self._tile)
+        self._find_arrays()
+
+    def _find_arrays(self) -> None:
+        table = table_of(RunArrays(self._tables, self._memory, self._scratch, self._final))
+        self._table, self._table_at = table, table.ctypes.data
 
     def make_room(self, wanted: int) -> int:
         """Make room for at least one of the wanted samples; return for how many."""
@@ -213,10 +196,10 @@ class OnlineRun:
         position, offset = int(clock[POSITION]), int(clock[OFFSET])
         used = position - offset
         if used + wanted > room:
-            signals, nodes, parts = self._program.signals, self._program.nodes, self._program.parts
-            if forget(signals, nodes, parts, self._memory, self._scratch, self._channels):
+            if forget(self._table_at, self._channels):
                 offset = int(clock[OFFSET])
             elif used == room:
                 self._memory = doubled(self._memory, self._channels)
                 self._scratch = scratch_for(self._program, 2 * room, self._tile)
+                self._find_arrays()
         return min(wanted, len(self._memory.stamps) - (position - offset))

@@ -12,13 +12,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from spatial_replay.compiled import inlined, piece
+from spatial_replay.compiled import inlined, uncounted
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
-from spatial_replay.monitor.online.state import Memory, Scratch
+from spatial_replay.monitor.online.state import START_NS, Memory, Scratch
 
 
-@piece
+@uncounted
 def read_table(table: Floats, variables: int, point: Floats, order: Integers) -> float:
     """Read a table at a point: walk its corners in descending order of the coordinates."""
     if variables == 1:
@@ -39,12 +39,12 @@ def read_table(table: Floats, variables: int, point: Floats, order: Integers) ->
     return float(result)
 
 
-@piece
+@uncounted
 def corner_value(corner: int, variable: int) -> float:
     return np.inf if (corner >> variable) & 1 else -np.inf
 
 
-@piece
+@uncounted
 def _start(nodes: Integers, part: Integers, table: Floats, values: Floats) -> None:
     """Fill the table before the first sample: each operator as it is there."""
     first, end = part[codes.PART_FIRST], part[codes.PART_END]
@@ -57,7 +57,7 @@ def _start(nodes: Integers, part: Integers, table: Floats, values: Floats) -> No
         table[corner] = values[end - 1 - first]
 
 
-@piece
+@uncounted
 def _fill_columns(
     nodes: Integers,
     part: Integers,
@@ -88,12 +88,12 @@ def _fill_columns(
                 column[k] = max(columns[a, k], columns[b, k])
 
 
-@piece
+@uncounted
 def _is_anchored(code: int) -> bool:
     return code in (codes.ANCHORED_UNTIL, codes.ANCHORED_RELEASE)
 
 
-@piece
+@uncounted
 def _expand_anchored(node: Integers, values: Floats, later: float, position: int, elapsed_ns: int) -> float:
     """Expand an anchored until or release at a sample, from `values` there and its value at the next sample.
 
@@ -109,7 +109,7 @@ def _expand_anchored(node: Integers, values: Floats, later: float, position: int
     return float(min(right, value)) if counts else float(value)
 
 
-@piece
+@uncounted
 def _close_windows(nodes: Integers, part: Integers, table: Floats, position: int, elapsed_ns: int) -> None:
     """Settle the anchored operators whose window no later sample can fall into."""
     for d in range(part[codes.PART_FIRST], part[codes.PART_END]):
@@ -127,7 +127,7 @@ def _close_windows(nodes: Integers, part: Integers, table: Floats, position: int
 @inlined
 def _step_channel(
     nodes: Integers, part: Integers, table: Floats, channel: int, mirror: int, memory: Memory,
-    scratch: Scratch, position: int, start_ns: int, begin: int, count: int,
+    scratch: Scratch, position: int, begin: int, count: int,
 ) -> None:  # fmt: skip
     """Run `step_tables` in one channel; put the values of an ending run and the bounds into the scratch."""
     first, end, variables, end_corner = (
@@ -149,7 +149,7 @@ def _step_channel(
         _step_simple(nodes[end - 1], table, columns, count, end_corner, ends, lows, highs)
         return
     for k in range(count):
-        elapsed_ns = memory.stamps[begin + k] - start_ns
+        elapsed_ns = memory.stamps[begin + k] - memory.clock[START_NS]
         for d in range(first, end):
             # what depends on no variable is the same at every corner
             if not nodes[d, codes.NODE_DEPENDS]:
@@ -183,7 +183,7 @@ def _step_channel(
         ends[k], lows[k], highs[k] = table[end_corner], table[0], table[corners - 1]
 
 
-@piece
+@uncounted
 def _step_simple(
     node: Integers,
     table: Floats,
@@ -212,7 +212,7 @@ def _step_simple(
     table[0], table[1] = low, high
 
 
-@piece
+@uncounted
 def _read_clauses(
     part: Integers, memory: Memory, scratch: Scratch, channels: int, begin: int, count: int, numbers: Floats
 ) -> None:
@@ -233,16 +233,15 @@ def _read_clauses(
             numbers[number, k] = value
 
 
-@piece
+@uncounted
 def step_tables(
     nodes: Integers, parts: Integers, memory: Memory, scratch: Scratch, channels: int, position: int,
-    start_ns: int, begin: int, count: int,
+    begin: int, count: int,
 ) -> None:  # fmt: skip
     """Substitute samples into the tables of the parts without windows, and read those that are signals.
 
     Args:
         position: of the first of the `count` samples; they stand at `begin` in the history.
-        start_ns: time of the first sample of the run.
     """
     nominal_high = 1 if channels > 1 else 0
     wide_low = 2 if channels > 2 else 0
@@ -260,9 +259,7 @@ def step_tables(
                 + (1 << part[codes.PART_VARIABLES]),
             ]
             mirror = channel ^ nominal_high
-            _step_channel(
-                nodes, part, table, channel, mirror, memory, scratch, position, start_ns, begin, count
-            )
+            _step_channel(nodes, part, table, channel, mirror, memory, scratch, position, begin, count)
             for k in range(count):
                 if channel == 0:
                     numbers[0, k] = ends[k]

@@ -1,0 +1,81 @@
+"""Where machine code is kept on disk: in a folder named after a digest of all sources of the package.
+
+So a changed kernel is never mistaken for the one before. `SPATIAL_REPLAY_CACHE` names another place for it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from typing import Final
+
+_STALE_S: Final = 7 * 24 * 3600.0
+_PACKAGE: Final = Path(__file__).parent
+
+
+def cache_folder() -> Path | None:
+    """Return the folder for machine code of these sources, made if need be; None if none can be written.
+
+    Code in it is loaded as it is, so it lies where only the user, or who installed the package, writes.
+    """
+    name = f"kernels-{source_digest()}"
+    shipped: Path | None = None
+    for parent in _cache_parents():
+        folder = parent / name
+        try:
+            is_new = not folder.exists()
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=folder):
+                pass
+        except OSError:
+            # code that was compiled when an image was built, and is read-only now
+            shipped = shipped or (folder if _holds_code(folder) else None)
+            continue
+        if is_new:
+            _remove_stale(parent, keep=name)
+            if shipped is not None:
+                with suppress(OSError):
+                    shutil.copytree(shipped, folder, dirs_exist_ok=True)
+        return folder
+    return None
+
+
+def _cache_parents() -> Iterator[Path]:
+    for name in ("SPATIAL_REPLAY_CACHE", "NUMBA_CACHE_DIR"):
+        if value := os.environ.get(name):
+            yield Path(value)
+    yield _PACKAGE / "__pycache__"
+    if value := os.environ.get("XDG_CACHE_HOME"):
+        yield Path(value) / "spatial-replay"
+    # a user without a home folder
+    with suppress(RuntimeError):
+        yield Path.home() / ".cache" / "spatial-replay"
+
+
+def _holds_code(folder: Path) -> bool:
+    return any(folder.rglob("*.nbi"))
+
+
+def _remove_stale(parent: Path, keep: str) -> None:
+    """Remove machine code of other sources that no process has added to for a while."""
+    oldest = time.time() - _STALE_S
+    for folder in parent.glob("kernels-*"):
+        with suppress(OSError):
+            if folder.name != keep and folder.stat().st_mtime < oldest:
+                shutil.rmtree(folder, ignore_errors=True)
+
+
+@cache
+def source_digest() -> str:
+    """Return a digest of the sources of the package: kernels take constants from anywhere in it."""
+    digest = hashlib.sha256()
+    for path in sorted(_PACKAGE.rglob("*.py")):
+        digest.update(path.relative_to(_PACKAGE).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:16]

@@ -1,0 +1,279 @@
+"""Bounded operators at neighbouring positions, from columns of contiguous numbers.
+
+Extrema over windows are computed by doubling: over 1, 2, 4, … numbers from each on, of which any two cover a
+window. Each of these passes is a plain loop over neighbouring numbers, which the compiler turns into vector
+instructions.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from spatial_replay.compiled import inlined, uncounted
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.monitor.online import codes
+from spatial_replay.monitor.online.state import Memory, Scratch, behind, first_behind
+
+
+class Recent(NamedTuple):
+    """What is known of the recent samples, and room to work in: arrays of `Memory` and `Scratch`."""
+
+    stamps: Integers
+    window_ends: Integers
+    window_next: Integers
+    extrema: Floats
+    ends: Integers
+
+
+@inlined
+def recent_of(memory: Memory, scratch: Scratch) -> Recent:
+    return Recent(memory.stamps, memory.window_ends, memory.window_next, scratch.extrema, scratch.ends)
+
+
+@inlined
+def beyond(mode: int, weak: int) -> float:
+    """Return the value an operator that is still open takes from beyond the last sample."""
+    if mode == codes.OPEN_END:
+        return np.inf if weak else -np.inf
+    return np.inf if mode == codes.OPEN_HIGH else -np.inf
+
+
+@uncounted
+def copy(source: Floats, target: Floats) -> None:
+    for k in range(len(target)):
+        target[k] = source[k]
+
+
+@uncounted
+def oppose(source: Floats, target: Floats) -> None:
+    for k in range(len(target)):
+        target[k] = -source[k]
+
+
+@uncounted
+def fill(target: Floats, value: float) -> None:
+    for k in range(len(target)):
+        target[k] = value
+
+
+@uncounted
+def join(is_greatest: bool, first: Floats, second: Floats, target: Floats) -> None:
+    """Take the greater, or the lesser, of each two numbers."""
+    if is_greatest:
+        for k in range(len(target)):
+            target[k] = max(first[k], second[k])
+    else:
+        for k in range(len(target)):
+            target[k] = min(first[k], second[k])
+
+
+@uncounted
+def extremum(is_greatest: bool, source: Floats, start: float) -> float:
+    """Return the greatest or least number and `start`, in four strands that need not wait for each other."""
+    a = b = c = d = start
+    count = len(source)
+    whole = count - count % 4
+    if is_greatest:
+        for k in range(0, whole, 4):
+            a, b = max(a, source[k]), max(b, source[k + 1])
+            c, d = max(c, source[k + 2]), max(d, source[k + 3])
+        for k in range(whole, count):
+            a = max(a, source[k])
+        return max(max(a, b), max(c, d))
+    for k in range(0, whole, 4):
+        a, b = min(a, source[k]), min(b, source[k + 1])
+        c, d = min(c, source[k + 2]), min(d, source[k + 3])
+    for k in range(whole, count):
+        a = min(a, source[k])
+    return min(min(a, b), min(c, d))
+
+
+@uncounted
+def enter_samples(
+    nodes: Integers, part: Integers, stamps: Integers, window_ends: Integers, window_next: Integers,
+    offset: int, last: int,
+) -> None:  # fmt: skip
+    """Note, for each window in seconds, which positions' windows begin with the new samples, and end before.
+
+    So each end is searched once, however often the window is looked through.
+    """
+    for d in range(part[codes.PART_FIRST], part[codes.PART_END]):
+        timed, near, far = nodes[d, codes.NODE_TIMED], nodes[d, codes.NODE_LOW], nodes[d, codes.NODE_HIGH]
+        if timed < 0:
+            continue
+        is_window = nodes[d, codes.NODE_CODE] != codes.SHIFT
+        starts, afters = window_ends[timed, 0], window_ends[timed, 1]
+        newest = max(window_next[timed, 0], offset)
+        begun, closed = max(window_next[timed, 1], offset), max(window_next[timed, 2], offset)
+        for position in range(newest, last + 1):
+            time_ns = stamps[position - offset]
+            while begun <= position and time_ns - stamps[begun - offset] >= near:
+                starts[begun - offset] = position
+                begun += 1
+            while is_window and closed < position and time_ns - stamps[closed - offset] > far:
+                afters[closed - offset] = position
+                closed += 1
+        window_next[timed, 0] = last + 1
+        window_next[timed, 1], window_next[timed, 2] = begun, closed
+
+
+@inlined
+def is_decided(node: Integers, mode: int) -> bool:
+    """Return whether what may come outdoes all that an open window holds."""
+    is_greatest = node[codes.NODE_CODE] == codes.PART_WINDOW_MAX
+    return mode != codes.OPEN_END and (mode == codes.OPEN_HIGH) == is_greatest
+
+
+@inlined
+def looks_ahead(code: int) -> bool:
+    return code in (codes.PART_WINDOW_MAX, codes.PART_WINDOW_MIN)
+
+
+@inlined
+def _first_open(node: Integers, recent: Recent, offset: int, last: int) -> int:
+    """Return the first position whose window ahead a later sample may fall into."""
+    if node[codes.NODE_UNIT] == codes.SAMPLES:
+        return int(max(last - node[codes.NODE_HIGH] + 1, offset))
+    first = recent.window_next[node[codes.NODE_TIMED], 2]
+    if recent.stamps[last - offset] - recent.stamps[first - offset] == node[codes.NODE_HIGH]:
+        first += 1
+    return int(first)
+
+
+@uncounted
+def _slide_evenly(
+    is_greatest: bool, source: Floats, target: Floats, begin: int, end: int, first: int, width: int,
+    extrema: Floats, offset: int, last: int,
+) -> None:  # fmt: skip
+    """Slide over windows of one width, that of `begin` from `first` on, nothing outside of the samples."""
+    nothing = -np.inf if is_greatest else np.inf
+    if width <= 0:
+        fill(target[begin - offset : end - offset], nothing)
+        return
+    numbers, other = extrema[0], extrema[1]
+    size = end - begin + width - 1
+    inside, beyond_last = max(offset, first), min(first + size, last + 1)
+    fill(numbers[: inside - first], nothing)
+    copy(source[inside - offset : beyond_last - offset], numbers[inside - first : beyond_last - first])
+    fill(numbers[beyond_last - first : size], nothing)
+    step = 1
+    while 2 * step <= width:
+        size -= step
+        join(is_greatest, numbers[:size], numbers[step : size + step], other[:size])
+        numbers, other = other, numbers
+        step *= 2
+    count, late = end - begin, width - step
+    join(is_greatest, numbers[:count], numbers[late : late + count], target[begin - offset : end - offset])
+
+
+@uncounted
+def _find_ends(node: Integers, begin: int, end: int, recent: Recent, offset: int, last: int) -> None:
+    """Put where the windows in seconds of begin … end - 1 start, and what comes after them, into `ends`."""
+    stamps, window_ends, window_next = recent.stamps, recent.window_ends, recent.window_next
+    starts, afters = recent.ends[0], recent.ends[1]
+    unit, near, far = node[codes.NODE_UNIT], node[codes.NODE_LOW], node[codes.NODE_HIGH]
+    if not looks_ahead(node[codes.NODE_CODE]):
+        for position in range(begin, end):
+            starts[position - begin] = first_behind(stamps, offset, position, unit, far)
+            afters[position - begin] = behind(stamps, offset, position, unit, near) + 1
+        return
+    timed = node[codes.NODE_TIMED]
+    begun, closed = window_next[timed, 1], window_next[timed, 2]
+    for k in range(end - begin):
+        starts[k] = window_ends[timed, 0, begin + k - offset] if begin + k < begun else last + 1
+        afters[k] = window_ends[timed, 1, begin + k - offset] if begin + k < closed else last + 1
+
+
+@uncounted
+def _slide_unevenly(
+    is_greatest: bool, source: Floats, target: Floats, begin: int, end: int, recent: Recent, offset: int
+) -> None:
+    """Slide over windows with the ends found, over all that are about as wide at a time."""
+    nothing = -np.inf if is_greatest else np.inf
+    starts, afters, count = recent.ends[0], recent.ends[1], end - begin
+    # the last windows mostly end alike, and each of these holds what the one after it does
+    at = beyond_last = afters[count - 1]
+    value = nothing
+    while count > 0 and afters[count - 1] == beyond_last:
+        count -= 1
+        while at > starts[count]:
+            at -= 1
+            number = source[at - offset]
+            value = max(value, number) if is_greatest else min(value, number)
+        target[begin + count - offset] = value
+    narrowest, widest = np.iinfo(np.int64).max, 0
+    for k in range(count):
+        width = afters[k] - starts[k]
+        if width > 0:
+            narrowest, widest = min(narrowest, width), max(widest, width)
+        else:
+            target[begin + k - offset] = nothing
+    if widest == 0:
+        return
+    numbers, other = recent.extrema[0], recent.extrema[1]
+    first, size = starts[0], afters[count - 1] - starts[0]
+    copy(source[first - offset : first + size - offset], numbers[:size])
+    step = 1
+    while True:
+        if 2 * step > narrowest:
+            for k in range(count):
+                if step <= afters[k] - starts[k] < 2 * step:
+                    one, two = numbers[starts[k] - first], numbers[afters[k] - step - first]
+                    target[begin + k - offset] = max(one, two) if is_greatest else min(one, two)
+        if 2 * step > widest:
+            return
+        size -= step
+        join(is_greatest, numbers[:size], numbers[step : size + step], other[:size])
+        numbers, other = other, numbers
+        step *= 2
+
+
+@uncounted
+def run_window(
+    node: Integers, source: Floats, target: Floats, begin: int, end: int, mode: int, recent: Recent,
+    offset: int, last: int,
+) -> None:  # fmt: skip
+    """Compute a bounded operator at begin … end - 1, the extremum of `source` over each window."""
+    code = node[codes.NODE_CODE]
+    is_greatest = code in (codes.PART_WINDOW_MAX, codes.PAST_WINDOW_MAX)
+    if looks_ahead(code) and is_decided(node, mode):
+        first = min(max(_first_open(node, recent, offset, last), begin), end)
+        fill(target[first - offset : end - offset], beyond(mode, node[codes.NODE_WEAK]))
+        end = first
+    if begin >= end:
+        return
+    if node[codes.NODE_UNIT] != codes.SAMPLES:
+        _find_ends(node, begin, end, recent, offset, last)
+        _slide_unevenly(is_greatest, source, target, begin, end, recent, offset)
+        return
+    near, width = node[codes.NODE_LOW], node[codes.NODE_HIGH] - node[codes.NODE_LOW] + 1
+    if looks_ahead(code):
+        width = min(width, last - (begin + near) + 1)
+        first = begin + near
+    else:
+        width = min(width, end - 1 - near - offset + 1)
+        first = begin - near - width + 1
+    _slide_evenly(is_greatest, source, target, begin, end, first, width, recent.extrema, offset, last)
+
+
+@uncounted
+def run_shift(
+    node: Integers, source: Floats, target: Floats, begin: int, end: int, mode: int, recent: Recent,
+    offset: int, last: int,
+) -> None:  # fmt: skip
+    """Compute a shift or a delay at begin … end - 1: `source` at a distance ahead or behind."""
+    unit, distance, timed = node[codes.NODE_UNIT], node[codes.NODE_LOW], node[codes.NODE_TIMED]
+    is_ahead = node[codes.NODE_CODE] == codes.SHIFT
+    missing = beyond(mode if is_ahead else codes.OPEN_END, node[codes.NODE_WEAK])
+    for position in range(begin, end):
+        if not is_ahead:
+            at = behind(recent.stamps, offset, position, unit, distance)
+        elif unit == codes.SAMPLES:
+            at = position + distance
+        elif position < recent.window_next[timed, 1]:
+            at = recent.window_ends[timed, 0, position - offset]
+        else:
+            at = last + 1
+        target[position - offset] = source[at - offset] if offset <= at <= last else missing
