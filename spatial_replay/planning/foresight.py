@@ -7,6 +7,7 @@ arranged together.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -15,6 +16,7 @@ from typing import Final
 
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.guards import Transition
+from spatial_replay.geometry.footprint import TrackedObject
 from spatial_replay.planning.arrangements import Arranger, Cell
 from spatial_replay.planning.candidates import Movables, by_cost
 from spatial_replay.planning.decisions import Candidate, Consideration, Edge, Reason, Target
@@ -37,7 +39,7 @@ from spatial_replay.planning.edges import (
 )
 from spatial_replay.planning.expectations import Expectations, Foreseen
 from spatial_replay.planning.map_layers import AVOIDED_CELLS
-from spatial_replay.planning.maps import concerns, gradient_map, proposition_maps
+from spatial_replay.planning.maps import centre_of, concerns, gradient_map, proposition_maps
 from spatial_replay.planning.ordering import MotionOrder
 from spatial_replay.planning.settings import Settings
 from spatial_replay.spec.formula import Formula, Outline
@@ -49,6 +51,8 @@ _MOST_EDGES: Final = 12
 """The most edges that are tried from one state that is foreseen."""
 _MOST_ORDERED: Final = 6
 """The most arrangements of which the order of motions is looked for."""
+_STILL_TURN: Final = math.radians(1.0)
+"""The widest turn of an object that stays as it is."""
 _STRICTLY: Final = 1e-12
 """What a constraint has to stay away from holding at least: at 0 it does."""
 
@@ -295,11 +299,28 @@ class Foresight:
         cells: Mapping[str, Cell],
     ) -> Iterator[tuple[tuple[Target, ...], tuple[Foreseen, int]]]:
         """Yield the motions to an arrangement, in an order in which each is possible."""
+        if self._settings.rules > 3:
+            cells = self._without_staying(scene, about, cells)
         poses = {name: about.pose(name, cell) for name, cell in cells.items()}
         robustness = self._expected.robustness(about.sample_with(cells), aims[0].guard)
         order = MotionOrder(self._expected, scene, aims, consideration, poses, robustness)
         if (found := order.found()) is not None:
             yield found.motions, (found.scene, found.state)
+
+    def _without_staying(
+        self, scene: Foreseen, about: Arranger, cells: Mapping[str, Cell]
+    ) -> Mapping[str, Cell]:
+        """Return an arrangement without the objects that may as well stay where they are."""
+        for name in list(cells):
+            tracked, (x, y, turn) = scene.sample.objects[name], about.pose(name, cells[name])
+            others = {other: cell for other, cell in cells.items() if other != name}
+            if not isinstance(tracked, TrackedObject) or abs(turn) > _STILL_TURN:
+                continue
+            away = math.dist((x, y), centre_of(tracked.footprint))
+            is_near = away <= self._settings.workspace.grid.cell_size
+            if is_near and about.meets(about.sample_with(others)):
+                cells = others
+        return cells
 
     def _begun(
         self,
