@@ -23,6 +23,7 @@ from spatial_replay.geometry.footprint import TrackedObject
 from spatial_replay.planning.demands import Budget, Demand, surplus, values_in, with_moved
 from spatial_replay.planning.maps import centre_of, concerns, moved_object, proposition_maps, radius_of
 from spatial_replay.planning.settings import Settings
+from spatial_replay.planning.targets import cell_hint
 from spatial_replay.planning.workspace import Grid, Workspace
 from spatial_replay.spec.formula import Atom, Formula, Outline, Quantified, SignedDistance, TrackedName
 from spatial_replay.spec.walks import base_of, iter_formulas, terms_of
@@ -36,6 +37,8 @@ _MOST_SOLUTIONS: Final = 6
 """The most arrangements of one set of objects."""
 _WIDEST: Final = 150_000
 """The most cells of a stencil, over all orientations; pairs with a larger one are compared at the end."""
+_MOST_NAMED: Final = 3
+"""The most things that a sentence names."""
 _ENOUGH: Final = 0.5
 """The share of its cells that each other object keeps after a choice by robustness."""
 
@@ -51,6 +54,7 @@ class _Field:
         turns: (A,) angles in radians.
         open: (A, rows, columns), whether the robot reaches a cell and nothing immovable stands there.
         clearance: (A, rows, columns), distance to what cannot be moved.
+        standing: for each thing that cannot be moved, "" for the workspace's obstacles, the distance to it.
         apart: for each other movable object in the way, the distance to it less the clearance needed.
         surplus: for each demand about the object, that with everything else where it is.
     """
@@ -58,12 +62,17 @@ class _Field:
     turns: Floats
     open: Booleans
     clearance: Floats
+    standing: Mapping[str, Floats]
     apart: Mapping[str, Floats]
     surplus: Mapping[Demand, Floats]
 
 
 class Arranger:
-    """The arrangements of movable objects in one sample that meet demands."""
+    """The arrangements of movable objects in one sample that meet demands.
+
+    Attributes:
+        is_tight: whether an object was found that has a place between cells only.
+    """
 
     def __init__(
         self,
@@ -82,6 +91,7 @@ class Arranger:
         self._about = {each: self._names(each) for each in self._demands}
         self._fields: dict[str, _Field] = {}
         self._visits = 0
+        self.is_tight = False
 
     def _names(self, demand: Demand) -> tuple[str, ...]:
         return tuple(name for name in self._movable if concerns(demand.formula, name))
@@ -101,10 +111,59 @@ class Arranger:
             own = [each for each in self._demands if self._about[each] == (name,)]
             if own and any(each in self._unmet for each in own) and (field := self._field(name)) is not None:
                 met = np.minimum.reduce([field.surplus[each] for each in own])
-                if not (field.open & (met >= 0.0)).any():
+                if not (field.open & (met >= 0.0)).any() and not self._fits_between(name, field, own):
+                    if self._settings.rules > 3 and (met >= 0.0).any():
+                        stands = _listed(self._standing(field, met >= 0.0))
+                        return f"{stands or 'the robot does not reach'} wherever {name} would have to be"
                     best = max(float(met[field.open].max(initial=-math.inf)), -math.inf)
-                    return f"{name}: nowhere would all of it hold, {-best:.4g} is missing at best"
+                    hint = cell_hint(-best, self._settings)
+                    return f"{name}: nowhere would all of it hold, {-best:.4g} is missing at best{hint}"
         return ""
+
+    def _fits_between(self, name: str, field: _Field, own: Sequence[Demand]) -> bool:
+        """Return whether an object has a place between cells where demands hold, if targets are refined."""
+        workspace, tracked = self._settings.workspace, self._movable[name]
+        if self._settings.rules < 4 or not self._settings.refine or self._settings.skill == "push":
+            return False
+        met = np.minimum.reduce([field.surplus[each] for each in own])
+        score = np.where(
+            workspace.within_reach(self._grid),
+            np.minimum(met, field.clearance - workspace.clearance),
+            -np.inf,
+        )
+        turn, row, column = np.unravel_index(int(np.argmax(score)), score.shape)
+        if score[turn, row, column] < -self._grid.cell_size or not self._budget.spend():
+            return False
+        x, y = self._grid.centre(int(row), int(column))
+        size, yaw = self._grid.cell_size / 8.0, (tracked.yaw or 0.0) + float(field.turns[turn])
+        supports = workspace.supports | {each for each in self._movable if each != name}
+        yaws = (yaw,) if workspace.yaws else ()
+        free = replace(workspace, supports=supports, yaws=yaws, keeps_yaw=False)
+        grid = Grid(x - 8.5 * size, y - 8.5 * size, size, 17, 17)
+        formulas = [each.formula for each in own]
+        maps = proposition_maps(formulas, self._regions, self._sample, name, free, grid)
+        good = (maps.clearance > workspace.clearance) & workspace.grid.contains(grid.centres()).reshape(
+            grid.shape
+        )
+        for each, low, high in zip(own, maps.lower, maps.upper, strict=True):
+            good &= ((low if each.wanted else -high) - each.least) >= 0.0
+        self.is_tight |= bool(good.any())
+        return bool(good.any())
+
+    def what_stands(self) -> str:
+        """Return what cannot be moved and stands where objects could go, as a sentence; "" for nothing."""
+        names: dict[str, None] = {}
+        for name, field in self._fields.items():
+            wanted = self._met(field, name, tuple(self._movable))
+            if not wanted.all():
+                names |= dict.fromkeys(self._standing(field, wanted))
+        return f"{_listed(list(names))} there" if names else ""
+
+    def _standing(self, field: _Field, wanted: Booleans) -> list[str]:
+        """Return what cannot be moved and stands in some cells, what is in most of them first."""
+        clearance = self._settings.workspace.clearance
+        counts = {each: int((wanted & (away <= clearance)).sum()) for each, away in field.standing.items()}
+        return sorted((each for each in counts if counts[each]), key=lambda each: -counts[each])
 
     def arrangements(self, most: int) -> Iterator[dict[str, Cell]]:
         """Yield arrangements of the least sets of objects first.
@@ -196,7 +255,8 @@ class Arranger:
         measured = zip(others, maps.lower[len(about) :], strict=True)
         apart = {other: low - workspace.clearance for other, low in measured}
         is_open = (maps.clearance > workspace.clearance) & workspace.within_reach(maps.grid)
-        return _Field(maps.turns, is_open, maps.clearance, apart, met)
+        standing = dict(zip(maps.obstacles, maps.distances, strict=True))
+        return _Field(maps.turns, is_open, maps.clearance, standing, apart, met)
 
     def _met(self, field: _Field, name: str, chosen: tuple[str, ...]) -> Booleans:
         """Return the cells where the demands hold that no other chosen object matters to."""
@@ -363,6 +423,13 @@ class Arranger:
         values = values_in(sample, [each.formula for each in self._demands], self._regions)
         columns = zip(self._demands, *values, strict=True)
         return all(surplus(low, high, each) >= 0.0 for each, low, high in columns)
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Return the first of some things as the beginning of a sentence about what cannot be moved."""
+    said = [each or "an obstacle of the workspace" for each in names[:_MOST_NAMED]]
+    verb = "stand" if len(said) > 1 else "stands"
+    return f"{' and '.join(said)}, which cannot be moved, {verb}" if said else ""
 
 
 def _best(among: Booleans, values: Floats, then: Floats) -> Cell:

@@ -206,8 +206,12 @@ def worst_state(automaton: Automaton, states: Iterable[int]) -> int | None:
     return max(distances, key=lambda state: (distances[state], -state), default=None)
 
 
-def why_no_path(automaton: Automaton, state: int, pruned: Mapping[Edge, Reason]) -> str:
-    """Return the sentence that every path from a state was pruned, with edges for each kind of reason."""
+def why_no_path(automaton: Automaton, state: int, pruned: Mapping[Edge, Reason], why: str = "") -> str:
+    """Return the sentence that every path from a state was pruned, with edges for each kind of reason.
+
+    Args:
+        why: what cannot be done; without it, what has to come after one of the edges.
+    """
     ahead, reachable = [state], {state}
     while ahead:
         after = set(automaton.successors[ahead.pop()]) - reachable
@@ -221,7 +225,7 @@ def why_no_path(automaton: Automaton, state: int, pruned: Mapping[Edge, Reason])
     later = [
         each.detail for edge, each in sorted(pruned.items()) if edge[0] in reachable and each.kind == LATER
     ]
-    what = f"; what cannot be done: {later[0]}" if later else ""
+    what = f"; what cannot be done: {why or later[0]}" if why or later else ""
     return f"no path left: every way from state {state} was given up ({reasons}){what}"
 
 
@@ -258,6 +262,11 @@ class Attempts:
         self._left: dict[Edge, int] = {}
         self._motions: list[FailedMotion] = []
         self._begin: tuple[Sample, Settings] | None = None
+
+    @property
+    def are_any(self) -> bool:
+        """Whether anything was tried."""
+        return bool(self._total)
 
     def why_exhausted(self, edge: Edge, most_failed: int) -> Reason | None:
         """Return why an edge is not tried again; None if it may be."""

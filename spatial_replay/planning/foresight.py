@@ -42,11 +42,14 @@ from spatial_replay.planning.map_layers import AVOIDED_CELLS
 from spatial_replay.planning.maps import centre_of, concerns, gradient_map, proposition_maps
 from spatial_replay.planning.ordering import MotionOrder
 from spatial_replay.planning.settings import Settings
+from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Formula, Outline
 from spatial_replay.trace.sample import Sample
 
 MOST_MAPS: Final = 150
 """The most maps that looking ahead computes for one decision."""
+_MOST_WHY_NOT: Final = 60
+"""The most maps that are computed to say what cannot be done."""
 _MOST_EDGES: Final = 12
 """The most edges that are tried from one state that is foreseen."""
 _MOST_ORDERED: Final = 6
@@ -390,24 +393,74 @@ class Foresight:
     @cached_property
     def _hopeless(self) -> frozenset[Edge]:
         """The edges that need what no arrangement of the objects can bring about."""
-        if self._first is None or not self._automaton.is_listable:
+        return self._needing(self._hopeless_literals)
+
+    def _needing(self, literals: Collection[tuple[int, bool]]) -> frozenset[Edge]:
+        """Return the edges that cannot be taken without some of these values of propositions."""
+        if not self._automaton.is_listable:
             return frozenset()
+        return frozenset(
+            (each.source, each.target)
+            for each in self._automaton.transitions
+            if all(any(literal in literals for literal in cube) for cube in each.guard)
+        )
+
+    @cached_property
+    def _hopeless_literals(self) -> tuple[tuple[int, bool], ...]:
+        """The values of propositions that no arrangement of the objects can bring about."""
+        if self._first is None or not self._automaton.is_listable:
+            return ()
         symbol = self._expected.symbol(self._first)
         literals = {
             literal for each in self._automaton.transitions for cube in each.guard for literal in cube
         }
-        hopeless: set[tuple[int, bool]] = set()
+        hopeless: list[tuple[int, bool]] = []
         budget = Budget(MOST_MAPS)
         for number, wanted in sorted(literals):
             if symbol[number] is (not wanted) and budget.left > 0:
                 why = self._why_hopeless(self._first.sample, number, wanted, budget)
                 if why:
-                    hopeless.add((number, wanted))
+                    hopeless.append((number, wanted))
                     self._why[f"{self._automaton.propositions[number].literal(wanted)}: {why}"] = None
-        return frozenset(
-            (each.source, each.target)
-            for each in self._automaton.transitions
-            if all(any(literal in hopeless for literal in cube) for cube in each.guard)
+        return tuple(hopeless)
+
+    def why_not(self, state: int) -> str:
+        """Return what every path to acceptance needs and cannot hold, and what stands there.
+
+        Without such a thing, as far as it is looked for, return "".
+        """
+        if self._first is None or self._settings.rules < 4:
+            return ""
+        for literal in self._hopeless_literals:
+            if next(self._automaton.paths(state, self._needing({literal})), None) is None:
+                return self._why_never(self._first.sample, literal)
+        return ""
+
+    def _why_never(self, sample: Sample, literal: tuple[int, bool]) -> str:
+        """Return what of a proposition cannot hold in any arrangement, and what stands there."""
+        budget = Budget(_MOST_WHY_NOT)
+        every = demands_of((literal,), self._formulas, self._settings.margin)
+        demands = next(iter(every), ())
+        # without any of those that are left, the others could hold
+        core = list(demands)
+        for each in reversed(demands):
+            fewer = tuple(other for other in core if other != each)
+            if fewer and budget.left > 0 and not self._is_possible(sample, fewer, budget):
+                core = list(fewer)
+        about = Arranger(sample, self._regions, self._settings, core, budget)
+        what = " and ".join(_text_of(each) for each in core)
+        if why := about.why_hopeless():
+            return f"{what}: {why}"
+        stands = about.what_stands()
+        said = "no places were found for all at once", stands, "smaller cells (cell_size) may help"
+        return f"{what}: {'; '.join(filter(None, said))}"
+
+    def _is_possible(self, sample: Sample, demands: Sequence[Demand], budget: Budget) -> bool:
+        """Return whether demands hold in some arrangement, as far as that is looked for."""
+        about = Arranger(sample, self._regions, self._settings, demands, budget)
+        why = about.why_hopeless()
+        return about.is_tight or (
+            not why and next(about.arrangements(self._settings.motions), None) is not None
         )
 
     def _why_hopeless(self, sample: Sample, number: int, wanted: bool, budget: Budget) -> str:
@@ -415,12 +468,19 @@ class Foresight:
         for demands in demands_of(((number, wanted),), self._formulas, self._settings.margin):
             about = Arranger(sample, self._regions, self._settings, demands, budget)
             why = about.why_hopeless()
+            if about.is_tight:
+                return ""
             if not why:
                 found = next(about.arrangements(self._settings.motions), None)
                 if found is not None or budget.left <= 0:
                     return ""
                 why = "no arrangement of objects brings it about"
         return why
+
+
+def _text_of(demand: Demand) -> str:
+    text = format_formula(demand.formula)
+    return text if demand.wanted else f"not ({text})"
 
 
 def _chosen(consideration: Consideration, number: int, motions: tuple[Target, ...]) -> Consideration:

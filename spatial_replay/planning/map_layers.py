@@ -198,7 +198,7 @@ def _causes(gradient: GradientMap, avoided: Booleans) -> tuple[tuple[BlockedBy, 
     held = blocked == CONSTRAINED
     texts: tuple[str, ...] = ()
     if held.any():
-        texts, which = _most_dangerous(gradient.made_of, blocked.shape)
+        texts, which = most_dangerous(gradient.made_of, blocked.shape)
         codes[held] += which[held]
     codes[(blocked == FREE) & avoided] = _FAILED * _NUMBERS
     found, counts = np.unique(codes[codes >= 0], return_counts=True)
@@ -215,7 +215,7 @@ def _causes(gradient: GradientMap, avoided: Booleans) -> tuple[tuple[BlockedBy, 
     return tuple(causes[:MOST_CAUSES]), blocked_by
 
 
-def _most_dangerous(parts: MapParts, shape: tuple[int, ...]) -> tuple[tuple[str, ...], NDArray[np.int64]]:
+def most_dangerous(parts: MapParts, shape: tuple[int, ...]) -> tuple[tuple[str, ...], NDArray[np.int64]]:
     """Return what may hold of the constraint set, as text, and by number that with the greatest robustness.
 
     A guard of one proposition is split into those of its parts of which any one makes it hold.

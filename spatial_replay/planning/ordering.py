@@ -14,7 +14,6 @@ import numpy as np
 
 from spatial_replay.automata.guards import Transition
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
-from spatial_replay.planning.candidates import nearest_target, points_along, target_in
 from spatial_replay.planning.decisions import Consideration, Target
 from spatial_replay.planning.demands import Budget, Demand, Pose, demands_of, with_moved, with_objects
 from spatial_replay.planning.edges import BESIDE
@@ -31,6 +30,7 @@ from spatial_replay.planning.maps import (
     proposition_maps,
     radius_of,
 )
+from spatial_replay.planning.targets import nearest_target, points_along, target_in
 from spatial_replay.spec.formula import Atom, SignedDistance, TrackedName
 
 _MOST_PARKED: Final = 2

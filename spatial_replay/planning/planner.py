@@ -24,6 +24,7 @@ from spatial_replay.planning.decisions import (
     Step,
 )
 from spatial_replay.planning.edges import (
+    LATER,
     Attempts,
     Observer,
     Symbol,
@@ -294,7 +295,13 @@ class Planner:
             edge = consideration.edge
             self._pruned[edge] = reason
             pruned |= {edge, *equivalent_edges(self.automaton, consideration, idle, pruned, self._symbol)}
-        return self._decided("no path", considered, why_no_path(self.automaton, state, self._pruned))
+        why = ""
+        if foresight is not None and self.settings.rules > 3 and not self._attempts.are_any:
+            first = considered[0].pruned if considered else None
+            is_later = any(each.kind == LATER for each in self._pruned.values())
+            why = foresight.why_not(state) or ("" if first is None or is_later else first.detail)
+        said = why_no_path(self.automaton, state, self._pruned, why)
+        return self._decided("no path", considered, said)
 
     def _considered(
         self,

@@ -1,0 +1,433 @@
+"""Targets: the best cell of an object's gradient map, or the nearest good cell that it can be pushed to.
+
+A target is then refined: from the middle of its cell to a better place and turn nearby, on finer grids.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import replace
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+
+from spatial_replay.geometry.arrays import Booleans, Floats
+from spatial_replay.geometry.footprint import TrackedObject
+from spatial_replay.planning.decisions import Target
+from spatial_replay.planning.map_layers import avoided_cells
+from spatial_replay.planning.maps import (
+    CONSTRAINED,
+    FREE,
+    OUT_OF_REACH,
+    REASONS,
+    GradientMap,
+    centre_of,
+    danger_of,
+    proposition_maps,
+    radius_of,
+)
+from spatial_replay.planning.paths import Path, shortest_path
+from spatial_replay.planning.settings import Settings
+from spatial_replay.planning.workspace import Grid
+
+_COARSEST: Final = 0.5
+"""The first distance between places, in cells."""
+_HALVED: Final = 4
+"""How often that distance is halved."""
+_MOST_GRIDS: Final = 12
+"""The most grids that are measured for one target."""
+_FARTHEST: Final = 2.0
+"""How far a target moves from the middle of its cell at most, in cells, along x and along y."""
+_SAME: Final = 0.25
+"""How near to a pose another one counts as the same, in cells."""
+_SAME_TURN: Final = math.radians(3.0)
+_BETTER: Final = 1e-9
+"""How much robustness a move has to gain."""
+
+_ASIDE: Final = math.radians(35.0)
+"""How far aside another push begins from a direction in which one failed at once."""
+_SWEPT: Final = math.radians(10.0)
+"""The widest angle between orientations that are looked at while an object turns on the spot."""
+
+Measured = Callable[[Grid, tuple[float, ...]], tuple[GradientMap, Floats]]
+"""Gives the map of an object over a grid in some orientations (yaws), and its room there."""
+
+
+def find_target(
+    gradient: GradientMap,
+    tracked: TrackedObject,
+    settings: Settings,
+    room: Floats,
+    failed: Collection[tuple[float, float]] = (),
+    failures: Sequence[Target] = (),
+) -> Target | str:
+    """Return the target for an object, or why there is none.
+
+    Args:
+        gradient: the map of the progress set.
+        tracked: the object before the motion.
+        room: (A, rows, columns), the distance to what room is kept from.
+        failed: places (x, y) where earlier attempts failed.
+        failures: targets for which motions failed while everything stood as it does.
+    """
+    holds = (gradient.blocked == FREE) & (gradient.robustness >= settings.margin)
+    good = holds & ~avoided_cells(gradient, settings, failed)
+    if not good.any():
+        return _why_nowhere(gradient, settings, bool(failed))
+    if settings.skill == "place":
+        # near a cell that was tried, a refined target may still be another one
+        untried = good & ~tried(gradient, failures, settings)
+        good = untried if untried.any() else good
+        return _best_cell(gradient, good & (room >= settings.room), good, tracked)
+    return _nearest_cell(gradient, good, tracked, settings, failures)
+
+
+def target_in(
+    gradient: GradientMap,
+    tracked: TrackedObject,
+    settings: Settings,
+    pose: tuple[float, float, float],
+    failures: Sequence[Target] = (),
+) -> Target | str:
+    """Return the target for an object at one pose (x, y, turn) of a map, or why it cannot get there."""
+    place = gradient.cell_of(*pose)
+    if gradient.blocked[place] != FREE:
+        return REASONS[gradient.blocked[place]]
+    only = np.zeros(gradient.blocked.shape, np.bool_)
+    only[place] = True
+    if settings.skill == "place":
+        return _target(gradient, tracked, place, (centre_of(tracked.footprint), pose[:2]))
+    return _nearest_cell(gradient, only, tracked, settings, failures)
+
+
+def nearest_target(
+    gradient: GradientMap,
+    good: np.ndarray,
+    tracked: TrackedObject,
+    settings: Settings,
+    failures: Sequence[Target] = (),
+) -> Target | str:
+    """Return the target in the nearest of some cells (A, rows, columns), or why there is none."""
+    if not good.any():
+        return "there is no place for it"
+    if settings.skill == "push":
+        return _nearest_cell(gradient, good, tracked, settings, failures)
+    here = centre_of(tracked.footprint)
+    away = np.hypot(*(gradient.grid.centres() - np.array(here)).T).reshape(gradient.grid.shape)
+    values = np.where(good, -away, -np.inf)
+    turn, row, column = (int(index) for index in np.unravel_index(int(np.argmax(values)), values.shape))
+    return _target(gradient, tracked, (turn, row, column), (here, gradient.grid.centre(row, column)))
+
+
+def points_along(waypoints: Sequence[tuple[float, float]], step: float) -> Iterator[tuple[float, float]]:
+    """Yield points on a way, no farther apart than a step."""
+    yield waypoints[0]
+    for (u, v), (x, y) in pairwise(waypoints):
+        count = max(1, math.ceil(math.dist((u, v), (x, y)) / step))
+        yield from ((u + k / count * (x - u), v + k / count * (y - v)) for k in range(1, count + 1))
+
+
+def _best_cell(gradient: GradientMap, roomy: np.ndarray, good: np.ndarray, tracked: TrackedObject) -> Target:
+    values = np.where(roomy if roomy.any() else good, gradient.robustness, -np.inf)
+    turn, row, column = (int(index) for index in np.unravel_index(int(np.argmax(values)), values.shape))
+    here, there = centre_of(tracked.footprint), gradient.grid.centre(row, column)
+    return _target(gradient, tracked, (turn, row, column), (here, there))
+
+
+def _nearest_cell(
+    gradient: GradientMap,
+    good: np.ndarray,
+    tracked: TrackedObject,
+    settings: Settings,
+    failures: Sequence[Target],
+) -> Target | str:
+    here = centre_of(tracked.footprint)
+    if not gradient.grid.contains(np.array(here)):
+        return "it lies too far outside the workspace"
+    cell = gradient.grid.cell(*here)
+    towards = _failed_directions(gradient.grid, tracked, failures)
+    entry = _path_into_reach(gradient, cell, settings, towards)
+    if entry is None:
+        return "no free path leads into reach" + _but_for(failures)
+    row, column = entry.cells[-1].tolist()
+    free = (gradient.blocked[0] == FREE) & ~towards
+    path, turned = shortest_path(free, (row, column), good[0]), 0
+    if path is None:
+        # it is turned at the end of its path, and only if that is needed
+        for layer in range(1, len(gradient.turns)):
+            goals = _turnable(gradient, layer, good[layer] & free, settings)
+            other = shortest_path(free, (row, column), goals)
+            if other is not None and (path is None or other.length < path.length):
+                path, turned = other, layer
+    if path is None:
+        return "no free path leads to a good place" + _but_for(failures)
+    cells = [(row, column) for row, column in (*entry.cells.tolist(), *path.cells[1:].tolist())]
+    # an object off the middle of its cell need not visit that middle first
+    first = 1 if cells[0] == cell and len(cells) > 1 else 0
+    turns = [gradient.grid.centre(*each) for each in cells[first:]]
+    return _target(gradient, tracked, (turned, *cells[-1]), (here, *turns))
+
+
+def _turnable(gradient: GradientMap, layer: int, goals: Booleans, settings: Settings) -> Booleans:
+    """Return in which of some cells (rows, columns) an object can be turned to the orientation of a layer."""
+    able = np.zeros(goals.shape, np.bool_)
+    if goals.any():
+        low, left = np.argwhere(goals).min(axis=0).tolist()
+        high, right = (np.argwhere(goals).max(axis=0) + 1).tolist()
+        grid, size = gradient.grid, gradient.grid.cell_size
+        corner = grid.xmin + left * size, grid.ymin + low * size
+        around, turn = Grid(*corner, size, right - left, high - low), float(gradient.turns[layer])
+        able[low:high, left:right] = can_turn_in(around, gradient, turn, settings)
+    return able & goals
+
+
+def can_turn_in(grid: Grid, gradient: GradientMap, turn: float, settings: Settings) -> Booleans:
+    """Return (rows, columns): whether a map's object can turn on the spot in each cell of a grid.
+
+    Nothing stands in its way there, and no constraint holds, in orientations every few degrees in between.
+    """
+    count = math.ceil(abs(turn) / _SWEPT)
+    about = gradient.made_of.now.about
+    tracked = about.sample.objects[gradient.name]
+    here = (tracked.yaw or 0.0) if isinstance(tracked, TrackedObject) else 0.0
+    yaws = tuple(here + turn * number / count for number in range(1, count))
+    if not yaws:
+        return np.ones(grid.shape, np.bool_)
+    workspace = replace(settings.workspace, yaws=yaws, keeps_yaw=False)
+    maps = proposition_maps(*about, gradient.name, workspace, grid)
+    is_kept = danger_of(maps, gradient.made_of.constraints) < -settings.constraint_margin
+    return np.asarray(((maps.clearance > workspace.clearance) & is_kept).all(axis=0))
+
+
+def _but_for(failures: Sequence[Target]) -> str:
+    return ", other than by motions that failed" if failures else ""
+
+
+def _failed_directions(grid: Grid, tracked: TrackedObject, failures: Sequence[Target]) -> Booleans:
+    """Return (rows, columns): where a path would begin in about a direction in which a push failed."""
+    towards = np.zeros(grid.shape, np.bool_)
+    here, radius = centre_of(tracked.footprint), radius_of(tracked)
+    offsets = (grid.centres() - np.array(here)).reshape(*grid.shape, 2)
+    away = np.hypot(offsets[..., 0], offsets[..., 1])
+    for each in failures:
+        angle = _beginning(each, radius)
+        along = offsets @ np.array([math.cos(angle), math.sin(angle)])
+        towards |= (away > grid.cell_size) & (away <= radius) & (along >= math.cos(_ASIDE) * away)
+    return towards
+
+
+def cell_hint(missing: float, settings: Settings) -> str:
+    """Return that smaller cells may help, if less than a cell is missing, and nothing looks between cells."""
+    looks_between = settings.rules < 4 or (settings.refine and settings.skill == "place")
+    is_close = missing <= settings.workspace.grid.cell_size
+    return "" if looks_between or not is_close else "; smaller cells (cell_size) may help"
+
+
+def begins_as(target: Target, failures: Sequence[Target], tracked: TrackedObject) -> bool:
+    """Return whether a push begins in about the direction of one that failed."""
+    radius = radius_of(tracked)
+    begins = _beginning(target, radius)
+    turned = (math.remainder(begins - _beginning(each, radius), math.tau) for each in failures)
+    return any(abs(each) < _ASIDE / 2.0 for each in turned)
+
+
+def _beginning(target: Target, distance: float) -> float:
+    """Return the angle in which a way begins: that to its first point at a distance, or to its end."""
+    begin, points = target.waypoints[0], points_along(target.waypoints, distance / 8.0)
+    x, y = next((each for each in points if math.dist(each, begin) >= distance), target.waypoints[-1])
+    return math.atan2(y - begin[1], x - begin[0])
+
+
+def _path_into_reach(
+    gradient: GradientMap, cell: tuple[int, int], settings: Settings, towards: Booleans
+) -> Path | None:
+    """Return the path to the nearest free cell.
+
+    Cells out of reach may be crossed only if the path starts in one. From a cell where a constraint would
+    hold, such cells may be crossed too, but no occupied ones; from an occupied cell the path first jumps to
+    the nearest cell that is not.
+    """
+    free = gradient.blocked[0] == FREE
+    is_reached = settings.workspace.within_reach(gradient.grid)[cell]
+    passable = free if is_reached else free | (gradient.blocked[0] == OUT_OF_REACH)
+    if not passable[cell]:
+        empty = gradient.clearance[0] > settings.workspace.clearance
+        passable = passable | (empty & (gradient.blocked[0] == CONSTRAINED))
+    passable = passable & ~towards
+    return shortest_path(passable, cell if passable[cell] else _nearest(passable, cell), free)
+
+
+def _nearest(cells: np.ndarray, cell: tuple[int, int]) -> tuple[int, int]:
+    """Return the one of some cells that is nearest to another cell."""
+    places = np.argwhere(cells)
+    row, column = places[int(np.argmin(((places - np.array(cell)) ** 2).sum(axis=1)))].tolist()
+    return row, column
+
+
+def _target(
+    gradient: GradientMap,
+    tracked: TrackedObject,
+    place: tuple[int, int, int],
+    waypoints: tuple[tuple[float, float], ...],
+) -> Target:
+    x, y = waypoints[-1]
+    turn = float(gradient.turns[place[0]])
+    yaw = None if tracked.yaw is None else tracked.yaw + turn
+    return Target(gradient.name, x, y, turn, yaw, waypoints, float(gradient.robustness[place]))
+
+
+def _why_nowhere(gradient: GradientMap, settings: Settings, has_failed: bool) -> str:
+    enough = gradient.robustness >= settings.margin
+    if not enough.any():
+        best = float(gradient.robustness.max())
+        hint = cell_hint(settings.margin - best, settings)
+        return f"nowhere would it hold: {best:.4g} at best, {settings.margin:.4g} needed{hint}"
+    counts = np.bincount(gradient.blocked[enough], minlength=len(REASONS))
+    if counts[FREE] and has_failed:
+        return "it was tried wherever it would hold"
+    reasons = zip(counts[1:].tolist(), REASONS[1:], strict=True)
+    listed = ", ".join(f"{count} cells: {reason}" for count, reason in reasons if count)
+    return f"blocked wherever it would hold: {listed}"
+
+
+# ------------------------------------------------------------------------------------------------ refined
+
+
+def between_cells(
+    gradient: GradientMap,
+    tracked: TrackedObject,
+    settings: Settings,
+    measured: Measured,
+    failures: Sequence[Target] = (),
+) -> Target | None:
+    """Return a target between cells, if no cell of a map is good enough but a place near the best one is.
+
+    A compass search as in `refined`, until nothing is missing. Only placed objects have such targets, since
+    no path over cells leads there.
+    """
+    missing, size = _missing(gradient, settings), settings.workspace.grid.cell_size
+    place = tuple(map(int, np.unravel_index(int(np.argmin(missing)), missing.shape)))
+    least = float(missing[place])
+    if settings.skill == "push" or not 0.0 < least <= size:
+        return None
+    (x, y), turn, spacing = (
+        gradient.grid.centre(*place[1:]),
+        float(gradient.turns[place[0]]),
+        _COARSEST * size,
+    )
+    yaws = ((tracked.yaw or 0.0) + turn,) if settings.workspace.yaws else ()
+    while spacing >= _COARSEST * size / 2.0**_HALVED:
+        near, _ = measured(Grid(x - 2.5 * spacing, y - 2.5 * spacing, spacing, 5, 5), yaws)
+        missing = _missing(near, settings)
+        place = tuple(map(int, np.unravel_index(int(np.argmin(missing)), missing.shape)))
+        if missing[place] >= least:
+            spacing /= 2.0
+            continue
+        least, (x, y) = float(missing[place]), near.grid.centre(*place[1:])
+        if near.blocked[place] == FREE and near.robustness[place] > settings.margin + _BETTER:
+            here, yaw = centre_of(tracked.footprint), None if tracked.yaw is None else tracked.yaw + turn
+            found = Target(gradient.name, x, y, turn, yaw, (here, (x, y)), float(near.robustness[place]))
+            return refined(found, tracked, settings, measured, failures)
+    return None
+
+
+def _missing(gradient: GradientMap, settings: Settings) -> Floats:
+    """Return (A, rows, columns): what is missing of progress, clearance or distance to constraints."""
+    workspace, parts = settings.workspace, gradient.made_of
+    missing = np.maximum(settings.margin - gradient.robustness, workspace.clearance - gradient.clearance)
+    missing = np.maximum(missing, danger_of(parts.now, parts.constraints) + settings.constraint_margin)
+    return np.where(workspace.within_reach(gradient.grid), missing, np.inf)
+
+
+def refined(
+    target: Target,
+    tracked: TrackedObject,
+    settings: Settings,
+    measured: Measured,
+    failures: Sequence[Target] = (),
+) -> Target:
+    """Return the target with the most robustness near a target, or the same one.
+
+    A compass search: the best of 5 x 5 places around the newest one, in up to three turns, and closer ones
+    once none is better. Places are free, as that of the target is, and have the preferred room if that has.
+
+    Args:
+        tracked: the object before the motion.
+        measured: measures maps around the target.
+        failures: targets for which motions failed; others are taken if there are any.
+    """
+    size = settings.workspace.grid.cell_size
+    spacing, turning, halved = _COARSEST * size, _widest_turn(target, tracked, settings) / 2.0, 0
+    pose, best, least = (target.x, target.y, target.turn), target.robustness, -math.inf
+    if is_repeated(target, failures, settings):
+        # any other place that is good enough is better
+        best = settings.margin - 2.0 * _BETTER
+    for number in range(_MOST_GRIDS):
+        x, y, turn = pose
+        low = x - 2.5 * spacing, y - 2.5 * spacing
+        turns = [0.0] if turning == 0.0 else [-turning, 0.0, turning]
+        yaws = tuple((tracked.yaw or 0.0) + turn + each for each in turns) if settings.workspace.yaws else ()
+        gradient, room = measured(Grid(*low, spacing, 5, 5), yaws)
+        if number == 0:
+            middle = len(gradient.turns) // 2, 2, 2
+            least = settings.room if room[middle] >= settings.room else -math.inf
+        good = (gradient.blocked == FREE) & (room >= least) & _near(gradient, target, tracked, settings)
+        good &= ~tried(gradient, failures, settings)
+        values = np.where(good, gradient.robustness, -np.inf)
+        place = tuple(map(int, np.unravel_index(int(np.argmax(values)), values.shape)))
+        if values[place] > best + _BETTER:
+            best = float(values[place])
+            pose = (*gradient.grid.centre(*place[1:]), float(gradient.turns[place[0]]))
+        elif halved == _HALVED:
+            break
+        else:
+            spacing, turning, halved = spacing / 2.0, turning / 2.0, halved + 1
+    x, y, turn = pose
+    if (x, y, turn) == (target.x, target.y, target.turn):
+        return target
+    yaw = None if tracked.yaw is None else tracked.yaw + turn
+    return Target(target.name, x, y, turn, yaw, (*target.waypoints[:-1], (x, y)), best)
+
+
+def tried(gradient: GradientMap, failures: Sequence[Target], settings: Settings) -> Booleans:
+    """Return (A, rows, columns): which poses of a map are some targets, but for a fraction of a cell."""
+    same = np.zeros(gradient.blocked.shape, np.bool_)
+    centres = gradient.grid.centres().reshape(*gradient.grid.shape, 2)
+    for each in failures:
+        near = np.hypot(centres[..., 0] - each.x, centres[..., 1] - each.y) <= _SAME * _cell(settings)
+        same |= (np.abs(gradient.turns - each.turn) <= _SAME_TURN)[:, None, None] & near
+    return same
+
+
+def is_repeated(target: Target, failures: Sequence[Target], settings: Settings) -> bool:
+    """Return whether a target is one of some others, but for a fraction of a cell."""
+    return any(
+        math.dist((target.x, target.y), (each.x, each.y)) <= _SAME * _cell(settings)
+        and abs(target.turn - each.turn) <= _SAME_TURN
+        for each in failures
+    )
+
+
+def _cell(settings: Settings) -> float:
+    return settings.workspace.grid.cell_size
+
+
+def _near(gradient: GradientMap, target: Target, tracked: TrackedObject, settings: Settings) -> Booleans:
+    """Return (A, rows, columns): whether poses are as near to a target as they may be."""
+    offsets = np.abs(gradient.grid.centres() - np.array([target.x, target.y])).max(axis=1)
+    near = offsets <= _FARTHEST * settings.workspace.grid.cell_size * (1.0 + 1e-9)
+    turned = np.abs(gradient.turns - target.turn) <= _widest_turn(target, tracked, settings) * (1.0 + 1e-9)
+    return np.asarray(turned[:, None, None] & near.reshape(gradient.grid.shape))
+
+
+def _widest_turn(target: Target, tracked: TrackedObject, settings: Settings) -> float:
+    """Return how far an object may be turned from an orientation: half the way to the next one; or 0.
+
+    A pushed object that keeps its orientation is not turned at all.
+    """
+    yaws = sorted(settings.workspace.yaws)
+    if len(yaws) < 2 or tracked.yaw is None or (settings.skill == "push" and target.turn == 0.0):
+        return 0.0
+    return min(after - before for before, after in pairwise(yaws)) / 2.0
