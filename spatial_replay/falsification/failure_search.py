@@ -27,7 +27,7 @@ from spatial_replay.falsification.simulations import Simulation, own_simulation,
 from spatial_replay.logs.downloads import local_copy
 from spatial_replay.logs.output_file import refuse_addresses
 from spatial_replay.replay.selection import DEFAULT_OPTIONS
-from spatial_replay.sanity import refuse_always_true
+from spatial_replay.sanity import refuse_decided
 from spatial_replay.sources.open_log import open_source
 from spatial_replay.spec.format import format_specification
 from spatial_replay.spec.formula import Specification
@@ -78,8 +78,8 @@ def falsify(
 
     Raises:
         UsageError: what cannot be varied, a folder of another search, an extra that is not installed.
-        SpecificationError: a specification with errors, one that no run violates, or names that the world
-            does not have.
+        SpecificationError: a specification with errors, one that no run violates or none satisfies,
+            or names that the world does not have.
         LogError: what an earlier search has left is damaged.
         OutputError: a file cannot be written.
     """
@@ -120,7 +120,7 @@ def search_failures(
 
     Raises:
         UsageError: nothing to vary, no budget, the folder is not one of this search.
-        SpecificationError: a specification that no run violates.
+        SpecificationError: a specification that no run violates, or none satisfies.
         LogError: what an earlier search has left is damaged.
         OutputError: a file cannot be written; the same call goes on from there.
     """
@@ -130,7 +130,7 @@ def search_failures(
         raise UsageError(f"the seed is {seed}; give 0 or more")
     space = Space(_distinct(parameters))
     for file in simulation.files:
-        refuse_always_true(file)
+        refuse_decided(file)
     refuse_addresses(Path(folder))
     files = LocalFolder(Path(folder))
     _claim(files, _identity(simulation, space, seed))

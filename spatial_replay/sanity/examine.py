@@ -124,23 +124,24 @@ def refuse_unsatisfiable(specification: Specification, name: str) -> None:
     Raises:
         SpecificationError: it is one.
     """
-    _refuse(specification, [name], satisfied=True)
+    _refuse(specification, [name], [True])
 
 
-def refuse_always_true(specification: Specification) -> None:
-    """Refuse results that no run violates with a margin.
+def refuse_decided(specification: Specification) -> None:
+    """Refuse results that no run violates with a margin, or none satisfies: no run tells anything about them.
 
     Raises:
         SpecificationError: there are some; all are reported together.
     """
-    _refuse(specification, [spec.name for spec in specification.results], satisfied=False)
+    _refuse(specification, [spec.name for spec in specification.results], [False, True])
 
 
-def _refuse(specification: Specification, names: Sequence[str], *, satisfied: bool) -> None:
-    """Refuse those specs of some names that no run satisfies, or violates."""
+def _refuse(specification: Specification, names: Sequence[str], ends: Sequence[bool]) -> None:
+    """Refuse those specs of some names that no run satisfies (True), or violates (False)."""
     examiner = _Examiner(specification)
     specs = [spec for spec in specification.specs if spec.name in names]
-    found = [examiner.why_empty(_Part(spec.name, spec.formula, spec.span), satisfied) for spec in specs]
+    parts = [_Part(spec.name, spec.formula, spec.span) for spec in specs]
+    found = [examiner.why_empty(part, satisfied) for part in parts for satisfied in ends]
     errors = [replace(each.diagnostic, severity="error") for each in found if each is not None]
     if errors:
         raise SpecificationError(errors)

@@ -53,14 +53,21 @@ def test_a_failure_is_the_log_that_its_command_records(
     assert {file: file.read_bytes() for file in Path("found").rglob("*.*")} == before
 
 
-def test_a_specification_that_no_run_violates_is_refused_before_the_first_run(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("formula", "error"),
+    [
+        ("G (red dist blue >= 0 or red dist blue < 1)", "every run satisfies beside: "),
+        ("F (red leftof blue and blue leftof red)", "no run satisfies beside: "),
+    ],
+)
+def test_a_specification_that_every_run_decides_alike_is_refused_before_the_first_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], formula: str, error: str
 ) -> None:
     spec = tmp_path / "beside.spatial"
-    spec.write_text("spec low = G (tool_z >= 0)\nspec beside = G (red dist blue >= 0 or red dist blue < 1)\n")
+    spec.write_text(f"spec low = G (tool_z >= 0)\nspec beside = {formula}\n")
     assert run(["falsify", "push", "--spec", str(spec), "-o", str(tmp_path / "found")]) == 2
     said = capsys.readouterr().err
-    assert "beside.spatial:2:6: error: every run satisfies beside: " in said
+    assert f"beside.spatial:2:6: error: {error}" in said
     assert not (tmp_path / "found").exists()
 
 
