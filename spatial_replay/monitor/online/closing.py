@@ -159,23 +159,24 @@ def absorb(table_at: int, number: int, channels: int, last: int) -> int:
     if part[codes.PART_IS_NESTED]:
         _absorb_nested(table_at, number, nodes, part, memory, scratch, channels, offset, last)
     else:
-        _absorb_plain(nodes, part, memory, scratch, channels, offset, last)
+        _absorb_plain(table_at, number, nodes, part, memory, channels, offset, last)
     if memory.cells[base] > before:
-        find_lows(nodes, part, memory, scratch, offset, last)
+        find_lows(table_at, number, last)
     return 0
 
 
 @uncounted
 def _absorb_plain(
-    nodes: Integers, part: Integers, memory: Memory, scratch: Scratch, channels: int, offset: int, last: int
-) -> None:
+    table_at: int, number: int, nodes: Integers, part: Integers, memory: Memory, channels: int, offset: int,
+    last: int,
+) -> None:  # fmt: skip
     """Absorb what has closed, many positions at a time, where no more than the root has a variable."""
     base, boundary, _ = cells_of(part)
     cells, root, size = memory.cells, nodes[part[codes.PART_END] - 1], CLOSING
     nodes_of_part = part[codes.PART_END] - part[codes.PART_FIRST]
     while size > 0:
         first, newest = cells[base], cells[base] + size - 1
-        if newest > last or not reach(nodes, part, memory, scratch, newest, newest, offset, last):
+        if newest > last or not reach(table_at, number, newest, newest, last):
             size //= 2
             continue
         for channel in range(channels):
@@ -205,7 +206,7 @@ def _absorb_nested(
     base, boundaries, states = cells_of(part)
     cells = memory.cells
     while cells[base] <= last:
-        if not reach(nodes, part, memory, scratch, cells[base], cells[base], offset, last):
+        if not reach(table_at, number, cells[base], cells[base], last):
             return
         for channel in range(channels):
             _renew_tables(table_at, number, nodes, part, channel, memory, scratch, offset, last)

@@ -32,8 +32,6 @@ from spatial_replay.monitor.online.sliding import (
 )
 from spatial_replay.monitor.online.state import (
     OFFSET,
-    Memory,
-    Scratch,
     ahead,
     behind,
     first_behind,
@@ -83,16 +81,15 @@ def cells_of(part: Integers) -> tuple[int, int, int]:
     return base, base + 1, base + 1 + part[codes.PART_VARIABLES]
 
 
-@uncounted
-def reach(
-    nodes: Integers, part: Integers, memory: Memory, scratch: Scratch, root_low: int, root_high: int,
-    offset: int, last: int,
-) -> bool:  # fmt: skip
-    """Compute which positions of each node matter for the root at root_low … root_high.
+@apart
+def reach(table_at: int, number: int, root_low: int, root_high: int, last: int) -> int:
+    """Compute which positions of a part's nodes matter for its root at root_low … root_high.
 
-    Returns whether every window that they look through has closed. `plain` holds the lower ends before
+    Returns 1 if every window that they look through has closed, else 0. `plain` holds the lower ends before
     they are widened to what the tables start from.
     """
+    tables, memory, scratch, _ = arrays_at(table_at)
+    nodes, part, offset = tables.nodes, tables.parts[number], memory.clock[OFFSET]
     first, end = part[codes.PART_FIRST], part[codes.PART_END]
     base, boundaries, states = cells_of(part)
     cells, low, high = memory.cells, scratch.low, scratch.high
@@ -128,7 +125,7 @@ def reach(
         ):
             low[b] = min(low[b], child_low)
             high[b] = max(high[b], child_high)
-    return closed
+    return 1 if closed else 0
 
 
 @inlined
@@ -157,12 +154,13 @@ def _operands_reach(
 
 
 @uncounted
-def find_lows(
-    nodes: Integers, part: Integers, memory: Memory, scratch: Scratch, offset: int, last: int
-) -> None:
-    """Enter the first position of each node that still matters."""
+def find_lows(table_at: int, number: int, last: int) -> None:
+    """Enter the first position of each of a part's nodes that still matters."""
+    # arrays are not passed on: most of them would be laid out for a call that hardly ever comes
+    tables, memory, scratch, _ = arrays_at(table_at)
+    part = tables.parts[number]
     base = min(memory.cells[part[codes.PART_CELL_START]], last)
-    reach(nodes, part, memory, scratch, base, last, offset, last)
+    reach(table_at, number, base, last, last)
     for d in range(part[codes.PART_FIRST], part[codes.PART_END]):
         memory.lows[d] = scratch.low[d - part[codes.PART_FIRST]]
 
@@ -180,7 +178,7 @@ def bring_columns_up(table_at: int, number: int, which: int, channels: int, last
     nodes, part, at = tables.nodes, tables.parts[number], columns_number(which)
     offset, known = memory.clock[OFFSET], memory.known[number, at]
     if known < 0:
-        find_lows(nodes, part, memory, scratch, offset, last)
+        find_lows(table_at, number, last)
     if known >= last:
         return 0
     memory.known[number, at] = last

@@ -13,7 +13,6 @@ for each table of a past operator, the position it belongs to (-1: before the fi
 from __future__ import annotations
 
 from spatial_replay.compiled import apart, uncounted
-from spatial_replay.geometry.arrays import Integers
 from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.closing import (
     CLOSING,
@@ -31,8 +30,6 @@ from spatial_replay.monitor.online.state import (
     NUMBERS,
     OFFSET,
     POSITION,
-    Memory,
-    Scratch,
     behind,
     first_behind,
 )
@@ -40,12 +37,11 @@ from spatial_replay.monitor.online.tables import read_table
 
 
 @uncounted
-def _value_at_first(
-    table_at: int, number: int, which: int, channels: int, part: Integers, root: Integers, memory: Memory,
-    scratch: Scratch, offset: int, last: int,
-) -> float:  # fmt: skip
+def _value_at_first(table_at: int, number: int, which: int, channels: int, last: int) -> float:
     """Return one of a part's numbers at the first sample."""
-    look = look_of(which, channels)
+    arrays, memory, scratch, _ = arrays_at(table_at)
+    part, offset, look = arrays.parts[number], memory.clock[OFFSET], look_of(which, channels)
+    root = arrays.nodes[part[codes.PART_END] - 1]
     base, variables = memory.cells[part[codes.PART_CELL_START]], part[codes.PART_VARIABLES]
     tables = memory.tables[look.channel, part[codes.PART_TABLE_START] : tables_end(part)]
     at = columns_number(which)
@@ -69,10 +65,11 @@ def _value_at_first(
 
 
 @uncounted
-def _value_at_last(
-    part: Integers, root: Integers, which: int, memory: Memory, offset: int, last: int
-) -> float:
+def _value_at_last(table_at: int, number: int, which: int, last: int) -> float:
     """Return what a part is at the last sample, once `_value_at_first` has run."""
+    tables, memory, _, _ = arrays_at(table_at)
+    part, offset = tables.parts[number], memory.clock[OFFSET]
+    root = tables.nodes[part[codes.PART_END] - 1]
     columns = memory.columns[which, part[codes.PART_FIRST] : part[codes.PART_END]]
     if is_plain(part):
         return root_value(root, columns, beyond(codes.OPEN_END, root[codes.NODE_WEAK]), last, last, offset)
@@ -91,7 +88,6 @@ def run_windows(table_at: int, channels: int, count: int) -> int:
         part, numbers = tables.parts[number], scratch.parts[number]
         if part[codes.PART_KIND] != codes.WINDOWED:
             continue
-        root = tables.nodes[part[codes.PART_END] - 1]
         for k in range(count):
             last = position + k
             if is_settled(part, memory):
@@ -113,23 +109,19 @@ def run_windows(table_at: int, channels: int, count: int) -> int:
                 if which >= 6 and channels < 4:
                     numbers[which, k] = numbers[which - 6, k]
                     continue
-                numbers[which, k] = _value_at_first(
-                    table_at, number, which, channels, part, root, memory, scratch, offset, last
-                )
+                numbers[which, k] = _value_at_first(table_at, number, which, channels, last)
                 if which < 2 and part[codes.PART_IS_REMEMBERING]:
-                    numbers[which + 2, k] = _value_at_last(part, root, which, memory, offset, last)
+                    numbers[which + 2, k] = _value_at_last(table_at, number, which, last)
             if last % CLOSING == CLOSING - 1:
                 absorb(table_at, number, channels, last)
     return 0
 
 
 @uncounted
-def _kept_from(
-    signals: Integers, nodes: Integers, parts: Integers, memory: Memory, scratch: Scratch, offset: int,
-    last: int,
-) -> int:  # fmt: skip
+def _kept_from(table_at: int, last: int) -> int:
     """Return the first position that anything may still look at after the sample at `last`."""
-    keep = last
+    tables, memory, scratch, _ = arrays_at(table_at)
+    signals, parts, offset, keep = tables.signals, tables.parts, memory.clock[OFFSET], last
     for s in range(signals.shape[0]):
         code, unit = signals[s, codes.SIGNAL_CODE], signals[s, codes.SIGNAL_UNIT]
         if code == codes.DELAY:
@@ -140,7 +132,7 @@ def _kept_from(
         part = parts[p]
         if part[codes.PART_KIND] == codes.WINDOWED and not is_settled(part, memory):
             base = min(memory.cells[part[codes.PART_CELL_START]], last)
-            reach(nodes, part, memory, scratch, base, last, offset, last)
+            reach(table_at, p, base, last, last)
             for d in range(part[codes.PART_END] - part[codes.PART_FIRST]):
                 keep = min(keep, scratch.low[d])
     return max(keep, offset)
@@ -153,10 +145,9 @@ def forget(table_at: int, channels: int) -> int:
     Returns:
         1 if any were dropped, else 0.
     """
-    tables, memory, scratch, _ = arrays_at(table_at)
-    signals = tables.signals
-    position, offset = memory.clock[POSITION], memory.clock[OFFSET]
-    keep = _kept_from(signals, tables.nodes, tables.parts, memory, scratch, offset, position - 1)
+    tables, memory, _, _ = arrays_at(table_at)
+    signals, position, offset = tables.signals, memory.clock[POSITION], memory.clock[OFFSET]
+    keep = _kept_from(table_at, position - 1)
     moved, kept = keep - offset, position - keep
     if 2 * moved < len(memory.stamps):
         return 0
