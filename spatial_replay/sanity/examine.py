@@ -128,7 +128,7 @@ def refuse_unsatisfiable(specification: Specification, name: str) -> None:
 
 
 def refuse_decided(specification: Specification) -> None:
-    """Refuse results that no run violates with a margin, or none satisfies: no run tells anything about them.
+    """Refuse results that no run violates with a margin, or none satisfies: no run says anything about them.
 
     Raises:
         SpecificationError: there are some; all are reported together.

@@ -293,7 +293,20 @@ def worlds():
     return program("plan_worlds")
 
 
-@pytest.mark.parametrize("kind", ["joint", "blocked", "tight", "ordered", "infeasible", "never"])
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "joint",
+        "blocked",
+        "tight",
+        "ordered",
+        "infeasible",
+        "never",
+        "swapped_apart",
+        "ring_apart",
+        "pushed_apart",
+    ],
+)
 def test_scenes_of_the_campaign_end_as_they_should(campaign, kind):
     for seed in range(2):
         random = np.random.default_rng([seed, list(campaign.KINDS).index(kind)])
