@@ -227,7 +227,7 @@ def bring_columns_up(table_at: int, number: int, which: int, channels: int, last
     return 0
 
 
-@uncounted
+@inlined
 def _first_up_to(node: Integers, distance: int, recent: Recent, offset: int, last: int, position: int) -> int:
     """Return the first position that is at most the distance in a column of its node before another one."""
     if node[codes.NODE_UNIT] == codes.SAMPLES:

@@ -230,7 +230,7 @@ def _slide_unevenly(
         step *= 2
 
 
-@uncounted
+@inlined
 def run_window(
     node: Integers, source: Floats, target: Floats, begin: int, end: int, mode: int, recent: Recent,
     offset: int, last: int,

@@ -12,7 +12,8 @@ for each table of a past operator, the position it belongs to (-1: before the fi
 
 from __future__ import annotations
 
-from spatial_replay.compiled import apart, uncounted
+from spatial_replay.compiled import apart, inlined, uncounted
+from spatial_replay.geometry.arrays import Integers
 from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.closing import (
     CLOSING,
@@ -30,18 +31,21 @@ from spatial_replay.monitor.online.state import (
     NUMBERS,
     OFFSET,
     POSITION,
+    Memory,
+    Scratch,
     behind,
     first_behind,
 )
 from spatial_replay.monitor.online.tables import read_table
 
 
-@uncounted
-def _value_at_first(table_at: int, number: int, which: int, channels: int, last: int) -> float:
+@inlined
+def _value_at_first(
+    table_at: int, number: int, which: int, channels: int, part: Integers, root: Integers, memory: Memory,
+    scratch: Scratch, offset: int, last: int,
+) -> float:  # fmt: skip
     """Return one of a part's numbers at the first sample."""
-    arrays, memory, scratch, _ = arrays_at(table_at)
-    part, offset, look = arrays.parts[number], memory.clock[OFFSET], look_of(which, channels)
-    root = arrays.nodes[part[codes.PART_END] - 1]
+    look = look_of(which, channels)
     base, variables = memory.cells[part[codes.PART_CELL_START]], part[codes.PART_VARIABLES]
     tables = memory.tables[look.channel, part[codes.PART_TABLE_START] : tables_end(part)]
     at = columns_number(which)
@@ -64,12 +68,11 @@ def _value_at_first(table_at: int, number: int, which: int, channels: int, last:
     return read_table(tables[: 1 << variables], variables, scratch.point, scratch.order)
 
 
-@uncounted
-def _value_at_last(table_at: int, number: int, which: int, last: int) -> float:
+@inlined
+def _value_at_last(
+    part: Integers, root: Integers, which: int, memory: Memory, offset: int, last: int
+) -> float:
     """Return what a part is at the last sample, once `_value_at_first` has run."""
-    tables, memory, _, _ = arrays_at(table_at)
-    part, offset = tables.parts[number], memory.clock[OFFSET]
-    root = tables.nodes[part[codes.PART_END] - 1]
     columns = memory.columns[which, part[codes.PART_FIRST] : part[codes.PART_END]]
     if is_plain(part):
         return root_value(root, columns, beyond(codes.OPEN_END, root[codes.NODE_WEAK]), last, last, offset)
@@ -88,6 +91,7 @@ def run_windows(table_at: int, channels: int, count: int) -> int:
         part, numbers = tables.parts[number], scratch.parts[number]
         if part[codes.PART_KIND] != codes.WINDOWED:
             continue
+        root = tables.nodes[part[codes.PART_END] - 1]
         for k in range(count):
             last = position + k
             if is_settled(part, memory):
@@ -109,9 +113,11 @@ def run_windows(table_at: int, channels: int, count: int) -> int:
                 if which >= 6 and channels < 4:
                     numbers[which, k] = numbers[which - 6, k]
                     continue
-                numbers[which, k] = _value_at_first(table_at, number, which, channels, last)
+                numbers[which, k] = _value_at_first(
+                    table_at, number, which, channels, part, root, memory, scratch, offset, last
+                )
                 if which < 2 and part[codes.PART_IS_REMEMBERING]:
-                    numbers[which + 2, k] = _value_at_last(table_at, number, which, last)
+                    numbers[which + 2, k] = _value_at_last(part, root, which, memory, offset, last)
             if last % CLOSING == CLOSING - 1:
                 absorb(table_at, number, channels, last)
     return 0
@@ -135,7 +141,7 @@ def _kept_from(table_at: int, last: int) -> int:
             reach(table_at, p, base, last, last)
             for d in range(part[codes.PART_END] - part[codes.PART_FIRST]):
                 keep = min(keep, scratch.low[d])
-    return max(keep, offset)
+    return int(max(keep, offset))
 
 
 @apart
