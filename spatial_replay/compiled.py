@@ -437,11 +437,10 @@ class _Process:
 
     def call_of(self, symbol: str, function: Any) -> Any:
         """Return what machine code calls to reach a function of integers that is compiled apart."""
-        import llvmlite.binding  # type: ignore[import-untyped]
-        from numba.core import types
+        from numba.core import codegen, types
 
         # by its name, since it lies elsewhere in the next process, which finds its callers in the cache
-        llvmlite.binding.add_symbol(symbol, function.machine_code.address)
+        cast(Any, codegen).ll.add_symbol(symbol, function.machine_code.address)
         return types.ExternalFunction(symbol, function.machine_code._sig)
 
     def array_at(self, kind: type) -> Any:
