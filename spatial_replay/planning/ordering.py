@@ -13,6 +13,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from spatial_replay.automata.guards import Transition
+from spatial_replay.geometry.arrays import Booleans
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
 from spatial_replay.planning.decisions import Consideration, Target
 from spatial_replay.planning.demands import Budget, Demand, Pose, demands_of, with_moved, with_objects
@@ -22,6 +23,7 @@ from spatial_replay.planning.map_layers import distance_to
 from spatial_replay.planning.maps import (
     FREE,
     Cubes,
+    PropositionMaps,
     centre_of,
     concerns,
     danger_of,
@@ -30,8 +32,11 @@ from spatial_replay.planning.maps import (
     proposition_maps,
     radius_of,
 )
+from spatial_replay.planning.paths import reachable
 from spatial_replay.planning.targets import nearest_target, points_along, target_in
-from spatial_replay.spec.formula import Atom, SignedDistance, TrackedName
+from spatial_replay.planning.workspace import Grid
+from spatial_replay.spec.formula import Atom, Formula, SignedDistance, TrackedName
+from spatial_replay.trace.sample import Sample
 
 _MOST_PARKED: Final = 2
 """The most objects that are brought aside for others."""
@@ -250,7 +255,7 @@ class MotionOrder:
                 continue
             clearance = self._clearance(scene, {name: way}, other)
             in_way = other in bound | beside or clearance <= settings.workspace.clearance
-            if in_way and self._spend(aside, 2):
+            if in_way and self._spend(aside, 3):
                 for target in self._parked(scene, state, other, {name: way}, left, is_first, other in beside):
                     yield other, target
 
@@ -267,10 +272,7 @@ class MotionOrder:
         formulas, workspace = self._expected.formulas, settings.workspace
         if self._is_careful:
             ways = [each for each in self._ways_to_hold(constraints) if not _concerned(each, others)]
-            formulas = list(dict.fromkeys(each.formula for way in ways for each in way))
-            constraints = tuple(
-                tuple((formulas.index(each.formula), each.wanted) for each in way) for way in ways
-            )
+            formulas, constraints = _cubes_of(ways)
         free = replace(workspace, supports=workspace.supports.union(others))
         about = formulas, self._expected.regions, scene.sample, name, free
         maps = proposition_maps(*about, self._expected.movables(scene).maps_of(name).grid)
@@ -326,6 +328,21 @@ class MotionOrder:
         apart = Atom("", "dist", SignedDistance(TrackedName(name), TrackedName(other)))
         return self._expected.values(with_objects(scene.sample, covered), [apart])[0][-1]
 
+    def _formulas_about(self, name: str, constraints: Cubes) -> tuple[Sequence[Formula], Cubes]:
+        """Return relations with an object, and the conjunctions of them that must not hold."""
+        if not self._is_careful:
+            return (), ()
+        return _cubes_of([each for each in self._ways_to_hold(constraints) if _concerned(each, [name])])
+
+    def _is_kept(
+        self, sample: Sample, name: str, grid: Grid, formulas: Sequence[Formula], constraints: Cubes
+    ) -> tuple[Booleans, PropositionMaps]:
+        """Return (A, rows, columns) where an object is clear and no constraint holds, and its maps."""
+        settings = self._expected.settings
+        maps = proposition_maps(formulas, self._expected.regions, sample, name, settings.workspace, grid)
+        is_kept = danger_of(maps, constraints) < -settings.constraint_margin
+        return np.asarray(is_kept & (maps.clearance > settings.workspace.clearance)), maps
+
     def _parked(
         self,
         scene: Foreseen,
@@ -349,13 +366,19 @@ class MotionOrder:
         now, workspace = movables.maps_of(name), settings.workspace
         gradient = gradient_map(now, self._aims[0].guard, constraints, workspace, settings.constraint_margin)
         places = {each: self._place_of(scene, each) for each in left if each != name}
-        later = with_objects(with_moved(scene.sample, places), covered)
-        formulas = self._expected.formulas if self._is_careful else ()
-        maps = proposition_maps(formulas, self._expected.regions, later, name, workspace, now.grid)
-        good = (gradient.blocked == FREE) & (maps.clearance > workspace.clearance)
-        if self._is_careful:
-            danger = danger_of(maps, self._constraints_at(state, is_first=False))
-            good &= danger < -settings.constraint_margin
+        there = with_moved(scene.sample, places)
+        later = self._formulas_about(name, self._constraints_at(state, is_first=False))
+        clear, maps = self._is_kept(with_objects(there, covered), name, now.grid, *later)
+        good = (gradient.blocked == FREE) & clear
+        after = np.ones_like(good)
+        if self._is_careful and settings.skill == "push":
+            after, _ = self._is_kept(there, name, now.grid, *later)
+            onwards = _reachable_from(centre_of(tracked.footprint), now.grid, gradient.blocked == FREE)
+            if name in self._places:
+                # behind those that are at their places by then, it would stay away from its own
+                onwards &= _reachable_from(self._place_of(scene, name)[:2], now.grid, after)
+            after &= onwards
+            good &= after
         # what is picked up or pushed again needs room
         room = np.minimum(maps.clearance, gradient.clearance)
         roomy = good & (room >= settings.room)
@@ -367,16 +390,39 @@ class MotionOrder:
             good &= distance_to([centre_of(tracked.footprint)], now.grid) > 2.0 * now.grid.cell_size
             far = good & (now.room([blocked]) > BESIDE * radius_of(beside))
             roomy = roomy & far if (roomy & far).any() else far
-        for _ in range(_MOST_PLACES if self._is_careful else 1):
-            among = roomy if roomy.any() else good
-            target = nearest_target(gradient, among, tracked, settings, movables.failed_here(name))
-            if isinstance(target, str):
-                return
-            found = movables.with_way(target, constraints)
-            if isinstance(found, Target) and not movables.is_repeated(found):
-                yield found
-            away = distance_to([(target.x, target.y)], gradient.grid) > 2.0 * radius_of(tracked)
-            good, roomy = good & away, roomy & away
+        free = np.ones_like(good)
+        for is_at_edge in (False, True) if self._is_careful and settings.skill == "push" else (False,):
+            if is_at_edge:
+                # in a corridor no place is clear of a way through its middle: others give way at its edges
+                if is_beside:
+                    return
+                good = roomy = (gradient.blocked == FREE) & after & free
+            for _ in range(_MOST_PLACES if self._is_careful else 1):
+                among = roomy if roomy.any() else good
+                if is_at_edge and among.any():
+                    among = among & (maps.clearance >= maps.clearance[among].max() - now.grid.cell_size / 2.0)
+                target = nearest_target(gradient, among, tracked, settings, movables.failed_here(name))
+                if isinstance(target, str):
+                    break
+                found = movables.with_way(target, constraints)
+                if isinstance(found, Target) and not movables.is_repeated(found):
+                    yield found
+                away = distance_to([(target.x, target.y)], gradient.grid) > 2.0 * radius_of(tracked)
+                free = free & away
+                good, roomy = good & away, roomy & away
+
+
+def _reachable_from(point: tuple[float, float], grid: Grid, free: Booleans) -> Booleans:
+    """Return (rows, columns) the cells that are joined to a point's by free ones (A, rows, columns); all if
+    that is not free itself."""
+    cell = grid.cell(*point)
+    return reachable(free[0], cell) if free[0][cell] else np.ones(grid.shape, np.bool_)
+
+
+def _cubes_of(ways: Sequence[tuple[Demand, ...]]) -> tuple[list[Formula], Cubes]:
+    """Return the relations of conjunctions, and these as cubes over them."""
+    formulas = list(dict.fromkeys(each.formula for way in ways for each in way))
+    return formulas, tuple(tuple((formulas.index(each.formula), each.wanted) for each in way) for way in ways)
 
 
 def _concerned(demands: Sequence[Demand], names: Iterable[str]) -> set[str]:

@@ -72,6 +72,32 @@ def shortest_path(free: Booleans, start: tuple[int, int], goals: Booleans) -> Pa
     return Path(read_only_integers(cells), int(steps.max(axis=1).sum()) - diagonal, diagonal)
 
 
+def reachable(free: Booleans, cell: tuple[int, int]) -> Booleans:
+    """Return the cells (rows, columns) to which a path leads from a free cell over free ones."""
+    found = np.zeros(free.shape, np.bool_)
+    found[cell] = True
+    while True:
+        count = np.count_nonzero(found)
+        for axis in (0, 1):
+            for step in (1, -1):
+                order = (
+                    (slice(None, None, step), slice(None))
+                    if axis == 0
+                    else (slice(None), slice(None, None, step))
+                )
+                found[order] |= _onwards(free[order], found[order], axis)
+        if np.count_nonzero(found) == count:
+            return found
+
+
+def _onwards(free: Booleans, found: Booleans, axis: int) -> Booleans:
+    """Return the free cells that follow one that is found, with no other cell between."""
+    place = np.arange(free.shape[axis]).reshape((-1, 1) if axis == 0 else (1, -1))
+    last_found = np.maximum.accumulate(np.where(found, place, -1), axis=axis)
+    last_blocked = np.maximum.accumulate(np.where(free, -1, place), axis=axis)
+    return np.asarray(last_found > last_blocked)
+
+
 def _bordered(cells: Booleans) -> NDArray[np.int8]:
     return np.pad(cells, 1).astype(np.int8)
 

@@ -48,10 +48,18 @@ def test_two_objects_change_places_past_a_third_one_that_both_have_to_keep_away_
     assert len(planned(SWAP, "abc", always)) <= 4
 
 
+@pytest.mark.parametrize("skill", ["place", "push"])
 @pytest.mark.parametrize("always", ["", "a dist b >= 0.3 and a dist c >= 0.3 and b dist c >= 0.3"])
-def test_three_objects_change_places_in_a_ring_by_four_motions(always):
-    moved = planned(RING, "abc", always)
+def test_three_objects_change_places_in_a_ring_by_four_motions(always, skill):
+    moved = planned(RING, "abc", always, skill=skill)
     assert (sorted(set(moved)), len(moved), moved[0]) == (["a", "b", "c"], 4, moved[-1])
+
+
+@pytest.mark.parametrize("always", ["", "a dist b >= 0.1"])
+def test_objects_that_are_pushed_pass_each_other_in_a_corridor(always):
+    corridor = Workspace(Grid.over(0, 1.25, 10, 2.75, 0.25), clearance=0.05)
+    moved = planned(SWAP, "ab", always, skill="push", workspace=corridor)
+    assert (moved[0], len(moved)) == (moved[2], 3)
 
 
 def test_earlier_rules_do_not_look_at_what_has_to_be_apart():
