@@ -83,6 +83,7 @@ class Foresight:
         self._known: dict[tuple[int, tuple[tuple[str, Pose], ...]], tuple[Target, ...] | None] = {}
         self._first: Foreseen | None = None
         self._why: dict[str, None] = {}
+        self._unordered = ""
         self._ruled_out: frozenset[Edge] = frozenset()
 
     def decide(
@@ -309,6 +310,8 @@ class Foresight:
         order = MotionOrder(self._expected, scene, aims, consideration, poses, robustness)
         if (found := order.found()) is not None:
             yield found.motions, (found.scene, found.state)
+        elif scene is self._first and not self._unordered:
+            self._unordered = " and ".join(sorted(poses))
 
     def _without_staying(
         self, scene: Foreseen, about: Arranger, cells: Mapping[str, Cell]
@@ -427,14 +430,17 @@ class Foresight:
     def why_not(self, state: int) -> str:
         """Return what every path to acceptance needs and cannot hold, and what stands there.
 
-        Without such a thing, as far as it is looked for, return "".
+        Or else, which objects have places to which no order of motions was found; "" without either.
         """
         if self._first is None or self._settings.rules < 4:
             return ""
         for literal in self._hopeless_literals:
             if next(self._automaton.paths(state, self._needing({literal})), None) is None:
                 return self._why_never(self._first.sample, literal)
-        return ""
+        if not self._unordered:
+            return ""
+        looked = f"as far as {MOST_MAPS} maps a decision show"
+        return f"{self._unordered}: there are places for all, but no order of motions to them, {looked}"
 
     def _why_never(self, sample: Sample, literal: tuple[int, bool]) -> str:
         """Return what of a proposition cannot hold in any arrangement, and what stands there."""

@@ -62,6 +62,16 @@ def test_objects_that_are_pushed_pass_each_other_in_a_corridor(always):
     assert (moved[0], len(moved)) == (moved[2], 3)
 
 
+def test_a_corridor_without_room_to_pass_is_said_before_the_first_motion():
+    corridor = Workspace(Grid.over(0, 1.75, 10, 2.25, 0.25), clearance=0.05)
+    settings = replace(TABLE, movable=("a", "b"), skill="push", workspace=corridor)
+    steps, _ = run(
+        Planner(sr.parse_specification(f"{REGIONS}spec s = {SWAP}"), settings), {n: THINGS[n] for n in "ab"}
+    )
+    assert [step.kind for step in steps] == ["no path"]
+    assert "a and b: there are places for all, but no order of motions to them" in steps[0].reason
+
+
 def test_earlier_rules_do_not_look_at_what_has_to_be_apart():
     specification = sr.parse_specification(f"{REGIONS}spec s = ({SWAP}) and G (a dist b >= 0.5)")
     things = {name: THINGS[name] for name in "ab"}
