@@ -8,7 +8,10 @@ from itertools import product
 from math import isfinite
 from typing import Final, Literal, NamedTuple, TypeAlias
 
+from spatial_replay.monitor.atoms.measurements import leaf_values
+from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.spec.formula import (
+    Atom,
     CentroidProjection,
     Earlier,
     Enlarged,
@@ -33,6 +36,8 @@ from spatial_replay.spec.formula import (
     Variable,
 )
 from spatial_replay.spec.walks import base_of, measured_terms
+from spatial_replay.trace.sample import Sample
+from spatial_replay.trace.trace import Trace
 
 MAX_INEQUALITIES: Final = 64
 """How many inequalities one relation is written as at most; one of more is not looked into."""
@@ -135,6 +140,8 @@ def _measured(measurement: Measurement, regions: Mapping[str, Outline]) -> Tree:
     """Return a measurement of unions as the least or greatest of measurements of their members."""
     kind: Literal["min", "max"]
     each: list[Measurement]
+    if all(isinstance(without_radius(plain(term)), RegionName) for term in measured_terms(measurement)):
+        return _of_regions(measurement, regions)
     match measurement:
         case SignedDistance() | Misalignment():
             kind, of = "min", type(measurement)
@@ -152,6 +159,14 @@ def _measured(measurement: Measurement, regions: Mapping[str, Outline]) -> Tree:
             terms = map(without_radius, members(measurement.term))
             each = [CentroidProjection(term, axis, kind) for term in terms]
     return _chosen(kind, tuple(_shifted(one, regions) for one in each))
+
+
+def _of_regions(measurement: Measurement, regions: Mapping[str, Outline]) -> Linear:
+    """Return what is measured of regions alone: a number, as they are where they are, or else unknown."""
+    nothing = TraceScene(Trace.from_samples([Sample(0, {})]), regions)
+    values = leaf_values(nothing, [Atom("", "", measurement)], {})[:, 0, 0]
+    is_known = len(set(values.tolist())) == 1 and isfinite(values[0])
+    return Linear((), exact(float(values[0]))) if is_known else Linear(((measurement, Fraction(1)),))
 
 
 def _shifted(measurement: Measurement, regions: Mapping[str, Outline]) -> Linear:

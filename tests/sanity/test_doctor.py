@@ -105,6 +105,13 @@ def test_contradictions_of_logic_alone_are_said_to_be() -> None:
     assert exclusions("a leftof b and a rightof b") == ()
 
 
+def test_a_relation_between_regions_holds_always_or_never() -> None:
+    nested = "region shelf = box(-1, -1, 2, 2)\n"
+    assert findings(f"{nested}spec s = F (left_bin enclosedin shelf)\n") == [("always true", ("s",))]
+    assert findings(f"{nested}spec s = G (shelf enclosedin left_bin)\n") == [("unsatisfiable", ("s",))]
+    assert findings("spec s = G (left_bin dist right_bin >= 1.5 -> a ovlp b)\n") == []
+
+
 def test_relations_are_reported_as_they_are_written_and_opposites_are_named() -> None:
     specification = sr.parse_specification("spec s = F (a dist b <= 0.2)\nspec t = G (b dist a >= 0.2)")
     examined = sr.doctor(specification)
