@@ -310,7 +310,7 @@ class Foresight:
         order = MotionOrder(self._expected, scene, aims, consideration, poses, robustness)
         if (found := order.found()) is not None:
             yield found.motions, (found.scene, found.state)
-        elif scene is self._first and not self._unordered:
+        elif scene is self._first and len(poses) > 1 and not self._unordered:
             self._unordered = " and ".join(sorted(poses))
 
     def _without_staying(

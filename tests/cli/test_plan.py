@@ -38,7 +38,7 @@ def test_a_plan_without_a_path_left_exits_with_1(tmp_path: Path, capsys: pytest.
     assert plan(tmp_path, IMPOSSIBLE) == 1
     said = capsys.readouterr().out
     reason = "no path left: every way from state 0 was given up (0 -> 1: no object can do it)"
-    assert f"the planner: {reason}\n" in said
+    assert f"the planner: {reason}; what cannot be done: red dist blue >= 100: " in said
     assert f"spatial-replay info {tmp_path / 'run.mcap'} --decisions shows" in said
     assert said.endswith("the log: torn is violated\n")
 
