@@ -15,7 +15,7 @@ from spatial_replay.planning.settings import Settings
 from spatial_replay.spec.formula import Formula, Outline
 from spatial_replay.trace.sample import Sample
 
-_MOST_ASIDE: Final = 48
+_MOST_ASIDE: Final = 80
 """The most maps that are computed to bring objects aside for one decision."""
 
 

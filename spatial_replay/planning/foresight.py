@@ -439,8 +439,7 @@ class Foresight:
                 return self._why_never(self._first.sample, literal)
         if not self._unordered:
             return ""
-        looked = f"as far as {MOST_MAPS} maps a decision show"
-        return f"{self._unordered}: there are places for all, but no order of motions to them, {looked}"
+        return f"{self._unordered}: there are places for all, but no order of motions to them was found"
 
     def _why_never(self, sample: Sample, literal: tuple[int, bool]) -> str:
         """Return what of a proposition cannot hold in any arrangement, and what stands there."""

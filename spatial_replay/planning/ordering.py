@@ -39,10 +39,10 @@ from spatial_replay.spec.formula import Atom, Formula, SignedDistance, TrackedNa
 from spatial_replay.trace.sample import Sample
 
 _MOST_PARKED: Final = 2
-"""The most objects that are brought aside for others."""
+"""The most objects that stand aside for others at once."""
 _MOST_PLACES: Final = 4
 """The most places that are tried for an object that is brought aside."""
-_MOST_MAPS: Final = 24
+_MOST_MAPS: Final = 40
 """The most maps that are computed to bring objects aside for one arrangement."""
 
 
@@ -109,7 +109,8 @@ class MotionOrder:
             if key not in self._targets:
                 self._targets[key] = self._target(scene, state, name, parked, is_first)
             target = self._targets[key]
-            if (found := self._on(scene, state, target, left - {name}, parked, is_first)) is not None:
+            still = tuple(each for each in parked if each != name) if self._is_careful else parked
+            if (found := self._on(scene, state, target, left - {name}, still, is_first)) is not None:
                 return found
         if self._expected.settings.rules > 1 and len(parked) < self._most_parked:
             for name in sorted(left):

@@ -62,6 +62,22 @@ def test_objects_that_are_pushed_pass_each_other_in_a_corridor(always):
     assert (moved[0], len(moved)) == (moved[2], 3)
 
 
+def test_two_pairs_of_objects_change_places_at_once():
+    spots = {"a": (2.0, 2.0), "b": (2.0, 5.0), "c": (7.0, 5.0), "d": (7.0, 2.0)}
+    regions = "".join(
+        f"region at_{name} = box({x - 0.8}, {y - 0.8}, {x + 0.8}, {y + 0.8})\n"
+        for name, (x, y) in spots.items()
+    )
+    goal = "a enclosedin at_b and b enclosedin at_a and c enclosedin at_d and d enclosedin at_c"
+    steps, _ = run(
+        Planner(
+            sr.parse_specification(f"{regions}spec s = F ({goal})"), replace(TABLE, movable=tuple("abcd"))
+        ),
+        {name: block(*spot, size=1) for name, spot in spots.items()},
+    )
+    assert [step.kind for step in steps] == ["execute"] * 6 + ["hold"]
+
+
 def test_a_corridor_without_room_to_pass_is_said_before_the_first_motion():
     corridor = Workspace(Grid.over(0, 1.75, 10, 2.25, 0.25), clearance=0.05)
     settings = replace(TABLE, movable=("a", "b"), skill="push", workspace=corridor)
@@ -69,7 +85,7 @@ def test_a_corridor_without_room_to_pass_is_said_before_the_first_motion():
         Planner(sr.parse_specification(f"{REGIONS}spec s = {SWAP}"), settings), {n: THINGS[n] for n in "ab"}
     )
     assert [step.kind for step in steps] == ["no path"]
-    assert "a and b: there are places for all, but no order of motions to them" in steps[0].reason
+    assert "a and b: there are places for all, but no order of motions to them was found" in steps[0].reason
 
 
 def test_earlier_rules_do_not_look_at_what_has_to_be_apart():
