@@ -256,7 +256,7 @@ class MotionOrder:
                 continue
             clearance = self._clearance(scene, {name: way}, other)
             in_way = other in bound | beside or clearance <= settings.workspace.clearance
-            if in_way and self._spend(aside, 3):
+            if in_way and self._spend(aside, 3 if self._is_careful else 2):
                 for target in self._parked(scene, state, other, {name: way}, left, is_first, other in beside):
                     yield other, target
 
