@@ -1,6 +1,6 @@
 """How all results stand, in one message → /spatial/standing.
 
-Viewers need no other topic of numbers: one message has every result, and of the worst one every node.
+Viewers need no other topic of numbers: one message has every result, and of the worst one every node now.
 """
 
 from __future__ import annotations
@@ -252,19 +252,17 @@ class StandingEncoder:
             violated = tuple((each, over[each]) for each in order[: counts[first], first].tolist())
             said = tuple(texts[which[first]] for texts, which in words)
             layout = _Layout(int(worst[first]), said, violated, final)
-            value, now = series[layout.worst][:_MOST_ROWS, :2].transpose(1, 0, 2)[:, :, members]
-            shown = rounded(np.stack([now, value], axis=1))
-            own = [numbers[:, members], shown.reshape(-1, len(members))]
+            now = series[layout.worst][:_MOST_ROWS, 1, members]
+            own = [numbers[:, members]]
             for each, _ in layout.violated:
                 certain_ns = np.minimum(since_ns[each, members], times_ns[members])
                 seconds = (certain_ns - (self._first_ns or 0)) / 1e9
                 own.append(np.stack([np.round(seconds, 3), rounded(-series[each][0, 3, members])]))
-            own.append(shown[:, 0])
+            own.append(rounded(now))
             bits = np.empty((len(members), 1 + sum(map(len, own))), np.uint64)
             bits[:, 0] = times_ns[members]
             np.concatenate([each.T for each in own], axis=1, out=bits[:, 1:].view(np.float64))
-            every = [marks[:, members], codes[layout.worst][:_MOST_ROWS, members], _present(now)]
-            own_marks = np.ascontiguousarray(np.concatenate(every).T)
+            own_marks = np.ascontiguousarray(np.concatenate([marks[:, members], _present(now)]).T)
             filled_groups.append((members, Filled(self._template(layout), bits, own_marks)))
         return filled_in(len(times_ns), filled_groups)
 
@@ -299,7 +297,6 @@ class StandingEncoder:
         for node, said in zip(self._nodes[worst][:_MOST_ROWS], self._written[worst], strict=False):
             unit = unit_of(node, self._units)
             text = said if node.name is None else node.name
-            message.nodes.add(text=text, now=1.0, value=1.0, unit=unit, standing=UNKNOWN)
             message.present.add(text=text, state=UNKNOWN_NOW, now=1.0, unit=unit)
         for index, over in violated:
             tree = self._trees[index]

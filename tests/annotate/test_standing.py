@@ -105,8 +105,8 @@ def test_every_message_says_how_all_results_stand_and_the_last_what_the_log_come
     assert [each.name for each in found[0].results] == ["met", "apart", "late"]
     assert [message.final for message in found] == [False] * 4 + [True]
     assert [message.worst for message in found] == ["met", "met", "apart", "apart", "apart"]
-    root, atom = found[2].nodes
-    assert (root.text, root.value) == ("apart", -0.5)
+    root, atom = found[2].present
+    assert (root.text, root.now) == ("apart", -0.5)
     assert (atom.text, atom.now) == ("a farfrom[1] b", -0.5)
     last = found[-1].present[1]
     assert [each.present[1].state for each in found[1:]] == [FAILS_NOW, FAILS_NOW, HOLDS_NOW, HOLDS_NOW]
@@ -172,7 +172,7 @@ def test_rows_of_a_quantifier_name_their_objects(tmp_path: Path) -> None:
     text += "spec safe = G forall d in both: d enclosedin table"
     log = annotated(tmp_path, text, moving([5.0, 4.0]))
     [*_, (_, last)] = messages(log, StandingUpdate, "/spatial/standing")
-    texts = [each.text for each in last.nodes]
+    texts = [each.text for each in last.present]
     assert texts[-2:] == ["a enclosedin table", "b enclosedin table"]
     assert len(set(texts)) == len(texts)
 

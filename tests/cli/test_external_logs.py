@@ -217,7 +217,7 @@ def test_a_declared_unit_of_lengths_is_at_axes_in_tables_in_sentences_and_in_wha
                 (channel.topic, message.data) for _, channel, message in make_reader(stream).iter_messages()
             ]
         standing = [StandingUpdate.FromString(data) for topic, data in messages if topic == STANDING]
-        assert {each.unit for message in standing for each in (*message.results, *message.nodes)} == {"m"}
+        assert {each.unit for message in standing for each in (*message.results, *message.present)} == {"m"}
         events = [Event.FromString(data) for topic, data in messages if topic == EVENTS]
         [end] = [each.metadata for each in events if "`meet` is violated" in each.metadata[-1].value]
         assert "`turtle1 ovlp turtle2` failed by 1.514 m" in end[-1].value

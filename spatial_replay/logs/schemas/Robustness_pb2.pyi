@@ -180,7 +180,6 @@ class StandingUpdate(google.protobuf.message.Message):
     TIME_NS_FIELD_NUMBER: builtins.int
     RESULTS_FIELD_NUMBER: builtins.int
     WORST_FIELD_NUMBER: builtins.int
-    NODES_FIELD_NUMBER: builtins.int
     FINAL_FIELD_NUMBER: builtins.int
     VIOLATED_FIELD_NUMBER: builtins.int
     PRESENT_FIELD_NUMBER: builtins.int
@@ -195,16 +194,12 @@ class StandingUpdate(google.protobuf.message.Message):
         """Every result, then the named specs that the results are made of, as far as a name is clear."""
 
     @property
-    def nodes(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___NodeStanding]:
-        """The nodes of the worst result, in the order of their ids."""
-
-    @property
     def violated(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___Violation]:
         """The results that are violated, whatever comes, the one that was so first before the others."""
 
     @property
     def present(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___PresentNode]:
-        """The same nodes as they are at the newest sample, for tables beside a cursor."""
+        """The nodes of the worst result at the newest sample, in the order of their ids, for tables beside a cursor."""
 
     def __init__(
         self,
@@ -212,13 +207,12 @@ class StandingUpdate(google.protobuf.message.Message):
         time_ns: builtins.int | None = ...,
         results: collections.abc.Iterable[global___ResultStanding] | None = ...,
         worst: builtins.str = ...,
-        nodes: collections.abc.Iterable[global___NodeStanding] | None = ...,
         final: builtins.bool = ...,
         violated: collections.abc.Iterable[global___Violation] | None = ...,
         present: collections.abc.Iterable[global___PresentNode] | None = ...,
     ) -> None: ...
     def HasField(self, field_name: typing.Literal["_time_ns", b"_time_ns", "time_ns", b"time_ns"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["_time_ns", b"_time_ns", "final", b"final", "nodes", b"nodes", "present", b"present", "results", b"results", "time_ns", b"time_ns", "violated", b"violated", "worst", b"worst"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["_time_ns", b"_time_ns", "final", b"final", "present", b"present", "results", b"results", "time_ns", b"time_ns", "violated", b"violated", "worst", b"worst"]) -> None: ...
     def WhichOneof(self, oneof_group: typing.Literal["_time_ns", b"_time_ns"]) -> typing.Literal["time_ns"] | None: ...
 
 global___StandingUpdate = StandingUpdate
@@ -298,44 +292,6 @@ class ResultStanding(google.protobuf.message.Message):
     def WhichOneof(self, oneof_group: typing.Literal["_robustness", b"_robustness"]) -> typing.Literal["robustness"] | None: ...
 
 global___ResultStanding = ResultStanding
-
-@typing.final
-class NodeStanding(google.protobuf.message.Message):
-    """One node with its text, for tables: numbers are rounded to four digits."""
-
-    DESCRIPTOR: google.protobuf.descriptor.Descriptor
-
-    TEXT_FIELD_NUMBER: builtins.int
-    NOW_FIELD_NUMBER: builtins.int
-    VALUE_FIELD_NUMBER: builtins.int
-    UNIT_FIELD_NUMBER: builtins.int
-    STANDING_FIELD_NUMBER: builtins.int
-    text: builtins.str
-    now: builtins.float
-    """Robustness at the newest sample; NaN where it is not determined."""
-    value: builtins.float
-    """Robustness at the first sample, of the samples seen so far; NaN where it is not determined."""
-    unit: builtins.str
-    """Unit of both; empty for footprint units."""
-    standing: global___Standing.ValueType
-    """Standing of `value`: whether the node holds at the first sample. See `PresentNode` for the newest one."""
-    def __init__(
-        self,
-        *,
-        text: builtins.str = ...,
-        now: builtins.float | None = ...,
-        value: builtins.float | None = ...,
-        unit: builtins.str = ...,
-        standing: global___Standing.ValueType = ...,
-    ) -> None: ...
-    def HasField(self, field_name: typing.Literal["_now", b"_now", "_value", b"_value", "now", b"now", "value", b"value"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["_now", b"_now", "_value", b"_value", "now", b"now", "standing", b"standing", "text", b"text", "unit", b"unit", "value", b"value"]) -> None: ...
-    @typing.overload
-    def WhichOneof(self, oneof_group: typing.Literal["_now", b"_now"]) -> typing.Literal["now"] | None: ...
-    @typing.overload
-    def WhichOneof(self, oneof_group: typing.Literal["_value", b"_value"]) -> typing.Literal["value"] | None: ...
-
-global___NodeStanding = NodeStanding
 
 @typing.final
 class PresentNode(google.protobuf.message.Message):
