@@ -82,11 +82,13 @@ def run_replay(
     if output is None:
         return replay.run(advance=advance)
     # imported here since a replay without an annotated log needs no writer
-    from spatial_replay.logs.mcap.writer import LogWriter
+    from spatial_replay.logs.mcap.writer import WHOLE_CHUNK_NS, LogWriter
     from spatial_replay.logs.output_file import replacing
 
     with ExitStack() as stack:
-        sink = stack.enter_context(LogWriter(stack.enter_context(replacing(output, inputs))))
+        sink = stack.enter_context(
+            LogWriter(stack.enter_context(replacing(output, inputs)), chunk_ns=WHOLE_CHUNK_NS)
+        )
         _begin(sink, source, replay, options, layer=layer)
         with _behind(sink.write_messages) as write:
             replayed = replay.run(write, layer=layer, advance=advance)

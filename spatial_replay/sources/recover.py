@@ -19,7 +19,7 @@ from spatial_replay.bags.ros1 import Ros1Bag
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.mcap.reader import is_samples
-from spatial_replay.logs.mcap.writer import LogWriter
+from spatial_replay.logs.mcap.writer import WHOLE_CHUNK_NS, LogWriter
 from spatial_replay.logs.messages import Channel, Messages, select
 from spatial_replay.logs.objects.decode import decode_objects
 from spatial_replay.logs.output_file import refuse_inputs, replacing
@@ -159,7 +159,10 @@ def _write(
     channels, metadata = reader.channels(names), reader.metadata()
     saved, start_ns, end_ns, is_ordered = Counter[str](), FOREVER, -1, True
     samples = _Samples(reader.name, channels, dict(metadata), faults)
-    with replacing(output, inputs) as stream, LogWriter(stream, profile=reader.profile) as writer:
+    with (
+        replacing(output, inputs) as stream,
+        LogWriter(stream, profile=reader.profile, chunk_ns=WHOLE_CHUNK_NS) as writer,
+    ):
         for name, data in metadata:
             if name != RECOVERY:
                 writer.add_metadata(name, data)

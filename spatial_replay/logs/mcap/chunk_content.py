@@ -183,15 +183,24 @@ class MessageRange:
 
 
 class OpenChunk(NamedTuple):
-    """A chunk to be packed: its messages, at least one, and the declarations that it begins with."""
+    """A chunk to be packed.
+
+    Attributes:
+        ranges: its messages, at least one.
+        message_bytes: how many bytes their records have.
+        declaring: the declarations that it begins with.
+        is_own: whether the messages are ours, and so each much like the one before.
+    """
 
     ranges: Sequence[MessageRange]
+    message_bytes: int
     declaring: bytes
+    is_own: bool
 
     @property
     def size(self) -> int:
         """How many bytes its content has."""
-        return len(self.declaring) + sum(each.size for each in self.ranges)
+        return len(self.declaring) + self.message_bytes
 
 
 class LaidOut(NamedTuple):

@@ -30,6 +30,9 @@ _MOST_KEPT: Final = 2**22
 """A thread keeps room for so many bytes of chunks."""
 COMPRESSION_LEVEL: Final = 1
 """Coordinates hardly shrink further at higher levels, which take several times as long."""
+_OWN_LEVEL, _OWN_HASH_LOG = -1, 12
+"""The same for our own messages, of which each is much like the one before: a table that fits into the first
+cache of the processor finds what repeats, and a quarter of the time is saved for a twentieth more bytes."""
 
 
 class PackedChunk(NamedTuple):
@@ -74,7 +77,7 @@ def pack(chunks: Sequence[OpenChunk]) -> PackedChunks:
     contents: list[bytes | bytearray | memoryview] = [
         content[begin:end] for begin, end in pairwise(laid_out.begin.tolist())
     ]
-    compressed = _compressor().multi_compress_to_buffer(contents)
+    compressed = _compressed(contents, [chunk.is_own for chunk in chunks])
     about = zip(
         contents,
         laid_out.counts.tolist(),
@@ -112,11 +115,26 @@ def _room(size: int) -> memoryview:
     return memoryview(_local.room)[:size]
 
 
-def _compressor() -> zstandard.ZstdCompressor:
-    """Return the compressor of this thread: one serves one thread at a time."""
-    if not hasattr(_local, "compressor"):
-        _local.compressor = zstandard.ZstdCompressor(level=COMPRESSION_LEVEL)
-    return cast(zstandard.ZstdCompressor, _local.compressor)
+def _compressed(contents: Sequence[bytes | bytearray | memoryview], are_own: Sequence[bool]) -> list[Any]:
+    """Compress the contents of chunks, in one call those of our messages, and in another those of others."""
+    compressed = list[Any](contents)
+    for is_own in set(are_own):
+        places = [place for place, own in enumerate(are_own) if own == is_own]
+        several = _compressor(is_own).multi_compress_to_buffer([contents[place] for place in places])
+        for number, place in enumerate(places):
+            compressed[place] = several[number]
+    return compressed
+
+
+def _compressor(is_own: bool) -> zstandard.ZstdCompressor:
+    """Return a compressor of this thread: one serves one thread at a time."""
+    if not hasattr(_local, "compressors"):
+        own = zstandard.ZstdCompressionParameters.from_level(_OWN_LEVEL, hash_log=_OWN_HASH_LOG)
+        _local.compressors = (
+            zstandard.ZstdCompressor(level=COMPRESSION_LEVEL),
+            zstandard.ZstdCompressor(compression_params=own),
+        )
+    return cast(zstandard.ZstdCompressor, _local.compressors[is_own])
 
 
 @dataclass(slots=True)

@@ -31,14 +31,16 @@ from spatial_replay.logs.output_file import output_error
 from spatial_replay.logs.topics import LIBRARY, MAGIC, OWN_PREFIX
 from spatial_replay.trace.sample import FOREVER
 
-CHUNK_BYTES = 128 * 2**10
+CHUNK_BYTES = 512 * 2**10
 """A chunk is closed when it holds this much, uncompressed."""
 CHUNK_NS = 10**9
 """A chunk is closed before a message this much later than its first one."""
+WHOLE_CHUNK_NS = 10 * CHUNK_NS
+"""The same for a log that nobody can see before it is whole: fewer chunks are quicker and smaller."""
 REPEAT_NS = 5 * 10**9
 """A channel is declared again in the second chunk with its messages, and in one this much after the last that
 declares it. In every chunk, schemas would add 15 % to an annotated log; so they add up to 5 %."""
-TOGETHER_BYTES = 16 * CHUNK_BYTES
+TOGETHER_BYTES = 4 * CHUNK_BYTES
 """So much is packed at once: messages are encoded together, and stay in the cache of the processor."""
 WAITING_BYTES = 256 * 2**20
 """Bytes of chunks that may wait for their compression: pictures and clouds of points make large ones."""
@@ -82,16 +84,19 @@ class LogWriter:
         *,
         profile: str = "",
         library: str = LIBRARY,
+        chunk_ns: int = CHUNK_NS,
         clock: Callable[[], float] | None = None,
     ) -> None:
         """Begin a log.
 
         Args:
             stream: takes bytes; need not seek. It is flushed after each chunk, and left open.
+            chunk_ns: a chunk is closed before a message this much later than its first one.
             clock: seconds, for a log whose samples come in real time.
         """
         self._stream = stream
         self._path = Path(str(getattr(stream, "name", "the log")))
+        self._chunk_ns = chunk_ns
         self._clock = clock
         self._offset = 0
         self._summary = McapSummary()
@@ -128,7 +133,7 @@ class LogWriter:
         if not len(messages):
             return
         numbers, lanes = self._numbers(messages)
-        closed = [_closed(lane) for lane in self._lanes if lane.open and self._is_over(lane)]
+        closed = [self._take(lane) for lane in self._lanes if lane.open and self._is_over(lane)]
         batches = []
         for number in range(len(self._lanes)):
             places = np.flatnonzero(lanes == number)
@@ -141,11 +146,12 @@ class LogWriter:
         open_bytes = np.array([lane.open_bytes if lane.open else -1 for lane in self._lanes], np.int64)
         ends = np.empty((len(messages) + len(self._lanes), 2), np.int64)
         # a copy, since a kernel is compiled again for arrays that are read-only
-        count = _divide(messages.log_time_ns.copy(), sizes, lanes, self._began_ns, open_bytes, ends)
+        times_ns = messages.log_time_ns.copy()
+        count = _divide(times_ns, sizes, lanes, self._chunk_ns, self._began_ns, open_bytes, ends)
         taken = [0] * len(self._lanes)
         for number, stop in ends[:count].tolist():
             self._extend(number, batches[number], taken[number], stop)
-            closed.append(_closed(self._lanes[number]))
+            closed.append(self._take(self._lanes[number]))
             taken[number] = stop
         for number, batch in enumerate(batches):
             if batch is not None:
@@ -184,7 +190,7 @@ class LogWriter:
 
     def flush(self) -> None:
         """Close the chunks and hand everything written so far to the operating system."""
-        self._pack([_closed(lane) for lane in self._lanes if lane.open])
+        self._pack([self._take(lane) for lane in self._lanes if lane.open])
         self._write_packed(0)
 
     def close(self) -> None:
@@ -238,12 +244,19 @@ class LogWriter:
         """Return whether a second of the clock has passed since a chunk began."""
         return self._clock is not None and (self._clock() - lane.began_s) * 1e9 >= CHUNK_NS
 
-    def _pack(self, closed: Sequence[tuple[list[MessageRange], int]]) -> None:
+    def _take(self, lane: _Lane) -> OpenChunk:
+        """Return the open chunk of a lane, and begin an empty one."""
+        declaring = self._declaring(lane.open)
+        chunk = OpenChunk(lane.open, lane.open_bytes, declaring, is_own=lane is self._lanes[0])
+        lane.open, lane.open_bytes = [], 0
+        return chunk
+
+    def _pack(self, closed: Sequence[OpenChunk]) -> None:
         """Pack chunks on other threads, some together, and write those that are ready."""
         together, size = list[OpenChunk](), 0
-        for number, (ranges, own_size) in enumerate(closed, start=1):
-            together.append(OpenChunk(ranges, self._declaring(ranges)))
-            size += own_size
+        for number, chunk in enumerate(closed, start=1):
+            together.append(chunk)
+            size += chunk.size
             if size >= TOGETHER_BYTES or number == len(closed):
                 self._packing.append((size, self._workers.submit(pack, together)))
                 self._packing_bytes += size
@@ -295,19 +308,13 @@ class LogWriter:
             raise output_error(self._path, error) from error
 
 
-def _closed(lane: _Lane) -> tuple[list[MessageRange], int]:
-    """Return the messages of an open chunk and their bytes, and begin an empty one."""
-    closed = lane.open, lane.open_bytes
-    lane.open, lane.open_bytes = [], 0
-    return closed
-
-
 @elementwise
 @long_kernel
 def _divide(
     times_ns: Integers,
     sizes: Integers,
     lanes: Integers,
+    chunk_ns: int,
     began_ns: Integers,
     open_bytes: Integers,
     ends: Integers,
@@ -316,6 +323,7 @@ def _divide(
 
     Args:
         times_ns, sizes, lanes: (M,) of each message: its log time, the bytes of its record, its lane.
+        chunk_ns: how long after the first message of a chunk the next one begins at the latest.
         began_ns: (L,) when the open chunk of each lane began.
         open_bytes: (L,) how much is in it, negative where none is open.
         ends: (M + L, 2), to be filled in: the lane of each chunk that ends, after how many of its messages.
@@ -327,7 +335,7 @@ def _divide(
     taken = np.zeros(open_bytes.shape[0], np.int64)
     for i in range(times_ns.shape[0]):
         for lane in range(open_bytes.shape[0]):
-            if open_bytes[lane] >= 0 and times_ns[i] - began_ns[lane] >= CHUNK_NS:
+            if open_bytes[lane] >= 0 and times_ns[i] - began_ns[lane] >= chunk_ns:
                 ends[count, 0], ends[count, 1] = lane, taken[lane]
                 open_bytes[lane] = -1
                 count += 1
