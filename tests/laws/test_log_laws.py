@@ -33,6 +33,7 @@ from spatial_replay.logs import (
     summarise_mcap,
 )
 from spatial_replay.logs.checksums import joined_checksum
+from spatial_replay.logs.mcap.writer import CHUNK_BYTES
 from spatial_replay.logs.objects.wire import WireTemplate
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.topics import OBJECTS, protobuf_channel
@@ -270,7 +271,7 @@ def test_a_copy_has_each_message_where_the_index_says(written, form):
         st.tuples(
             st.sampled_from(["/spatial/a", "/spatial/b", "/camera"]),
             st.sampled_from([0, 10**7, 10**9 - 1, 10**9, -(10**9)]),
-            st.sampled_from([0, 500, 40_000, 130_000]),
+            st.sampled_from([0, 500, CHUNK_BYTES // 3, CHUNK_BYTES + 1000]),
         ),
         min_size=1,
         max_size=40,
@@ -296,7 +297,7 @@ def test_chunks_end_at_the_same_messages_however_these_are_divided_among_calls(g
         if isinstance(record, Chunk):
             messages = [each for each in breakup_chunk(record) if isinstance(each, Message)]
             assert all(each.log_time < messages[0].log_time + 10**9 for each in messages)
-            assert sum(len(each.data) + 31 for each in messages[:-1]) < 128 * 2**10
+            assert sum(len(each.data) + 31 for each in messages[:-1]) < CHUNK_BYTES
 
 
 @given(st.lists(st.binary(max_size=200), max_size=6), st.sampled_from(["compiled", "interpreted"]))

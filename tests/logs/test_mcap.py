@@ -115,7 +115,7 @@ def test_chunks_end_by_size_or_after_a_second():
     slow = make_reader(io.BytesIO(log_of(moving_cup(10)))).get_summary().chunk_indexes
     assert all(chunk.message_end_time - chunk.message_start_time < 10**9 for chunk in slow)
     assert len(slow) == 4
-    fast = make_reader(io.BytesIO(log_of(moving_cup(5000, step_ns=1000)))).get_summary().chunk_indexes
+    fast = make_reader(io.BytesIO(log_of(moving_cup(12_000, step_ns=1000)))).get_summary().chunk_indexes
     assert all(CHUNK_BYTES <= chunk.uncompressed_size < 2 * CHUNK_BYTES for chunk in fast[:-1])
     assert len(fast) > 2
 

@@ -56,12 +56,12 @@ class PackedChunks(NamedTuple):
     """Chunks ready to be written.
 
     Attributes:
-        data: their records and indexes.
+        data: their records and indexes, piece by piece.
         chunks: what the summary says of each.
         counts: how many messages there are, by channel.
     """
 
-    data: bytes
+    data: Sequence[Any]
     chunks: Sequence[PackedChunk]
     counts: Sequence[int]
 
@@ -100,7 +100,7 @@ def pack(chunks: Sequence[OpenChunk]) -> PackedChunks:
                 offsets += channel, at
                 at += INDEX_HEAD + count * INDEX_ENTRY
         packed.append(PackedChunk(record_bytes, end - begin, offsets, len(data), len(own), *span))
-    return PackedChunks(b"".join(parts), packed, laid_out.counts.sum(axis=0).tolist())
+    return PackedChunks(parts, packed, laid_out.counts.sum(axis=0).tolist())
 
 
 _local = threading.local()

@@ -284,7 +284,8 @@ class LogWriter:
             size, packing = self._packing.popleft()
             packed = packing.result()
             self._summary.add(packed, self._offset)
-            self._write(packed.data)
+            for piece in packed.data:
+                self._write(piece)
             self._packing_bytes -= size
             self._flush_stream()
 
@@ -294,7 +295,7 @@ class LogWriter:
         self._write(content)
         return offset, len(content)
 
-    def _write(self, data: bytes) -> None:
+    def _write(self, data: Any) -> None:
         try:
             self._stream.write(data)
         except OSError as error:

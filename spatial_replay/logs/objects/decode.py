@@ -341,8 +341,9 @@ def _observations(groups: Sequence[_Group], times_ns: Integers) -> Observations:
     classes = {name: code for code, name in enumerate(ordered)}
 
     def column(field: str) -> Floats:
-        picked = (g.numbers[:, getattr(g.layout, field)].ravel() for g in groups)
-        return np.concatenate([np.empty(0), *picked])
+        picked = [np.take(g.numbers, getattr(g.layout, field), axis=1).reshape(-1) for g in groups]
+        # most blocks have one layout, and need no copy
+        return picked[0] if len(picked) == 1 else np.concatenate([np.empty(0), *picked])
 
     def repeated(values: Iterable[tuple[_Group, Sequence[int] | Integers]]) -> Integers:
         tiled = (np.tile(np.asarray(v, np.int64), len(g.samples)) for g, v in values)
