@@ -36,7 +36,7 @@ CHUNK_BYTES = 512 * 2**10
 CHUNK_NS = 10**9
 """A chunk is closed before a message this much later than its first one."""
 WHOLE_CHUNK_NS = 10 * CHUNK_NS
-"""The same for a log that nobody can see before it is whole: fewer chunks are quicker and smaller."""
+"""The same for a log that appears only when it is whole: fewer chunks are quicker and smaller."""
 REPEAT_NS = 5 * 10**9
 """A channel is declared again in the second chunk with its messages, and in one this much after the last that
 declares it. In every chunk, schemas would add 15 % to an annotated log; so they add up to 5 %."""
