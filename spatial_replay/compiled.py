@@ -126,17 +126,17 @@ def allocating_apart(function: Callable[..., int]) -> Callable[..., int]:
     return _Apart(function, {})
 
 
-def by_address(function: Callable[..., int]) -> Callable[[int, bytes, int, int], int]:
-    """Return a kernel compiled apart as a function of an address, of bytes, and of two more integers.
+def by_address(function: Callable[..., int]) -> Callable[[int, bytes, int], int]:
+    """Return a kernel compiled apart as a function of an address, of bytes, and of one more integer.
 
     Looking at what a call is given takes as long as many a kernel: a quarter of a microsecond for each array.
     What it is given here is not looked at, and has to stay where it is as long as the call lasts.
     """
     if _process.only == "interpreted":
-        return lambda places, given, *rest: function(
-            places, np.frombuffer(given, np.uint8).ctypes.data, *rest
+        return lambda places, given, number: function(
+            places, np.frombuffer(given, np.uint8).ctypes.data, number
         )
-    return cast(Callable[[int, bytes, int, int], int], cast("_Apart", function).entry())
+    return cast(Callable[[int, bytes, int], int], cast("_Apart", function).entry())
 
 
 def compile_ahead() -> None:
@@ -364,11 +364,13 @@ _C_TYPES: Final[dict[type, Any]] = {
     np.float64: ctypes.c_double,
     np.int64: ctypes.c_int64,
     np.uint8: ctypes.c_uint8,
+    np.int8: ctypes.c_int8,
 }
 
 floats_at: Final = _ArrayAt("floats_at", np.float64)
 integers_at: Final = _ArrayAt("integers_at", np.int64)
 bytes_at: Final = _ArrayAt("bytes_at", np.uint8)
+flags_at: Final = _ArrayAt("flags_at", np.int8)
 """Within kernels that are given addresses; numbers need not be aligned."""
 
 

@@ -4,20 +4,35 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Literal, TypeAlias
+from struct import Struct
+from typing import Final, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from spatial_replay.errors import GeometryError
-from spatial_replay.geometry.arrays import Floats, Integers, read_only_floats
-from spatial_replay.geometry.outline import NOT_CONVEX, SOUND, convex_hull, convex_pieces, normalise_polygons
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.geometry.outline import (
+    NOT_CONVEX,
+    SOUND,
+    convex_hull,
+    convex_pieces,
+    normalise_polygon,
+    normalise_polygons,
+)
 from spatial_replay.text import is_encodable
 
 Concave: TypeAlias = Literal["decompose", "hull"]
 """How a non-convex polygon is treated: split into convex parts, or replaced by its convex hull."""
+
+_pack_part: Final = Struct("=2d").pack
+_pack_object: Final = Struct("=5d").pack
+PARTS, BOTTOM, TOP, YAW, UNCERTAINTY = range(5)
+"""The numbers of a packed object: how many parts it has, NaN for a height or a yaw that it does not have."""
+_PLAIN: Final = _pack_object(1.0, math.nan, math.nan, math.nan, 0.0)
+"""What most objects are packed as: they share it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,6 +45,8 @@ class ConvexPart:
         vertices: (n, 2) float64, read-only, counter-clockwise, no repeated or collinear ones; one
             vertex is a point (with a radius: a disc), two are a segment (a capsule).
         radius: rounding radius in footprint units, at least 0.
+        packed: how many vertices there are, the radius, x and y of each vertex, as bytes of doubles: what a
+            monitor gives to its kernel. The vertices are a view of it.
 
     Raises:
         GeometryError: no vertex, coordinates that are not finite, vertices that are not convex, a
@@ -38,6 +55,7 @@ class ConvexPart:
 
     vertices: Floats
     radius: float = 0.0
+    packed: bytes = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         vertices, is_convex = _tidy(self.vertices)
@@ -46,10 +64,10 @@ class ConvexPart:
                 f"the vertices {_shown(vertices)} are not those of a convex polygon in order; "
                 "Footprint.polygon takes any polygon"
             )
-        object.__setattr__(self, "vertices", vertices)
-        object.__setattr__(self, "radius", _finite(self.radius, "a part's radius"))
-        if self.radius < 0:
-            raise GeometryError(f"a part's radius is {self.radius}; give 0 or more")
+        radius = _finite(self.radius, "a part's radius")
+        if radius < 0:
+            raise GeometryError(f"a part's radius is {radius}; give 0 or more")
+        _fill(self, vertices.tobytes(), radius)
 
     def __repr__(self) -> str:
         radius = f", radius={self.radius:.6g}" if self.radius else ""
@@ -62,6 +80,23 @@ class ConvexPart:
 
     def __hash__(self) -> int:
         return hash((self.radius, _ring(self.vertices)))
+
+
+def _fill(part: ConvexPart, corners: bytes, radius: float) -> None:
+    """Give a part its numbers, which are checked already."""
+    count = len(corners) // 16
+    packed = _pack_part(count, radius) + corners
+    object.__setattr__(part, "packed", packed)
+    object.__setattr__(
+        part, "vertices", np.ndarray((count, 2), np.float64, packed, len(packed) - len(corners))
+    )
+    object.__setattr__(part, "radius", radius)
+
+
+def _checked_part(corners: bytes, radius: float = 0.0) -> ConvexPart:
+    part = object.__new__(ConvexPart)
+    _fill(part, corners, radius)
+    return part
 
 
 def convex_parts(start: Integers, vertices: Floats, radius: Floats) -> list[ConvexPart]:
@@ -78,14 +113,11 @@ def convex_parts(start: Integers, vertices: Floats, radius: Floats) -> list[Conv
     if outlines.fault.any() or not (np.isfinite(radius) & (radius >= 0)).all():
         each = zip(pairwise(start.tolist()), radius.tolist(), strict=True)
         return [ConvexPart(vertices[begin:end], rounding) for (begin, end), rounding in each]
-    tidy = read_only_floats(outlines.vertices)
-    parts: list[ConvexPart] = []
-    for (begin, end), rounding in zip(pairwise(outlines.vertex_start.tolist()), radius.tolist(), strict=True):
-        part = object.__new__(ConvexPart)
-        object.__setattr__(part, "vertices", tidy[begin:end])
-        object.__setattr__(part, "radius", rounding)
-        parts.append(part)
-    return parts
+    corners, ends = outlines.vertices.tobytes(), (16 * outlines.vertex_start).tolist()
+    return [
+        _checked_part(corners[begin:end], rounding)
+        for (begin, end), rounding in zip(pairwise(ends), radius.tolist(), strict=True)
+    ]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -156,7 +188,7 @@ class Footprint:
             raise GeometryError(f"concave={concave!r}; choose 'decompose' or 'hull'")
         corners, is_convex = _tidy(vertices)
         if is_convex:
-            return cls((ConvexPart(corners),))
+            return cls((_checked_part(corners.tobytes()),))
         if concave == "hull":
             return cls((ConvexPart(convex_hull(corners)),))
         pieces = [ConvexPart(piece) for piece in convex_pieces(corners)]
@@ -183,6 +215,7 @@ class TrackedObject:
         yaw: its orientation in radians, counter-clockwise from the x axis, or None.
         height: (bottom, top) in footprint units, or None.
         uncertainty: how far its true outline may differ, as a radius in footprint units.
+        packed: its other numbers as `ConvexPart.packed`, then that of each part.
 
     Raises:
         GeometryError: a value that is not finite, bottom above top, a negative uncertainty.
@@ -193,6 +226,7 @@ class TrackedObject:
     yaw: float | None = None
     height: tuple[float, float] | None = None
     uncertainty: float = 0.0
+    packed: tuple[bytes, ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if not isinstance(self.footprint, Footprint):
@@ -211,24 +245,32 @@ class TrackedObject:
         object.__setattr__(self, "uncertainty", _finite(self.uncertainty, "uncertainty"))
         if self.uncertainty < 0:
             raise GeometryError(f"uncertainty is {self.uncertainty}; give 0 or more")
+        object.__setattr__(self, "packed", (self._own_numbers(), *[p.packed for p in self.footprint.parts]))
+
+    def _own_numbers(self) -> bytes:
+        parts, yaw, height = len(self.footprint.parts), self.yaw, self.height
+        if parts == 1 and yaw is None and height is None and self.uncertainty == 0.0:
+            return _PLAIN
+        bottom, top = (math.nan, math.nan) if height is None else height
+        return _pack_object(parts, bottom, top, math.nan if yaw is None else yaw, self.uncertainty)
 
 
 def _tidy(vertices: ArrayLike) -> tuple[Floats, bool]:
-    """Return normalised, read-only vertices, and whether they are convex.
+    """Return normalised vertices, and whether they are convex.
 
     Raises:
         GeometryError: anything but one or more finite points.
     """
     try:
-        corners = np.array(vertices, dtype=np.float64)
+        corners = np.array(vertices, dtype=np.float64, order="C")
     except (TypeError, ValueError) as error:
         raise GeometryError(f"vertices are {vertices!r}; give pairs of numbers (x, y)") from error
     if corners.ndim != 2 or corners.shape[1] != 2 or not len(corners):
         raise GeometryError(f"vertices have the shape {corners.shape}; give one or more pairs (x, y)")
-    outlines = normalise_polygons(np.array([0, len(corners)]), corners)
-    if outlines.fault[0] not in (SOUND, NOT_CONVEX):
+    corners, fault = normalise_polygon(corners)
+    if fault not in (SOUND, NOT_CONVEX):
         raise GeometryError(f"vertices {_shown(corners)} are not all finite numbers of at most 1e100")
-    return read_only_floats(outlines.vertices), bool(outlines.fault[0] == SOUND)
+    return corners, fault == SOUND
 
 
 def _finite(value: float, what: str) -> float:

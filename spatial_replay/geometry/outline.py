@@ -67,6 +67,13 @@ def normalise_polygons(vertex_start: Integers, vertices: Floats) -> Outlines:
     return Outlines(start, tidy[:used], fault)
 
 
+def normalise_polygon(vertices: Floats) -> tuple[Floats, int]:
+    """Normalise one outline (n, 2), in place; return its vertices and its fault (see `Outlines`)."""
+    counts, fault = np.empty(1, np.int64), np.empty(1, np.int8)
+    used = _normalise_all(np.array([0, len(vertices)]), vertices, counts, fault)
+    return vertices[:used], fault.item(0)
+
+
 @elementwise
 @kernel
 def _normalise_all(start: Integers, vertices: Floats, counts: Integers, fault: NDArray[np.int8]) -> int:

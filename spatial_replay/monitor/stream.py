@@ -225,7 +225,6 @@ class LiveStream:
             numbers = self._live.extend_with(self._leaves.values(samples), sample.time_ns)
         else:
             numbers = self._live.extend(*planned, sample.time_ns)
-        numbers.setflags(write=False)
         return [numbers[own] for own in self._own_nodes] if len(self._own_nodes) > 1 else [numbers]
 
     def _extend_apart(self, sample: Sample, samples: Sequence[Sample | None]) -> list[Floats | None]:

@@ -11,7 +11,6 @@ each sample assigns objects to placeholders. Tracks that appear under new names 
 
 from __future__ import annotations
 
-from array import array
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import chain, zip_longest
@@ -29,12 +28,7 @@ from spatial_replay.geometry.footprint import TrackedObject
 from spatial_replay.geometry.measure import QUANTITY_CODES
 from spatial_replay.monitor.atoms.delays import NO_DELAY, RecentSamples, iter_delays
 from spatial_replay.monitor.atoms.instructions import LeafCode
-from spatial_replay.monitor.atoms.live_kernel import (
-    ABSENT,
-    PlacedPlan,
-    PlanArrays,
-    leaves_of_sample,
-)
+from spatial_replay.monitor.atoms.live_kernel import ABSENT, leaves_of_sample
 from spatial_replay.monitor.atoms.live_rows import (
     Leaves,
     Member,
@@ -42,6 +36,7 @@ from spatial_replay.monitor.atoms.live_rows import (
     PlanRows,
 )
 from spatial_replay.monitor.atoms.measurements import leaf_values, quantity_of
+from spatial_replay.monitor.atoms.plan_arrays import PlacedPlan, PlanArrays
 from spatial_replay.monitor.atoms.terms import TraceScene, footprint_from_outline
 from spatial_replay.spec.formula import (
     ANY_CLASS,
@@ -61,71 +56,85 @@ from spatial_replay.trace.trace import Trace
 class LeafPlan:
     """Index arrays that compute the leaves of a sample and the earlier ones it looks back at."""
 
-    def __init__(self, frame: PlanContext, members: frozenset[Member]) -> None:
+    def __init__(
+        self, frame: PlanContext, members: frozenset[Member], placeholders: Mapping[_Classes, Sequence[str]]
+    ) -> None:
         """Plan for samples that hold no other members of open groups.
+
+        Args:
+            placeholders: those members that stand for unnamed objects, of each kind.
 
         Raises:
             UsageError: more bindings than `MAX_BINDINGS`.
         """
-        self._classes = frame.classes
         rows = PlanRows(frame, members)
         code = LeafCode(rows)
         outputs = [number for leaves in frame.leaves for number in code.add_leaves(leaves, {})]
         arrays = _arrays(frame, rows, code, outputs)
         self.placed = PlacedPlan(arrays, places_of(arrays))
+        self.placeholders = placeholders
         self._places = tuple(rows.places)
         self._signals = tuple(code.signals)
-        is_plain = not self._places and len(frame.delays) == 1
-        self._pack_signals = Struct(f"={1 + len(self._signals)}d").pack if is_plain else None
+        self._has_classes = bool(frame.classes)
+        count = len(frame.delays) + len(self._signals) + (len(self._places) if self._has_classes else 0)
+        self._pack = Struct(f"={count}d").pack
 
     @property
     def nbytes(self) -> int:
         """The memory of its arrays."""
         return sum(array.nbytes for array in self.placed.arrays)
 
-    def numbers(self, samples: Sequence[Sample | None], stands_for: Mapping[str, str]) -> bytes:
+    def numbers(
+        self, samples: Sequence[Sample | None], stands_for: Mapping[str, str], codes: ClassCodes
+    ) -> bytes:
         """Flatten samples for `measure_sample`, as the bytes of doubles.
 
         Args:
             samples: the one at each of the frame's delays; None before the first.
             stands_for: the objects that go by another name among the plan's members.
+            codes: those of classes.
         """
-        if self._pack_signals is not None:
-            signals = cast(Sample, samples[0]).signals
-            return self._pack_signals(0.0, *[signals.get(name, nan) for name in self._signals])
-        numbers: list[float] = [ABSENT if sample is None else 0 for sample in samples]
-        parts: list[float] = []
-        vertices: list[bytes] = []
-        classes = self._classes
-        lookups = [_NOTHING_THERE if sample is None else sample.objects.get for sample in samples]
+        newest: Any = samples[0]
+        numbers = [0.0]
+        if len(samples) > 1:
+            numbers = [0.0 if sample else ABSENT for sample in samples]
+        for name in self._signals:
+            numbers.append(newest.signals.get(name, nan))
+        if not self._places:
+            return self._pack(*numbers)
+        packed = [b""]
+        lookups = [newest.objects.get]
+        if len(samples) > 1:
+            lookups = [sample.objects.get if sample else _NOTHING_THERE for sample in samples]
         for place, name in self._places:
             tracked: Any = lookups[place](stands_for.get(name, name) if stands_for else name)
-            if tracked is None:
-                numbers += _NO_OBJECT_THERE
-                continue
-            yaw, (bottom, top), own = tracked.yaw, tracked.height or _NO_HEIGHT, tracked.footprint.parts
-            code = class_code(tracked, classes) if classes else 0
-            numbers += (code, len(own), bottom, top, nan if yaw is None else yaw, tracked.uncertainty)
-            for part in own:
-                corners = part.vertices
-                parts += (len(corners), part.radius)
-                # an array that is read as a buffer keeps 72 bytes for that as long as it lives
-                vertices.append(corners.tobytes())
-        if self._signals:
-            newest = cast(Sample, samples[0]).signals
-            parts += [newest.get(name, nan) for name in self._signals]
-        # one copy of all: each array that is made or passed costs as much as some objects
-        return b"".join((array("d", numbers + parts), *vertices))
+            packed += _NO_OBJECT_THERE if tracked is None else tracked.packed
+            if self._has_classes:
+                numbers.append(0.0 if tracked is None else codes[tracked.class_name])
+        packed[0] = self._pack(*numbers)
+        return b"".join(packed)
 
 
-_NO_HEIGHT = (nan, nan)
 _NOTHING_THERE: Callable[[str], None] = MappingProxyType[str, None]({}).get
-_NO_OBJECT_THERE = (ABSENT, 0, nan, nan, nan, 0.0)
+_NO_OBJECT_THERE = (Struct("=5d").pack(0.0, nan, nan, nan, 0.0),)
 
 
-def class_code(tracked: TrackedObject, classes: Mapping[str, int]) -> int:
-    """Return the code of an object's class."""
-    return classes.get((tracked.class_name or "").casefold(), 0) if classes else 0
+class ClassCodes(dict[str | None, int]):
+    """The codes of classes as objects name them, 0 of any other; those asked for lately are kept."""
+
+    def __init__(self, classes: Mapping[str, int]) -> None:
+        super().__init__()
+        self._classes = classes
+
+    def __missing__(self, name: str | None) -> int:
+        if len(self) >= MOST_CLASSES:
+            self.clear()
+        self[name] = code = self._classes.get((name or "").casefold(), 0)
+        return code
+
+
+MOST_CLASSES = 1024
+"""Classes that are kept."""
 
 
 def _arrays(frame: PlanContext, rows: PlanRows, code: LeafCode, outputs: Sequence[int]) -> PlanArrays:
@@ -152,7 +161,15 @@ def _arrays(frame: PlanContext, rows: PlanRows, code: LeafCode, outputs: Sequenc
         [outline.height for outline in frame.regions.values()],
     )
     return PlanArrays(
-        extent=_whole([len(frame.delays), len(frame.regions), len(rows.places), len(code.signals)]),
+        extent=_whole(
+            [
+                len(frame.delays),
+                len(frame.regions),
+                len(rows.places),
+                len(code.signals),
+                len(rows.places) if frame.classes else 0,
+            ]
+        ),
         region_parts=np.diff(regions.part_start),
         region_sizes=np.diff(regions.vertex_start),
         region_radius=regions.radius.copy(),
@@ -234,7 +251,8 @@ class SampleLeaves:
         while any(name.startswith(self._prefix) for name in self._own_names):
             self._prefix += "?"
         self._own_members: frozenset[Member] = frozenset()  # grows, but no further than the specification
-        self._only_plan = None if open_classes else LeafPlan(self._frame, frozenset())
+        self._codes = ClassCodes(self._frame.classes)
+        self._only_plan = None if open_classes else LeafPlan(self._frame, frozenset(), {})
         self._plans: OrderedDict[tuple[frozenset[Member], _Counts], LeafPlan] = OrderedDict()
         self._bytes = 0
 
@@ -269,7 +287,7 @@ class SampleLeaves:
             if any(sample is not None and sample.unknown for sample in samples):
                 return None
             plan, stands_for = self._fitting_plan(samples)
-        return plan.placed, plan.numbers(samples, stands_for)
+        return plan.placed, plan.numbers(samples, stands_for, self._codes)
 
     def _fitting_plan(self, samples: Sequence[Sample | None]) -> tuple[LeafPlan, Mapping[str, str]]:
         """Return a plan for the members of open groups in some samples, and their names in it."""
@@ -282,9 +300,7 @@ class SampleLeaves:
             plan = self._plan_for(counts)
         stands_for: dict[str, str] = {}
         for classes, names in unnamed.items():
-            stands_for.update(
-                zip_longest(self._placeholders(classes, counts[classes]), names, fillvalue=_NO_OBJECT)
-            )
+            stands_for.update(zip_longest(plan.placeholders[classes], names, fillvalue=_NO_OBJECT))
         return plan, stands_for
 
     def _values_with_unknown(self) -> Floats:
@@ -296,14 +312,17 @@ class SampleLeaves:
         """Return the members of open groups that the specification does not name, by their classes."""
         found: dict[str, _Classes] = {}
         own: list[Member] = []
+        codes, takes_any, own_names = self._codes, self._takes_any, self._own_names
         for sample in samples:
             for name, tracked in () if sample is None else sample.objects.items():
-                code = class_code(cast(TrackedObject, tracked), self._frame.classes)
-                if not (code or self._takes_any):
+                code = codes[cast(TrackedObject, tracked).class_name]
+                if not (code or takes_any):
                     continue
-                if name in self._own_names:
+                if name in own_names:
                     own.append(Member(name, code))
-                elif code not in found.setdefault(name, (code,)):
+                elif name not in found:
+                    found[name] = (code,)
+                elif code not in found[name]:
                     found[name] = tuple(sorted((*found[name], code)))
         if not self._own_members.issuperset(own):
             self._own_members |= frozenset(own)
@@ -312,23 +331,24 @@ class SampleLeaves:
             kinds.setdefault(classes, []).append(name)
         return kinds
 
-    def _placeholders(self, classes: _Classes, count: int) -> list[str]:
-        """Return placeholder names for unnamed objects, none of which the specification uses."""
-        return [f"{self._prefix}{classes} {number}" for number in range(count)]
-
     def _plan_for(self, counts: Mapping[_Classes, int]) -> LeafPlan:
         """Return the plan for the given number of unnamed members of each kind."""
         key = self._own_members, tuple(sorted(counts.items()))
         if key in self._plans:
             self._plans.move_to_end(key)
             return self._plans[key]
+        # names that the specification does not use
+        placeholders = {
+            classes: [f"{self._prefix}{classes} {number}" for number in range(count)]
+            for classes, count in counts.items()
+        }
         unnamed = {
             Member(name, code)
-            for classes, count in counts.items()
-            for name in self._placeholders(classes, count)
+            for classes, names in placeholders.items()
+            for name in names
             for code in classes
         }
-        plan = LeafPlan(self._frame, self._own_members | unnamed)
+        plan = LeafPlan(self._frame, self._own_members | unnamed, placeholders)
         self._plans[key] = plan
         self._bytes += plan.nbytes
         while len(self._plans) > 1 and (len(self._plans) > MOST_PLANS or self._bytes > MOST_BYTES):

@@ -14,7 +14,8 @@ import numpy as np
 
 from spatial_replay.compiled import apart, by_address, floats_at, inlined, integers_at
 from spatial_replay.geometry.arrays import Floats, Integers, starts_from_counts
-from spatial_replay.monitor.atoms.live_kernel import MOST_CHANNELS, PlacedPlan, measure_sample
+from spatial_replay.monitor.atoms.live_kernel import MOST_CHANNELS, measure_sample
+from spatial_replay.monitor.atoms.plan_arrays import PlacedPlan
 from spatial_replay.monitor.online.program import Program
 from spatial_replay.monitor.online.run_arrays import arrays_at
 from spatial_replay.monitor.online.state import KEEPS, OFFSET, POSITION
@@ -25,6 +26,7 @@ ROOM: Final = 64
 """Recent samples a run has room for at first: few, so that they stay in the processor's cache."""
 
 _NO_ROOM: Final = -1
+_DOUBLE: Final = np.dtype(np.float64)
 
 # what a kernel is given: the addresses of the plan's table, of the leaves of a sample, and of the lines on
 # runs; how many leaves, runs and channels there are; the time of the sample
@@ -36,13 +38,13 @@ _OF_RUN: Final = 3
 
 
 @inlined
-def _measured(given: Integers, sample_at: int, length: int, time_ns: int) -> int:
+def _measured(given: Integers, sample_at: int, time_ns: int) -> int:
     """Measure a sample, for all runs, and have its leaves in as many channels as these have.
 
     Returns:
         0; else, how many channels are needed, or `_NO_ROOM` if a run has no room for a sample.
     """
-    found, channels = measure_sample(given[_PLAN], sample_at, length, given[_LEAVES]), given[_CHANNELS]
+    found, channels = measure_sample(given[_PLAN], sample_at, given[_LEAVES]), given[_CHANNELS]
     if found > channels:
         return found
     leaves = floats_at(given[_LEAVES], (channels, given[_LEAF_COUNT]))
@@ -59,37 +61,42 @@ def _measured(given: Integers, sample_at: int, length: int, time_ns: int) -> int
     return 0
 
 
+@inlined
+def _begin(given_at: int, run: Integers) -> None:
+    given = integers_at(given_at, _GIVEN)
+    times_at = given_at + 8 * _TIME
+    begin_step(run[_TABLE], run[_LEAVES_AT], given[_CHANNELS], given[_LEAF_COUNT], times_at, 1, 0, 1)
+
+
 @apart
-def _take_in(given_at: int, sample_at: int, length: int, time_ns: int) -> int:
+def _take_in(given_at: int, sample_at: int, time_ns: int) -> int:
     """Add a sample to all runs, whose programs have no windows under their parts.
 
     Args:
-        sample_at, length: address of the numbers for the sample (see `measure_sample`), and their count.
+        sample_at: address of the numbers for the sample (see `measure_sample`).
 
     Returns:
         0; or, if nothing was added, how many channels are needed, or `_NO_ROOM`.
     """
-    given, time_at = integers_at(given_at, _GIVEN), given_at + 8 * _TIME
-    wanted = _measured(given, sample_at, length, time_ns)
-    if wanted == 0:
-        for at in range(given[_RUNS], given[_RUNS] + given[_RUN_COUNT] * _OF_RUN * 8, _OF_RUN * 8):
-            run = integers_at(at, _OF_RUN)
-            begin_step(run[_TABLE], run[_LEAVES_AT], given[_CHANNELS], given[_LEAF_COUNT], time_at, 1, 0, 1)
-            end_step(run[_TABLE], given[_CHANNELS], run[_SERIES_AT], 1, 0, 1)
+    given = integers_at(given_at, _GIVEN)
+    wanted = _measured(given, sample_at, time_ns)
+    for r in range(given[_RUN_COUNT] if wanted == 0 else 0):
+        run = integers_at(given[_RUNS] + r * _OF_RUN * 8, _OF_RUN)
+        _begin(given_at, run)
+        end_step(run[_TABLE], given[_CHANNELS], run[_SERIES_AT], 1, 0, 1)
     return wanted
 
 
 @apart
-def _take_in_with_windows(given_at: int, sample_at: int, length: int, time_ns: int) -> int:
+def _take_in_with_windows(given_at: int, sample_at: int, time_ns: int) -> int:
     """`_take_in` for any programs."""
-    given, time_at = integers_at(given_at, _GIVEN), given_at + 8 * _TIME
-    wanted = _measured(given, sample_at, length, time_ns)
-    if wanted == 0:
-        for at in range(given[_RUNS], given[_RUNS] + given[_RUN_COUNT] * _OF_RUN * 8, _OF_RUN * 8):
-            run = integers_at(at, _OF_RUN)
-            begin_step(run[_TABLE], run[_LEAVES_AT], given[_CHANNELS], given[_LEAF_COUNT], time_at, 1, 0, 1)
-            run_windows(run[_TABLE], given[_CHANNELS], 1)
-            end_step(run[_TABLE], given[_CHANNELS], run[_SERIES_AT], 1, 0, 1)
+    given = integers_at(given_at, _GIVEN)
+    wanted = _measured(given, sample_at, time_ns)
+    for r in range(given[_RUN_COUNT] if wanted == 0 else 0):
+        run = integers_at(given[_RUNS] + r * _OF_RUN * 8, _OF_RUN)
+        _begin(given_at, run)
+        run_windows(run[_TABLE], given[_CHANNELS], 1)
+        end_step(run[_TABLE], given[_CHANNELS], run[_SERIES_AT], 1, 0, 1)
     return wanted
 
 
@@ -107,7 +114,8 @@ class LiveRuns:
         self._ends = list(pairwise(leaves.tolist()))
         self._plan: PlacedPlan | None = None
         self._leaves = np.empty((MOST_CHANNELS, int(leaves[-1])))
-        self._series = np.empty((int(nodes[-1]), 4))
+        self._shape = int(nodes[-1]), 4
+        self._series = np.empty(self._shape)
         self._of_runs = np.zeros((len(programs), _OF_RUN), np.int64)
         self._of_runs[:, _LEAVES_AT] = self._leaves.ctypes.data + 8 * leaves[:-1]
         self._of_runs[:, _SERIES_AT] = self._series.ctypes.data + 4 * 8 * nodes[:-1]
@@ -127,12 +135,13 @@ class LiveRuns:
         """Add a sample, as the bytes of what `measure_sample` takes.
 
         Returns:
-            (N, 4): value, now, lower and upper of the nodes of all formulas, one formula after the other.
+            (N, 4), read-only: value, now, lower and upper of the nodes of all formulas, one formula after the
+            other.
         """
         if plan is not self._plan:
             self._plan = plan
             self._given[_PLAN] = plan.table.ctypes.data
-        while wanted := self._take_in(self._given_at, sample, len(sample) // 8, time_ns):
+        while wanted := self._take_in(self._given_at, sample, time_ns):
             for run in self._runs:
                 if wanted == _NO_ROOM:
                     run.make_room(1)
@@ -140,7 +149,8 @@ class LiveRuns:
                     run.widen(wanted)
             self._channels = max(self._channels, wanted)
             self._find_arrays()
-        return self._series.copy()
+        # a view of bytes cannot be written to
+        return np.ndarray(self._shape, _DOUBLE, self._series.tobytes())
 
     def extend_with(self, leaves: Floats, time_ns: int) -> Floats:
         """Add a sample of which the leaves (C, A, 1) are known; return what `extend` does."""
@@ -151,7 +161,9 @@ class LiveRuns:
         ]
         self._channels = max(self._channels, len(leaves))
         self._find_arrays()
-        return np.concatenate(series)
+        joined = np.concatenate(series)
+        joined.setflags(write=False)
+        return joined
 
     def _find_arrays(self) -> None:
         """Enter where the arrays of all runs are, and how many channels they have."""
