@@ -12,13 +12,13 @@ specification that this is in, are violated whatever comes. A goal that is not r
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from enum import IntEnum
 from types import MappingProxyType
 from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from spatial_replay.annotate.obligations import Obligation, standing_of
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.spec.formula import (
     ANY_CLASS,
@@ -51,49 +51,6 @@ class ClassMembers(NamedTuple):
 
     class_name: str
     excluded: frozenset[str]
-
-
-class Obligation(NamedTuple):
-    """A temporal subformula that is in no larger one.
-
-    Attributes:
-        node: its id in the formula's tree.
-        sign: 1 where the formula needs it to hold, -1 where it needs it not to.
-    """
-
-    node: int
-    sign: float
-
-    def is_fulfilled(self, series: Floats, at: Integers) -> NDArray[np.bool_]:
-        """Return (S,) whether it is decided as it should be, whatever samples follow.
-
-        Args:
-            series: (N, 4, T): value, now, lower, upper of each node.
-            at: (S,) indices of samples.
-        """
-        if self.sign > 0.0:
-            return np.asarray(series[self.node, 2, at] >= 0.0)
-        return np.asarray(series[self.node, 3, at] < 0.0)
-
-    def is_open(self, series: Floats, at: Integers) -> NDArray[np.bool_]:
-        """Return (S,) whether it is met, or later samples may still meet it; see `is_fulfilled`."""
-        if self.sign > 0.0:
-            return np.asarray(series[self.node, 3, at] >= 0.0)
-        return np.asarray(series[self.node, 2, at] <= 0.0)
-
-
-class Standing(IntEnum):
-    """How a requirement stands in a sample.
-
-    `FULFILLED`: its obligation is, so that it no longer counts. `HOLDING` and `VIOLATED`: now, in the sign
-    that counts. `PENDING`: it fails now, and later samples can make up for that. `UNKNOWN`: not observed.
-    """
-
-    FULFILLED = 0
-    HOLDING = 1
-    VIOLATED = 2
-    PENDING = 3
-    UNKNOWN = 4
 
 
 class Requirement(NamedTuple):
@@ -129,18 +86,7 @@ class Requirement(NamedTuple):
             series: (N, 4, T): value, now, lower, upper of each node.
             at: (S,) indices of samples.
         """
-        now = self.sign * series[self.node, 1, at]
-        standing = np.full(now.shape, Standing.UNKNOWN, np.uint8)
-        standing[now >= 0.0] = Standing.HOLDING
-        fails = now < 0.0
-        is_pending = np.full(now.shape, not self.can_violate)
-        for each in (self.conjunct, self.obligation):
-            if each is not None:
-                is_pending |= each.is_open(series, at)
-        standing[fails] = np.where(is_pending[fails], Standing.PENDING, Standing.VIOLATED)
-        if self.obligation is not None:
-            standing[self.obligation.is_fulfilled(series, at)] = Standing.FULFILLED
-        return standing
+        return self._numbers(series, at)[0]
 
     def robustness(self, series: Floats, at: Integers) -> Floats:
         """Return (S,) its robustness where it holds or is violated, in the sign that counts; else NaN.
@@ -149,9 +95,11 @@ class Requirement(NamedTuple):
             series: (N, 4, T): value, now, lower, upper of each node.
             at: (S,) indices of samples.
         """
-        standing = self.standing(series, at)
-        counts = (standing == Standing.HOLDING) | (standing == Standing.VIOLATED)
-        return np.where(counts, self.sign * series[self.node, 1, at], np.nan)
+        return self._numbers(series, at)[1]
+
+    def _numbers(self, series: Floats, at: Integers) -> tuple[NDArray[np.uint8], Floats]:
+        own = Obligation(self.node, self.sign)
+        return standing_of(series, at, own, self.obligation, self.conjunct if self.can_violate else None)
 
     def outcome(self, series: Floats, at: Integers) -> Floats:
         """Return (S,) the robustness of its obligation over the finished log, in the sign that counts.

@@ -6,7 +6,15 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from spatial_replay.geometry.arrays import Floats, Integers, flat_index, starts_from_counts
+from spatial_replay.compiled import copying_kernel, floats_at, integers_at
+from spatial_replay.geometry.arrays import (
+    Floats,
+    Integers,
+    combined,
+    equal_places,
+    flat_index,
+    starts_from_counts,
+)
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.footprint import Footprint
 from spatial_replay.trace.trace import Trace
@@ -37,13 +45,6 @@ class Rings(NamedTuple):
             begin, end = end, end + length
             rings.append(self.points[begin:end])
         return tuple(rings)
-
-    def points_from(self, footprints: Integers, count: int) -> Floats:
-        """Return (K, count, 2), as many points from the first one of each footprint (K,) on."""
-        points = np.ascontiguousarray(self.points)
-        runs = len(points) - count + 1
-        anywhere = np.ndarray((max(runs, 0), 2 * count), np.float64, points, 0, (16, 8))
-        return np.asarray(anywhere[self.start[footprints]].reshape(-1, count, 2))
 
 
 class Form(NamedTuple):
@@ -102,16 +103,41 @@ def boxes(points: Floats, start: Integers) -> tuple[Floats, Floats]:
         points: (P, 2).
         start: (R + 1,), where each row begins and the last one ends; none is empty.
     """
-    if len(start) < 2:
-        return np.empty((0, 2)), np.empty((0, 2))
-    count = int(start[1] - start[0])
-    if count > ROUND or (np.diff(start) != count).any():
-        return np.minimum.reduceat(points, start[:-1]), np.maximum.reduceat(points, start[:-1])
-    corners = points[start[0] : start[-1]].reshape(-1, count, 2)
-    low, high = corners[:, 0], corners[:, 0]
-    for corner in range(1, count):
-        low, high = np.minimum(low, corners[:, corner]), np.maximum(high, corners[:, corner])
+    low, high = np.empty((len(start) - 1, 2)), np.empty((len(start) - 1, 2))
+    if len(low):
+        points, start = np.ascontiguousarray(points), np.ascontiguousarray(start)
+        _boxes(points.ctypes.data, start.ctypes.data, low, high)
     return low, high
+
+
+def _boxes_by_corner(points_at: int, start_at: int, low: Floats, high: Floats) -> None:
+    """Do what `_boxes` does, the same corner of all rows together."""
+    start = integers_at(start_at, len(low) + 1)
+    points, count = floats_at(points_at, (int(start[-1]), 2)), int(start[1] - start[0])
+    if count > ROUND or (np.diff(start) != count).any():
+        low[:] = np.minimum.reduceat(points, start[:-1])
+        high[:] = np.maximum.reduceat(points, start[:-1])
+        return
+    corners = points[start[0] : start[-1]].reshape(-1, count, 2)
+    low[:] = high[:] = corners[:, 0]
+    for corner in range(1, count):
+        np.minimum(low, corners[:, corner], out=low)
+        np.maximum(high, corners[:, corner], out=high)
+
+
+@copying_kernel(_boxes_by_corner)
+def _boxes(points_at: int, start_at: int, low: Floats, high: Floats) -> None:
+    """Fill in the least and the greatest coordinates (R, 2) of rows of points; NaN if one of them is."""
+    start = integers_at(start_at, low.shape[0] + 1)
+    points = floats_at(points_at, 2 * start[low.shape[0]])
+    for row in range(low.shape[0]):
+        for axis in range(2):
+            least = greatest = points[2 * start[row] + axis]
+            for k in range(start[row] + 1, start[row + 1]):
+                number = points[2 * k + axis]
+                least = number if number < least or number != number else least
+                greatest = number if number > greatest or number != number else greatest
+            low[row, axis], high[row, axis] = least, greatest
 
 
 _ANGLES = np.arange(ROUND) * (2.0 * np.pi / ROUND)
@@ -135,21 +161,18 @@ def _forms(footprints: FootprintBatch, lengths: Integers) -> tuple[Integers, tup
     """Return (R,) the form of each footprint, and the forms."""
     part_counts = np.diff(footprints.part_start)
     has_height = ~np.isnan(footprints.bottom)
-    key = part_counts * 2 + has_height
+    columns = [part_counts, has_height]
     for part in range(int(part_counts.max(initial=0))):
         there = part_counts > part
         length = np.zeros(len(footprints), np.int64)
         length[there] = lengths[footprints.part_start[:-1][there] + part]
-        _, key = np.unique(key * (int(length.max()) + 1) + length, return_inverse=True)
-    _, examples, form = np.unique(key, return_index=True, return_inverse=True)
-    forms = tuple(
-        Form(
-            tuple(lengths[footprints.part_start[row] : footprints.part_start[row + 1]].tolist()),
-            bool(has_height[row]),
-        )
-        for row in examples.tolist()
-    )
-    return form.astype(np.int64), forms
+        columns.append(length)
+    form, forms = np.zeros(len(footprints), np.int64), list[Form]()
+    for places in equal_places(combined(columns, len(footprints))):
+        form[places], row = len(forms), int(places[0])
+        rings = lengths[footprints.part_start[row] : footprints.part_start[row + 1]]
+        forms.append(Form(tuple(rings.tolist()), bool(has_height[row])))
+    return form, tuple(forms)
 
 
 class SceneBounds(NamedTuple):

@@ -16,6 +16,7 @@ from spatial_replay.annotate.robustness import Codes, standing_codes
 from spatial_replay.annotate.scene.scene_update import spaced
 from spatial_replay.annotate.specification import ReportedTree, unit_of
 from spatial_replay.geometry.arrays import Floats, Integers, combined, equal_places
+from spatial_replay.logs.message_numbers import Columns, gathered
 from spatial_replay.logs.objects.wire import WireTemplate
 from spatial_replay.logs.payloads import Filled, filled_in
 from spatial_replay.logs.schemas.Robustness_pb2 import (
@@ -243,8 +244,8 @@ class StandingEncoder:
             kind="stable",
         )
         counts = (of_results == VIOLATED).sum(axis=0)
-        marks, numbers = self._rows(series, codes)
-        filled_groups = []
+        marks, numbers = self._columns(series, codes)
+        filled_groups, of_violated = [], dict[int, tuple[Floats, Floats]]()
         is_listed = np.arange(len(order))[:, None] < counts
         keys = [worst, *(which for _, which in words), *np.where(is_listed, order, -1)]
         for members in equal_places(combined(keys, len(times_ns))):
@@ -252,29 +253,29 @@ class StandingEncoder:
             violated = tuple((each, over[each]) for each in order[: counts[first], first].tolist())
             said = tuple(texts[which[first]] for texts, which in words)
             layout = _Layout(int(worst[first]), said, violated, final)
-            now = series[layout.worst][:_MOST_ROWS, 1, members]
-            own = [numbers[:, members]]
+            now = series[layout.worst][:_MOST_ROWS, 1]
+            own = [Columns(each, members) for each in (times_ns[:, None], *numbers)]
             for each, _ in layout.violated:
-                certain_ns = np.minimum(since_ns[each, members], times_ns[members])
-                seconds = (certain_ns - (self._first_ns or 0)) / 1e9
-                own.append(np.stack([np.round(seconds, 3), rounded(-series[each][0, 3, members])]))
-            own.append(rounded(now))
-            bits = np.empty((len(members), 1 + sum(map(len, own))), np.uint64)
-            bits[:, 0] = times_ns[members]
-            np.concatenate([each.T for each in own], axis=1, out=bits[:, 1:].view(np.float64))
-            own_marks = np.ascontiguousarray(np.concatenate([marks[:, members], _present(now)]).T)
-            filled_groups.append((members, Filled(self._template(layout), bits, own_marks)))
+                if each not in of_violated:
+                    seconds = (np.minimum(since_ns[each], times_ns) - (self._first_ns or 0)) / 1e9
+                    of_violated[each] = np.round(seconds, 3)[:, None], -series[each][0, 3, :, None]
+                since, by = of_violated[each]
+                own += [Columns(since, members), Columns(by, members, is_rounded=True)]
+            own.append(Columns(now.T, members, is_rounded=True))
+            own_marks = [Columns(each, members) for each in (*marks, _present(now).T)]
+            of = (gathered(own, len(members)), gathered(own_marks, len(members), np.uint8))
+            filled_groups.append((members, Filled(self._template(layout), *of)))
         return filled_in(len(times_ns), filled_groups)
 
-    def _rows(self, series: Sequence[Floats], codes: Sequence[Codes]) -> tuple[Codes, Floats]:
-        """Return the standing (E, S) and the robustness (E, S) of each entry of `results`."""
-        marks = [each[0] for each in codes]
-        numbers = [each[0, 0] for each in series]
+    def _columns(self, series: Sequence[Floats], codes: Sequence[Codes]) -> tuple[list[Codes], list[Floats]]:
+        """Return the standing (S, 1) and the robustness (S, 1) of each entry of `results`."""
+        marks = [each[0, :, None] for each in codes]
+        numbers = [each[0, 0, :, None] for each in series]
         for own, numbered, parts in zip(codes, series, self._parts, strict=True):
             for identifier, node in parts.values():
-                marks.append(own[identifier])
-                numbers.append(numbered[identifier, 0 if looks_ahead(node) else 1])
-        return np.array(marks, np.uint8), np.array(numbers)
+                marks.append(own[identifier, :, None])
+                numbers.append(numbered[identifier, 0 if looks_ahead(node) else 1, :, None])
+        return marks, numbers
 
     def _template(self, layout: _Layout) -> WireTemplate:
         if layout not in self._templates:
@@ -325,36 +326,3 @@ def _present(now: Floats) -> Codes:
 def part_title(name: str, tree: ReportedTree) -> str:
     """Return what a named spec within a result is known by."""
     return f"{name} in {tree.title}"
-
-
-_POWERS: Final = np.array([float(f"1e{digits}") for digits in range(20)])
-_POWERS.flags.writeable = False
-
-
-_TOGETHER: Final = 4096
-"""Numbers that are rounded at once: all passes over them stay within the processor's cache."""
-
-
-def rounded(numbers: Floats) -> Floats:
-    """Return numbers with four digits, so that viewers print them short; very large and small ones stay."""
-    shown = np.array(numbers, np.float64, order="C")
-    flat = shown.reshape(-1)
-    for begin in range(0, len(flat), _TOGETHER):
-        part = flat[begin : begin + _TOGETHER]
-        part[:] = _rounded(part)
-    return shown
-
-
-def _rounded(numbers: Floats) -> Floats:
-    size = np.abs(numbers)
-    is_usual = (size >= 1e-15) & (size < 1e15)
-    usual = numbers
-    if not is_usual.all():
-        size, usual = np.where(is_usual, size, 1.0), np.where(is_usual, numbers, 0.0)
-    digits = (3.0 - np.floor(np.log10(size))).astype(np.int64)
-    power = _POWERS[np.abs(digits)]
-    # quotients and products of whole numbers, so that the result is the number nearest to those digits
-    shown = np.round(usual * power) / power
-    if (digits < 0).any():
-        shown = np.where(digits < 0, np.round(usual / power) * power, shown)
-    return np.where(is_usual, shown, numbers) if usual is not numbers else shown

@@ -29,6 +29,7 @@ from spatial_replay.annotate.scene.scene_entities import (
     point_at,
 )
 from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.logs.message_numbers import Columns, gathered
 from spatial_replay.logs.objects.wire import WireTemplate
 from spatial_replay.logs.payloads import Filled, Words
 from spatial_replay.spec.formula import Outline
@@ -144,11 +145,9 @@ class SceneTemplate:
     template: WireTemplate
     order: Integers
 
-    def filled(self, times_ns: Integers, columns: Sequence[Floats]) -> Filled:
-        """Return messages with times (S,) and numbers: columns (S, n), one after the other."""
-        stamps = _encoded_stamps(times_ns).view(np.float64)
-        words = np.concatenate([stamps, *columns], axis=1).view(np.uint64)
-        return Filled(self.template, words, np.empty((len(words), 0), np.uint8), self.order)
+    def filled(self, columns: Sequence[Columns], count: int) -> Filled:
+        """Return as many messages, whose numbers are those of the columns, one after the other."""
+        return Filled(self.template, gathered(columns, count), np.empty((count, 0), np.uint8), self.order)
 
 
 def make_template(layout: SceneLayout, regions: tuple[Region, ...], lift: float) -> SceneTemplate:
@@ -272,7 +271,7 @@ _ARROW_NUMBERS: Final = 10
 
 def numbers_of_witness(
     points: Floats, z: Floats, scale: float, labels: Sequence[bytes], words: int
-) -> list[Floats]:
+) -> list[Columns]:
     """Return what to fill in for the arrow at the worst violation.
 
     Args:
@@ -281,9 +280,6 @@ def numbers_of_witness(
         scale: the size of objects in the scene.
         labels: S texts.
         words: how many words of 8 bytes each of them takes.
-
-    Returns:
-        columns (S, n).
     """
     begin, end = points[:, 0], points[:, 1]
     length = np.hypot(*(end - begin).T)
@@ -293,7 +289,7 @@ def numbers_of_witness(
     middle = [(begin + end) / 2.0, z + ARROW_HEAD * scale]
     text = b"".join([label.ljust(8 * words) for label in labels])
     label = np.frombuffer(text, "<f8")
-    return [column.reshape(len(points), -1) for column in (*arrow, *middle, label)]
+    return [Columns(column.reshape(len(points), -1)) for column in (*arrow, *middle, label)]
 
 
 def _add_entity(message: SceneUpdate, identifier: str) -> SceneEntity:
@@ -364,7 +360,7 @@ def _offsets(payload: bytes, wanted: bytes) -> list[int]:
     return [found.start() for found in re.finditer(re.escape(wanted), payload)]
 
 
-def _encoded_stamps(times_ns: Integers) -> Words:
+def encoded_stamps(times_ns: Integers) -> Words:
     """Encode nanoseconds (S,) as the contents of timestamps: (S, 2) words that overlap, at `_STAMP_WORDS`."""
     rows = np.tile(np.frombuffer(_STAMP_BYTES, np.uint8), (len(times_ns), 1))
     shifts = np.arange(0, 35, 7)

@@ -35,11 +35,13 @@ def labelled_objects(
     Where a sample has very many, these are the ones that violate a specification there, the worst first, and
     then those that it names.
     """
+    is_crowded = is_present.sum(axis=1) >= _CROWD
+    if not is_crowded.any():
+        return np.ones(is_present.shape, np.bool_)
     named = {each for result in results for own in result.requirements for each in own.objects}
     is_named = np.array([name in named for name in names], np.bool_)
     urgency = np.where(robustness < 0.0, robustness, np.where(is_named, 0.0, np.inf))
     urgency[~is_present] = np.inf
-    is_crowded = is_present.sum(axis=1) >= _CROWD
     rank = np.argsort(np.argsort(urgency, axis=1, kind="stable"), axis=1, kind="stable")
     is_chosen = (urgency < np.inf) & (rank < _MOST_LABELS)
     return np.asarray(np.where(is_crowded[:, None], is_chosen, True))

@@ -34,6 +34,7 @@ from spatial_replay.annotate.scene.scene_template import (
     Region,
     SceneLayout,
     SceneTemplate,
+    encoded_stamps,
     make_template,
     numbers_of_witness,
 )
@@ -46,7 +47,8 @@ from spatial_replay.annotate.violations import (
     worst_robustness,
 )
 from spatial_replay.geometry.arrays import Floats, Integers, combined, equal_places
-from spatial_replay.logs.payloads import filled_in
+from spatial_replay.logs.message_numbers import Columns, runs
+from spatial_replay.logs.payloads import Words, filled_in
 from spatial_replay.monitor.atoms.terms import footprint_from_outline
 from spatial_replay.spec.formula import Outline
 from spatial_replay.trace.trace import Trace
@@ -164,13 +166,19 @@ class SceneEncoder:
         arrows = arrow_texts(results, violations, state.first_ns or 0, self.unit)
         content = _content(trace, names, rows, state, scale, violations, arrows, has_label, banners)
         shades = colours(objects, scales), colours(regions, scales)
+        columns = _Numbers(
+            encoded_stamps(times_ns),
+            shades[1].reshape(len(written), -1),
+            shades[0].reshape(-1, 3) if (rows >= 0).all() else shades[0][rows >= 0],
+            _heights(content, scale),
+        )
         templates = dict(state.templates)
         filled = []
         for layout, samples in _by_layout(content):
             if layout not in templates:
                 templates[layout] = make_template(layout, self._drawn, _LIFT * scale)
-            numbers = self._numbers(layout, samples, content, *shades, scale)
-            filled.append((samples, templates[layout].filled(times_ns[samples], numbers)))
+            own = _numbers(layout, samples, content, columns, scale)
+            filled.append((samples, templates[layout].filled(own, len(samples))))
         last = content.forms[-1] >= FIRST_FORM
         after = SceneState(
             first_ns=state.first_ns,
@@ -214,33 +222,47 @@ class SceneEncoder:
         (left, low), (right, high) = points.min(axis=0).tolist(), points.max(axis=0).tolist()
         return (left + right) / 2.0, high + max(_BANNER_LIFT * (high - low), scale)
 
-    def _numbers(
-        self,
-        layout: SceneLayout,
-        samples: Integers,
-        content: SceneContent,
-        objects: Floats,
-        regions: Floats,
-        scale: float,
-    ) -> list[Floats]:
-        """Return what to fill in the layout's template, as columns (S, n), each number once."""
-        columns = [regions[samples].reshape(len(samples), -1)]
-        shown = [content.names.index(drawn.name) for drawn in layout.objects]
-        if shown:
-            rows = content.observations[samples][:, shown]
-            of_all = [
-                content.rings.points_from(rows[:, 0], sum(sum(drawn.form.rings) for drawn in layout.objects)),
-                objects[samples][:, shown],
-                content.middles[rows],
-            ]
-            if layout.has_heights:
-                top, bottom = content.footprints.top[rows], content.footprints.bottom[rows]
-                of_all.append(np.stack([top, bottom, top - bottom, top + _LIFT * scale], axis=-1))
-            columns += [each.reshape(len(samples), -1) for each in of_all]
-        if isinstance(layout.witness, CauseText):
-            numbers = [content.numbers[index] for index in samples.tolist()]
-            columns += _numbers_of_arrow(content.violations, samples, scale, numbers, layout.witness.words)
-        return columns
+
+class _Numbers(NamedTuple):
+    """Numbers of S messages.
+
+    Attributes:
+        stamps: (S, 2), encoded times.
+        regions: (S, 3 * regions), their colours.
+        objects: (R, 3), colours of the objects that are shown, message by message.
+        heights: (R, 4) of these, as `make_template` has them; (0, 4) if none has a height.
+    """
+
+    stamps: Words
+    regions: Floats
+    objects: Floats
+    heights: Floats
+
+
+def _heights(content: SceneContent, scale: float) -> Floats:
+    if not any(form.has_height for form in content.rings.forms):
+        return np.empty((0, 4))
+    top, bottom = content.footprints.top, content.footprints.bottom
+    return np.stack([top, bottom, top - bottom, top + _LIFT * scale], axis=-1)
+
+
+def _numbers(
+    layout: SceneLayout, samples: Integers, content: SceneContent, numbers: _Numbers, scale: float
+) -> list[Columns]:
+    """Return what to fill in the layout's template, each number once, in some messages (K,)."""
+    columns = [Columns(numbers.stamps, samples), Columns(numbers.regions, samples)]
+    count = len(layout.objects)
+    if count:
+        # those that are shown follow each other
+        first = content.observations[samples, content.names.index(layout.objects[0].name)]
+        corners = sum(sum(drawn.form.rings) for drawn in layout.objects)
+        columns.append(Columns(runs(content.rings.points, corners), content.rings.start[first]))
+        of_all = [numbers.objects, content.middles, *([numbers.heights] if layout.has_heights else [])]
+        columns += [Columns(runs(each, count), first) for each in of_all]
+    if isinstance(layout.witness, CauseText):
+        labels = [content.numbers[index] for index in samples.tolist()]
+        columns += _numbers_of_arrow(content.violations, samples, scale, labels, layout.witness.words)
+    return columns
 
 
 def _arrows_of(
@@ -284,7 +306,7 @@ def _shades_of(
 
 def _numbers_of_arrow(
     found: Violations, samples: Integers, scale: float, numbers: Sequence[bytes], words: int
-) -> list[Floats]:
+) -> list[Columns]:
     z = np.fmax(found.top[samples], 0.0) + 3.0 * _LIFT * scale
     return numbers_of_witness(found.points[samples], z, scale, numbers, words)
 
@@ -358,7 +380,8 @@ def _levels(sizes: Floats, scale: float) -> Integers:
     """Return how small some objects are: one level for each time that the size is halved."""
     with np.errstate(divide="ignore", invalid="ignore"):
         levels = np.round(LEVELS / 2.0 - np.log2(sizes / scale))
-    return np.clip(np.nan_to_num(levels), 0.0, LEVELS).astype(np.int64)
+    # of what has no size known, as NaN, 0
+    return np.fmin(np.fmax(levels, 0.0), LEVELS).astype(np.int64)
 
 
 def _class_codes(trace: Trace, rows: Integers) -> Integers:
@@ -369,17 +392,15 @@ def _class_codes(trace: Trace, rows: Integers) -> Integers:
 
 def _by_layout(content: SceneContent) -> Iterator[tuple[SceneLayout, Integers]]:
     """Yield the layouts, each with its samples (S,)."""
-    keys = np.column_stack([content.forms, content.styles, content.arrow, content.banner])
-    for samples in equal_places(combined(keys.T, len(keys))):
-        yield _layout(content, keys[samples[0]]), samples
+    keys = [*content.forms.T, *content.styles.T, content.arrow, content.banner]
+    for samples in equal_places(combined(keys, len(content.arrow))):
+        yield _layout(content, int(samples[0])), samples
 
 
-def _layout(content: SceneContent, key: NDArray[np.int64]) -> SceneLayout:
-    count = len(content.names)
-    arrow, banner = key[-2:].tolist()
-    listed: list[tuple[str, int, int]] = list(
-        zip(content.names, key[:count].tolist(), key[count : 2 * count].tolist(), strict=True)
-    )
+def _layout(content: SceneContent, message: int) -> SceneLayout:
+    arrow, banner = int(content.arrow[message]), int(content.banner[message])
+    of_objects = content.forms[message].tolist(), content.styles[message].tolist()
+    listed: list[tuple[str, int, int]] = list(zip(content.names, *of_objects, strict=True))
     shown = tuple(
         DrawnObject(name, content.rings.forms[form - FIRST_FORM], style >> 1, bool(style & 1))
         for name, form, style in listed
