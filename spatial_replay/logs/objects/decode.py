@@ -330,9 +330,11 @@ def _signals_given_twice(groups: Sequence[_Group]) -> dict[int, str]:
 
 
 def _padded(words: Words) -> Floats:
-    # the last two places, UNKNOWN and ZERO
-    padding = np.broadcast_to([np.nan, 0.0], (len(words), 2))
-    return np.concatenate([words.view(np.float64), padding], axis=1)
+    padded = np.empty((len(words), words.shape[1] + 2))
+    padded[:, :-2] = words.view(np.float64)
+    # UNKNOWN and ZERO
+    padded[:, -2:] = np.nan, 0.0
+    return padded
 
 
 def _observations(groups: Sequence[_Group], times_ns: Integers) -> Observations:
