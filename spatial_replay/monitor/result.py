@@ -299,10 +299,12 @@ class SpecResult(Displayed):
         """
         if self.semantics != "ltlf":
             return ()
-        if self.leaves is not None:
-            return find_vacuous(self.evidence, self.leaves, self.times_ns)
-        leaves = self.evidence.columns(self.evidence.instance.program.leaves)
-        return find_vacuous(self.evidence, leaves, self.evidence.times_ns())
+        leaves, times_ns = self.leaves, self.times_ns
+        if leaves is None:
+            leaves = self.evidence.columns(self.evidence.instance.program.leaves)
+            times_ns = self.evidence.times_ns()
+        is_infinite = bool(self.final[0, 0] == np.inf)
+        return find_vacuous(self.evidence, leaves, times_ns, is_infinite=is_infinite)
 
     @property
     def can_explain(self) -> bool:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.monitor.offline import OfflineNodes, evaluate_offline
+from spatial_replay.monitor.offline import evaluate_offline
 from spatial_replay.monitor.online.codes import low_and_high
 from spatial_replay.monitor.witness.evidence import Evidence
 from spatial_replay.monitor.witness.path import End, deciding_path
@@ -65,25 +65,28 @@ def no_instances(name: str, parameter: str) -> Vacuous:
     return Vacuous(None, text, "no instances", Sentence(message))
 
 
-def find_vacuous(evidence: Evidence, leaves: Floats, times_ns: Integers) -> tuple[Vacuous, ...]:
+def find_vacuous(
+    evidence: Evidence, leaves: Floats, times_ns: Integers, *, is_infinite: bool
+) -> tuple[Vacuous, ...]:
     """Return the parts of an instance's formula that decided nothing, in the order of the text.
 
     Args:
         evidence: the samples that it was evaluated over.
         leaves: (C, A, T), its leaves in them.
         times_ns: (T,), T at least 1.
+        is_infinite: whether the formula's robustness is infinite at least, at the first sample.
     """
     instance = evidence.instance
     nodes = [node for _, _, node in iter_nodes(instance.formula)]
-    done = evaluate_offline(instance.formula, instance.program.leaves, leaves, times_ns)
     scopes = _scopes(instance.formula, times_ns)
     found = [
         *_empty_windows(nodes, scopes, times_ns),
-        *_idle_implications(nodes, scopes, done, evidence),
+        *_idle_implications(nodes, scopes, leaves, times_ns, evidence),
         *_idle_bodies(nodes, scopes, evidence),
         *_empty_groups(nodes, scopes, evidence),
     ]
-    if done.ends(0)[0][0] == np.inf:
+    if is_infinite:
+        done = evaluate_offline(instance.formula, instance.program.leaves, leaves, times_ns)
         path = deciding_path(instance.formula, done, times_ns, 0, End.LOW)
         node, sample = path.steps[-1].node, path.steps[-1].sample
         if node not in {each.node for each in found}:
@@ -160,6 +163,8 @@ def windows_of(formula: Temporal, times_ns: Integers) -> tuple[Integers, Integer
     near = min(bound.lower, furthest)
     far = furthest if bound.upper is None else min(bound.upper, furthest)
     low, high = (places + near, places + far) if is_ahead else (places - far, places - near)
+    if bound.unit == "samples":
+        return np.clip(low, 0, count), np.clip(high + 1, 0, count)
     begin = np.searchsorted(places, low, side="left").astype(np.int64)
     return begin, np.searchsorted(places, high, side="right").astype(np.int64)
 
@@ -182,15 +187,16 @@ def _empty_windows(
 
 
 def _idle_implications(
-    nodes: Sequence[Formula], scopes: Sequence[_Samples], done: OfflineNodes, evidence: Evidence
+    nodes: Sequence[Formula],
+    scopes: Sequence[_Samples],
+    leaves: Floats,
+    times_ns: Integers,
+    evidence: Evidence,
 ) -> Iterator[_Idle]:
-    antecedents: dict[int, int] = {}
-    for identifier, parent, _ in iter_nodes(evidence.instance.formula):
-        if parent is not None:
-            antecedents.setdefault(parent, identifier)
+    order = evidence.instance.program.leaves
     for identifier, (node, scope) in enumerate(zip(nodes, scopes, strict=True)):
         if isinstance(node, Boolean) and node.operator == "->" and scope.any():
-            high = done.ends(antecedents[identifier])[1]
+            high = evaluate_offline(node.operands[0], order, leaves, times_ns).ends(0)[1]
             if not (high[scope] >= 0.0).any():
                 yield _untested(identifier, node, evidence)
 
