@@ -14,7 +14,7 @@ from spatial_replay.automata.compile import automaton, stored_text
 from spatial_replay.automata.dot_hoa import size_words
 from spatial_replay.automata.guards import Transition
 from spatial_replay.errors import NoAutomatonError
-from spatial_replay.geometry.arrays import Flags, Integers
+from spatial_replay.geometry.arrays import Flags, Integers, combined, equal_places
 from spatial_replay.logs.messages import Attachment
 from spatial_replay.logs.objects.wire import WireTemplate
 from spatial_replay.logs.payloads import Filled, filled_in
@@ -234,10 +234,13 @@ def _distinct(
 ) -> tuple[list[bytes], Integers]:
     """Return the distinct steps, each with a key, and which of them (T,) each sample takes."""
     if before.ndim == 1:
-        both = np.stack([before, after], axis=1)
-        rows = np.ascontiguousarray(both).view(np.uint8).reshape(len(both), -1)
-    else:
-        rows = np.packbits(np.concatenate([before, after], axis=1), axis=1)
+        steps, groups = np.stack([before, after], axis=1), np.empty(len(before), np.int64)
+        keys = list[bytes]()
+        for places in equal_places(combined([before, after], len(before))):
+            groups[places] = len(keys)
+            keys.append(steps[places[0]].tobytes())
+        return keys, groups
+    rows = np.packbits(np.concatenate([before, after], axis=1), axis=1)
     kinds, groups = np.unique(rows.view(f"V{rows.shape[1]}").ravel(), return_inverse=True)
     return [kind.tobytes() for kind in kinds], groups.ravel()
 

@@ -314,19 +314,23 @@ def _locate(
     """Fill in the points of the samples `here` (H,), whose leaves are given, and the atoms of quantifiers."""
     if result.leaf_pairs is None:
         return
-    leaf, scene = found.leaf[here], TraceScene(trace, result.leaf_pairs.regions)
-    for index in np.unique(leaf[leaf >= 0]).tolist():
-        there = here[leaf == index]
+    here = here[found.leaf[here] >= 0]
+    if not len(here):
+        return
+    # of all samples, these are often few
+    leaf, scene = found.leaf[here], TraceScene(trace.take(samples[here]), result.leaf_pairs.regions)
+    for index in np.unique(leaf).tolist():
+        there = np.flatnonzero(leaf == index)
         pair = result.leaf_pairs.pairs[index]
         if pair is not None:
-            _point_at(scene, pair, samples, there, found)
-        for body, those in _bound(result, index, trace.times_ns[samples[there]]):
+            _point_at(scene, pair, there, here[there], found)
+        for body, those in _bound(result, index, scene.trace.times_ns[there]):
             of_body = pair_of(body)
-            those = there[those][found.moment_ns[there[those]] < 0]
+            those = there[those][found.moment_ns[here[there[those]]] < 0]
             if of_body is not None and len(those):
-                found.atom[those] = len(found.atoms)
+                found.atom[here[those]] = len(found.atoms)
                 found.atoms.append(result.leaf_pairs.text_of(body))
-                _point_at(scene, of_body, samples, those, found)
+                _point_at(scene, of_body, those, here[those], found)
 
 
 def _bound(result: EvaluatedResult, leaf: int, times_ns: Integers) -> Iterator[tuple[Formula, Integers]]:
@@ -343,9 +347,9 @@ def _bound(result: EvaluatedResult, leaf: int, times_ns: Integers) -> Iterator[t
 
 
 def _point_at(scene: TraceScene, pair: Pair, samples: Integers, there: Integers, found: Violations) -> None:
-    """Fill in the points of some samples between which an atom is shown."""
+    """Fill in the points of some samples of a scene, those of the violations `there`."""
     operands = [scene.resolve(term).operand for term in (pair.first, pair.second)]
-    first, second = (Operand(each.rows[samples[there]], each.enlargement) for each in operands)
+    first, second = (Operand(each.rows[samples], each.enlargement) for each in operands)
     numbers = contacts(scene.batch, first, second, is_protrusion=pair.is_protrusion)
     found.points[there] = numbers[:, :4].reshape(-1, 2, 2)
     found.top[there] = numbers[:, 5]
