@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -27,8 +27,9 @@ _FLATNESS = 1e-9
 _ROUNDING = 4 * 2.0**-52
 _SMALLEST = 1e-100
 
+_Corner: TypeAlias = tuple[float, float]
 _Ring: TypeAlias = tuple[int, ...]
-"""A polygon, as indices of its vertices."""
+"""A polygon, as indices of its corners."""
 
 
 class Outlines(NamedTuple):
@@ -260,12 +261,11 @@ def convex_pieces(vertices: Floats) -> list[Floats]:
     polygon = Polygon(vertices)
     if not polygon.is_valid:
         raise GeometryError(_describe_crossing(polygon))
-    number = {(float(x), float(y)): i for i, (x, y) in enumerate(vertices)}
-    triangles = [
-        tuple(number[float(x), float(y)] for x, y in get_coordinates(triangle)[:3])
-        for triangle in constrained_delaunay_triangles(polygon).geoms
-    ]
-    pieces = _merge((ring if _turn(vertices, *ring) > 0 else ring[::-1] for ring in triangles), vertices)
+    corners = [(x, y) for x, y in vertices.tolist()]
+    number = {corner: i for i, corner in enumerate(corners)}
+    closed = get_coordinates(constrained_delaunay_triangles(polygon)).reshape(-1, 4, 2)
+    triangles = [tuple([number[x, y] for x, y in triangle]) for triangle in closed[:, :3].tolist()]
+    pieces = _merge((ring if _turn(corners, *ring) > 0 else ring[::-1] for ring in triangles), corners)
     return [vertices[list(ring)] for ring in pieces]
 
 
@@ -280,24 +280,24 @@ def _describe_crossing(polygon: object) -> str:
     )
 
 
-def _turn(vertices: Floats, a: int, b: int, c: int) -> float:
+def _turn(corners: Sequence[_Corner], a: int, b: int, c: int) -> float:
     """Return a positive number if the path a, b, c turns left."""
-    (ax, ay), (bx, by), (cx, cy) = vertices[a], vertices[b], vertices[c]
-    return float((bx - ax) * (cy - by) - (by - ay) * (cx - bx))
+    (ax, ay), (bx, by), (cx, cy) = corners[a], corners[b], corners[c]
+    return (bx - ax) * (cy - by) - (by - ay) * (cx - bx)
 
 
-def _merge(triangles: Iterable[_Ring], vertices: Floats) -> list[_Ring]:
+def _merge(triangles: Iterable[_Ring], corners: Sequence[_Corner]) -> list[_Ring]:
     """Join counter-clockwise triangles across shared edges while the result is convex."""
     rings = dict(enumerate(triangles))
     ring_of_edge = {edge: name for name, ring in rings.items() for edge in _edges(ring)}
     shared = [(i, j) for i, j in ring_of_edge if i < j and (j, i) in ring_of_edge]
-    for i, j in sorted(shared, key=lambda edge: (-_squared_length(vertices, *edge), edge)):
+    for i, j in sorted(shared, key=lambda edge: (-_squared_length(corners, *edge), edge)):
         left, right = rings[ring_of_edge[i, j]], rings[ring_of_edge[j, i]]
         # left runs j … i, right runs i … j
         from_j, from_i = _rotated(left, j), _rotated(right, i)
         ring = from_j + from_i[1:-1]
-        at_i = _turn(vertices, from_j[-2], i, from_i[1])
-        at_j = _turn(vertices, from_i[-2], j, from_j[1])
+        at_i = _turn(corners, from_j[-2], i, from_i[1])
+        at_j = _turn(corners, from_i[-2], j, from_j[1])
         if at_i < 0 or at_j < 0:
             continue
         merged, removed = ring_of_edge[i, j], ring_of_edge[j, i]
@@ -317,5 +317,6 @@ def _rotated(ring: _Ring, first: int) -> _Ring:
     return ring[place:] + ring[:place]
 
 
-def _squared_length(vertices: Floats, i: int, j: int) -> float:
-    return float(np.sum((vertices[i] - vertices[j]) ** 2))
+def _squared_length(corners: Sequence[_Corner], i: int, j: int) -> float:
+    (ax, ay), (bx, by) = corners[i], corners[j]
+    return (ax - bx) * (ax - bx) + (ay - by) * (ay - by)
