@@ -208,8 +208,6 @@ class Monitor:
         trial = LiveStream(specification, checked, 0)
         for time_ns in range(2 * ROOM):
             trial.extend(Sample(time_ns))
-        # unknown members of open groups take another way
-        trial.extend(Sample(2 * ROOM, unknown={"unknown": None}))
         if checked == "ltlf":
             rehearse(specification)
         self._live = LiveStream(specification, checked, start_ns or 0)

@@ -220,11 +220,7 @@ class LiveStream:
             return self._extend_apart(sample, samples)
         if sample.time_ns < self._start_ns:
             return [None] * len(self._evaluators)
-        planned = self._leaves.planned(samples)
-        if planned is None:
-            numbers = self._live.extend_with(self._leaves.values(samples), sample.time_ns)
-        else:
-            numbers = self._live.extend(*planned, sample.time_ns)
+        numbers = self._live.extend(*self._leaves.planned(samples), sample.time_ns)
         return [numbers[own] for own in self._own_nodes] if len(self._own_nodes) > 1 else [numbers]
 
     def _extend_apart(self, sample: Sample, samples: Sequence[Sample | None]) -> list[Floats | None]:

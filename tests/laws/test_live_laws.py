@@ -19,6 +19,7 @@ LOOKING_BACK = """\
 group people = class "person"
 group everyone = all
 spec alone = G forall x in people: x dist (everyone except x) >= 1
+spec apart = G forall x, y in people: x dist y >= 0.5
 spec going = F exists x in everyone: x dist x[-{samples}] >= 1
 spec parted = H[0, {samples}] forall x in people[-{duration}ms]: x dist a[-{duration}ms] >= 0.5
 spec near = (everyone[-{samples}] dist b <= 3) S[0, {duration}ms] (a oriented[0.5] c)

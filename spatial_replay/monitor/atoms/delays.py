@@ -62,16 +62,9 @@ class RecentSamples:
 
     def add(self, sample: Sample) -> list[Sample | None]:
         """Add the next sample; return the one at each delay from it, None before the first sample."""
-        self._newest = sample
         if self._is_newest_only:
             return [sample]
         return [_at_delay(delay, queue, sample) for delay, queue in self._queues]
-
-    @property
-    def span(self) -> list[Sample]:
-        """Every sample since the earliest that may be looked back at, in order."""
-        longest = max((queue for _, queue in self._queues), key=len, default=deque[Sample]())
-        return list(longest) or [self._newest]
 
 
 def _at_delay(delay: Delay, queue: deque[Sample], sample: Sample) -> Sample | None:

@@ -24,7 +24,6 @@ import numpy as np
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats, Integers, places_of, starts_from_counts
 from spatial_replay.geometry.batch import FootprintBatch
-from spatial_replay.geometry.footprint import TrackedObject
 from spatial_replay.geometry.measure import QUANTITY_CODES
 from spatial_replay.monitor.atoms.delays import NO_DELAY, RecentSamples, iter_delays
 from spatial_replay.monitor.atoms.instructions import LeafCode
@@ -35,9 +34,9 @@ from spatial_replay.monitor.atoms.live_rows import (
     PlanContext,
     PlanRows,
 )
-from spatial_replay.monitor.atoms.measurements import leaf_values, quantity_of
+from spatial_replay.monitor.atoms.measurements import quantity_of
 from spatial_replay.monitor.atoms.plan_arrays import PlacedPlan, PlanArrays
-from spatial_replay.monitor.atoms.terms import TraceScene, footprint_from_outline
+from spatial_replay.monitor.atoms.terms import footprint_from_outline
 from spatial_replay.spec.formula import (
     ANY_CLASS,
     Enlarged,
@@ -50,7 +49,6 @@ from spatial_replay.spec.formula import (
 )
 from spatial_replay.spec.walks import base_of, iter_terms, measured_terms
 from spatial_replay.trace.sample import Sample
-from spatial_replay.trace.trace import Trace
 
 
 class LeafPlan:
@@ -107,16 +105,23 @@ class LeafPlan:
         if len(samples) > 1:
             lookups = [sample.objects.get if sample else _NOTHING_THERE for sample in samples]
         for place, name in self._places:
-            tracked: Any = lookups[place](stands_for.get(name, name) if stands_for else name)
-            packed += _NO_OBJECT_THERE if tracked is None else tracked.packed
+            name = stands_for.get(name, name) if stands_for else name
+            tracked: Any = lookups[place](name)
+            if tracked is not None:
+                packed += tracked.packed
+                if self._has_classes:
+                    numbers.append(codes[tracked.class_name])
+                continue
+            unknown: Any = _NOTHING if samples[place] is None else cast(Sample, samples[place]).unknown
+            packed.append(_HIDDEN if name in unknown else _NOT_THERE)
             if self._has_classes:
-                numbers.append(0.0 if tracked is None else codes[tracked.class_name])
+                numbers.append(codes[unknown[name]] if name in unknown else 0.0)
         packed[0] = self._pack(*numbers)
         return b"".join(packed)
 
 
 _NOTHING_THERE: Callable[[str], None] = MappingProxyType[str, None]({}).get
-_NO_OBJECT_THERE = (Struct("=5d").pack(0.0, nan, nan, nan, 0.0),)
+_NOT_THERE, _HIDDEN = (Struct("=5d").pack(parts, nan, nan, nan, 0.0) for parts in (0.0, -1.0))
 
 
 class ClassCodes(dict[str | None, int]):
@@ -269,23 +274,16 @@ class SampleLeaves:
         Raises:
             UsageError: more bindings than `MAX_BINDINGS`.
         """
-        planned = self.planned(samples)
-        if planned is None:
-            return self._values_with_unknown()
-        plan, numbers = planned
-        return leaves_of_sample(plan, numbers)
+        return leaves_of_sample(*self.planned(samples))
 
-    def planned(self, samples: Sequence[Sample | None]) -> tuple[PlacedPlan, bytes] | None:
-        """Return what `measure_sample` takes, as bytes; None if `values` alone can compute the leaves.
+    def planned(self, samples: Sequence[Sample | None]) -> tuple[PlacedPlan, bytes]:
+        """Return what `measure_sample` takes, as bytes.
 
         Raises:
             UsageError: more bindings than `MAX_BINDINGS`.
         """
         plan, stands_for = self._only_plan, _NOTHING
         if plan is None:
-            # to what names its objects, one that is unknown is as one that is not there
-            if any(sample is not None and sample.unknown for sample in samples):
-                return None
             plan, stands_for = self._fitting_plan(samples)
         return plan.placed, plan.numbers(samples, stands_for, self._codes)
 
@@ -303,19 +301,15 @@ class SampleLeaves:
             stands_for.update(zip_longest(plan.placeholders[classes], names, fillvalue=_NO_OBJECT))
         return plan, stands_for
 
-    def _values_with_unknown(self) -> Floats:
-        """Compute the leaves as a replay does: plans have no unknown members of open groups."""
-        scene = TraceScene(Trace.from_samples(self._recent.span), self._regions)
-        return leaf_values(scene, list(chain.from_iterable(self._frame.leaves)), {})[:, :, -1:]
-
     def _unnamed_members(self, samples: Sequence[Sample | None]) -> dict[_Classes, list[str]]:
         """Return the members of open groups that the specification does not name, by their classes."""
         found: dict[str, _Classes] = {}
         own: list[Member] = []
         codes, takes_any, own_names = self._codes, self._takes_any, self._own_names
-        for sample in samples:
-            for name, tracked in () if sample is None else sample.objects.items():
-                code = codes[cast(TrackedObject, tracked).class_name]
+        for sample in filter(None, samples):
+            classes = [(name, cast(Any, tracked).class_name) for name, tracked in sample.objects.items()]
+            for name, class_name in chain(classes, sample.unknown.items()):
+                code = codes[class_name]
                 if not (code or takes_any):
                     continue
                 if name in own_names:
@@ -327,8 +321,8 @@ class SampleLeaves:
         if not self._own_members.issuperset(own):
             self._own_members |= frozenset(own)
         kinds: dict[_Classes, list[str]] = {}
-        for name, classes in found.items():
-            kinds.setdefault(classes, []).append(name)
+        for name, kind in found.items():
+            kinds.setdefault(kind, []).append(name)
         return kinds
 
     def _plan_for(self, counts: Mapping[_Classes, int]) -> LeafPlan:

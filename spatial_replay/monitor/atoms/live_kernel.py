@@ -2,7 +2,8 @@
 
 A plan's arrays say which rows are measured with which, and how leaves follow. Rows stand for, in this order:
 each sample looked at, the regions, then the places, each an object in one of those samples. A missing sample
-or object has the class code `ABSENT`.
+or object has the class code `ABSENT`; an object that is there, but not known where, has its class, and no
+parts.
 
 What is worked with lies in one piece of memory: to allocate an array, and to count who refers to it, takes as
 long as to measure a pair of boxes.
@@ -66,7 +67,7 @@ def _parts_and_corners(plan: PlanArrays, sample_at: int) -> tuple[int, int]:
     parts, corners = len(plan.region_radius), len(plan.region_vertices) // 2
     at = _places_at(plan, sample_at)
     for _ in range(plan.extent[2]):
-        own = int(floats_at(at, _OF_OBJECT)[PARTS])
+        own = max(int(floats_at(at, _OF_OBJECT)[PARTS]), 0)
         at += 8 * _OF_OBJECT
         parts += own
         for _ in range(own):
@@ -125,9 +126,11 @@ def _rows_of_sample(plan: PlanArrays, sample_at: int, parts: int, corners: int, 
     at = _places_at(plan, sample_at)
     for row in range(here, rows):
         tracked = floats_at(at, _OF_OBJECT)
-        own = int(tracked[PARTS])
+        own = max(int(tracked[PARTS]), 0)
         at += 8 * _OF_OBJECT
-        made.classes[row] = ABSENT if own == 0 else int(codes[row - here]) if len(codes) else 0
+        made.classes[row] = int(codes[row - here]) if len(codes) else 0
+        if tracked[PARTS] == 0.0:
+            made.classes[row] = ABSENT
         made.part_start[row + 1] = part + own
         made.bottom[row], made.top[row] = tracked[BOTTOM], tracked[TOP]
         made.yaw[row], made.uncertainty[row] = tracked[YAW], tracked[UNCERTAINTY]
@@ -148,27 +151,38 @@ def _is_there(classes: Integers, row: int, wanted: int) -> bool:
     return classes[row] != ABSENT and wanted in (ANY, classes[row])
 
 
+@inlined
+def _is_hidden(plan: PlanArrays, rows: SampleRows, row: int) -> bool:
+    """Return whether an object that is there is not known where."""
+    is_place = row >= plan.extent[0] + plan.extent[1]
+    return bool(is_place and rows.part_start[row] == rows.part_start[row + 1])
+
+
 @merged
 def _measure(plan: PlanArrays, rows: SampleRows, room_at: int, values: Floats, spreads: Floats) -> None:
     """Fill `values` and `spreads` (K, 1), as `measurements.measured` gives them."""
     if len(values) == 0:  # signals alone
         return
     operands = len(plan.operand_start) - 1
-    widths, of_operands = integers_at(room_at, operands), floats_at(room_at + 8 * operands, operands + 1)
-    measured = floats_at(room_at + 8 * (2 * operands + 1), (len(plan.geometric), 1))
-    members_at = room_at + 8 * (2 * operands + 1 + len(plan.geometric))
-    members = integers_at(members_at, len(plan.operand_rows))
-    of_operands[operands] = 0.0  # for no operand, -1
+    of_operands = floats_at(room_at, operands + 1)
+    widths = integers_at(room_at + 8 * (operands + 1), operands)
+    hidden = integers_at(room_at + 16 * (operands + 1), operands + 1)
+    measured_at = room_at + 24 * (operands + 1)
+    measured = floats_at(measured_at, (len(plan.geometric), 1))
+    members = integers_at(measured_at + 8 * len(plan.geometric), len(plan.operand_rows))
+    of_operands[operands], hidden[operands] = 0.0, 0  # for no operand, -1
     for operand in range(operands):
         begin, end = plan.operand_start[operand], plan.operand_start[operand + 1]
-        widths[operand], spread = end - begin, 0.0
+        widths[operand], hidden[operand], spread = end - begin, 0, 0.0
         for k in range(begin, end):
-            row = plan.operand_rows[k]
-            if _is_there(rows.classes, row, plan.operand_classes[k]):
+            row, members[k] = plan.operand_rows[k], ABSENT
+            if not _is_there(rows.classes, row, plan.operand_classes[k]):
+                continue
+            if _is_hidden(plan, rows, row):
+                hidden[operand] = 1
+            else:
                 members[k] = row
                 spread = max(spread, rows.uncertainty[row])
-            else:
-                members[k] = ABSENT
         of_operands[operand] = spread
     measure_rows(
         rows.part_start,
@@ -191,7 +205,7 @@ def _measure(plan: PlanArrays, rows: SampleRows, room_at: int, values: Floats, s
     )
     for g in range(len(plan.geometric)):
         k = plan.geometric[g]
-        values[k, 0] = measured[g, 0]
+        values[k, 0] = np.nan if hidden[plan.first[g]] or hidden[plan.second[g]] else measured[g, 0]
         spreads[k, 0] = of_operands[plan.first[g]] + of_operands[plan.second[g]]
     for y in range(len(plan.yaws)):
         k, a, b = plan.yaws[y, 0], plan.yaws[y, 1], plan.yaws[y, 2]
@@ -209,9 +223,16 @@ def _closest(plan: PlanArrays, rows: SampleRows, room_at: int, closest: Floats) 
     for k in range(len(closest)):
         begin, end = plan.closest_start[k], plan.closest_start[k + 1]
         members = integers_at(room_at + 24, (1, end - begin))
+        there = hidden = 0
         for m in range(begin, end):
-            is_there = _is_there(rows.classes, plan.closest_rows[m], plan.closest_classes[m])
-            members[0, m - begin] = plan.closest_rows[m] if is_there else ABSENT
+            row, members[0, m - begin] = plan.closest_rows[m], ABSENT
+            if not _is_there(rows.classes, row, plan.closest_classes[m]):
+                continue
+            there += 1
+            if _is_hidden(plan, rows, row):
+                hidden += 1
+            else:
+                members[0, m - begin] = row
         closest_rows(
             rows.part_start,
             rows.vertex_start,
@@ -227,6 +248,8 @@ def _closest(plan: PlanArrays, rows: SampleRows, room_at: int, closest: Floats) 
         )
         closest[k, 0, 0] = closest[k, 1, 0] = found[0, 0]
         closest[k, 2, 0], closest[k, 3, 0] = found[0, 1], found[0, 2]
+        if hidden > 0 and there > 1:  # it may be anywhere, and so may be the closest
+            closest[k, 0, 0] = closest[k, 2, 0] = -np.inf
 
 
 @inlined
@@ -244,8 +267,10 @@ def _channels_of(values: Floats, spreads: Floats, signals: Floats, closest: Floa
     """Return the number of channels needed: 4 with uncertainty, 2 with anything unknown, else 1."""
     channels = 1
     for k in range(len(closest)):
-        if closest[k, 2, 0] != closest[k, 0, 0] or closest[k, 3, 0] != closest[k, 0, 0]:
+        if closest[k, 2, 0] != closest[k, 0, 0] or closest[k, 3, 0] != closest[k, 1, 0]:
             return 4
+        if closest[k, 0, 0] != closest[k, 1, 0]:
+            channels = 2
     for k in range(len(values)):
         if spreads[k, 0] != 0.0:
             return 4
@@ -263,7 +288,7 @@ def _channels_of(values: Floats, spreads: Floats, signals: Floats, closest: Floa
 @inlined
 def _room_for_numbers(plan: PlanArrays) -> int:
     flags, results = (len(plan.is_group) + 7) // 8, 2 * (len(plan.required_start) - 1)
-    while_measuring = 2 * len(plan.operand_start) - 1 + len(plan.geometric) + len(plan.operand_rows)
+    while_measuring = 3 * len(plan.operand_start) + len(plan.geometric) + len(plan.operand_rows)
     # one after the other
     work = max(while_measuring, 3 + len(plan.closest_rows))
     return int(flags + results + 4 * len(plan.closest_enlargement) + work)
@@ -302,7 +327,7 @@ def measure_sample(table_at: int, sample_at: int, leaves_at: int) -> int:
         table_at: address of the table of a plan's arrays.
         sample_at: address of these numbers: for each sample looked at 0, or `ABSENT`; the value of each
             signal; if the plan distinguishes classes, the code of that at each place; of each place, as its
-            object and this one's parts are `packed`, or as an object without parts.
+            object is `packed`: as one of no parts if it is not there, of -1 if it is not known where.
         leaves_at: address of room for all channels of the leaves.
 
     Returns:

@@ -7,7 +7,6 @@ address of a table that says where all arrays lie.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -111,7 +110,6 @@ class LiveRuns:
         self._take_in = by_address(_take_in_with_windows if has_windows else _take_in)
         leaves = starts_from_counts([len(program.leaves) for program in programs])
         nodes = starts_from_counts([len(program.reports) for program in programs])
-        self._ends = list(pairwise(leaves.tolist()))
         self._plan: PlacedPlan | None = None
         self._leaves = np.empty((MOST_CHANNELS, int(leaves[-1])))
         self._shape = int(nodes[-1]), 4
@@ -151,19 +149,6 @@ class LiveRuns:
             self._find_arrays()
         # a view of bytes cannot be written to
         return np.ndarray(self._shape, _DOUBLE, self._series.tobytes())
-
-    def extend_with(self, leaves: Floats, time_ns: int) -> Floats:
-        """Add a sample of which the leaves (C, A, 1) are known; return what `extend` does."""
-        times_ns = np.array([time_ns], np.int64)
-        series = [
-            run.extend(leaves[:, begin:end], times_ns)[:, :, 0]
-            for run, (begin, end) in zip(self._runs, self._ends, strict=True)
-        ]
-        self._channels = max(self._channels, len(leaves))
-        self._find_arrays()
-        joined = np.concatenate(series)
-        joined.setflags(write=False)
-        return joined
 
     def _find_arrays(self) -> None:
         """Enter where the arrays of all runs are, and how many channels they have."""
