@@ -31,12 +31,14 @@ class Rings(NamedTuple):
         points: (P, 2), counter-clockwise.
         form: (R,) int64, index into `forms`.
         forms: for each form, the lengths of its rings and whether it has a height.
+        has_round: whether any part is rounded, or a point.
     """
 
     start: Integers
     points: Floats
     form: Integers
     forms: tuple[Form, ...]
+    has_round: bool
 
     def rings_of(self, footprint: int) -> tuple[Floats, ...]:
         """Return the rings (n, 2) of one of the footprints."""
@@ -63,7 +65,7 @@ def rings_of(footprints: FootprintBatch, point_radius: float) -> Rings:
     form, forms = _forms(footprints, lengths)
     if not is_round.any():
         corners = footprints.vertices[footprints.vertex_start[0] : footprints.vertex_start[-1]]
-        return Rings(part_start[footprints.part_start], corners, form, forms)
+        return Rings(part_start[footprints.part_start], corners, form, forms, False)
     points = np.empty((part_start[-1], 2))
     straight = ~is_round
     points[flat_index(part_start[:-1][straight], counts[straight])] = footprints.vertices[
@@ -74,7 +76,7 @@ def rings_of(footprints: FootprintBatch, point_radius: float) -> Rings:
         corners = footprints.vertices[footprints.vertex_start[parts][:, None] + np.arange(count)]
         radius = np.where(footprints.radius[parts] > 0.0, footprints.radius[parts], point_radius)
         points[part_start[parts][:, None] + np.arange(ROUND)] = _rounded(corners, radius)
-    return Rings(part_start[footprints.part_start], points, form, forms)
+    return Rings(part_start[footprints.part_start], points, form, forms, True)
 
 
 def outlines_of(footprint: Footprint) -> list[Floats]:
@@ -163,10 +165,9 @@ def _forms(footprints: FootprintBatch, lengths: Integers) -> tuple[Integers, tup
     has_height = ~np.isnan(footprints.bottom)
     columns = [part_counts, has_height]
     for part in range(int(part_counts.max(initial=0))):
-        there = part_counts > part
-        length = np.zeros(len(footprints), np.int64)
-        length[there] = lengths[footprints.part_start[:-1][there] + part]
-        columns.append(length)
+        has_part = part_counts > part
+        at = np.where(has_part, footprints.part_start[:-1] + part, 0)
+        columns.append(np.where(has_part, lengths[at], 0))
     form, forms = np.zeros(len(footprints), np.int64), list[Form]()
     for places in equal_places(combined(columns, len(footprints))):
         form[places], row = len(forms), int(places[0])

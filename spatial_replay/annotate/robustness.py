@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from google.protobuf.message import DecodeError
@@ -72,6 +73,17 @@ def encode_robustness(
         series: (N, 4, T): value, now, lower, upper.
         final: whether lower and upper are those of the finished log.
     """
+    count = len(times_ns)
+    numbers = series.reshape(4 * len(names), count)
+    words = gathered([Columns(times_ns[:, None]), Columns(numbers.T)], count)
+    marks = gathered([Columns(standing_codes(series, final=final).T)], count, np.uint8)
+    template = _encoded_once(name, object, tuple(names), final)
+    return filled_in(count, [(np.arange(count), Filled(template, words, marks))])
+
+
+@lru_cache(64)
+def _encoded_once(name: str, object: str | None, names: tuple[str | None, ...], final: bool) -> WireTemplate:
+    """Return the template of a result's messages, which are encoded a block at a time."""
     message = Robustness(time_ns=1, specification=name, object=object or "", final=final)
     for identifier, node in enumerate(names):
         message.nodes.add(
@@ -83,11 +95,7 @@ def encode_robustness(
             upper=1.0,
             standing=UNKNOWN,
         )
-    count = len(times_ns)
-    numbers = series.reshape(4 * len(names), count)
-    words = gathered([Columns(times_ns[:, None]), Columns(numbers.T)], count)
-    marks = gathered([Columns(standing_codes(series, final=final).T)], count, np.uint8)
-    return filled_in(count, [(np.arange(count), Filled(WireTemplate.of(message), words, marks))])
+    return WireTemplate.of(message)
 
 
 def standing_codes(series: Floats, *, final: bool = False) -> Codes:

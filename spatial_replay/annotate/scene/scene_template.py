@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
@@ -150,7 +151,35 @@ class SceneTemplate:
         return Filled(self.template, gathered(columns, count), np.empty((count, 0), np.uint8), self.order)
 
 
-def make_template(layout: SceneLayout, regions: tuple[Region, ...], lift: float) -> SceneTemplate:
+class EncodedRegions(NamedTuple):
+    """The regions of all messages.
+
+    Attributes:
+        count: how many there are.
+        entities: encoded, but for their colours and timestamps.
+        order: which of a message's numbers their fields have.
+    """
+
+    count: int
+    entities: bytes
+    order: list[int]
+
+
+def encode_regions(regions: Sequence[Region]) -> EncodedRegions:
+    """Encode regions; larger ones lie lower, so that they hide no smaller one."""
+    sizes = [region.size for region in regions]
+    message, order = SceneUpdate(), list[int]()
+    for number, (region, size) in enumerate(zip(regions, sizes, strict=True)):
+        smaller = sum(other < size for other in sizes)
+        depth = _LABEL_LIFT * smaller / len(regions) * min(sizes)
+        entity = _add_entity(message, REGION + region.name)
+        _add_region(entity, region, depth)
+        at = len(_STAMP_WORDS) + 3 * number
+        order += [at, at + 1, at + 2] * (len(entity.lines) + len(entity.triangles))
+    return EncodedRegions(len(regions), _encoded(message), order)
+
+
+def make_template(layout: SceneLayout, regions: EncodedRegions, lift: float) -> SceneTemplate:
     """Return the template of a layout.
 
     The numbers of a message are, each once: its timestamp (2), the colours of the regions (3 each), the
@@ -160,29 +189,24 @@ def make_template(layout: SceneLayout, regions: tuple[Region, ...], lift: float)
     Args:
         lift: height of flat objects above the plane, so that they cover regions.
     """
-    message = SceneUpdate()
+    gone, last = SceneUpdate(), SceneUpdate()
     for name in layout.deleted:
-        message.deletions.add(id=OBJECT + name, type=SceneEntityDeletion.MATCHING_ID, timestamp=_A_STAMP)
+        gone.deletions.add(id=OBJECT + name, type=SceneEntityDeletion.MATCHING_ID, timestamp=_A_STAMP)
     if layout.witness == "deleted":
-        message.deletions.add(id=WITNESS, type=SceneEntityDeletion.MATCHING_ID, timestamp=_A_STAMP)
-    for region in regions:
-        # larger ones lie lower, so that they hide no smaller one
-        smaller = sum(other.size < region.size for other in regions)
-        depth = _LABEL_LIFT * smaller / len(regions) * min(other.size for other in regions)
-        _add_region(_add_entity(message, REGION + region.name), region, depth)
-    for drawn in layout.objects:
-        _add_object(_add_entity(message, OBJECT + drawn.name), drawn, lift)
+        gone.deletions.add(id=WITNESS, type=SceneEntityDeletion.MATCHING_ID, timestamp=_A_STAMP)
     if layout.banner is not None:
-        _add_banner(_add_entity(message, BANNER), layout.banner, lift)
-    places, end = _places(layout, len(regions))
-    number, order = "", _order_of_regions(regions)
+        _add_banner(_add_entity(last, BANNER), layout.banner, lift)
+    places, end = _places(layout, regions.count)
+    number, order = "", [*regions.order]
     for drawn, own in zip(layout.objects, places, strict=True):
         order += _order_of_object(drawn, own)
     if isinstance(layout.witness, CauseText):
         number = "#" * (8 * layout.witness.words)
-        point_at(_add_entity(message, WITNESS), layout.witness.text + number, lift)
+        point_at(_add_entity(last, WITNESS), layout.witness.text + number, lift)
         order += range(end, end + _ARROW_NUMBERS + layout.witness.words)
-    encoded = message.SerializeToString(deterministic=True)
+    objects = [_encoded_object(drawn, lift) for drawn in layout.objects]
+    # messages are joined by joining their bytes
+    encoded = b"".join([_encoded(gone), regions.entities, *objects, _encoded(last)])
     slots = _offsets(encoded, SLOT_BYTES)
     if number:
         # the end of the last text of all
@@ -193,6 +217,10 @@ def make_template(layout: SceneLayout, regions: tuple[Region, ...], lift: float)
     words = [*slots, *(begin + at for begin in stamps for at in _STAMP_WORDS)]
     template = WireTemplate(payload, np.array(words, np.int64), np.empty(0, np.int64))
     return SceneTemplate(template, np.array(order + [0, 1] * len(stamps), np.int64))
+
+
+def _encoded(message: SceneUpdate) -> bytes:
+    return message.SerializeToString(deterministic=True)
 
 
 def border_of(region: Region) -> list[Floats]:
@@ -255,16 +283,6 @@ def _corners(rings: tuple[int, ...], begin: int) -> list[list[tuple[int, int]]]:
     ]
 
 
-def _order_of_regions(regions: Sequence[Region]) -> list[int]:
-    """Return which numbers the regions' fields have: the colours of lines and faces."""
-    order = []
-    for number, region in enumerate(regions):
-        entity = _region_entity(region)
-        at = len(_STAMP_WORDS) + 3 * number
-        order += [at, at + 1, at + 2] * (len(entity.lines) + len(entity.triangles))
-    return order
-
-
 _ARROW_NUMBERS: Final = 10
 """Of `numbers_of_witness`, but for its text."""
 
@@ -320,10 +338,12 @@ def _add_region(entity: SceneEntity, region: Region, depth: float = 0.0) -> None
     )
 
 
-def _region_entity(region: Region) -> SceneEntity:
-    entity = SceneEntity()
-    _add_region(entity, region)
-    return entity
+@lru_cache(4096)
+def _encoded_object(drawn: DrawnObject, lift: float) -> bytes:
+    """Encode an object: most of those in a layout are in the one before, too."""
+    message = SceneUpdate()
+    _add_object(_add_entity(message, OBJECT + drawn.name), drawn, lift)
+    return _encoded(message)
 
 
 def _add_object(entity: SceneEntity, drawn: DrawnObject, lift: float) -> None:
@@ -362,9 +382,16 @@ def _offsets(payload: bytes, wanted: bytes) -> list[int]:
 
 def encoded_stamps(times_ns: Integers) -> Words:
     """Encode nanoseconds (S,) as the contents of timestamps: (S, 2) words that overlap, at `_STAMP_WORDS`."""
-    rows = np.tile(np.frombuffer(_STAMP_BYTES, np.uint8), (len(times_ns), 1))
-    shifts = np.arange(0, 35, 7)
-    more = np.array([0x80, 0x80, 0x80, 0x80, 0x00])
-    for begin, number in ((1, times_ns // _NS), (7, times_ns % _NS)):
-        rows[:, begin : begin + 5] = number[:, None] >> shifts & 0x7F | more
-    return np.concatenate([rows[:, at : at + 8].copy().view("<u8") for at in _STAMP_WORDS], axis=1)
+    seconds, nanos = map(_padded, np.divmod(times_ns, _NS))
+    # a tag, five bytes, another tag, five bytes; the words are its first eight bytes, and its last
+    first = 0x08 | seconds << 8 | 0x10 << 48 | nanos << 56
+    last = seconds >> 24 | 0x10 << 16 | nanos << 24
+    return np.stack([first, last], axis=1).view(np.uint64)
+
+
+def _padded(numbers: Integers) -> Integers:
+    """Return numbers of less than 35 bits as the five bytes that they are encoded in."""
+    padded = np.full(len(numbers), 0x80808080)
+    for place in range(5):
+        padded |= (numbers >> 7 * place & 0x7F) << 8 * place
+    return padded

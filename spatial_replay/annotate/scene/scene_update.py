@@ -31,9 +31,11 @@ from spatial_replay.annotate.scene.scene_template import (
     Banner,
     CauseText,
     DrawnObject,
+    EncodedRegions,
     Region,
     SceneLayout,
     SceneTemplate,
+    encode_regions,
     encoded_stamps,
     make_template,
     numbers_of_witness,
@@ -132,10 +134,12 @@ class SceneEncoder:
     regions: Mapping[str, Outline]
     unit: str = ""
     _drawn: tuple[Region, ...] = field(init=False, repr=False)
+    _encoded: EncodedRegions = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         drawn = tuple(_region(name, self.regions[name]) for name in sorted(self.regions))
         object.__setattr__(self, "_drawn", drawn)
+        object.__setattr__(self, "_encoded", encode_regions(drawn))
 
     def encode(
         self, trace: Trace, results: Sequence[EvaluatedResult] = (), state: SceneState | None = None
@@ -176,7 +180,7 @@ class SceneEncoder:
         filled = []
         for layout, samples in _by_layout(content):
             if layout not in templates:
-                templates[layout] = make_template(layout, self._drawn, _LIFT * scale)
+                templates[layout] = make_template(layout, self._encoded, _LIFT * scale)
             own = _numbers(layout, samples, content, columns, scale)
             filled.append((samples, templates[layout].filled(own, len(samples))))
         last = content.forms[-1] >= FIRST_FORM
@@ -366,11 +370,12 @@ def _content(
     forms = np.where(was_present, DELETED, ABSENT)
     forms[is_present] = FIRST_FORM + rings.form
     styles = np.full(rows.shape, -1, np.int64)
-    styles[is_present] = 2 * _levels(extents(footprints), scale) + has_label[is_present]
+    low, high = boxes(rings.points, rings.start)
+    sizes = extents(footprints) if rings.has_round else np.maximum(*(high - low).T)
+    styles[is_present] = 2 * _levels(sizes, scale) + has_label[is_present]
     was_pointing = np.append(before.is_pointing, found.is_shown[:-1])
     witness = np.where(found.is_shown, FIRST_FORM + arrows.cause, np.where(was_pointing, DELETED, ABSENT))
     said = witness, arrows.causes, arrows.numbers
-    low, high = boxes(rings.points, rings.start)
     # half the sum of the ends does not depend on the order in which points are added up
     drawn = observations, footprints, rings, (low + high) / 2.0
     return SceneContent(names, rows, forms, styles, *drawn, found, *said, *banners)
