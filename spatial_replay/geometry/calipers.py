@@ -18,6 +18,15 @@ from spatial_replay.geometry.arrays import Floats
 
 MANY = 4096
 """Above so many pairs of vertices a walk takes less time than looking at all."""
+BLOCKS = 64
+"""Edges are left out by blocks, at most twice as many; vertices are looked for by as many strides."""
+DIRECTIONS = 8
+"""In so many directions the first look is for a vertex that sticks out far."""
+
+
+@inlined
+def _stride(count: int) -> int:
+    return 1 + count // BLOCKS
 
 
 @inlined
@@ -34,15 +43,6 @@ def _height(vertices: Floats, edges: Floats, i: int, j: int) -> float:
 
 
 @inlined
-def _lowest(vertices: Floats, edges: Floats, i: int, start: int, stop: int) -> int:
-    lowest = start
-    for j in range(start + 1, stop):
-        if _height(vertices, edges, i, j) < _height(vertices, edges, i, lowest):
-            lowest = j
-    return lowest
-
-
-@inlined
 def _after(k: int, start: int, stop: int) -> int:
     return k + 1 if k + 1 < stop else start
 
@@ -50,6 +50,58 @@ def _after(k: int, start: int, stop: int) -> int:
 @inlined
 def _before(k: int, start: int, stop: int) -> int:
     return k - 1 if k > start else stop - 1
+
+
+@inlined
+def _bound(
+    vertices: Floats, edges: Floats, begin: int, end: int, j: int, b_start: int, b_stop: int
+) -> tuple[float, int]:
+    """Return how far edges of A separate it from B at most, and a vertex of B low above them.
+
+    No edge separates A from B by more than any one vertex of B is above it.
+
+    Args:
+        j: a vertex of B from where heights above these edges fall in order.
+    """
+    stride = _stride(b_stop - b_start)
+    middle = (begin + end) // 2
+    for _ in range(b_start, b_stop, stride):
+        ahead = j + stride if j + stride < b_stop else j + stride - (b_stop - b_start)
+        if _height(vertices, edges, middle, ahead) >= _height(vertices, edges, middle, j):
+            break
+        j = ahead
+    bound = -np.inf
+    for i in range(begin, end):
+        bound = max(bound, _height(vertices, edges, i, j))
+    return bound, j
+
+
+@piece
+def _most_separating(
+    vertices: Floats, edges: Floats, begin: int, end: int, j: int, b_start: int, b_stop: int
+) -> tuple[float, int, int]:
+    """Return how far the edges from `begin` to before `end` separate A from B, which one, and B's lowest.
+
+    Args:
+        j: a vertex of B low above these edges.
+    """
+    separation, best, lowest = -np.inf, begin, j
+    for _ in range(b_stop - b_start):
+        before = _before(j, b_start, b_stop)
+        if _height(vertices, edges, begin, before) >= _height(vertices, edges, begin, j):
+            break
+        j = before
+    for i in range(begin, end):
+        height = _height(vertices, edges, i, j)
+        for _ in range(b_stop - b_start):
+            following = _after(j, b_start, b_stop)
+            ahead = _height(vertices, edges, i, following)
+            if ahead > height:
+                break
+            j, height = following, ahead
+        if height > separation:
+            separation, best, lowest = height, i, j
+    return separation, best, lowest
 
 
 @piece
@@ -64,18 +116,28 @@ def _separate(
         polygons' distance is attained there, for the edges of A or for those of B.
     """
     separation, nearest, squared = -np.inf, np.inf, np.inf
-    j = _lowest(vertices, edges, a_start, b_start, b_stop)
-    best, lowest = a_start, j
-    for i in range(a_start, a_stop):
-        height = _height(vertices, edges, i, j)
-        for _ in range(b_stop - b_start):
-            following = _after(j, b_start, b_stop)
-            ahead = _height(vertices, edges, i, following)
-            if ahead > height:
-                break
-            j, height = following, ahead
-        if height > separation:
-            separation, best, lowest = height, i, j
+    block = _stride(a_stop - a_start)
+    first = b_start
+    for j in range(b_start, b_stop, _stride(b_stop - b_start)):
+        if _height(vertices, edges, a_start, j) < _height(vertices, edges, a_start, first):
+            first = j
+    # the block that may separate most, then those that may separate as much
+    least, j, begin, most, low = -np.inf, first, a_start, -np.inf, first
+    for at in range(a_start, a_stop, block):
+        bound, j = _bound(vertices, edges, at, min(at + block, a_stop), j, b_start, b_stop)
+        if bound > most:
+            most, begin, low = bound, at, j
+    least, best, lowest = _most_separating(
+        vertices, edges, begin, min(begin + block, a_stop), low, b_start, b_stop
+    )
+    j = first
+    for at in range(a_start, a_stop, block):
+        bound, j = _bound(vertices, edges, at, min(at + block, a_stop), j, b_start, b_stop)
+        # the first of those that separate equally counts, as if all were looked at
+        if bound >= least and bound > separation:
+            found, i, k = _most_separating(vertices, edges, at, min(at + block, a_stop), j, b_start, b_stop)
+            if found > separation:
+                separation, best, lowest = found, i, k
     if separation < 0.0:
         return separation, nearest, squared
     # edges that are parallel to others separate as much as their neighbours, at several vertices
@@ -108,12 +170,11 @@ def walked_distance(
     return min(nearest, math.sqrt(min(a_squared, b_squared)))
 
 
-@piece
-def walked_protrusion(
+@inlined
+def _deepest_within(
     vertices: Floats, edges: Floats, a_start: int, a_stop: int, b_start: int, b_stop: int
-) -> float:
-    """Return the greatest signed distance from a vertex of A to the polygon B."""
-    # the greatest height above any edge of B: the result, if that is negative
+) -> tuple[float, int]:
+    """Return the greatest height of a vertex of A above any edge of B, and a vertex above one if any is."""
     greatest = -np.inf
     j = a_start
     for k in range(a_start + 1, a_stop):
@@ -128,39 +189,81 @@ def walked_protrusion(
                 break
             j, height = following, ahead
         greatest = max(greatest, height)
-    if greatest < 0.0:
-        return greatest
-    # else that of the vertices outside. An edge that separates a vertex most has the nearest point of B, and
-    # among the edges that separate it all lead up to that one: from vertex to vertex it moves little
-    greatest, edge, depth = 0.0, b_start, 0.0
-    for v in range(a_start, a_stop):
-        # one that lies so deep within that the way from it does not lead outside
-        depth -= edges[v - 1, 2] if v > a_start else 0.0
-        if depth > 0.0:
-            continue
-        height = _height(vertices, edges, edge, v)
+        if greatest >= 0.0:
+            break
+    return greatest, j
+
+
+@inlined
+def _edge_below(
+    vertices: Floats, edges: Floats, edge: int, v: int, b_start: int, b_stop: int
+) -> tuple[int, float]:
+    """Return the edge of B above which vertex v is highest, and how high; `edge` is a guess."""
+    height = _height(vertices, edges, edge, v)
+    if height < 0.0:
+        for i in range(b_start, b_stop, _stride(b_stop - b_start)):
+            if _height(vertices, edges, i, v) > height:
+                edge, height = i, _height(vertices, edges, i, v)
+    if height < 0.0:
+        for i in range(b_start, b_stop):
+            if _height(vertices, edges, i, v) > height:
+                edge, height = i, _height(vertices, edges, i, v)
         if height < 0.0:
-            for i in range(b_start, b_stop):
-                if _height(vertices, edges, i, v) > height:
-                    edge, height = i, _height(vertices, edges, i, v)
-            if height < 0.0:
-                depth = -height
-                continue
-        for way in range(2):
-            for _ in range(b_stop - b_start):
-                following = _after(edge, b_start, b_stop) if way == 0 else _before(edge, b_start, b_stop)
-                ahead = _height(vertices, edges, following, v)
-                if ahead < height:
-                    break
-                edge, height = following, ahead
-        distance, squared = np.inf, np.inf
-        for i in (_before(edge, b_start, b_stop), edge, _after(edge, b_start, b_stop)):
-            dx, dy = vertices[v, 0] - vertices[i, 0], vertices[v, 1] - vertices[i, 1]
-            above = edges[i, 0] * dx + edges[i, 1] * dy
-            if above >= 0.0 and 0.0 <= edges[i, 0] * dy - edges[i, 1] * dx <= edges[i, 2]:
+            return edge, height
+    # among the edges that separate a vertex all lead up to the one that separates it most
+    for way in range(2):
+        for _ in range(b_stop - b_start):
+            following = _after(edge, b_start, b_stop) if way == 0 else _before(edge, b_start, b_stop)
+            ahead = _height(vertices, edges, following, v)
+            if ahead < height:
+                break
+            edge, height = following, ahead
+    return edge, height
+
+
+@inlined
+def _above(vertices: Floats, edges: Floats, i: int, v: int) -> tuple[float, float]:
+    """Return how high v is above the edge from i, +inf beside it, and its squared distance from vertex i."""
+    dx, dy = vertices[v, 0] - vertices[i, 0], vertices[v, 1] - vertices[i, 1]
+    above = edges[i, 0] * dx + edges[i, 1] * dy
+    is_beside = above < 0.0 or not 0.0 <= edges[i, 0] * dy - edges[i, 1] * dx <= edges[i, 2]
+    return np.inf if is_beside else above, dx * dx + dy * dy
+
+
+@piece
+def walked_protrusion(
+    vertices: Floats, edges: Floats, a_start: int, a_stop: int, b_start: int, b_stop: int
+) -> float:
+    """Return the greatest signed distance from a vertex of A to the polygon B."""
+    v, most = a_start, -np.inf
+    for i in range(b_start, b_stop, 1 + (b_stop - b_start) // DIRECTIONS):
+        for k in range(a_start, a_stop, _stride(a_stop - a_start)):
+            if _height(vertices, edges, i, k) > most:
+                v, most = k, _height(vertices, edges, i, k)
+    if most < 0.0:
+        most, v = _deepest_within(vertices, edges, a_start, a_stop, b_start, b_stop)
+        if most < 0.0:
+            return most
+    greatest, edge, to_spare = 0.0, b_start, 0.0
+    for _ in range(a_stop - a_start):
+        # on the way from vertex to vertex the distance grows by no more than the way
+        if to_spare <= 0.0:
+            edge, height = _edge_below(vertices, edges, edge, v, b_start, b_stop)
+            distance = height
+            if height >= 0.0:
+                # the edge that separates a vertex most has the nearest point of B, or ends there
+                following = _after(edge, b_start, b_stop)
+                distance, squared = _above(vertices, edges, edge, v)
+                above, of_following = _above(vertices, edges, following, v)
+                distance, squared = min(distance, above), min(squared, of_following)
+                above, _ = _above(vertices, edges, _before(edge, b_start, b_stop), v)
                 distance = min(distance, above)
-            squared = min(squared, dx * dx + dy * dy)
-        if distance > height:
-            distance = min(distance, math.sqrt(squared))
-        greatest = max(greatest, distance)
+                if distance > height:
+                    distance = min(distance, math.sqrt(squared))
+                greatest = max(greatest, distance)
+            to_spare = greatest - distance
+            # what coordinates may be off by from rounding
+            to_spare -= 1e-9 * (abs(vertices[v, 0]) + abs(vertices[v, 1]) + to_spare)
+        to_spare -= edges[v, 2]
+        v = _after(v, a_start, a_stop)
     return greatest
