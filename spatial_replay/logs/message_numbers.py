@@ -97,7 +97,7 @@ def _gather(table: Integers, powers: Floats, out_at: int, count: int, width: int
         for s in range(table.shape[0]):
             columns, rows_at = table[s, _COUNT], table[s, _ROWS]
             source, down, across = table[s, _AT], table[s, _ROW], table[s, _COLUMN]
-            if across == 8 and not table[s, _IS_ROUNDED]:
+            if size == 8 and across == 8 and not table[s, _IS_ROUNDED]:
                 # side by side as in messages: row by row
                 for i in range(first, last):
                     row = integers_at(rows_at + 8 * i, 1)[0] if rows_at else i

@@ -34,6 +34,7 @@ from spatial_replay.logs import (
 )
 from spatial_replay.logs.checksums import joined_checksum
 from spatial_replay.logs.mcap.writer import CHUNK_BYTES
+from spatial_replay.logs.message_numbers import Columns, gathered
 from spatial_replay.logs.objects.wire import WireTemplate
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.topics import OBJECTS, protobuf_channel
@@ -305,3 +306,24 @@ def test_checksums_of_contents_join_to_that_of_all(contents, form):
     with only(form):
         joined = joined_checksum(list(map(zlib.crc32, contents)), list(map(len, contents)))
     assert joined == zlib.crc32(b"".join(contents))
+
+
+@given(st.data(), st.sampled_from([np.uint8, np.uint64]), st.sampled_from(["compiled", "interpreted"]))
+def test_numbers_gathered_from_columns_of_any_strides_are_all_of_them_side_by_side(data, kind, form):
+    count = data.draw(st.integers(1, 300))
+    columns = []
+    for seed in range(data.draw(st.integers(1, 4))):
+        width, step = data.draw(st.integers(1, 3)), data.draw(st.sampled_from([1, 2, 8]))
+        made = np.random.default_rng(seed).integers(1, 256, (width, count * step)).astype(kind)
+        # side by side, one below the other, or with others between them
+        numbers = data.draw(st.sampled_from([made[:, ::step].T, np.ascontiguousarray(made[:, ::step].T)]))
+        rows = data.draw(st.sampled_from([None, np.arange(count)[::-1]]))
+        columns.append((numbers, rows))
+    # an array of one column may have any stride from that to the next
+    odd = np.lib.stride_tricks.as_strided(np.full(8 * count, 7, kind), (count, 1), (kind().itemsize, 8))
+    columns.append((odd, None))
+    with only(form):
+        found = gathered([Columns(*each) for each in columns], count, kind)
+    assert np.array_equal(
+        found, np.concatenate([each if rows is None else each[rows] for each, rows in columns], axis=1)
+    )
