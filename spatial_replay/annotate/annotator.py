@@ -326,6 +326,8 @@ class Annotator:
         self, channel: Channel, blocks: Sequence[SeriesBlock], encoded: Sequence[Sequence[bytes]]
     ) -> Messages:
         """Order the messages of results by time; among equal times the order of results stays."""
+        if len(blocks) == 1:
+            return self._messages(channel, blocks[0].times_ns, encoded[0])
         times_ns = np.concatenate([np.empty(0, np.int64), *(block.times_ns for block in blocks)])
         order = np.argsort(times_ns, kind="stable")
         return self._messages(channel, times_ns[order], chosen_payloads(joined_payloads(encoded), order))

@@ -155,12 +155,12 @@ class EncodedRegions(NamedTuple):
     """The regions of all messages.
 
     Attributes:
-        count: how many there are.
+        number: how many there are.
         entities: encoded, but for their colours and timestamps.
         order: which of a message's numbers their fields have.
     """
 
-    count: int
+    number: int
     entities: bytes
     order: list[int]
 
@@ -196,7 +196,7 @@ def make_template(layout: SceneLayout, regions: EncodedRegions, lift: float) -> 
         gone.deletions.add(id=WITNESS, type=SceneEntityDeletion.MATCHING_ID, timestamp=_A_STAMP)
     if layout.banner is not None:
         _add_banner(_add_entity(last, BANNER), layout.banner, lift)
-    places, end = _places(layout, regions.count)
+    places, end = _places(layout, regions.number)
     number, order = "", [*regions.order]
     for drawn, own in zip(layout.objects, places, strict=True):
         order += _order_of_object(drawn, own)

@@ -26,6 +26,7 @@ from spatial_replay.annotate.scene.scene_frames import (
     colours,
     shade_codes,
 )
+from spatial_replay.annotate.scene.scene_numbers import SceneNumbers
 from spatial_replay.annotate.scene.scene_template import (
     LEVELS,
     Banner,
@@ -36,9 +37,7 @@ from spatial_replay.annotate.scene.scene_template import (
     SceneLayout,
     SceneTemplate,
     encode_regions,
-    encoded_stamps,
     make_template,
-    numbers_of_witness,
 )
 from spatial_replay.annotate.scene.scene_text import ArrowTexts, arrow_texts, banners_of, labelled_objects
 from spatial_replay.annotate.violations import (
@@ -49,8 +48,7 @@ from spatial_replay.annotate.violations import (
     worst_robustness,
 )
 from spatial_replay.geometry.arrays import Floats, Integers, combined, equal_places
-from spatial_replay.logs.message_numbers import Columns, runs
-from spatial_replay.logs.payloads import Words, filled_in
+from spatial_replay.logs.payloads import filled_in
 from spatial_replay.monitor.atoms.terms import footprint_from_outline
 from spatial_replay.spec.formula import Outline
 from spatial_replay.trace.trace import Trace
@@ -170,18 +168,14 @@ class SceneEncoder:
         arrows = arrow_texts(results, violations, state.first_ns or 0, self.unit)
         content = _content(trace, names, rows, state, scale, violations, arrows, has_label, banners)
         shades = colours(objects, scales), colours(regions, scales)
-        columns = _Numbers(
-            encoded_stamps(times_ns),
-            shades[1].reshape(len(written), -1),
-            shades[0].reshape(-1, 3) if (rows >= 0).all() else shades[0][rows >= 0],
-            _heights(content, scale),
-        )
+        shown = shades[0].reshape(-1, 3) if (rows >= 0).all() else shades[0][rows >= 0]
+        columns = SceneNumbers(times_ns, shades[1], shown, content, scale, _LIFT * scale)
         templates = dict(state.templates)
         filled = []
         for layout, samples in _by_layout(content):
             if layout not in templates:
                 templates[layout] = make_template(layout, self._encoded, _LIFT * scale)
-            own = _numbers(layout, samples, content, columns, scale)
+            own = columns.of_messages(layout, samples)
             filled.append((samples, templates[layout].filled(own, len(samples))))
         last = content.forms[-1] >= FIRST_FORM
         after = SceneState(
@@ -227,48 +221,6 @@ class SceneEncoder:
         return (left + right) / 2.0, high + max(_BANNER_LIFT * (high - low), scale)
 
 
-class _Numbers(NamedTuple):
-    """Numbers of S messages.
-
-    Attributes:
-        stamps: (S, 2), encoded times.
-        regions: (S, 3 * regions), their colours.
-        objects: (R, 3), colours of the objects that are shown, message by message.
-        heights: (R, 4) of these, as `make_template` has them; (0, 4) if none has a height.
-    """
-
-    stamps: Words
-    regions: Floats
-    objects: Floats
-    heights: Floats
-
-
-def _heights(content: SceneContent, scale: float) -> Floats:
-    if not any(form.has_height for form in content.rings.forms):
-        return np.empty((0, 4))
-    top, bottom = content.footprints.top, content.footprints.bottom
-    return np.stack([top, bottom, top - bottom, top + _LIFT * scale], axis=-1)
-
-
-def _numbers(
-    layout: SceneLayout, samples: Integers, content: SceneContent, numbers: _Numbers, scale: float
-) -> list[Columns]:
-    """Return what to fill in the layout's template, each number once, in some messages (K,)."""
-    columns = [Columns(numbers.stamps, samples), Columns(numbers.regions, samples)]
-    count = len(layout.objects)
-    if count:
-        # those that are shown follow each other
-        first = content.observations[samples, content.names.index(layout.objects[0].name)]
-        corners = sum(sum(drawn.form.rings) for drawn in layout.objects)
-        columns.append(Columns(runs(content.rings.points, corners), content.rings.start[first]))
-        of_all = [numbers.objects, content.middles, *([numbers.heights] if layout.has_heights else [])]
-        columns += [Columns(runs(each, count), first) for each in of_all]
-    if isinstance(layout.witness, CauseText):
-        labels = [content.numbers[index] for index in samples.tolist()]
-        columns += _numbers_of_arrow(content.violations, samples, scale, labels, layout.witness.words)
-    return columns
-
-
 def _arrows_of(
     results: Sequence[EvaluatedResult],
     trace: Trace,
@@ -306,13 +258,6 @@ def _shades_of(
         of_objects[:, :, number] = shade_codes(objects, scales[chosen])
         of_regions[:, :, number] = shade_codes(places, scales[chosen])
     return of_objects, of_regions
-
-
-def _numbers_of_arrow(
-    found: Violations, samples: Integers, scale: float, numbers: Sequence[bytes], words: int
-) -> list[Columns]:
-    z = np.fmax(found.top[samples], 0.0) + 3.0 * _LIFT * scale
-    return numbers_of_witness(found.points[samples], z, scale, numbers, words)
 
 
 def _region(name: str, outline: Outline) -> Region:
