@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 from spatial_replay.compiled import compile_ahead
 from spatial_replay.errors import TraceError, UsageError
@@ -76,7 +76,7 @@ class SpecUpdate:
         """The root's verdict; pending before the monitor's start."""
         if self.numbers is None:
             return Verdict.PENDING
-        return online_verdict(float(self.numbers[0, 2]), float(self.numbers[0, 3]))
+        return online_verdict(self.numbers.item(0, 2), self.numbers.item(0, 3))
 
 
 class Monitored(NamedTuple):
@@ -108,11 +108,26 @@ class Update:
     settled: tuple[Settled, ...] = field(repr=False, default=())
     satisfied: tuple[Settled, ...] = field(repr=False, default=())
 
-    @cached_property
+    @property
     def specs(self) -> tuple[SpecUpdate, ...]:
         """One for each result spec, in the order of the text."""
-        each = zip(self.monitored.specs, self.numbers, strict=True)
-        return tuple([SpecUpdate(spec, numbers, names, unit) for (spec, names, unit), numbers in each])
+        own = self.__dict__
+        # nearly all that is read of an update comes this way: the lock of a cached property, and constructors
+        # of frozen values, would take as long as the kernel
+        if "_specs" not in own:
+            made: list[SpecUpdate] = []
+            for (spec, names, unit), numbers in zip(self.monitored.specs, self.numbers, strict=True):
+                update = object.__new__(SpecUpdate)
+                fields = update.__dict__
+                fields["spec"], fields["numbers"], fields["names"], fields["unit"] = (
+                    spec,
+                    numbers,
+                    names,
+                    unit,
+                )
+                made.append(update)
+            own["_specs"] = tuple(made)
+        return cast("tuple[SpecUpdate, ...]", own["_specs"])
 
     @property
     def places(self) -> Mapping[str, tuple[int, int]]:
