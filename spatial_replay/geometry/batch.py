@@ -92,13 +92,16 @@ class FootprintBatch:
         cls, footprints: Sequence[Footprint], heights: Sequence[tuple[float, float] | None] | None = None
     ) -> FootprintBatch:
         """Build one row per footprint, with its height interval (bottom, top) if it has one."""
-        parts = [part for footprint in footprints for part in footprint.parts]
+        packed = [part.packed for footprint in footprints for part in footprint.parts]
+        # a part's number of vertices and radius lie before its vertices
+        numbers = np.frombuffer(b"".join(packed)).reshape(-1, 2)
+        heads = starts_from_counts([len(each) for each in packed]) // numbers.strides[0]
         intervals = [height or (np.nan, np.nan) for height in heights or [None] * len(footprints)]
         return cls(
             part_start=starts_from_counts([len(footprint.parts) for footprint in footprints]),
-            vertex_start=starts_from_counts([len(part.vertices) for part in parts]),
-            vertices=np.concatenate([np.empty((0, 2)), *(part.vertices for part in parts)]),
-            radius=np.array([part.radius for part in parts], dtype=np.float64),
+            vertex_start=heads - np.arange(len(heads)),
+            vertices=np.delete(numbers, heads[:-1], axis=0),
+            radius=numbers[heads[:-1], 1],
             bottom=np.array([bottom for bottom, _ in intervals], dtype=np.float64),
             top=np.array([top for _, top in intervals], dtype=np.float64),
         )

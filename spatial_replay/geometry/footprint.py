@@ -28,6 +28,8 @@ Concave: TypeAlias = Literal["decompose", "hull"]
 """How a non-convex polygon is treated: split into convex parts, or replaced by its convex hull."""
 
 _pack_part: Final = Struct("=2d").pack
+_OF_VERTEX: Final = 16
+"""Bytes of a vertex, and of what comes before the first."""
 _pack_object: Final = Struct("=5d").pack
 PARTS, BOTTOM, TOP, YAW, UNCERTAINTY = range(5)
 """The numbers of a packed object: how many parts it has, NaN for a height or a yaw that it does not have."""
@@ -35,7 +37,7 @@ _PLAIN: Final = _pack_object(1.0, math.nan, math.nan, math.nan, 0.0)
 """What most objects are packed as: they share it."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, init=False)
 class ConvexPart:
     """A rounded convex polygon: the Minkowski sum of its hull with a disc.
 
@@ -46,28 +48,32 @@ class ConvexPart:
             vertex is a point (with a radius: a disc), two are a segment (a capsule).
         radius: rounding radius in footprint units, at least 0.
         packed: how many vertices there are, the radius, x and y of each vertex, as bytes of doubles: what a
-            monitor gives to its kernel. The vertices are a view of it.
+            monitor gives to its kernel. The vertices are a view of it, made when asked for.
 
     Raises:
         GeometryError: no vertex, coordinates that are not finite, vertices that are not convex, a
             negative radius. Clockwise order, repeated and collinear vertices are accepted and corrected.
     """
 
-    vertices: Floats
-    radius: float = 0.0
-    packed: bytes = field(init=False, repr=False)
+    radius: float
+    packed: bytes = field(repr=False)
 
-    def __post_init__(self) -> None:
-        vertices, is_convex = _tidy(self.vertices)
+    def __init__(self, vertices: ArrayLike, radius: float = 0.0) -> None:
+        corners, is_convex = _tidy(vertices)
         if not is_convex:
             raise GeometryError(
-                f"the vertices {_shown(vertices)} are not those of a convex polygon in order; "
+                f"the vertices {_shown(corners)} are not those of a convex polygon in order; "
                 "Footprint.polygon takes any polygon"
             )
-        radius = _finite(self.radius, "a part's radius")
+        radius = _finite(radius, "a part's radius")
         if radius < 0:
             raise GeometryError(f"a part's radius is {radius}; give 0 or more")
-        _fill(self, vertices.tobytes(), radius)
+        _fill(self, corners.tobytes(), radius)
+
+    @property
+    def vertices(self) -> Floats:
+        count = len(self.packed) // _OF_VERTEX - 1
+        return np.ndarray((count, 2), np.float64, self.packed, _OF_VERTEX)
 
     def __repr__(self) -> str:
         radius = f", radius={self.radius:.6g}" if self.radius else ""
@@ -84,13 +90,8 @@ class ConvexPart:
 
 def _fill(part: ConvexPart, corners: bytes, radius: float) -> None:
     """Give a part its numbers, which are checked already."""
-    count = len(corners) // 16
-    packed = _pack_part(count, radius) + corners
-    object.__setattr__(part, "packed", packed)
-    object.__setattr__(
-        part, "vertices", np.ndarray((count, 2), np.float64, packed, len(packed) - len(corners))
-    )
     object.__setattr__(part, "radius", radius)
+    object.__setattr__(part, "packed", _pack_part(len(corners) // _OF_VERTEX, radius) + corners)
 
 
 def _checked_part(corners: bytes, radius: float = 0.0) -> ConvexPart:
@@ -113,7 +114,7 @@ def convex_parts(start: Integers, vertices: Floats, radius: Floats) -> list[Conv
     if outlines.fault.any() or not (np.isfinite(radius) & (radius >= 0)).all():
         each = zip(pairwise(start.tolist()), radius.tolist(), strict=True)
         return [ConvexPart(vertices[begin:end], rounding) for (begin, end), rounding in each]
-    corners, ends = outlines.vertices.tobytes(), (16 * outlines.vertex_start).tolist()
+    corners, ends = outlines.vertices.tobytes(), (_OF_VERTEX * outlines.vertex_start).tolist()
     return [
         _checked_part(corners[begin:end], rounding)
         for (begin, end), rounding in zip(pairwise(ends), radius.tolist(), strict=True)
@@ -245,14 +246,15 @@ class TrackedObject:
         object.__setattr__(self, "uncertainty", _finite(self.uncertainty, "uncertainty"))
         if self.uncertainty < 0:
             raise GeometryError(f"uncertainty is {self.uncertainty}; give 0 or more")
-        object.__setattr__(self, "packed", (self._own_numbers(), *[p.packed for p in self.footprint.parts]))
+        object.__setattr__(self, "packed", self._packed())
 
-    def _own_numbers(self) -> bytes:
-        parts, yaw, height = len(self.footprint.parts), self.yaw, self.height
-        if parts == 1 and yaw is None and height is None and self.uncertainty == 0.0:
-            return _PLAIN
+    def _packed(self) -> tuple[bytes, ...]:
+        parts, yaw, height = self.footprint.parts, self.yaw, self.height
+        if len(parts) == 1 and yaw is None and height is None and self.uncertainty == 0.0:
+            return _PLAIN, parts[0].packed
         bottom, top = (math.nan, math.nan) if height is None else height
-        return _pack_object(parts, bottom, top, math.nan if yaw is None else yaw, self.uncertainty)
+        yaw = math.nan if yaw is None else yaw
+        return _pack_object(len(parts), bottom, top, yaw, self.uncertainty), *[part.packed for part in parts]
 
 
 def _tidy(vertices: ArrayLike) -> tuple[Floats, bool]:

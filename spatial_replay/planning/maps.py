@@ -389,8 +389,9 @@ def moved_batch(tracked: TrackedObject, positions: Floats, turns: Floats) -> Foo
     footprint = tracked.footprint
     centre = np.array(centre_of(footprint))
     count = len(positions) * len(turns)
-    vertices = np.concatenate([part.vertices for part in footprint.parts])
-    sizes = np.array([len(part.vertices) for part in footprint.parts], np.int64)
+    outlines = [part.vertices for part in footprint.parts]
+    vertices = np.concatenate(outlines)
+    sizes = np.array([len(outline) for outline in outlines], np.int64)
     bottom, top = tracked.height or (math.nan, math.nan)
     placed = [_placed(vertices, centre, positions, turn) for turn in turns.tolist()]
     return FootprintBatch(

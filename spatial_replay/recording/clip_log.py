@@ -40,8 +40,8 @@ _LATE_S: Final = 1.0
 _LATE_NS: Final = 10**9
 """How far samples may come behind messages, and messages behind samples."""
 
-_MESSAGE_BYTES, _SAMPLE_BYTES, _OBJECT_BYTES, _VERTEX_BYTES = 320, 400, 600, 16
-"""What a message takes in memory besides its payload; a sample, each object of it, each corner."""
+_MESSAGE_BYTES, _SAMPLE_BYTES, _OBJECT_BYTES = 320, 400, 600
+"""What a message takes in memory besides its payload; a sample, each object of it besides its corners."""
 
 _MOST_STATIC: Final = 256
 _MOST_EVENTS: Final = 256
@@ -445,7 +445,7 @@ def _sample_bytes(sample: Sample) -> int:
     size = _SAMPLE_BYTES
     for tracked in sample.objects.values():
         footprint = tracked if isinstance(tracked, Footprint) else tracked.footprint
-        size += _OBJECT_BYTES + _VERTEX_BYTES * sum(len(part.vertices) for part in footprint.parts)
+        size += _OBJECT_BYTES + sum(len(part.packed) for part in footprint.parts)
     return size
 
 
