@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 
 from spatial_replay.annotate.scene.scene_frames import SceneContent
@@ -14,6 +16,9 @@ from spatial_replay.annotate.scene.scene_template import (
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.message_numbers import Columns, runs
 
+LIFT: Final = 0.01
+"""Height of flat objects above the plane, by the scale of the scene."""
+
 
 class SceneNumbers:
     """The numbers of S messages that show R objects in all."""
@@ -25,7 +30,6 @@ class SceneNumbers:
         objects: Floats,
         content: SceneContent,
         scale: float,
-        lift: float,
     ) -> None:
         """Take over what the messages show.
 
@@ -35,15 +39,14 @@ class SceneNumbers:
             objects: (R, 3), colours of the objects that are shown, message by message.
             content: of the messages.
             scale: the size of objects in the scene.
-            lift: height of flat objects above the plane.
         """
         self._stamps = encoded_stamps(times_ns)
         self._regions = regions.reshape(len(times_ns), -1)
-        self._content, self._scale, self._lift = content, scale, lift
+        self._content, self._scale = content, scale
         self._of_objects = [objects, content.middles]
         if any(form.has_height for form in content.rings.forms):
             top, bottom = content.footprints.top, content.footprints.bottom
-            self._of_objects.append(np.stack([top, bottom, top - bottom, top + lift], axis=-1))
+            self._of_objects.append(np.stack([top, bottom, top - bottom, top + LIFT * scale], axis=-1))
 
     def of_messages(self, layout: SceneLayout, samples: Integers) -> list[Columns]:
         """Return what to fill in a layout's template, each number once, in some messages (K,)."""
@@ -58,6 +61,6 @@ class SceneNumbers:
             columns += [Columns(runs(each, count), first) for each in of_objects]
         if isinstance(layout.witness, CauseText):
             found, labels = content.violations, [content.numbers[index] for index in samples.tolist()]
-            z = np.fmax(found.top[samples], 0.0) + 3.0 * self._lift
+            z = np.fmax(found.top[samples], 0.0) + 3.0 * LIFT * self._scale
             columns += numbers_of_witness(found.points[samples], z, self._scale, labels, layout.witness.words)
         return columns

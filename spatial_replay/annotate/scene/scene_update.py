@@ -26,7 +26,7 @@ from spatial_replay.annotate.scene.scene_frames import (
     colours,
     shade_codes,
 )
-from spatial_replay.annotate.scene.scene_numbers import SceneNumbers
+from spatial_replay.annotate.scene.scene_numbers import LIFT, SceneNumbers
 from spatial_replay.annotate.scene.scene_template import (
     LEVELS,
     Banner,
@@ -56,9 +56,8 @@ from spatial_replay.trace.trace import Trace
 PERIOD_NS: Final = 20_000_000
 """The least time between two messages; viewers warn of more."""
 
-_LIFT: Final = 0.01
 _POINT: Final = 0.02
-"""Height of flat objects above the plane, and radius of a point, by the scale of the scene."""
+"""Radius of a point, by the scale of the scene."""
 
 _UNSCALED: Final = 1.0
 """The scale before any object is shown, and that of a scene of points, which have no size."""
@@ -169,12 +168,12 @@ class SceneEncoder:
         content = _content(trace, names, rows, state, scale, violations, arrows, has_label, banners)
         shades = colours(objects, scales), colours(regions, scales)
         shown = shades[0].reshape(-1, 3) if (rows >= 0).all() else shades[0][rows >= 0]
-        columns = SceneNumbers(times_ns, shades[1], shown, content, scale, _LIFT * scale)
+        columns = SceneNumbers(times_ns, shades[1], shown, content, scale)
         templates = dict(state.templates)
         filled = []
         for layout, samples in _by_layout(content):
             if layout not in templates:
-                templates[layout] = make_template(layout, self._encoded, _LIFT * scale)
+                templates[layout] = make_template(layout, self._encoded, LIFT * scale)
             own = columns.of_messages(layout, samples)
             filled.append((samples, templates[layout].filled(own, len(samples))))
         last = content.forms[-1] >= FIRST_FORM
