@@ -307,9 +307,10 @@ class SampleLeaves:
         own: list[Member] = []
         codes, takes_any, own_names = self._codes, self._takes_any, self._own_names
         for sample in filter(None, samples):
-            classes = [(name, cast(Any, tracked).class_name) for name, tracked in sample.objects.items()]
-            for name, class_name in chain(classes, sample.unknown.items()):
-                code = codes[class_name]
+            objects: Any = sample.objects
+            coded = [codes[each.class_name] for each in objects.values()]
+            coded += [codes[class_name] for class_name in sample.unknown.values()]
+            for name, code in zip(chain(objects, sample.unknown), coded, strict=True):
                 if not (code or takes_any):
                     continue
                 if name in own_names:
