@@ -19,7 +19,7 @@ from spatial_replay.compiled import elementwise, inlined, long_kernel
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.geometry.calipers import are_many, walked_distance, walked_protrusion
 
-SIGNED_DISTANCE, PROTRUSION = 0, 1
+NOTHING, SIGNED_DISTANCE, PROTRUSION = -1, 0, 1
 MIN_X, MAX_X, MIN_Y, MAX_Y, MIN_Z, MAX_Z = 2, 3, 4, 5, 6, 7
 CENTROID_MIN_X, CENTROID_MAX_X, CENTROID_MIN_Y, CENTROID_MAX_Y = 8, 9, 10, 11
 
@@ -354,6 +354,8 @@ def measure_rows(
 ) -> None:
     """Fill `values` (K, T) with K quantities in the samples from `begin` to before `end`; see `measure`.
 
+    Those whose quantity is `NOTHING` stay as they are.
+
     In sample t, operand o has the `width[o]` rows from `members[member_start[o] + t * width[o]]` on;
     `member_start` (O + 1,) ends with the total. `edges` (V, 4), one for each vertex, is room to work in;
     calls for other samples may share it at the same time, since all write the same there.
@@ -364,7 +366,7 @@ def measure_rows(
     for block in range(begin, end, BLOCK):
         block_end = min(block + BLOCK, end)
         for k in range(len(quantity)):
-            if quantity[k] < MIN_X:
+            if SIGNED_DISTANCE <= quantity[k] <= PROTRUSION:
                 for operand in (first[k], second[k]):
                     of_first = member_start[operand]
                     for m in range(of_first + block * width[operand], of_first + block_end * width[operand]):
@@ -382,6 +384,6 @@ def measure_rows(
                 if quantity[k] == SIGNED_DISTANCE:
                     grown = enlargement[a] + enlargement[b]
                     values[k, t] = _union_distance(rows, members, a_members, b_members, grown)
-                else:
+                elif quantity[k] == PROTRUSION:
                     grown = enlargement[a] - enlargement[b]
                     values[k, t] = _union_protrusion(rows, members, a_members, b_members, grown)

@@ -15,7 +15,7 @@ from spatial_replay.cores import over_cores
 from spatial_replay.errors import GeometryError
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.geometry.batch import FootprintBatch
-from spatial_replay.geometry.kernels import measure_rows
+from spatial_replay.geometry.kernels import NOTHING, measure_rows
 
 Quantity: TypeAlias = Literal[
     "signed_distance", "protrusion", "min_x", "max_x", "min_y", "max_y", "min_z", "max_z",
@@ -85,6 +85,14 @@ def measure(batch: FootprintBatch, operands: Sequence[Operand], requests: Sequen
     for request in requests:
         _check_request(request, len(operands))
     values = np.empty((len(requests), samples.pop() if samples else 0))
+    codes = np.array([QUANTITY_CODES[request.quantity] for request in requests], dtype=np.int64)
+    if values.shape[1] > 1:
+        rests = [_rests(operand) for operand in operands]
+        still = [k for k, each in enumerate(requests) if all(rests[o] for o in _operands_of(each))]
+        if still:
+            once = [Operand(operand.rows[:1], operand.enlargement) for operand in operands]
+            values[still] = measure(batch, once, [requests[k] for k in still])
+            codes[still] = NOTHING
     arguments = (
         batch.part_start,
         batch.vertex_start,
@@ -96,7 +104,7 @@ def measure(batch: FootprintBatch, operands: Sequence[Operand], requests: Sequen
         np.concatenate([[0], np.cumsum(size)]),
         width,
         np.array([operand.enlargement for operand in operands], dtype=np.float64),
-        np.array([QUANTITY_CODES[request.quantity] for request in requests], dtype=np.int64),
+        codes,
         np.array([request.first for request in requests], dtype=np.int64),
         np.array([request.second for request in requests], dtype=np.int64),
         np.empty((len(batch.vertices), 4)),
@@ -107,11 +115,20 @@ def measure(batch: FootprintBatch, operands: Sequence[Operand], requests: Sequen
     return values
 
 
+def _rests(operand: Operand) -> bool:
+    """Return whether an operand has the same rows in all samples."""
+    rows = operand.rows
+    return bool((rows[0] == rows[-1]).all() and (rows == rows[0]).all())
+
+
+def _operands_of(request: MeasureRequest) -> tuple[int, ...]:
+    return (request.first, request.second) if request.quantity in _BETWEEN_TWO else (request.first,)
+
+
 def _check_request(request: MeasureRequest, operand_count: int) -> None:
     if request.quantity not in QUANTITY_CODES:
         raise GeometryError(f"no quantity {request.quantity!r}; there are {', '.join(QUANTITY_CODES)}")
-    needed = [request.first, request.second] if request.quantity in _BETWEEN_TWO else [request.first]
-    for index in needed:
+    for index in _operands_of(request):
         if not 0 <= index < operand_count:
             asked = f"{request.quantity} asks for operand {index}"
             raise GeometryError(f"{asked}; there are {operand_count}, from 0")

@@ -286,8 +286,8 @@ def _to_static(trace: Trace, name: str, workspace: Workspace) -> Floats:
 
 def _trace_over_cells(here: Trace, tracked: TrackedObject, name: str, grid: Grid, turns: Floats) -> Trace:
     """Return a trace with the sample of `here` for each turn, row and column, the object moved there."""
-    places = moved_batch(tracked, grid.centres(), turns)
-    count, column = len(places), here.names.index(name)
+    footprints = _with_moved(here.footprints, tracked, grid.centres(), turns)
+    count, column = len(footprints) - len(here.footprints), here.names.index(name)
     own = np.full(count, here.rows[0, column])
     rows = np.repeat(here.rows, count, axis=0)
     rows[:, column] = len(here.footprints) + np.arange(count)
@@ -295,7 +295,7 @@ def _trace_over_cells(here: Trace, tracked: TrackedObject, name: str, grid: Grid
         times_ns=np.arange(count, dtype=np.int64),
         names=here.names,
         rows=rows,
-        footprints=FootprintBatch.concatenate([here.footprints, places]),
+        footprints=footprints,
         yaw=np.concatenate((here.yaw, here.yaw[own] + np.repeat(turns, count // len(turns)))),
         uncertainty=np.concatenate((here.uncertainty, here.uncertainty[own])),
         class_code=np.concatenate((here.class_code, here.class_code[own])),
@@ -379,43 +379,55 @@ def moved_object(tracked: TrackedObject, x: float, y: float, turn: float = 0.0) 
     footprint = tracked.footprint
     centre = np.array(centre_of(footprint))
     place = np.array([[x, y]])
-    parts = (ConvexPart(_placed(p.vertices, centre, place, turn)[0], p.radius) for p in footprint.parts)
+    parts = []
+    for part in footprint.parts:
+        placed = np.empty((1, *part.vertices.shape))
+        _place(part.vertices, centre, place, turn, placed)
+        parts.append(ConvexPart(placed[0], part.radius))
     yaw = None if tracked.yaw is None else tracked.yaw + turn
     return replace(tracked, footprint=Footprint(tuple(parts)), yaw=yaw)
 
 
-def moved_batch(tracked: TrackedObject, positions: Floats, turns: Floats) -> FootprintBatch:
-    """Return the object turned by each angle (A,) in radians, at each position (M, 2), as A * M rows."""
-    footprint = tracked.footprint
-    centre = np.array(centre_of(footprint))
+def _with_moved(
+    batch: FootprintBatch, tracked: TrackedObject, positions: Floats, turns: Floats
+) -> FootprintBatch:
+    """Return a batch, and A * M more rows: the object turned by each angle (A,), at each position (M, 2)."""
+    parts = tracked.footprint.parts
+    centre = np.array(centre_of(tracked.footprint))
     count = len(positions) * len(turns)
-    outlines = [part.vertices for part in footprint.parts]
-    vertices = np.concatenate(outlines)
+    outlines = [part.vertices for part in parts]
+    corners = np.concatenate(outlines)
     sizes = np.array([len(outline) for outline in outlines], np.int64)
     bottom, top = tracked.height or (math.nan, math.nan)
-    placed = [_placed(vertices, centre, positions, turn) for turn in turns.tolist()]
-    return FootprintBatch(
-        part_start=np.arange(count + 1, dtype=np.int64) * len(sizes),
-        vertex_start=starts_from_counts(np.tile(sizes, count)),
-        vertices=np.concatenate(placed).reshape(-1, 2),
-        radius=np.tile([part.radius for part in footprint.parts], count),
-        bottom=np.full(count, bottom),
-        top=np.full(count, top),
+    part_start = batch.part_start[-1] + np.arange(count + 1, dtype=np.int64) * len(sizes)
+    vertex_start = batch.vertex_start[-1] + starts_from_counts(np.tile(sizes, count))
+    # of many cells, they are written where they stay
+    vertices = np.empty((len(batch.vertices) + count * len(corners), 2))
+    vertices[: len(batch.vertices)] = batch.vertices
+    placed = vertices[len(batch.vertices) :].reshape(len(turns), len(positions), len(corners), 2)
+    for number, turn in enumerate(turns.tolist()):
+        _place(corners, centre, positions, turn, placed[number])
+    return FootprintBatch.trusted(
+        part_start=np.concatenate((batch.part_start[:-1], part_start)),
+        vertex_start=np.concatenate((batch.vertex_start[:-1], vertex_start)),
+        vertices=vertices,
+        radius=np.concatenate((batch.radius, np.tile([part.radius for part in parts], count))),
+        bottom=np.concatenate((batch.bottom, np.full(count, bottom))),
+        top=np.concatenate((batch.top, np.full(count, top))),
     )
 
 
-def _placed(vertices: Floats, centre: Floats, positions: Floats, turn: float) -> Floats:
-    """Return (M, n, 2): vertices (n, 2) turned around the centre, which is moved to each position (M, 2)."""
+def _place(vertices: Floats, centre: Floats, positions: Floats, turn: float, placed: Floats) -> None:
+    """Fill `placed` (M, n, 2): vertices (n, 2) turned around the centre, moved to each position (M, 2)."""
     local = vertices - centre
     if turn != 0.0:
         cosine, sine = math.cos(turn), math.sin(turn)
         x, y = local[:, 0], local[:, 1]
         local = np.stack((x * cosine - y * sine, x * sine + y * cosine), axis=1)
-    placed = np.empty((len(positions), len(local), 2))
-    # along the many positions, and not along the few vertices
-    for vertex, axis in np.ndindex(*local.shape):
-        np.add(positions[:, axis], local[vertex, axis], out=placed[:, vertex, axis])
-    return placed
+    # both coordinates in one go, as complex numbers, and along the many positions, not along the few vertices
+    at, filled = (np.ascontiguousarray(each).view(np.complex128)[..., 0] for each in (positions, placed))
+    for number, (x, y) in enumerate(local.tolist()):
+        np.add(at, complex(x, y), out=filled[:, number])
 
 
 def _weight_and_centre(part: ConvexPart) -> tuple[float, tuple[float, float]]:

@@ -154,6 +154,26 @@ def test_each_sample_has_its_own_rows():
     assert measure(batch, operands, [MeasureRequest("signed_distance", 0, 1)]).tolist() == [[0.5, 1.5, 2.5]]
 
 
+def test_what_stays_has_the_same_number_in_every_sample():
+    batch = FootprintBatch.from_footprints([Footprint.box(x, 0, x + 1, 1) for x in (0, 2, 5, 9)])
+    stays, also, goes = (np.array([places]).T for places in ([1] * 3, [3] * 3, [0, 2, 0]))
+    operands = [Operand(goes), Operand(stays, 0.5), Operand(also), Operand(np.hstack((stays, also)))]
+    requests = [
+        MeasureRequest("signed_distance", 1, 2),
+        MeasureRequest("protrusion", 0, 3),
+        MeasureRequest("max_x", 1),
+        MeasureRequest("protrusion", 3, 2),
+        MeasureRequest("min_x", 0),
+    ]
+    assert measure(batch, operands, requests).tolist() == [
+        [5.5, 5.5, 5.5],
+        [2.0, 3.0, 2.0],
+        [3.5, 3.5, 3.5],
+        [7.0, 7.0, 7.0],
+        [0.0, 5.0, 0.0],
+    ]
+
+
 def test_no_requests_give_no_measurements():
     batch = FootprintBatch.from_footprints([])
     assert measure(batch, [], []).shape == (0, 0)

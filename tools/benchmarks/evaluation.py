@@ -60,27 +60,39 @@ CORNERS = 1000
 def bench_corners(bench: Any) -> None:
     """Objects with outlines of 1,000 corners, each with each: the signed distance, the protrusion."""
     at, turns = np.random.default_rng(1), np.linspace(0, 2 * np.pi, CORNERS, endpoint=False)
+    circle = np.column_stack((np.cos(turns), np.sin(turns)))
+    star = circle * (1 + 0.3 * np.sin(9 * turns))[:, None]
+    # outline, how far around, how many samples
     shapes = {
-        "convex": np.column_stack((np.cos(turns), np.sin(turns))),
-        "concave": np.column_stack((np.cos(turns), np.sin(turns))) * (1 + 0.3 * np.sin(9 * turns))[:, None],
+        "convex": (circle, 9.0, 20),
+        "convex, overlapping": (circle, 0.5, 20),
+        "concave": (star, 9.0, 1),
     }
-    for shape, outline in shapes.items():
-        objects = {
-            f"o{number}": sr.TrackedObject(sr.Footprint.polygon(outline + place))
-            for number, place in enumerate(at.uniform(-9, 9, (12, 2)))
-        }
-        trace = sr.Trace.from_samples([sr.Sample(0, objects)])
+    for shape, (outline, around, count) in shapes.items():
+        samples = [
+            sr.Sample(
+                number,
+                {
+                    f"o{each}": sr.TrackedObject(sr.Footprint.polygon(outline + place))
+                    for each, place in enumerate(at.uniform(-around, around, (12, 2)))
+                },
+            )
+            for number in range(count)
+        ]
+        trace, objects = sr.Trace.from_samples(samples), list(samples[0].objects)
         pairs = [(a, b) for a in objects for b in objects if a < b]
         for relation in ("dist", "enclosedin"):
             atoms = [f"{a} dist {b} >= 0" if relation == "dist" else f"{a} enclosedin {b}" for a, b in pairs]
             specification = sr.parse_specification(" or ".join(atoms))
+            sr.evaluate(specification, replace(trace))
             bench.measure(
                 f"{shape}, {relation}",
                 lambda fresh, specification=specification: sr.evaluate(specification, fresh),
                 prepare=lambda trace=trace: replace(trace),
-                per=len(pairs),
+                per=len(pairs) * count,
                 unit="pair",
                 runs=11,
+                limit_s=2e-5 if outline is circle else None,
             )
 
 

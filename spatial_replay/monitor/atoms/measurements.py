@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
+from functools import reduce
 
 import numpy as np
 
@@ -50,12 +51,18 @@ def measured(scene: TraceScene, measurements: Sequence[Measurement]) -> tuple[Fl
             found[key] = array
     if not keys:
         return np.empty((0, len(scene))), np.empty((0, len(scene)))
-    values, spreads = (np.array([found[key][row] for key in keys]) for row in (0, 1))
-    return values, spreads
+    values = np.array([found[key][0] for key in keys])
+    if scene.is_sure:
+        return values, np.zeros(values.shape)
+    return values, np.array([found[key][1] for key in keys])
 
 
 def _measure(scene: TraceScene, measurements: Sequence[Measurement]) -> list[Floats]:
-    """Compute value (NaN if unknown) and uncertainty of each measurement, (2, T), in one kernel call."""
+    """Compute value (NaN if unknown) and uncertainty of each measurement, in one kernel call.
+
+    Returns:
+        (2, T) each, or (1, T), the values alone, where the scene is sure.
+    """
     numbers: dict[Term, int] = {}
     operands: list[Operand] = []
 
@@ -74,14 +81,16 @@ def _measure(scene: TraceScene, measurements: Sequence[Measurement]) -> list[Flo
     result = []
     for each in measurements:
         found = [scene.resolve(term) for term in measured_terms(each)]
-        if isinstance(each, Misalignment):
-            value, spread = misalignment(found[0].yaw, found[1].yaw), np.zeros(len(scene))
-        else:
-            value, spread = next(values), np.sum([one.spread for one in found], axis=0)
-        unknown = np.logical_or.reduce([one.unknown for one in found])
+        value = misalignment(found[0].yaw, found[1].yaw) if isinstance(each, Misalignment) else next(values)
+        unknown = reduce(np.logical_or, [one.unknown for one in found])
         if unknown.any():
             value = np.where(unknown, np.nan, value)
-        array = np.array((value, spread))
+        columns = [value]
+        if not scene.is_sure:
+            is_turn = isinstance(each, Misalignment)
+            spread = np.zeros(len(scene)) if is_turn else reduce(np.add, [one.spread for one in found])
+            columns.append(spread)
+        array = np.array(columns)
         array.flags.writeable = False
         result.append(array)
     return result
@@ -151,7 +160,7 @@ def leaf_values(scene: TraceScene, leaves: Sequence[Formula], bindings: Bindings
     )
     is_known = np.isfinite(values).all() and np.isfinite(signals).all() and not (members < 0).any()
     is_known = is_known and (closest[:, 0] == closest[:, 1]).all()
-    is_sure = not spreads.any() and (closest[:, :2] == closest[:, 2:]).all()
+    is_sure = (scene.is_sure or not spreads.any()) and (closest[:, :2] == closest[:, 2:]).all()
     channels = 4 if not is_sure else 1 if is_known else 2
     result = np.empty((channels, len(outputs), len(scene)))
     arguments = (

@@ -68,6 +68,11 @@ class TraceScene:
         return len(self.trace) - self.skip
 
     @cached_property
+    def is_sure(self) -> bool:
+        """Whether nothing in the trace is uncertain."""
+        return not self.trace.uncertainty.any()
+
+    @cached_property
     def batch(self) -> FootprintBatch:
         """The trace's footprints, and after them the regions'."""
         regions = [footprint_from_outline(outline) for outline in self.regions.values()]
@@ -119,7 +124,7 @@ class TraceScene:
         base, source = self._base_and_source(term)
         if isinstance(base, RegionName):
             return self._found_region(base, source < 0)
-        at = np.maximum(source, 0)
+        at = np.maximum(source, 0) if isinstance(term, Earlier) else slice(self.skip, None)
         if isinstance(base, Group):
             is_open = base.members is None
             rows = (self._open_rows(base)[1] if is_open else self._named_rows(base))[at]
@@ -144,7 +149,11 @@ class TraceScene:
         seen = rows >= 0
         at = np.maximum(rows, 0)
         if len(self.trace.uncertainty) and seen.shape[1]:
-            spread = np.where(seen, self.trace.uncertainty[at], 0.0).max(axis=1)
+            spread = (
+                np.zeros(len(rows))
+                if self.is_sure
+                else np.where(seen, self.trace.uncertainty[at], 0.0).max(axis=1)
+            )
             yaw = np.where(seen[:, 0], self.trace.yaw[at[:, 0]], np.nan)
         else:
             spread, yaw = np.zeros(len(rows)), np.full(len(rows), np.nan)
