@@ -53,27 +53,15 @@ def _before(k: int, start: int, stop: int) -> int:
 
 
 @inlined
-def _bound(
-    vertices: Floats, edges: Floats, begin: int, end: int, j: int, b_start: int, b_stop: int
-) -> tuple[float, int]:
-    """Return how far edges of A separate it from B at most, and a vertex of B low above them.
-
-    No edge separates A from B by more than any one vertex of B is above it.
-
-    Args:
-        j: a vertex of B from where heights above these edges fall in order.
-    """
+def _low_vertex(vertices: Floats, edges: Floats, i: int, j: int, b_start: int, b_stop: int) -> int:
+    """Return a vertex of B low above the edge i of A; above those before it, j was one."""
     stride = _stride(b_stop - b_start)
-    middle = (begin + end) // 2
     for _ in range(b_start, b_stop, stride):
         ahead = j + stride if j + stride < b_stop else j + stride - (b_stop - b_start)
-        if _height(vertices, edges, middle, ahead) >= _height(vertices, edges, middle, j):
+        if _height(vertices, edges, i, ahead) >= _height(vertices, edges, i, j):
             break
         j = ahead
-    bound = -np.inf
-    for i in range(begin, end):
-        bound = max(bound, _height(vertices, edges, i, j))
-    return bound, j
+    return j
 
 
 @piece
@@ -121,21 +109,26 @@ def _separate(
     for j in range(b_start, b_stop, _stride(b_stop - b_start)):
         if _height(vertices, edges, a_start, j) < _height(vertices, edges, a_start, first):
             first = j
-    # the block that may separate most, then those that may separate as much
-    least, j, begin, most, low = -np.inf, first, a_start, -np.inf, first
+    # a block that separates much, then those that may separate as much
+    j, begin, most, low = first, a_start, -np.inf, first
     for at in range(a_start, a_stop, block):
-        bound, j = _bound(vertices, edges, at, min(at + block, a_stop), j, b_start, b_stop)
-        if bound > most:
-            most, begin, low = bound, at, j
-    least, best, lowest = _most_separating(
-        vertices, edges, begin, min(begin + block, a_stop), low, b_start, b_stop
-    )
+        middle = min(at + block // 2, a_stop - 1)
+        j = _low_vertex(vertices, edges, middle, j, b_start, b_stop)
+        if _height(vertices, edges, middle, j) > most:
+            most, begin, low = _height(vertices, edges, middle, j), at, j
+    end = min(begin + block, a_stop)
+    least, best, lowest = _most_separating(vertices, edges, begin, end, low, b_start, b_stop)
     j = first
     for at in range(a_start, a_stop, block):
-        bound, j = _bound(vertices, edges, at, min(at + block, a_stop), j, b_start, b_stop)
+        end = min(at + block, a_stop)
+        j = _low_vertex(vertices, edges, min(at + block // 2, a_stop - 1), j, b_start, b_stop)
+        # no edge separates A from B by more than any one vertex of B is above it
+        bound = -np.inf
+        for i in range(at, end):
+            bound = max(bound, _height(vertices, edges, i, j))
         # the first of those that separate equally counts, as if all were looked at
         if bound >= least and bound > separation:
-            found, i, k = _most_separating(vertices, edges, at, min(at + block, a_stop), j, b_start, b_stop)
+            found, i, k = _most_separating(vertices, edges, at, end, j, b_start, b_stop)
             if found > separation:
                 separation, best, lowest = found, i, k
     if separation < 0.0:
