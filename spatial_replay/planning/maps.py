@@ -381,8 +381,9 @@ def moved_object(tracked: TrackedObject, x: float, y: float, turn: float = 0.0) 
     place = np.array([[x, y]])
     parts = []
     for part in footprint.parts:
-        placed = np.empty((1, *part.vertices.shape))
-        _place(part.vertices, centre, place, turn, placed)
+        corners = part.vertices
+        placed = np.empty((1, *corners.shape))
+        _place(corners, centre, place, turn, placed)
         parts.append(ConvexPart(placed[0], part.radius))
     yaw = None if tracked.yaw is None else tracked.yaw + turn
     return replace(tracked, footprint=Footprint(tuple(parts)), yaw=yaw)
