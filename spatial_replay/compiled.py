@@ -103,13 +103,16 @@ def merged(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Res
 
 
 def inlined(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """Return a small helper that is compiled into every kernel that calls it.
+    """Return a small helper that is compiled into every kernel that calls it, and allocates no array."""
+    return inlined_as(function)(function)
 
-    It allocates no array, and so takes no part in the compiler's counting of references, which would
-    dominate a function of a few floating-point operations.
-    """
+
+def inlined_as(
+    interpreted: Callable[_Arguments, _Result],
+) -> Callable[[Callable[_Arguments, _Result]], Callable[_Arguments, _Result]]:
+    """Return what makes an inlined helper; interpreted, it is another function."""
     options = {"forceinline": True, "_nrt": False, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-    return _Kernel(function, options)
+    return lambda function: _Kernel(function, options, interpreted_as=interpreted)
 
 
 def apart(function: Callable[..., int]) -> Callable[..., int]:

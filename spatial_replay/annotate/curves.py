@@ -11,7 +11,7 @@ from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.messages import Channel
 from spatial_replay.logs.schemas.Curves_pb2 import Curves, NodeCurves, SpecificationCurves
 from spatial_replay.logs.topics import CURVES_TOPIC, protobuf_channel
-from spatial_replay.monitor.online.operators import looks_ahead
+from spatial_replay.monitor.online.rewriting import looks_ahead
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.spec.formula import Formula, iter_nodes
 

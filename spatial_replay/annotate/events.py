@@ -38,7 +38,7 @@ from spatial_replay.annotate.verdict_changes import (
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.online.codes import low_and_high
-from spatial_replay.monitor.online.operators import looks_ahead
+from spatial_replay.monitor.online.rewriting import looks_ahead
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.sentences import amount_text, uncertain_text
 from spatial_replay.monitor.stream import SeriesBlock

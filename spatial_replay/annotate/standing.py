@@ -30,7 +30,7 @@ from spatial_replay.logs.schemas.Robustness_pb2 import (
     VIOLATED,
     StandingUpdate,
 )
-from spatial_replay.monitor.online.operators import looks_ahead
+from spatial_replay.monitor.online.rewriting import looks_ahead
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.spec.formula import Formula, iter_nodes
 from spatial_replay.trace.sample import LATEST_NS

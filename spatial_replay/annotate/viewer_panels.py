@@ -39,7 +39,7 @@ from spatial_replay.logs.topics import (
     STANDING,
     topic_of_camera,
 )
-from spatial_replay.monitor.online.operators import looks_ahead
+from spatial_replay.monitor.online.rewriting import looks_ahead
 from spatial_replay.palette import CURVES, FAILING, HOLDING, NEGATIVE, NEUTRAL, POSITIVE, hexadecimal, lighter
 from spatial_replay.spec.formula import Formula
 from spatial_replay.text import number_text, shortened_formula

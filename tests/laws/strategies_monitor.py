@@ -111,6 +111,22 @@ nested_windows = responses(
     )
 )
 """Windows below windows, which are kept at each position that is open."""
+_lasting = st.one_of(responses(windows_of(_literals, bounds)), windows_of(_literals, bounds))
+_from_later = st.one_of(
+    st.builds(Bound, st.integers(1, 3), st.none(), st.just("samples")),
+    st.builds(Bound, st.sampled_from([100, 250, 500]), st.none(), st.just("ns")),
+)
+lasting_windows = st.one_of(
+    st.builds(
+        lambda outer, inner, body: Temporal(outer, (Temporal(inner, (body,)),)),
+        st.sampled_from(["F", "G"]),
+        st.sampled_from(["F", "G", "O", "H"]),
+        _lasting,
+    ),
+    st.builds(Temporal, st.sampled_from(["F", "G"]), st.tuples(_lasting), _from_later),
+    st.builds(Temporal, st.sampled_from(["U", "R", "W"]), st.tuples(_literals, _lasting), _from_later),
+)
+"""Windows below what holds from some time on, or again and again."""
 formulas_of_leaves = st.one_of(_responses, _nested(1), _nested(2), _nested(3), _nested(4), _windows_within)
 
 

@@ -21,6 +21,7 @@ from laws.strategies_monitor import (
     bounds,
     cuts,
     formulas_of_leaves,
+    lasting_windows,
     leaf_runs,
     nested_windows,
     recordings,
@@ -104,6 +105,15 @@ def test_every_node_on_every_prefix_equals_the_definitions(data, formula, run, r
 @given(data=st.data(), formula=nested_windows, run=leaf_runs(max_size=40), room=st.integers(2, 64))
 def test_windows_below_windows_equal_the_definitions(data, formula, run, room):
     """On runs so long that windows close while others are open."""
+    series, final = run_of(formula, run, room=room, cuts=data.draw(cuts(len(run))))
+    wide_leaf = run.wide_leaf if run.channels == 4 else run.nominal_leaf
+    expected = numbers_of(formula, run.times_ns, run.nominal_leaf, wide_leaf)
+    assert_same((series, final), (expected.series, expected.final))
+
+
+@settings(max_examples=60)
+@given(data=st.data(), formula=lasting_windows, run=leaf_runs(max_size=20), room=st.integers(2, 64))
+def test_windows_that_recur_or_begin_later_equal_the_definitions(data, formula, run, room):
     series, final = run_of(formula, run, room=room, cuts=data.draw(cuts(len(run))))
     wide_leaf = run.wide_leaf if run.channels == 4 else run.nominal_leaf
     expected = numbers_of(formula, run.times_ns, run.nominal_leaf, wide_leaf)

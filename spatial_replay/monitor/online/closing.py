@@ -11,9 +11,10 @@ import numpy as np
 from spatial_replay.compiled import apart, inlined, uncounted
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
-from spatial_replay.monitor.online.open_windows import bring_columns_up, cells_of, find_lows, reach
+from spatial_replay.monitor.online.node_columns import cells_of, signal_of, start_of_past, tables_end
+from spatial_replay.monitor.online.open_windows import bring_columns_up, find_lows, reach
 from spatial_replay.monitor.online.run_arrays import arrays_at
-from spatial_replay.monitor.online.sliding import beyond, extremum, join, recent_of, run_shift, run_window
+from spatial_replay.monitor.online.sliding import either, extremum, join, recent_of, run_shift, run_window
 from spatial_replay.monitor.online.state import OFFSET, Memory, Scratch
 from spatial_replay.monitor.online.tables import corner_value, read_table
 
@@ -22,30 +23,17 @@ CLOSING = 16
 
 
 @uncounted
-def root_value(root: Integers, columns: Floats, after: float, first: int, last: int, offset: int) -> float:
+def root_value(
+    root: Integers, left: Floats, right: Floats, after: float, first: int, last: int, offset: int
+) -> float:
     """Return an unbounded until or release at `first`, given what it is after `last`."""
-    a, b, is_until = root[codes.NODE_A], root[codes.NODE_B], root[codes.NODE_CODE] == codes.UNTIL
-    if a < 0:
-        return extremum(is_until, columns[b, first - offset : last + 1 - offset], after)
+    is_until = root[codes.NODE_CODE] == codes.UNTIL
+    if root[codes.NODE_A] < 0:
+        return extremum(is_until, right[first - offset : last + 1 - offset], after)
     value = after
     for k in range(last - offset, first - offset - 1, -1):
-        if is_until:
-            value = max(columns[b, k], min(columns[a, k], value))
-        else:
-            value = min(columns[b, k], max(columns[a, k], value))
+        value = either(is_until, right[k], either(not is_until, left[k], value))
     return value
-
-
-@inlined
-def is_plain(part: Integers) -> bool:
-    """Return whether the root is all that depends on a variable."""
-    return part[codes.PART_VARIABLES] == 1 and not part[codes.PART_IS_NESTED]
-
-
-@inlined
-def tables_end(part: Integers) -> int:
-    """Return where a part's own table and those of its past operators end; they begin with its own."""
-    return int(part[codes.PART_TABLE_START] + (part[codes.PART_TABLES] << part[codes.PART_VARIABLES]))
 
 
 @inlined
@@ -57,58 +45,22 @@ def is_settled(part: Integers, memory: Memory) -> bool:
 
 @inlined
 def _run_recurrence(
-    node: Integers, columns: Floats, target: Floats, start: float, begin: int, end: int, step: int
+    node: Integers, left: Floats, right: Floats, target: Floats, start: float, begin: int, end: int, step: int
 ) -> None:
     """Run an operator without a window: until and release backwards, since and trigger forwards."""
-    a, b = node[codes.NODE_A], node[codes.NODE_B]
+    has_left = node[codes.NODE_A] >= 0
     is_strong = node[codes.NODE_CODE] in (codes.UNTIL, codes.PAST_SINCE)
     value = start
     for k in range(begin, end, step):
         if is_strong:
-            value = max(columns[b, k], min(columns[a, k], value) if a >= 0 else value)
+            value = max(right[k], min(left[k], value) if has_left else value)
         else:
-            value = min(columns[b, k], max(columns[a, k], value) if a >= 0 else value)
+            value = min(right[k], max(left[k], value) if has_left else value)
         target[k] = value
 
 
-@inlined
-def _run_until(
-    node: Integers, part: Integers, columns: Floats, target: Floats, low: int, high: int, mode: int,
-    corner: int, memory: Memory, scratch: Scratch, offset: int,
-) -> None:  # fmt: skip
-    """Run an unbounded until or release at low … high; its variable's value goes to the point."""
-    variable = node[codes.NODE_VARIABLE]
-    if mode == codes.OPEN_CORNER:
-        after = corner_value(corner, variable) if variable >= 0 else -np.inf
-    else:
-        after = beyond(mode, node[codes.NODE_WEAK])
-    _run_recurrence(node, columns, target, after, high - offset, low - offset - 1, -1)
-    if variable >= 0:
-        boundary = memory.cells[cells_of(part)[1] + variable]
-        scratch.point[variable] = target[boundary - offset] if boundary <= high else after
-
-
-@inlined
-def _run_since(
-    node: Integers, part: Integers, tables: Floats, columns: Floats, target: Floats, high: int,
-    memory: Memory, scratch: Scratch, offset: int,
-) -> None:  # fmt: skip
-    """Run an unbounded since or trigger from the position of its table up to `high`."""
-    table, variables = node[codes.NODE_TABLE], part[codes.PART_VARIABLES]
-    start = memory.cells[cells_of(part)[2] + table]
-    if start < 0:
-        value = np.inf if node[codes.NODE_WEAK] else -np.inf
-    else:
-        at = table << variables
-        value = read_table(tables[at : at + (1 << variables)], variables, scratch.point, scratch.order)
-    scratch.starts[table] = value
-    _run_recurrence(node, columns, target, value, start + 1 - offset, high - offset + 1, 1)
-
-
 @apart
-def run_dependent(
-    table_at: int, number: int, at: int, channel: int, mode: int, corner: int, last: int
-) -> int:
+def run_dependent(table_at: int, number: int, channel: int, corner: int, last: int) -> int:
     """Run the nodes of a part that depend on a variable or a table, at the positions low … high of `Scratch`.
 
     `scratch.point` receives the variables' values where the table's base ends, `scratch.starts` the
@@ -116,33 +68,47 @@ def run_dependent(
 
     Args:
         number: of the part.
-        at: which of the columns of `Memory` they are.
-        channel: of the tables.
-        mode, corner: what lies beyond the last sample; the values of the variables if that is `OPEN_CORNER`.
+        channel: of the columns of what does not depend on any, and of the tables.
+        corner: of the table, the values of the variables.
     """
     arrays, memory, scratch, _ = arrays_at(table_at)
     nodes, part, offset = arrays.nodes, arrays.parts[number], memory.clock[OFFSET]
-    first, recent = part[codes.PART_FIRST], recent_of(memory, scratch)
-    columns = memory.columns[at, first : part[codes.PART_END]]
+    first, recent, cells = part[codes.PART_FIRST], recent_of(memory, scratch), memory.cells
+    settled, history = memory.columns[channel], memory.history[channel]
     tables = memory.tables[channel, part[codes.PART_TABLE_START] : tables_end(part)]
+    _, boundaries, states = cells_of(part)
     for d in range(first, part[codes.PART_END]):
         node = nodes[d]
         if not node[codes.NODE_DEPENDS]:
             continue
-        code, a, b, target = node[0], node[codes.NODE_A], node[codes.NODE_B], columns[d - first]
+        code, a, b, target = node[0], node[codes.NODE_A], node[codes.NODE_B], scratch.corners[d - first]
         own_low, own_high = scratch.low[d - first], scratch.high[d - first]
         begin, end = own_low - offset, own_high - offset + 1
+        a, b = max(a, 0), max(b, 0)
+        left, right = signal_of(nodes, first + a), signal_of(nodes, first + b)
+        one = settled[first + a] if left < 0 else history[left]
+        two = settled[first + b] if right < 0 else history[right]
+        if nodes[first + a, codes.NODE_DEPENDS]:
+            one = scratch.corners[a]
+        if nodes[first + b, codes.NODE_DEPENDS]:
+            two = scratch.corners[b]
         if code in (codes.PART_AND, codes.PART_OR):
-            one, two = columns[a, begin:end], columns[b, begin:end]
-            join(code == codes.PART_OR, one, two, target[begin:end])
+            join(code == codes.PART_OR, one[begin:end], two[begin:end], target[begin:end])
         elif code in (codes.UNTIL, codes.RELEASE):
-            _run_until(node, part, columns, target, own_low, own_high, mode, corner, memory, scratch, offset)
+            variable = node[codes.NODE_VARIABLE]
+            value = corner_value(corner, variable) if variable >= 0 else -np.inf
+            _run_recurrence(node, one, two, target, value, end - 1, begin - 1, -1)
+            if variable >= 0:
+                boundary = cells[boundaries + variable]
+                scratch.point[variable] = target[boundary - offset] if boundary <= own_high else value
         elif code in (codes.PAST_SINCE, codes.PAST_TRIGGER):
-            _run_since(node, part, tables, columns, target, own_high, memory, scratch, offset)
+            table, start = node[codes.NODE_TABLE], cells[states + node[codes.NODE_TABLE]]
+            scratch.starts[table] = start_of_past(node, part, tables, start, scratch)
+            _run_recurrence(node, one, two, target, scratch.starts[table], start + 1 - offset, end, 1)
         elif code in (codes.SHIFT, codes.PAST_DELAY):
-            run_shift(node, columns[a], target, own_low, own_high + 1, mode, recent, offset, last)
+            run_shift(node, one, target, own_low, own_high + 1, codes.OPEN_CORNER, recent, offset, last)
         else:
-            run_window(node, columns[a], target, own_low, own_high + 1, mode, recent, offset, last)
+            run_window(node, one, target, own_low, own_high + 1, codes.OPEN_CORNER, recent, offset, last)
     return 0
 
 
@@ -154,8 +120,8 @@ def absorb(table_at: int, number: int, channels: int, last: int) -> int:
     base = cells_of(part)[0]
     before = memory.cells[base]
     # of closed positions a column holds the same whatever is open, so that any look of a channel will do
-    for channel in range(channels):
-        bring_columns_up(table_at, number, channel if channel < 2 else channel + 2, channels, last)
+    looks = (1, 3, 3, 3 | 48)[channels - 1]
+    bring_columns_up(table_at, number, looks, channels, last)
     if part[codes.PART_IS_NESTED]:
         _absorb_nested(table_at, number, nodes, part, memory, scratch, channels, offset, last)
     else:
@@ -173,21 +139,27 @@ def _absorb_plain(
     """Absorb what has closed, many positions at a time, where no more than the root has a variable."""
     base, boundary, _ = cells_of(part)
     cells, root, size = memory.cells, nodes[part[codes.PART_END] - 1], CLOSING
-    nodes_of_part = part[codes.PART_END] - part[codes.PART_FIRST]
     while size > 0:
         first, newest = cells[base], cells[base] + size - 1
         if newest > last or not reach(table_at, number, newest, newest, last):
             size //= 2
             continue
         for channel in range(channels):
-            columns = memory.columns[channel, part[codes.PART_FIRST] : part[codes.PART_END]]
+            columns, history = memory.columns[channel], memory.history[channel]
             tables = memory.tables[channel, part[codes.PART_TABLE_START] : tables_end(part)]
             if part[codes.PART_VARIABLES] == 0:
                 if first == 0:
-                    tables[0] = columns[nodes_of_part - 1, 0 - offset]
+                    tables[0] = columns[part[codes.PART_END] - 1, 0 - offset]
                 continue
-            worst = root_value(root, columns, -np.inf, first, newest, offset)
-            best = root_value(root, columns, np.inf, first, newest, offset)
+            a, b = (
+                part[codes.PART_FIRST] + max(root[codes.NODE_A], 0),
+                part[codes.PART_FIRST] + root[codes.NODE_B],
+            )
+            signal, other = signal_of(nodes, a), signal_of(nodes, b)
+            left = columns[a] if signal < 0 else history[signal]
+            right = columns[b] if other < 0 else history[other]
+            worst = root_value(root, left, right, -np.inf, first, newest, offset)
+            best = root_value(root, left, right, np.inf, first, newest, offset)
             if first > 0:
                 low, high = tables[0], tables[1]
                 worst, best = max(low, min(worst, high)), max(low, min(best, high))
@@ -202,12 +174,14 @@ def _absorb_nested(
     table_at: int, number: int, nodes: Integers, part: Integers, memory: Memory, scratch: Scratch,
     channels: int, offset: int, last: int,
 ) -> None:  # fmt: skip
-    """Absorb what has closed, position by position."""
+    """Absorb what has closed, many positions at a time."""
     base, boundaries, states = cells_of(part)
-    cells = memory.cells
-    while cells[base] <= last:
-        if not reach(table_at, number, cells[base], cells[base], last):
-            return
+    cells, size = memory.cells, CLOSING
+    while size > 0:
+        newest = cells[base] + size - 1
+        if newest > last or not reach(table_at, number, cells[base], newest, last):
+            size //= 2
+            continue
         for channel in range(channels):
             _renew_tables(table_at, number, nodes, part, channel, memory, scratch, offset, last)
         for d in range(part[codes.PART_FIRST], part[codes.PART_END]):
@@ -220,7 +194,7 @@ def _absorb_nested(
                 cells[boundaries + variable] = scratch.high[at] + 1
             if table >= 0:
                 cells[states + table] = max(cells[states + table], scratch.plain[at] - 1)
-        cells[base] += 1
+        cells[base] = newest + 1
 
 
 @uncounted
@@ -228,16 +202,17 @@ def _renew_tables(
     table_at: int, number: int, nodes: Integers, part: Integers, channel: int, memory: Memory,
     scratch: Scratch, offset: int, last: int,
 ) -> None:  # fmt: skip
-    """Renew the tables of a part, in one channel, after adding the position at its base."""
+    """Renew the tables of a part, in one channel, after adding positions from its base on."""
     first, end, variables = part[codes.PART_FIRST], part[codes.PART_END], part[codes.PART_VARIABLES]
     fresh, size = scratch.fresh, 1 << variables
     base, _, states = cells_of(part)
     tables = memory.tables[channel, part[codes.PART_TABLE_START] : tables_end(part)]
-    columns = memory.columns[channel, first:end]
     for corner in range(size):
-        run_dependent(table_at, number, channel, channel, codes.OPEN_CORNER, corner, last)
+        run_dependent(table_at, number, channel, corner, last)
         if memory.cells[base] == 0:
-            fresh[corner] = columns[end - 1 - first, 0 - offset]
+            is_known = not nodes[end - 1, codes.NODE_DEPENDS]
+            root = memory.columns[channel, end - 1] if is_known else scratch.corners[end - 1 - first]
+            fresh[corner] = root[0 - offset]
         else:
             fresh[corner] = read_table(tables[:size], variables, scratch.point, scratch.order)
         for d in range(first, end):
@@ -245,7 +220,7 @@ def _renew_tables(
             if table >= 0:
                 state = scratch.plain[d - first] - 1
                 is_new = state > memory.cells[states + table]
-                value = columns[d - first, state - offset] if is_new else scratch.starts[table]
+                value = scratch.corners[d - first, state - offset] if is_new else scratch.starts[table]
                 fresh[table * size + corner] = value
     for k in range(len(tables)):
         tables[k] = fresh[k]

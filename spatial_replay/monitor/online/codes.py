@@ -41,7 +41,8 @@ AHEAD = 16  # added to a code from ONCE on: its mirror image in time (see `finis
 NODE_CODE, NODE_A, NODE_B, NODE_WEAK, NODE_UNIT, NODE_LOW, NODE_HIGH = range(7)
 NODE_VARIABLE, NODE_TABLE, NODE_DEPENDS = 7, 8, 9  # the first two -1 for none
 NODE_TIMED = 10  # the number of a window or shift ahead in seconds, -1 for none
-NODE_WIDTH = 11
+NODE_CUTS = 11  # whether its windows cut a part's bound short (see `PART_IS_CUT`)
+NODE_WIDTH = 12
 # codes of parts' nodes
 LITERAL = 0  # signal a, negated if b
 PART_AND, PART_OR = 2, 3
@@ -63,7 +64,10 @@ PART_KIND, PART_IS_REMEMBERING, PART_END_CORNER = 6, 7, 8  # the corner that end
 PART_IS_NESTED = 9  # whether a node below the root depends on a variable, or any on a table
 # of clauses: signals, whether they join by minimum, and the part beside them, -1 for none
 PART_ENDING, PART_LOWER, PART_UPPER, PART_IS_MINIMUM, PART_BESIDE = 10, 11, 12, 13, 14
-PART_WIDTH = 15
+# whether the bound that is not known at once is the value but for positions where a window of those nodes
+# is open that cut it
+PART_IS_CUT = 15
+PART_WIDTH = 16
 # kinds of parts
 TABLE, WINDOWED, CLAUSES = 0, 1, 2  # see `tables`, `windows`, `clauses`
 

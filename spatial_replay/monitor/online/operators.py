@@ -14,6 +14,7 @@ import numpy as np
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.monitor.online import codes
+from spatial_replay.monitor.online.rewriting import from_first, looks_ahead, recurring
 from spatial_replay.spec.formula import (
     FUTURE_OPERATORS,
     Atom,
@@ -32,13 +33,6 @@ Row = tuple[int, ...]
 
 NOTHING = -1
 """Stands where a row has no operand, no upper end, no variable, no table or no window."""
-
-
-def looks_ahead(formula: Formula) -> bool:
-    """Return whether a formula contains a future operator."""
-    if isinstance(formula, Temporal) and formula.operator in FUTURE_OPERATORS:
-        return True
-    return any(looks_ahead(operand) for operand in operands_of(formula))
 
 
 def window_of(bound: Bound | None) -> tuple[int, int, int | None]:
@@ -66,7 +60,7 @@ class SignalTable:
         self._leaf_numbers: dict[tuple[object, ...], int] = {}
         self._rows: dict[Row, int] = {}
         # an expansion holds an operand more than once; without this, nested ones would take 2**depth steps
-        self._added: dict[int, int] = {}
+        self._added: dict[int, tuple[Formula, int]] = {}
         for leaf in leaves:
             self._leaf_number(leaf)
 
@@ -104,8 +98,8 @@ class SignalTable:
         formula = expand(formula)
         if id(formula) not in self._added:
             operands = [self.add(each) for each in operands_of(formula)]
-            self._added[id(formula)] = self._added_row(formula, operands)
-        return self._added[id(formula)]
+            self._added[id(formula)] = formula, self._added_row(formula, operands)
+        return self._added[id(formula)][1]
 
     def _added_row(self, formula: Formula, operands: list[int]) -> int:
         match formula:
@@ -193,7 +187,9 @@ def part_of(signals: SignalTable, node: Temporal) -> WindowedPart:
     bounded = node.operator in FUTURE_OPERATORS and (node.bound is not None or node.operator in ("X", "WX"))
     part = WindowedPart(signals, node, anchored=bounded)
     if bounded and not part.is_flat:
-        part = WindowedPart(signals, node, anchored=False)
+        # what a past operator over a future one is now is read at the last sample, too
+        asked = node if part.is_remembering else from_first(node)
+        part = WindowedPart(signals, asked, anchored=False)
     if part.variables > MAX_VARIABLES:
         raise UsageError(
             f"a formula nests {part.variables} unbounded temporal operators under one {node.operator}; "
@@ -296,7 +292,7 @@ class WindowedPart(PartRows):
         """
         super().__init__()
         self._signals = signals
-        self._added: dict[tuple[int, bool], int] = {}
+        self._added: dict[tuple[int, bool], tuple[Formula, int]] = {}
         if anchored:
             self._anchored(root, True)
         else:
@@ -312,11 +308,13 @@ class WindowedPart(PartRows):
             formula, positive = expand(formula.operands[0]), not positive
         key = (id(formula), positive)
         if key not in self._added:
-            self._added[key] = self._built(formula, positive)
-        return self._added[key]
+            self._added[key] = formula, self._built(formula, positive)
+        return self._added[key][1]
 
     def _built(self, formula: Formula, positive: bool) -> int:
         if isinstance(formula, Boolean | Temporal) and looks_ahead(formula):
+            if isinstance(formula, Temporal):
+                formula = recurring(formula)
             operands = [self._add(each, positive) for each in formula.operands]
             if isinstance(formula, Boolean):
                 is_both = (formula.operator == "and") == positive

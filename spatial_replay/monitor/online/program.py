@@ -27,9 +27,9 @@ from spatial_replay.monitor.online.operators import (
     SignalTable,
     WindowedPart,
     array_of_rows,
-    looks_ahead,
     part_of,
 )
+from spatial_replay.monitor.online.rewriting import looks_ahead
 from spatial_replay.spec.formula import Atom, Boolean, Formula, Quantified, Temporal, iter_nodes
 
 
@@ -83,7 +83,7 @@ def compile_formula(formula: Formula) -> Program:
         elif isinstance(node, Temporal):
             part = part_of(signals, node)
             clauses = clauses_of(signals, part)
-            number = parts.add(part) if clauses is None else parts.add_clauses(clauses)
+            number = parts.add(part, signals) if clauses is None else parts.add_clauses(clauses, signals)
             reports.append((codes.REPORT_PART, number, _now_rule(node, part), *ends))
     return Program(
         leaves=tuple(signals.leaves),
@@ -117,24 +117,28 @@ class _Parts:
         self.literals = set[int]()
         self._built: dict[tuple[Row, ...] | Row, int] = {}
 
-    def add_clauses(self, clauses: Clauses) -> int:
+    def add_clauses(self, clauses: Clauses, signals: SignalTable) -> int:
         """Add a part that is made of signals, after the part beside it, and return its number."""
-        beside = NOTHING if clauses.beside is None else self.add(clauses.beside)
+        beside = NOTHING if clauses.beside is None else self.add(clauses.beside, signals)
         own = (clauses.ending, clauses.lower, clauses.upper, int(clauses.is_minimum), beside)
         if own not in self._built:
             self._built[own] = len(self.part_rows)
             end = len(self.node_rows)
-            row = (end, end, 0, 0, self.table_size, self.cells, codes.CLAUSES, 0, 0, 0, *own)
+            row = (end, end, 0, 0, self.table_size, self.cells, codes.CLAUSES, 0, 0, 0, *own, 0)
             self.part_rows.append(row)
         return self._built[own]
 
-    def add(self, part: PartRows) -> int:
-        """Add a part and return its number."""
-        rows = part.rows()
+    def add(self, part: PartRows, signals: SignalTable) -> int:
+        """Add a part and return its number.
+
+        Args:
+            signals: receives those that a part with windows looks at negated.
+        """
+        rows = part.rows() if part.is_flat else tuple(_looked_up(row, signals) for row in part.rows())
         if rows in self._built:
             return self._built[rows]
         self._built[rows] = len(self.part_rows)
-        first = len(self.node_rows)
+        first, cutting = len(self.node_rows), _cutting(rows)
         self.part_rows.append(
             (
                 first,
@@ -148,11 +152,13 @@ class _Parts:
                 part.end_corner,
                 int(part.is_nested),
                 *[NOTHING] * 5,
+                int(cutting is not None),
             )
         )
-        for row in rows:
+        for number, row in enumerate(rows):
             is_timed = row[codes.NODE_CODE] in codes.AHEAD_OF and row[codes.NODE_UNIT] != codes.SAMPLES
-            self.node_rows.append((*row, self.timed if is_timed else NOTHING))
+            cuts = cutting is not None and number in cutting
+            self.node_rows.append((*row, self.timed if is_timed else NOTHING, int(cuts)))
             if row[codes.NODE_CODE] == codes.LITERAL and not part.is_flat:
                 self.literals.add(row[codes.NODE_A])
             self.timed += is_timed
@@ -160,6 +166,45 @@ class _Parts:
         self.cells += 1 + part.variables + part.tables
         self.keeps_history |= not part.is_flat
         return self._built[rows]
+
+
+def _looked_up(row: Row, signals: SignalTable) -> Row:
+    """Return a row whose numbers, if it is a literal, are those of a signal."""
+    code, signal, is_negated, *rest = row
+    if code != codes.LITERAL or not is_negated:
+        return row
+    return (code, signals.row(codes.NOT, signal), 0, *rest)
+
+
+def _cutting(rows: tuple[Row, ...]) -> set[int] | None:
+    """Return the windows that are the greatest while they are open, of a root that joins by the minimum.
+
+    Where one is open, what it stands in is no bound; anywhere else, the best that may come is what counts for
+    the value, too. The same upside down. None where other nodes make a difference between the two.
+    """
+    code, left, body, *_ = rows[-1]
+    if code not in (codes.UNTIL, codes.RELEASE) or left != NOTHING:
+        return None
+    is_weak = code == codes.RELEASE
+    window = codes.PART_WINDOW_MAX if is_weak else codes.PART_WINDOW_MIN
+    either, both = (codes.PART_OR, codes.PART_AND) if is_weak else (codes.PART_AND, codes.PART_OR)
+    differs: list[bool] = []
+    for own, a, b, weak, *_ in rows[: body + 1]:
+        operands = {codes.LITERAL: (), either: (a, b), both: (a, b)}.get(own, (a,))
+        is_free = own in (codes.LITERAL, either, both, *codes.AHEAD_OF)
+        is_open = own == window or (own == codes.SHIFT and bool(weak) != is_weak)
+        differs.append(not is_free or is_open or any(differs[each] for each in operands))
+    found, waiting = set[int](), [body]
+    while waiting:
+        row = waiting.pop()
+        own, a, b, *_ = rows[row]
+        if own == either:
+            waiting += (a, b)
+        elif own == window and not differs[a]:
+            found.add(row)
+        elif differs[row]:
+            return None
+    return found
 
 
 def _nodes_with_operands(formula: Formula) -> list[tuple[Formula, list[int]]]:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
 from typing import Any, Final, NamedTuple, cast
 
-from spatial_replay.compiled import floats_at, inlined, integers_at
+import numpy as np
+
+from spatial_replay.compiled import floats_at, inlined_as, integers_at
 from spatial_replay.geometry.arrays import PLACE, Floats, Integers, places_of, shape_2, shape_3, shape_4
 from spatial_replay.monitor.online.program import Program
 from spatial_replay.monitor.online.state import Memory, Scratch
@@ -41,11 +44,18 @@ _FINAL: Final = len(_TABLES) + len(_MEMORY) + len(_SCRATCH)
 
 
 def table_of(run: RunArrays) -> Integers:
-    """Return where a run's arrays lie, for `arrays_at`."""
-    return places_of([*run.tables, *run.memory, *run.scratch, run.final])
+    """Return where a run's arrays lie, for `arrays_at`; `run` has to be kept as long as it is used."""
+    places = places_of([*run.tables, *run.memory, *run.scratch, run.final])
+    return np.vstack((places, [[id(run)] + [0] * (PLACE - 1)]))
 
 
-@inlined
+def _run_at(table_at: int) -> RunArrays:
+    """Return the arrays of a run as they were given: making them again takes the interpreter long."""
+    identity = ctypes.c_int64.from_address(int(table_at) + 8 * PLACE * (_FINAL + 1)).value
+    return cast(RunArrays, ctypes.cast(identity, ctypes.py_object).value)
+
+
+@inlined_as(_run_at)
 def arrays_at(table_at: int) -> RunArrays:
     """Return the arrays of a run from the address of its table."""
     at = integers_at(table_at, (_FINAL + 1, PLACE))
@@ -70,6 +80,8 @@ def arrays_at(table_at: int) -> RunArrays:
             cells=integers_at(at[_MEMORY.cells, 0], at[_MEMORY.cells, 1]),
             columns=floats_at(at[_MEMORY.columns, 0], shape_3(at, _MEMORY.columns)),
             known=integers_at(at[_MEMORY.known, 0], shape_2(at, _MEMORY.known)),
+            unjoined=integers_at(at[_MEMORY.unjoined, 0], shape_2(at, _MEMORY.unjoined)),
+            joined=floats_at(at[_MEMORY.joined, 0], shape_3(at, _MEMORY.joined)),
             lows=integers_at(at[_MEMORY.lows, 0], at[_MEMORY.lows, 1]),
             window_ends=integers_at(at[_MEMORY.window_ends, 0], shape_3(at, _MEMORY.window_ends)),
             window_next=integers_at(at[_MEMORY.window_next, 0], shape_2(at, _MEMORY.window_next)),
@@ -77,6 +89,7 @@ def arrays_at(table_at: int) -> RunArrays:
         ),
         Scratch(
             columns=floats_at(at[_SCRATCH.columns, 0], shape_2(at, _SCRATCH.columns)),
+            corners=floats_at(at[_SCRATCH.corners, 0], shape_2(at, _SCRATCH.corners)),
             low=integers_at(at[_SCRATCH.low, 0], at[_SCRATCH.low, 1]),
             high=integers_at(at[_SCRATCH.high, 0], at[_SCRATCH.high, 1]),
             plain=integers_at(at[_SCRATCH.plain, 0], at[_SCRATCH.plain, 1]),

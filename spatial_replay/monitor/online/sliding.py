@@ -16,6 +16,11 @@ from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.state import Memory, Scratch, behind, first_behind
 
+NEAR = 16
+"""So far behind the last sample, what a window in seconds begins with is found by walking back."""
+STRIDE = 16
+"""So many numbers are filled with one at a time, at first."""
+
 
 class Recent(NamedTuple):
     """What is known of the recent samples, and room to work in: arrays of `Memory` and `Scratch`."""
@@ -47,12 +52,6 @@ def copy(source: Floats, target: Floats) -> None:
 
 
 @uncounted
-def oppose(source: Floats, target: Floats) -> None:
-    for k in range(len(target)):
-        target[k] = -source[k]
-
-
-@uncounted
 def fill(target: Floats, value: float) -> None:
     for k in range(len(target)):
         target[k] = value
@@ -67,6 +66,23 @@ def join(is_greatest: bool, first: Floats, second: Floats, target: Floats) -> No
     else:
         for k in range(len(target)):
             target[k] = min(first[k], second[k])
+
+
+@inlined
+def either(is_greatest: bool, first: float, second: float) -> float:
+    """Return the greater or the lesser of two numbers."""
+    return max(first, second) if is_greatest else min(first, second)
+
+
+@uncounted
+def join_changed(
+    is_greatest: bool, first: Floats, second: Floats, target: Floats, begin: int, known: int, end: int
+) -> int:
+    """Join numbers from `begin` to before `end`; return the first that changes, of those before `known`."""
+    while begin < known and either(is_greatest, first[begin], second[begin]) == target[begin]:
+        begin += 1
+    join(is_greatest, first[begin:end], second[begin:end], target[begin:end])
+    return begin
 
 
 @uncounted
@@ -132,7 +148,7 @@ def looks_ahead(code: int) -> bool:
 
 
 @inlined
-def _first_open(node: Integers, recent: Recent, offset: int, last: int) -> int:
+def first_unclosed(node: Integers, recent: Recent, offset: int, last: int) -> int:
     """Return the first position whose window ahead a later sample may fall into."""
     if node[codes.NODE_UNIT] == codes.SAMPLES:
         return int(max(last - node[codes.NODE_HIGH] + 1, offset))
@@ -143,7 +159,7 @@ def _first_open(node: Integers, recent: Recent, offset: int, last: int) -> int:
 
 
 @uncounted
-def _slide_evenly(
+def slide_evenly(
     is_greatest: bool, source: Floats, target: Floats, begin: int, end: int, first: int, width: int,
     extrema: Floats, offset: int, last: int,
 ) -> None:  # fmt: skip
@@ -239,7 +255,7 @@ def run_window(
     code = node[codes.NODE_CODE]
     is_greatest = code in (codes.PART_WINDOW_MAX, codes.PAST_WINDOW_MAX)
     if looks_ahead(code) and is_decided(node, mode):
-        first = min(max(_first_open(node, recent, offset, last), begin), end)
+        first = min(max(first_unclosed(node, recent, offset, last), begin), end)
         fill(target[first - offset : end - offset], beyond(mode, node[codes.NODE_WEAK]))
         end = first
     if begin >= end:
@@ -255,7 +271,7 @@ def run_window(
     else:
         width = min(width, end - 1 - near - offset + 1)
         first = begin - near - width + 1
-    _slide_evenly(is_greatest, source, target, begin, end, first, width, recent.extrema, offset, last)
+    slide_evenly(is_greatest, source, target, begin, end, first, width, recent.extrema, offset, last)
 
 
 @uncounted
@@ -277,3 +293,69 @@ def run_shift(
         else:
             at = last + 1
         target[position - offset] = source[at - offset] if offset <= at <= last else missing
+
+
+@inlined
+def window_start(node: Integers, recent: Recent, position: int, offset: int, last: int) -> int:
+    """Return the position that a window ahead starts with, at most that after the last sample."""
+    if node[codes.NODE_UNIT] == codes.SAMPLES:
+        return int(min(position + node[codes.NODE_LOW], last + 1))
+    timed = node[codes.NODE_TIMED]
+    is_begun = position < recent.window_next[timed, 1]
+    return int(recent.window_ends[timed, 0, position - offset]) if is_begun else last + 1
+
+
+@inlined
+def run_to_last(
+    is_greatest: bool, node: Integers, source: Floats, target: Floats, value: float, lowest: int,
+    changed: int, since: int, recent: Recent, offset: int, last: int,
+) -> int:  # fmt: skip
+    """Compute extrema from where a window starts to the last sample, backwards as far as they change.
+
+    Args:
+        value: what lies beyond.
+        lowest: the first position.
+        changed: the first position at which `source` has changed.
+        since: the first sample for which `target` has no numbers yet.
+
+    Returns:
+        The first position that changes.
+    """
+    is_even = node[codes.NODE_UNIT] == codes.SAMPLES or node[codes.NODE_LOW] == 0
+    position, at, stride = last, last + 1, STRIDE
+    while position >= lowest:
+        start = window_start(node, recent, position, offset, last)
+        while at > start:
+            at -= 1
+            value = either(is_greatest, value, source[at - offset])
+        if position < since:
+            if at <= changed and target[position - offset] == value:
+                break
+            # where many change, most become equal to the newest
+            if is_even and position - stride >= lowest and position + STRIDE < since and at == start:
+                begin = at - stride - offset
+                if extremum(is_greatest, source[begin : begin + stride], value) == value:
+                    begin = position - stride - offset
+                    fill(target[begin : begin + stride + 1], value)
+                    position, at = position - stride - 1, at - stride
+                    stride *= 2
+                    continue
+                stride = STRIDE
+        target[position - offset] = value
+        position -= 1
+    return position + 1
+
+
+@inlined
+def first_up_to(node: Integers, distance: int, recent: Recent, offset: int, last: int, position: int) -> int:
+    """Return the first position that is at most the distance in a column of its node before another one."""
+    if node[codes.NODE_UNIT] == codes.SAMPLES:
+        return int(max(position - node[distance], offset))
+    if distance == codes.NODE_HIGH and position > last - NEAR:
+        # of those whose windows have closed, the newest are the only ones that may hold it
+        timed = node[codes.NODE_TIMED]
+        first, afters = recent.window_next[timed, 2], recent.window_ends[timed, 1]
+        while first > offset and afters[first - 1 - offset] > position:
+            first -= 1
+        return int(first)
+    return first_behind(recent.stamps, offset, position, node[codes.NODE_UNIT], node[distance])

@@ -16,6 +16,7 @@ from spatial_replay.monitor.online.codes import (
     CHANNELS,
     HISTORICALLY,
     ONCE,
+    PART_IS_NESTED,
     PART_KIND,
     SAMPLES,
     WINDOWED,
@@ -36,6 +37,9 @@ continuation, and of its value if the run ends there."""
 
 LOOKS = 6
 """How many of these a part with windows computes apart: what it is now comes with its value."""
+
+JOINED = 64
+"""So many open positions together are joined, of which only few change with a sample."""
 
 POSITION, OFFSET, START_NS, KEEPS = range(4)
 CLOCK = 4
@@ -58,6 +62,8 @@ class Memory(NamedTuple):
         cells: the parts' bookkeeping (see `windows`).
         columns: (LOOKS, D, room), the nodes of the parts with windows at the recent samples, for each number.
         known: (P, LOOKS), the last sample that each part's columns know, -1 for none.
+        unjoined: (P, LOOKS), the first sample that is not yet in `joined`.
+        joined: (LOOKS, P, room / JOINED), what the root of each part joins, so many positions at a time.
         lows: (D,), the first position of each of these nodes that matters.
         window_ends: (W, 2, room), where the windows in seconds ahead of the recent samples start, and what
             comes after them.
@@ -78,6 +84,8 @@ class Memory(NamedTuple):
     cells: Integers
     columns: Floats
     known: Integers
+    unjoined: Integers
+    joined: Floats
     lows: Integers
     window_ends: Integers
     window_next: Integers
@@ -89,6 +97,7 @@ class Scratch(NamedTuple):
 
     Attributes:
         columns: (D, tile), a column per node of a part.
+        corners: (D, room), the nodes of a part that depend on a variable, at one corner of its table.
         low, high, plain, changed: (D,), positions per node.
         values: (D,), a number per node.
         point, order: (16,), a point at which a table is read.
@@ -102,6 +111,7 @@ class Scratch(NamedTuple):
     """
 
     columns: Floats
+    corners: Floats
     low: Integers
     high: Integers
     plain: Integers
@@ -138,6 +148,8 @@ def first_memory(program: Program, room: int) -> Memory:
         cells=cells,
         columns=np.zeros((LOOKS, nodes, room)),
         known=np.full((len(program.parts), LOOKS), -1),
+        unjoined=np.zeros((len(program.parts), LOOKS), np.int64),
+        joined=np.zeros((LOOKS, len(program.parts), room // JOINED + 1)),
         lows=np.zeros(nodes, np.int64),
         window_ends=np.zeros((program.timed, 2, room), np.int64),
         window_next=np.full((program.timed, 3), -1),
@@ -159,6 +171,7 @@ def scratch_for(program: Program, room: int, tile: int) -> Scratch:
     open_room = room if has_windows(program) else 0
     return Scratch(
         columns=np.zeros((widest, tile)),
+        corners=np.zeros((widest if program.parts[:, PART_IS_NESTED].any() else 0, room)),
         low=low,
         high=high,
         plain=plain,
@@ -211,6 +224,7 @@ def doubled(memory: Memory, channels: int) -> Memory:
     _know_no_columns(memory)
     return memory._replace(
         columns=np.zeros((*memory.columns.shape[:2], 2 * old)),
+        joined=np.zeros((*memory.joined.shape[:2], 2 * old // JOINED + 1)),
         window_ends=np.zeros((*memory.window_ends.shape[:2], 2 * old), np.int64),
         stamps=np.concatenate((memory.stamps, np.zeros(old, np.int64))),
         history=history,

@@ -185,8 +185,9 @@ class OnlineRun:
         self._find_arrays()
 
     def _find_arrays(self) -> None:
-        table = table_of(RunArrays(self._tables, self._memory, self._scratch, self._final))
-        self._table, self._table_at = table, table.ctypes.data
+        self._arrays = RunArrays(self._tables, self._memory, self._scratch, self._final)
+        self._table = table_of(self._arrays)
+        self._table_at = self._table.ctypes.data
 
     def make_room(self, wanted: int) -> int:
         """Make room for at least one of the wanted samples; return for how many."""

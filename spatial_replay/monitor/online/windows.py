@@ -12,22 +12,32 @@ for each table of a past operator, the position it belongs to (-1: before the fi
 
 from __future__ import annotations
 
+import numpy as np
+
 from spatial_replay.compiled import apart, inlined, uncounted
-from spatial_replay.geometry.arrays import Integers
+from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
-from spatial_replay.monitor.online.closing import (
-    CLOSING,
-    absorb,
-    is_plain,
-    is_settled,
-    root_value,
-    run_dependent,
+from spatial_replay.monitor.online.closing import CLOSING, absorb, is_settled
+from spatial_replay.monitor.online.node_columns import (
+    columns_number,
+    look_of,
+    set_point,
+    signal_of,
     tables_end,
 )
-from spatial_replay.monitor.online.open_windows import bring_columns_up, columns_number, look_of, reach
+from spatial_replay.monitor.online.open_windows import bring_columns_up, is_plain, reach, runs_root
 from spatial_replay.monitor.online.run_arrays import arrays_at
-from spatial_replay.monitor.online.sliding import beyond, copy, enter_samples
+from spatial_replay.monitor.online.sliding import (
+    beyond,
+    copy,
+    either,
+    enter_samples,
+    extremum,
+    first_unclosed,
+    recent_of,
+)
 from spatial_replay.monitor.online.state import (
+    JOINED,
     NUMBERS,
     OFFSET,
     POSITION,
@@ -38,45 +48,110 @@ from spatial_replay.monitor.online.state import (
 )
 from spatial_replay.monitor.online.tables import read_table
 
+_MANY = 4
+"""From so many stretches of open positions on, each is joined by itself, and only if it has changed."""
+
+
+@inlined
+def _is_known(which: int, part: Integers, root: Integers) -> bool:
+    """Return whether what may still come outdoes all that is open, whatever that is."""
+    is_high = which in (5, 7)
+    is_bound = is_plain(part) and root[codes.NODE_A] < 0 and which in (4, 5)
+    return is_bound and is_high == (root[codes.NODE_CODE] == codes.UNTIL)
+
+
+@inlined
+def _looks(part: Integers, root: Integers, channels: int) -> int:
+    """Return which numbers of a part are computed by themselves before the last sample, a bit for each.
+
+    Numbers 2 and 3 (now) come with 0 and 1; those of an ending run count for the last sample only.
+    """
+    looks = 1 | 2 if channels > 1 else 1
+    for which in (4, 5):
+        if not _is_known(which, part, root) and not _is_cut(which, part, channels):
+            looks |= 1 << which
+    return looks
+
+
+@inlined
+def _is_cut(which: int, part: Integers, channels: int) -> bool:
+    """Return whether a number is that of the value, cut short, which needs no columns of its own."""
+    return part[codes.PART_IS_CUT] == 1 and which in (4, 5) and channels < 4
+
+
+@uncounted
+def _joined(
+    number: int, at: int, is_until: bool, body: Floats, value: float, begin: int, end: int, memory: Memory,
+    count: int,
+) -> float:  # fmt: skip
+    """Join a number with those at begin … end - 1, of `count` recent ones, of which few ever change."""
+    if end - begin < _MANY * JOINED:
+        return extremum(is_until, body[begin : max(end, begin)], value)
+    joined, nothing = memory.joined[at, number], -np.inf if is_until else np.inf
+    first = max(memory.unjoined[number, at] - memory.clock[OFFSET], 0) // JOINED
+    for k in range(first, (count - 1) // JOINED + 1):
+        joined[k] = extremum(is_until, body[k * JOINED : min(k * JOINED + JOINED, count)], nothing)
+    memory.unjoined[number, at] = memory.clock[OFFSET] + count
+    whole, after = begin // JOINED + 1, end // JOINED
+    value = extremum(is_until, body[begin : whole * JOINED], value)
+    value = extremum(is_until, joined[whole:after], value)
+    return extremum(is_until, body[after * JOINED : end], value)
+
+
+@inlined
+def _cut_at(nodes: Integers, part: Integers, memory: Memory, scratch: Scratch, offset: int, last: int) -> int:
+    """Return the first position where a window is open that cuts a part's bound short."""
+    first, recent = last + 1, recent_of(memory, scratch)
+    for d in range(part[codes.PART_FIRST], part[codes.PART_END]):
+        if nodes[d, codes.NODE_CUTS]:
+            first = min(first, first_unclosed(nodes[d], recent, offset, last))
+    return first
+
 
 @inlined
 def _value_at_first(
-    table_at: int, number: int, which: int, channels: int, part: Integers, root: Integers, memory: Memory,
-    scratch: Scratch, offset: int, last: int,
+    nodes: Integers, part: Integers, number: int, which: int, channels: int, memory: Memory, scratch: Scratch,
+    offset: int, last: int,
 ) -> float:  # fmt: skip
-    """Return one of a part's numbers at the first sample."""
-    look = look_of(which, channels)
+    """Return one of a part's numbers at the first sample, once its columns are brought up."""
+    look, at, root = look_of(which, channels), columns_number(which), nodes[part[codes.PART_END] - 1]
     base, variables = memory.cells[part[codes.PART_CELL_START]], part[codes.PART_VARIABLES]
     tables = memory.tables[look.channel, part[codes.PART_TABLE_START] : tables_end(part)]
-    at = columns_number(which)
-    columns = memory.columns[at, part[codes.PART_FIRST] : part[codes.PART_END]]
-    is_simple, value = is_plain(part), beyond(look.mode, root[codes.NODE_WEAK])
-    # where anything may still come to outdo the rest, the rest makes no difference
-    is_known = is_simple and root[codes.NODE_A] < 0 and look.mode != codes.OPEN_END
-    if not (is_known and (look.mode == codes.OPEN_HIGH) == (root[codes.NODE_CODE] == codes.UNTIL)):
-        bring_columns_up(table_at, number, which, channels, last)
-        if is_simple:
-            value = root_value(root, columns, value, base, last, offset)
-    if is_simple:
+    if is_plain(part):
+        value = beyond(look.mode, root[codes.NODE_WEAK])
+        if root[codes.NODE_A] >= 0:
+            value = memory.columns[at, part[codes.PART_END] - 1, base - offset] if base <= last else value
+        elif not _is_known(which, part, root):
+            end = last + 1
+            if _is_cut(which, part, channels):
+                at = look.channel
+                end = _cut_at(nodes, part, memory, scratch, offset, last)
+            d = part[codes.PART_FIRST] + root[codes.NODE_B]
+            signal, is_until = signal_of(nodes, d), root[codes.NODE_CODE] == codes.UNTIL
+            body = memory.columns[at, d] if signal < 0 else memory.history[look.channel, signal]
+            begin, count = base - offset, last + 1 - offset
+            value = _joined(number, at, is_until, body, value, begin, end - offset, memory, count)
         return value if base == 0 else max(tables[0], min(value, tables[1]))
-    if part[codes.PART_IS_NESTED]:
-        for d in range(len(columns)):
-            scratch.low[d], scratch.high[d] = memory.lows[part[codes.PART_FIRST] + d], last
-        run_dependent(table_at, number, at, look.channel, look.mode, 0, last)
     if base == 0:
-        return float(columns[len(columns) - 1, 0 - offset])
+        return float(memory.columns[at, part[codes.PART_END] - 1, 0 - offset])
+    for d in range(part[codes.PART_FIRST], part[codes.PART_END]):
+        set_point(nodes[d], part, memory.columns[at, d], memory.cells, look.mode, offset, last, scratch.point)
     return read_table(tables[: 1 << variables], variables, scratch.point, scratch.order)
 
 
 @inlined
 def _value_at_last(
-    part: Integers, root: Integers, which: int, memory: Memory, offset: int, last: int
+    nodes: Integers, part: Integers, which: int, channel: int, memory: Memory, offset: int, last: int
 ) -> float:
-    """Return what a part is at the last sample, once `_value_at_first` has run."""
-    columns = memory.columns[which, part[codes.PART_FIRST] : part[codes.PART_END]]
-    if is_plain(part):
-        return root_value(root, columns, beyond(codes.OPEN_END, root[codes.NODE_WEAK]), last, last, offset)
-    return float(columns[len(columns) - 1, last - offset])
+    """Return what a part is at the last sample, once its columns are brought up."""
+    root = nodes[part[codes.PART_END] - 1]
+    if runs_root(part, root):
+        return float(memory.columns[which, part[codes.PART_END] - 1, last - offset])
+    d = part[codes.PART_FIRST] + root[codes.NODE_B]
+    signal = signal_of(nodes, d)
+    body = (memory.columns[which, d] if signal < 0 else memory.history[channel, signal])[last - offset]
+    value = beyond(codes.OPEN_END, root[codes.NODE_WEAK])
+    return either(root[codes.NODE_CODE] == codes.UNTIL, float(body), value)
 
 
 @apart
@@ -92,6 +167,7 @@ def run_windows(table_at: int, channels: int, count: int) -> int:
         if part[codes.PART_KIND] != codes.WINDOWED:
             continue
         root = tables.nodes[part[codes.PART_END] - 1]
+        looks = _looks(part, root, channels)
         for k in range(count):
             last = position + k
             if is_settled(part, memory):
@@ -103,21 +179,24 @@ def run_windows(table_at: int, channels: int, count: int) -> int:
                 enter_samples(
                     tables.nodes, part, memory.stamps, memory.window_ends, memory.window_next, offset, last
                 )
+            if k == count - 1 and channels == 4:
+                looks |= 1 << 6 | 1 << 7
+            bring_columns_up(table_at, number, looks, channels, last)
             for which in range(NUMBERS):
-                # numbers 2 and 3 (now) come with 0 and 1; those of an ending run count for the last only
                 if which in (2, 3) or (which >= 6 and k < count - 1):
                     continue
                 if which == 1 and channels == 1:
                     numbers[1, k], numbers[3, k] = numbers[0, k], numbers[2, k]
-                    continue
-                if which >= 6 and channels < 4:
+                elif which >= 6 and channels < 4:
                     numbers[which, k] = numbers[which - 6, k]
-                    continue
-                numbers[which, k] = _value_at_first(
-                    table_at, number, which, channels, part, root, memory, scratch, offset, last
-                )
-                if which < 2 and part[codes.PART_IS_REMEMBERING]:
-                    numbers[which + 2, k] = _value_at_last(part, root, which, memory, offset, last)
+                else:
+                    numbers[which, k] = _value_at_first(
+                        tables.nodes, part, number, which, channels, memory, scratch, offset, last
+                    )
+                    if which < 2 and part[codes.PART_IS_REMEMBERING]:
+                        numbers[which + 2, k] = _value_at_last(
+                            tables.nodes, part, which, look_of(which, channels).channel, memory, offset, last
+                        )
             if last % CLOSING == CLOSING - 1:
                 absorb(table_at, number, channels, last)
     return 0
