@@ -72,9 +72,8 @@ def copying_kernel(
 def elementwise(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
     """Return a kernel of which the interpreter takes two to five times as little time.
 
-    It gets its arrays as memoryviews, whose elements are plain numbers; of the arrays in a named tuple, those
-    of one dimension. So it must take and set single elements, with no slices but of one dimension, and never
-    divide by zero.
+    It gets its arrays as memoryviews of plain numbers; of a named tuple, those of one dimension. So it must
+    take and set single elements, with no slices but of one dimension, and never divide by zero.
     """
     kernel = cast("_Kernel[_Arguments, _Result]", function)
     return _Kernel(kernel.__wrapped__, kernel.options, is_elementwise=True, times=kernel.times)
@@ -96,8 +95,7 @@ def uncounted(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _
 def merged(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
     """Return a piece that becomes part of its callers.
 
-    A call of a piece counts references to all arrays that it is given, which takes longer than many a piece;
-    within one function, nearly all of that counting cancels out.
+    A call of a piece counts references to all arrays; within one function, nearly all of that cancels out.
     """
     return _Kernel(function, {"forceinline": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True})
 
