@@ -59,7 +59,7 @@ def _times(operator: str, bounds: list[str], values: Any, times_ns: Any) -> dict
     return times
 
 
-ONLINE = 400_000
+ONLINE = 1_000_000
 RESPONSES = {
     "G (a -> F[0,w] b)": "G (p >= 0 -> F{bound} q >= 0)",
     "G (a -> G[0,w] b)": "G (p >= 0 -> G{bound} q >= 0)",

@@ -12,7 +12,7 @@ import numpy as np
 from spatial_replay.compiled import inlined, uncounted
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
-from spatial_replay.monitor.online.state import Memory, behind, first_behind, is_closed, past_value
+from spatial_replay.monitor.online.state import Memory, behind, is_closed, past_value
 
 
 @uncounted
@@ -114,20 +114,23 @@ def _slide(
 
     The wedge is a ring; `ends` counts the positions that ever left and entered it.
     """  # fmt: skip
+    unit, near, far = signal[3], signal[4], signal[5]
     sign = 1.0 if signal[0] == codes.WINDOW_MAX else -1.0
     size = wedge.shape[0]
     head, tail = ends[0], ends[1]
     for k in range(count):
-        newest = behind(stamps, offset, position + k, signal[3], signal[4])
-        while entering <= newest:
+        here = position + k
+        while entering <= here and _apart(stamps, offset, unit, entering, here) >= near:
             value = sign * source[entering - offset]
             while tail > head and sign * source[wedge[(tail - 1) % size] - offset] <= value:
                 tail -= 1
             wedge[tail % size] = entering
             tail += 1
             entering += 1
-        oldest = first_behind(stamps, offset, position + k, signal[3], signal[5])
-        while tail > head and wedge[head % size] < oldest:
+        # what is forgotten is farther than any window reaches
+        while tail > head and (
+            wedge[head % size] < offset or _apart(stamps, offset, unit, wedge[head % size], here) > far
+        ):
             head += 1
         target[k] = source[wedge[head % size] - offset] if tail > head else -sign * np.inf
     ends[0], ends[1] = head, tail

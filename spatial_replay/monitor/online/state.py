@@ -19,6 +19,7 @@ from spatial_replay.monitor.online.codes import (
     PART_IS_NESTED,
     PART_KIND,
     SAMPLES,
+    SIGNAL_IS_KEPT,
     WINDOWED,
 )
 from spatial_replay.monitor.online.program import Program
@@ -207,11 +208,16 @@ def _know_no_columns(memory: Memory) -> None:
     memory.window_next[:] = -1
 
 
-def doubled(memory: Memory, channels: int) -> Memory:
-    """Return the memory with twice the room for recent samples; only channels in use take up memory."""
+def doubled(memory: Memory, channels: int, signals: Integers) -> Memory:
+    """Return the memory with twice the room for recent samples; only channels in use take up memory.
+
+    Args:
+        signals: (S, 8), those of the program; of some, only the newest sample is looked at.
+    """
     old = len(memory.stamps)
     history = np.zeros((*memory.history.shape[:2], 2 * old))
-    history[:channels, :, :old] = memory.history[:channels]
+    for signal in np.flatnonzero(signals[:, SIGNAL_IS_KEPT]).tolist():
+        history[:channels, signal, :old] = memory.history[:channels, signal]
     wedges = np.zeros((*memory.wedges.shape[:2], 2 * old), np.int64)
     heights = np.zeros((*memory.heights.shape[:3], 2 * old))
     for window, channel in np.ndindex(len(wedges), channels):

@@ -180,7 +180,7 @@ class OnlineRun:
         """Run more samples together from now on: with many, the calls cost more than what the cache saves."""
         self._tile = LONG_TILE
         while len(self._memory.stamps) < (2 if self._program.keeps_history else 1) * LONG_TILE:
-            self._memory = doubled(self._memory, self._channels)
+            self._memory = doubled(self._memory, self._channels, self._program.signals)
         self._scratch = scratch_for(self._program, len(self._memory.stamps), self._tile)
         self._find_arrays()
 
@@ -200,7 +200,7 @@ class OnlineRun:
             if forget(self._table_at, self._channels):
                 offset = int(clock[OFFSET])
             elif used == room:
-                self._memory = doubled(self._memory, self._channels)
+                self._memory = doubled(self._memory, self._channels, self._program.signals)
                 self._scratch = scratch_for(self._program, 2 * room, self._tile)
                 self._find_arrays()
         return min(wanted, len(self._memory.stamps) - (position - offset))
