@@ -426,7 +426,8 @@ def _place(vertices: Floats, centre: Floats, positions: Floats, turn: float, pla
         x, y = local[:, 0], local[:, 1]
         local = np.stack((x * cosine - y * sine, x * sine + y * cosine), axis=1)
     # both coordinates in one go, as complex numbers, and along the many positions, not along the few vertices
-    at, filled = (np.ascontiguousarray(each).view(np.complex128)[..., 0] for each in (positions, placed))
+    at = np.ascontiguousarray(positions, np.float64).view(np.complex128)[..., 0]
+    filled = placed.view(np.complex128)[..., 0]
     for number, (x, y) in enumerate(local.tolist()):
         np.add(at, complex(x, y), out=filled[:, number])
 
