@@ -25,7 +25,7 @@ from functools import cached_property, partial
 from operator import methodcaller
 from pathlib import Path
 from types import FunctionType
-from typing import Any, Final, Generic, Literal, ParamSpec, TypeVar, cast
+from typing import Any, Final, Generic, Literal, ParamSpec, TypeAlias, TypeVar, cast
 
 import numpy as np
 
@@ -33,6 +33,7 @@ from spatial_replay.code_cache import cache_folder
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
+_Making: TypeAlias = Callable[[Callable[_Arguments, _Result]], Callable[_Arguments, _Result]]
 
 _COLD_S: Final = 2.0
 _WARM_S: Final = 0.15
@@ -44,7 +45,7 @@ _GUESS_S: Final = 2e-6
 _LONG: Final = 3.0
 """How many times that a kernel takes whose calls are long: it works on pairs of elements."""
 _COPYING: Final = 0.01
-"""The same of a kernel that copies bytes: it takes many at once."""
+"""The same of a kernel that copies bytes, many at once. With 1, a long log has it compiled at once."""
 _CALL: Final = 32
 """As many elements take as long as what a call costs anyway."""
 
@@ -63,10 +64,10 @@ def long_kernel(function: Callable[_Arguments, _Result]) -> Callable[_Arguments,
 
 
 def copying_kernel(
-    interpreted: Callable[_Arguments, _Result],
-) -> Callable[[Callable[_Arguments, _Result]], Callable[_Arguments, _Result]]:
+    interpreted: Callable[_Arguments, _Result], times: float = _COPYING
+) -> _Making[_Arguments, _Result]:
     """Return what makes a long kernel that copies bytes; interpreted, it is another function."""
-    return lambda function: _Kernel(function, {"nogil": True}, times=_COPYING, interpreted_as=interpreted)
+    return lambda function: _Kernel(function, {"nogil": True}, times=times, interpreted_as=interpreted)
 
 
 def elementwise(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
@@ -105,9 +106,7 @@ def inlined(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Re
     return inlined_as(function)(function)
 
 
-def inlined_as(
-    interpreted: Callable[_Arguments, _Result],
-) -> Callable[[Callable[_Arguments, _Result]], Callable[_Arguments, _Result]]:
+def inlined_as(interpreted: Callable[_Arguments, _Result]) -> _Making[_Arguments, _Result]:
     """Return what makes an inlined helper; interpreted, it is another function."""
     options = {"forceinline": True, "_nrt": False, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     return lambda function: _Kernel(function, options, interpreted_as=interpreted)
@@ -301,8 +300,7 @@ def _view(value: Any) -> object:
         # kernels take rows of the arrays in named tuples, and a memoryview of several dimensions has none
         make: Any = type(value)
         return cast(object, make(*(_view(each) if each.ndim == 1 else each for each in value)))
-    # an array is a buffer, though its type does not say so
-    return memoryview(cast(bytes, value)) if isinstance(value, np.ndarray) else value
+    return value.data if isinstance(value, np.ndarray) else value
 
 
 class _Apart(_Kernel[..., int]):

@@ -28,11 +28,11 @@ class Payloads(Sequence[bytes]):
     """M encoded messages in one buffer; each becomes an object of its own when it is asked for.
 
     Attributes:
-        data: the buffer.
+        data: the buffer, of single bytes.
         begin, end: (M,) int64, where each lies in it.
     """
 
-    data: bytes
+    data: bytes | memoryview
     begin: Integers
     end: Integers
 
@@ -49,8 +49,9 @@ class Payloads(Sequence[bytes]):
         """Join messages, one after the other."""
         sizes = starts_from_counts(list(map(len, [each.data for each in several])))[:-1]
         shifts = np.repeat(sizes, list(map(len, several)))
+        views = [np.frombuffer(each.data, np.uint8) for each in several]
         return cls(
-            b"".join([each.data for each in several]),
+            np.concatenate([np.empty(0, np.uint8), *views]).data,
             np.concatenate([sizes[:0], *(each.begin for each in several)]) + shifts,
             np.concatenate([sizes[:0], *(each.end for each in several)]) + shifts,
         )
@@ -67,10 +68,10 @@ class Payloads(Sequence[bytes]):
     def __getitem__(self, index: int | slice) -> bytes | Payloads:
         if isinstance(index, slice):
             return Payloads(self.data, self.begin[index], self.end[index])
-        return self.data[self.begin[index] : self.end[index]]
+        return bytes(self.data[self.begin[index] : self.end[index]])
 
     def __iter__(self) -> Iterator[bytes]:
-        return map(self.data.__getitem__, map(slice, self.begin.tolist(), self.end.tolist()))
+        return map(bytes, map(self.data.__getitem__, map(slice, self.begin.tolist(), self.end.tolist())))
 
     @property
     def nbytes(self) -> int:

@@ -8,6 +8,7 @@ import math
 import struct
 import tempfile
 import zlib
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -33,13 +34,17 @@ from spatial_replay.logs import (
     summarise_mcap,
 )
 from spatial_replay.logs.checksums import joined_checksum
+from spatial_replay.logs.mcap.chunks import iter_records
 from spatial_replay.logs.mcap.writer import CHUNK_BYTES
 from spatial_replay.logs.message_numbers import Columns, gathered
+from spatial_replay.logs.objects.sample_columns import ColumnReader, trace_of
 from spatial_replay.logs.objects.wire import WireTemplate
+from spatial_replay.logs.payloads import Payloads
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.topics import OBJECTS, protobuf_channel
 from spatial_replay.sources import open_source
 
+FORMS = st.sampled_from(["compiled", "interpreted"])
 CHANNEL = protobuf_channel(OBJECTS, ObjectStates)
 
 
@@ -186,6 +191,79 @@ def test_flipped_bytes_only_take_samples_away(trace, data):
 @given(st.binary(max_size=300))
 def test_any_bytes_after_the_magic_are_at_worst_an_error(content):
     read(b"\x89MCAP0\r\n" + content)
+
+
+@given(traces().filter(len), st.lists(st.integers(1, 9), min_size=1, max_size=4), st.data(), FORMS)
+@settings(max_examples=80)
+def test_samples_in_columns_are_what_their_messages_hold(trace, repeats, data, form):
+    """Some samples of each of a few layouts, one of whose bytes may be another."""
+    chosen = data.draw(st.lists(st.integers(0, len(trace) - 1), min_size=len(repeats), max_size=len(repeats)))
+    listed = list(trace.samples())
+    samples = [listed[index] for index, count in zip(chosen, repeats, strict=True) for _ in range(count)]
+    samples = [Sample(7 * k, each.objects, each.signals, each.unknown) for k, each in enumerate(samples)]
+    payloads = encode_objects(Trace.from_samples(samples))
+    times = np.array([sample.time_ns for sample in samples])
+    if is_changed := data.draw(st.booleans()):
+        sample = data.draw(st.integers(0, len(samples) - 1))
+        place = data.draw(st.integers(0, len(payloads[sample]) - 1))
+        changed = bytearray(payloads[sample])
+        changed[place] ^= data.draw(st.integers(1, 255))
+        payloads[sample] = bytes(changed)
+    with only(form):
+        columns = ColumnReader().read(Payloads.of(payloads), times)
+    is_sound = all(sample.objects and not sample.unknown for sample in samples)
+    assert columns is not None or is_changed or not is_sound
+    if columns is not None:
+        decoded, faults = decode_objects(payloads, times)
+        assert not faults
+        assert columns_of(trace_of(columns)) == columns_of(decoded)
+
+
+def columns_of(trace):
+    """All arrays of a trace, bit for bit, and its names."""
+    shapes = trace.footprints
+    numbers = trace.times_ns, trace.rows, trace.yaw, trace.uncertainty, trace.class_code
+    numbers = *numbers, *trace.signals.values()
+    arrays = *numbers, *(getattr(shapes, each) for each in shapes.__slots__)
+    bits = [(array.dtype, array.shape, array.tobytes()) for array in arrays]
+    return trace.names, trace.classes, list(trace.signals), bits
+
+
+@given(traces(max_samples=3).filter(len), st.data())
+@settings(max_examples=60)
+def test_logs_of_many_chunks_are_read_alike_in_machine_code(trace, data):
+    """Whole, changed, and cut off."""
+    samples = [
+        Sample(1_000_000_000 * k, each.objects, each.signals, each.unknown)
+        for k in range(20)
+        for each in list(trace.samples())[k % len(trace) :][:1]
+    ]
+    content = bytearray(write([Trace.from_samples(samples)]))
+    for _ in range(data.draw(st.integers(0, 3))):
+        place = data.draw(st.integers(8, len(content) - 1))
+        content[place] ^= data.draw(st.integers(1, 255))
+    content = bytes(content[: data.draw(st.one_of(st.none(), st.integers(8, len(content))))])
+    found = []
+    for form in ("compiled", "interpreted"):
+        with only(form):
+            read_trace = read(content)
+        found.append(None if read_trace is None else (columns_of(read_trace), read_trace.faults))
+    assert found[0] == found[1]
+
+
+@given(traces(max_samples=3).filter(len), st.lists(st.integers(0, 4), min_size=1, max_size=9), FORMS)
+@settings(max_examples=30)
+def test_chunks_that_are_named_several_times_are_read_as_often(trace, named, form):
+    first = next(trace.samples())
+    samples = [replace(first, time_ns=k * 10**9) for k in range(5)]
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "run.mcap")
+        path.write_bytes(write([Trace.from_samples(samples)]))
+        with McapSource(path).open_walk() as walk, only(form):
+            places = [walk.places[number] for number in named]
+            found = [list(records.messages.payloads) for _, records in iter_records(walk.stream, places)]
+    payloads = encode_objects(Trace.from_samples(samples))
+    assert [each for several in found for each in several] == [payloads[number] for number in named]
 
 
 @given(traces())

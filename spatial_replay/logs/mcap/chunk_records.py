@@ -6,7 +6,8 @@ import struct
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from io import BytesIO
-from typing import Any, NamedTuple, TypeAlias, TypeVar
+from itertools import accumulate
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from mcap import records
@@ -15,9 +16,12 @@ from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 from numpy.typing import NDArray
 
-from spatial_replay.compiled import elementwise, long_kernel
-from spatial_replay.geometry.arrays import Integers
+from spatial_replay.compiled import bytes_at, copying_kernel, elementwise, integers_at, long_kernel
+from spatial_replay.geometry.arrays import Booleans, Integers
 from spatial_replay.logs.payloads import Payloads
+
+if TYPE_CHECKING:
+    from spatial_replay.logs.objects.sample_columns import SampleColumns
 
 RECORD_HEAD = struct.Struct("<BQ")
 """Opcode and length of the body that follows."""
@@ -84,10 +88,20 @@ class RecordHeads(NamedTuple):
 
 def walk_records(content: bytes) -> tuple[RecordHeads, bool]:
     """Return the schemas, channels and messages in some bytes, and whether the last record breaks off."""
-    walk = _Walk(copies=False)
-    end = walk.over(content, np.array([len(content)]), np.empty(0, np.uint8))
-    fields = (walk.heads[name].astype(np.uint64) for name in _MESSAGE_FIELDS.names or ())
-    return RecordHeads(*walk.places[:3].copy(), *fields), end < len(content)
+    walk = _Walk()
+    end = walk.over(np.frombuffer(content, np.uint8), np.array([len(content)]), np.empty(0, np.uint8))
+    opcode, begins, ends = walk.places.copy()
+    heads = np.zeros(len(opcode), _MESSAGE_FIELDS)
+    messages = np.flatnonzero(opcode == _MESSAGE)
+    heads[messages] = _heads_at(np.frombuffer(content, np.uint8), begins[messages])
+    fields = (heads[name].astype(np.uint64) for name in _MESSAGE_FIELDS.names or ())
+    return RecordHeads(opcode, begins, ends, *fields), end < len(content)
+
+
+def _heads_at(content: Bytes, begin: Integers) -> MessageHeads:
+    """Return (n,) the heads of messages whose bodies begin at `begin`, (n,)."""
+    rows = content[begin[:, None] + np.arange(_MESSAGE_BYTES)]
+    return np.asarray(rows.view(_MESSAGE_FIELDS).reshape(-1))
 
 
 class _Walk:
@@ -95,73 +109,46 @@ class _Walk:
 
     Attributes:
         count, declarations: how many records the last ones have, and how many of them are not messages.
-        channel: the one of all its messages; -1 without any, -2 if they differ or have times beyond int64.
-        payloads: theirs, one after the other in the first `used` bytes, if they are copied.
+        used: the size of the messages' payloads, in bytes.
+        channel: the one of all messages; -1 without any, -2 if they differ or have times beyond int64.
     """
 
-    def __init__(self, *, copies: bool) -> None:
-        """Begin; `copies` says whether payloads are copied."""
-        self._copies = copies
-        self._places = np.empty((5, 0), np.int64)
-        self._heads = np.empty(0, np.uint8)
+    def __init__(self) -> None:
+        self._places = np.empty((3, 0), np.int64)
         self._state = np.zeros(6, np.int64)
-        self.payloads = np.empty(0, np.uint8)
         self.count = self.used = self.declarations = 0
         self.channel = -1
 
-    def over(self, content: bytes | memoryview, ends: Integers, passed_over: Bytes) -> int:
+    def over(self, content: Bytes, ends: Integers, passed_over: Bytes, channel: int = -1) -> int:
         """Walk over the records in some bytes; return where the last whole one ends.
 
         Args:
             ends: (C,) int64, where chunks end, in each of which the records must be whole.
             passed_over: by channel, 1 if its messages are not wanted.
+            channel: as the attribute, of messages before.
         """
-        view = np.frombuffer(content, np.uint8)
-        if self._copies and len(self.payloads) < len(content):
-            # the next chunk is about as large
-            self.payloads = np.empty(len(content) + len(content) // 8, np.uint8)
         # room for as many records as there could be would be many times the bytes
         if (enough := len(content) // 128 + 32) > self._places.shape[1]:
-            self._make_room(2 * enough)
-        self._state[:] = 0, 0, 0, 0, 0, -1
+            self._places = np.empty((3, 2 * enough), np.int64)
+        self._state[:] = 0, 0, 0, 0, 0, channel
         while True:
-            _walk_on(view, ends, passed_over, self._state, self._places, self._heads, self.payloads)
+            _walk_on(content, ends, passed_over, self._state, self._places)
             position, _, self.count, self.used, self.declarations, self.channel = self._state.tolist()
             if self.count < self._places.shape[1]:
                 return int(position)
-            self._make_room(2 * self.count)
-
-    def _make_room(self, count: int) -> None:
-        more = count - self._places.shape[1]
-        self._places = np.concatenate([self._places, np.empty((5, more), np.int64)], axis=1)
-        self._heads = np.concatenate([self._heads, np.empty(_MESSAGE_BYTES * more, np.uint8)])
+            more = np.empty((3, self.count), np.int64)
+            self._places = np.concatenate([self._places, more], axis=1)
 
     @property
     def places(self) -> Integers:
-        """(5, N) int64: opcode, begin and end of each record; begin and end of its payload in `payloads`."""
+        """(3, N) int64: opcode, begin and end of each record."""
         return self._places[:, : self.count]
-
-    @property
-    def heads(self) -> MessageHeads:
-        """(N,) the heads of the records that are messages; those of others are 0."""
-        heads = self._heads[: _MESSAGE_BYTES * self.count].copy().view(_MESSAGE_FIELDS)
-        if self.declarations:
-            heads[self._places[0, : self.count] != _MESSAGE] = 0
-        return heads
 
 
 @elementwise
 @long_kernel
-def _walk_on(
-    content: Bytes,
-    ends: Integers,
-    passed_over: Bytes,
-    state: Integers,
-    places: Integers,
-    heads: Bytes,
-    payloads: Bytes,
-) -> None:
-    """Fill in the records from a position on that there is room for: where they are, heads and payloads.
+def _walk_on(content: Bytes, ends: Integers, passed_over: Bytes, state: Integers, places: Integers) -> None:
+    """Fill in where the records from a position on are, as many as there is room for.
 
     Args:
         state: position, chunk, records, bytes of payloads, declarations and the channel so far; see `_Walk`.
@@ -183,16 +170,17 @@ def _walk_on(
         if position + _RECORD_HEAD > size:
             break
         begin = position + _RECORD_HEAD
-        # from the highest byte on, so that no length, however large, overflows
-        length = 0
-        for k in range(begin - 1, position, -1):
-            length = min(256 * length + content[k], size)
-        if length > size - begin:
+        length = high = 0
+        for k in range(position + 4, position, -1):
+            length = 256 * length + content[k]
+        for k in range(position + 5, begin):
+            high += content[k]
+        # no content has 4 GiB
+        if high > 0 or length > size - begin:
             break
         end = begin + length
         opcode = content[position]
         is_taken = _SCHEMA <= opcode <= _CHANNEL
-        before = used
         if is_taken:
             declarations += 1
         elif opcode == _MESSAGE and length >= _MESSAGE_BYTES:
@@ -203,18 +191,60 @@ def _walk_on(
                     only = channel
                 if only != channel or content[begin + _LAST_OF_LOG_TIME] >= 128:
                     only = -2
-                payload = begin + _MESSAGE_BYTES
-                heads[_MESSAGE_BYTES * count : _MESSAGE_BYTES * (count + 1)] = content[begin:payload]
-                if payloads.shape[0] > 0:
-                    used += end - payload
-                    payloads[before:used] = content[payload:end]
+                used += length - _MESSAGE_BYTES
         if is_taken:
             places[0, count], places[1, count], places[2, count] = opcode, begin, end
-            places[3, count], places[4, count] = before, used
             count += 1
         position = end
     state[0], state[1], state[2] = position, chunk, count
     state[3], state[4], state[5] = used, declarations, only
+
+
+def _copied_by_join(
+    content: Bytes, places: Integers, heads: Bytes, payloads: Bytes, starts: Integers, first: int
+) -> int:
+    """See `_copy_messages`."""
+    begin, end = places[1:, places[0] == _MESSAGE]
+    count = first + len(begin)
+    heads[_MESSAGE_BYTES * first : _MESSAGE_BYTES * count] = _heads_at(content, begin).view(np.uint8)
+    view = content.data
+    joined = b"".join(map(view.__getitem__, map(slice, (begin + _MESSAGE_BYTES).tolist(), end.tolist())))
+    payloads[starts[first] : starts[first] + len(joined)] = np.frombuffer(joined, np.uint8)
+    starts[first + 1 : count + 1] = starts[first] + np.cumsum(end - begin - _MESSAGE_BYTES)
+    return count
+
+
+@copying_kernel(_copied_by_join, times=1.0)
+def _copy_messages(
+    content: Bytes, places: Integers, heads: Bytes, payloads: Bytes, starts: Integers, first: int
+) -> int:
+    """Copy the heads and payloads of the messages among some records; return how many there are then.
+
+    Args:
+        content: where the records are, at `places` as `_Walk` has them.
+        heads, payloads: where to, one after the other.
+        starts: (m + 1,) int64, where payloads begin; that of the first is there already.
+        first: how many messages there were before.
+    """
+    source, target, heads_at = content.ctypes.data, payloads.ctypes.data, heads.ctypes.data
+    for record in range(places.shape[1]):
+        if places[0, record] != _MESSAGE:
+            continue
+        at, head = source + places[1, record], heads_at + _MESSAGE_BYTES * first
+        body, to = at + _MESSAGE_BYTES, target + starts[first]
+        length = places[2, record] - places[1, record] - _MESSAGE_BYTES
+        # 22 bytes, as three words of which the last two overlap
+        integers_at(head, 2)[0] = integers_at(at, 2)[0]
+        integers_at(head, 2)[1] = integers_at(at, 2)[1]
+        integers_at(head + _MESSAGE_BYTES - 8, 1)[0] = integers_at(body - 8, 1)[0]
+        words = length // 8
+        for k in range(words):
+            integers_at(to, words)[k] = integers_at(body, words)[k]
+        for k in range(8 * words, length):
+            bytes_at(to, length)[k] = bytes_at(body, length)[k]
+        starts[first + 1] = starts[first] + length
+        first += 1
+    return first
 
 
 Declaration: TypeAlias = records.Schema | records.Channel
@@ -226,33 +256,74 @@ class RawMessages:
 
     Attributes:
         heads: (M,) channel, sequence, log_time and publish_time.
-        payloads: M encoded messages.
+        buffers: M encoded messages, in one buffer or several, one after the other.
         channel: the one of all, if they are known to have one, and times below 2**63; else negative.
+        samples: all of the messages that are samples, as columns, in the order of the messages; None where
+            they are not.
     """
 
     heads: MessageHeads
-    payloads: Payloads
+    buffers: tuple[Payloads, ...]
     channel: int = -2
+    samples: tuple[SampleColumns, ...] | None = None
 
     @classmethod
     def join(cls, several: Sequence[RawMessages]) -> RawMessages:
         """Join messages, one after the other."""
         heads = np.concatenate([np.empty(0, _MESSAGE_FIELDS), *(each.heads for each in several)])
-        return cls(heads, Payloads.join([each.payloads for each in several]))
+        buffers = tuple(buffer for each in several for buffer in each.buffers)
+        parts = [each.samples for each in several if len(each)]
+        if None in parts:
+            return cls(heads, buffers)
+        return cls(heads, buffers, samples=tuple(part for each in parts for part in each or ()))
+
+    @property
+    def payloads(self) -> Payloads:
+        """M encoded messages; several buffers are joined whenever it is asked for."""
+        return self.buffers[0] if len(self.buffers) == 1 else Payloads.join(self.buffers)
+
+    @property
+    def buffer_bytes(self) -> int:
+        """The size of the buffers."""
+        return sum(len(each.data) for each in self.buffers)
 
     def __len__(self) -> int:
         return len(self.heads)
 
     def take(self, chosen: Integers) -> RawMessages:
         """Return the messages with the given indices, in that order."""
-        return RawMessages(self.heads[chosen], self.payloads.take(chosen))
+        return RawMessages(self.heads[chosen], (self.payloads.take(chosen),))
 
-    def compact(self) -> RawMessages:
-        """Return the same messages in a buffer that holds nothing else."""
-        return RawMessages(self.heads, Payloads.of(list(self.payloads)))
+    def divided(self, count: int, chosen: Booleans) -> tuple[RawMessages, RawMessages]:
+        """Return the first messages, and the others in a buffer that holds nothing else.
 
-    def __getitem__(self, part: slice) -> RawMessages:
-        return RawMessages(self.heads[part], self.payloads[part])
+        Args:
+            chosen: by channel, those of samples.
+        """
+        if count == len(self):
+            return self, RawMessages.join([])
+        first, rest = self.heads[:count], self.heads[count:]
+        payloads = self.payloads
+        samples = self.samples, self.samples
+        if self.samples is not None:
+            samples = _divided(self.samples, int(np.count_nonzero(chosen[first["channel"]])))
+        return (
+            RawMessages(first, (payloads[:count],), samples=samples[0]),
+            RawMessages(rest, (Payloads.of(list(payloads[count:])),), samples=samples[1]),
+        )
+
+
+def _divided(
+    columns: Sequence[SampleColumns], count: int
+) -> tuple[tuple[SampleColumns, ...], tuple[SampleColumns, ...]]:
+    first, rest = list[SampleColumns](), list[SampleColumns]()
+    for each in columns:
+        if own := min(count, len(each)):
+            first.append(each[:own])
+        if own < len(each):
+            rest.append(each[own:])
+        count -= own
+    return tuple(first), tuple(rest)
 
 
 @dataclass(frozen=True, slots=True)
@@ -284,31 +355,86 @@ class Splitter:
         """
         self._passed_over = np.zeros(max(passed_over, default=-1) + 1, np.uint8)
         self._passed_over[list(passed_over)] = 1
-        self._walk = _Walk(copies=True)
+        self._walk = _Walk()
+        self._heads = np.empty(0, np.uint8)
+        self._starts = np.zeros(1, np.int64)
+        self._known: dict[tuple[int, int], list[tuple[bytes, Declaration]]] = {}
+        self._begin(0)
 
-    def split(self, content: bytes | memoryview, sizes: Sequence[int] = ()) -> Records:
-        """See `split_records`.
+    def _begin(self, size: int) -> None:
+        self._size = size
+        self._payloads = np.empty(0, np.uint8)
+        self._count, self._channel = 0, -1
+        self._declarations: list[Declaration] = []
+        self._damage: str | None = None
 
-        Args:
-            sizes: of the chunks that the content is made of; it is one chunk without.
-        """
-        walk = self._walk
-        ends = np.cumsum(sizes or [len(content)])
-        end = walk.over(content, ends, self._passed_over)
-        damage = "a record breaks off" if end < len(content) else None
-        heads, bounds = walk.heads, walk.places[3:].copy()
-        declarations: list[Declaration] = []
+    def split(self, content: bytes | memoryview) -> Records:
+        """See `split_records`."""
+        self._begin(len(content))
+        self.add(content, [len(content)])
+        return self.records()
+
+    def begin(self, size: int) -> None:
+        """Begin with other chunks, of so many bytes in all."""
+        self._begin(size)
+
+    def add(self, content: bytes | memoryview, sizes: Sequence[int]) -> bool:
+        """Take in the next chunks, whose sizes are given; return whether all their records are sound."""
+        walk, view = self._walk, np.frombuffer(content, np.uint8)
+        end = walk.over(view, np.array(list(accumulate(sizes))), self._passed_over, self._channel)
+        self._channel = walk.channel
+        if end < len(content):
+            self._damage = "a record breaks off"
+        places = walk.places
         if walk.declarations:
-            opcode, begin, stop = walk.places[:3].tolist()
-            is_message = walk.places[0] == _MESSAGE
-            for index in np.flatnonzero(~is_message).tolist():
-                read = records.Schema.read if opcode[index] == Opcode.SCHEMA else records.Channel.read
+            places = self._declared(content, places)
+        self._make_room(places.shape[1], len(content))
+        self._count = _copy_messages(view, places, self._heads, self._payloads, self._starts, self._count)
+        return self._damage is None
+
+    def records(self) -> Records:
+        """Return the records that were taken in."""
+        heads = self._heads[: _MESSAGE_BYTES * self._count].copy().view(_MESSAGE_FIELDS)
+        starts = self._starts[: self._count + 1].copy()
+        payloads = Payloads(self._payloads.data[: starts[-1]], starts[:-1], starts[1:])
+        messages = RawMessages(heads, (payloads,), self._channel)
+        return Records(messages, self._declarations, self._damage)
+
+    def _declared(self, content: bytes | memoryview, places: Integers) -> Integers:
+        """Take in the declarations among records; return the records before one that cannot be read."""
+        for index in np.flatnonzero(places[0] != _MESSAGE).tolist():
+            opcode, begin, end = places[:, index].tolist()
+            body = bytes(content[begin:end])
+            # many chunks declare the same; comparing is quicker than a hash of a long schema
+            alike = self._known.setdefault((opcode, len(body)), [])
+            known = next((each for known_body, each in alike if known_body == body), None)
+            if known is None:
+                read = records.Schema.read if opcode == Opcode.SCHEMA else records.Channel.read
                 try:
-                    declarations.append(decoded(read, bytes(content[begin[index] : stop[index]])))
+                    known = decoded(read, body)
                 except DamageError as error:
-                    damage = str(error)
-                    is_message[index:] = False
-                    break
-            heads, bounds = heads[is_message], bounds[:, is_message]
-        payloads = Payloads(walk.payloads[: walk.used].tobytes(), bounds[0], bounds[1])
-        return Records(RawMessages(heads, payloads, walk.channel), declarations, damage)
+                    self._damage = str(error)
+                    return places[:, :index]
+                alike.append((body, known))
+            self._declarations.append(known)
+        return places
+
+    def _make_room(self, count: int, size: int) -> None:
+        """Make room for some records more, of which the payloads are those of the walk."""
+        if (most := self._count + count) >= len(self._starts):
+            self._heads = _longer(self._heads, 2 * _MESSAGE_BYTES * most)
+            self._starts = _longer(self._starts, 2 * most + 1)
+        used = int(self._starts[self._count]) + self._walk.used
+        if used > len(self._payloads):
+            # those of the other chunks are about as large
+            share = self._walk.used * self._size // max(size, 1)
+            self._payloads = _longer(self._payloads, max(used, min(share + share // 16, self._size)))
+
+
+_Number = TypeVar("_Number", bound=np.generic)
+
+
+def _longer(array: NDArray[_Number], length: int) -> NDArray[_Number]:
+    longer = np.empty(length, array.dtype)
+    longer[: len(array)] = array
+    return longer

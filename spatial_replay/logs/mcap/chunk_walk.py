@@ -53,15 +53,19 @@ class ChunkWalk:
         return any(channel.topic == OBJECTS for channel in self.channels.values())
 
     def iter_messages(
-        self, places: Sequence[ChunkPlace], is_wanted: Callable[[str], bool] = lambda topic: True
+        self,
+        places: Sequence[ChunkPlace],
+        is_wanted: Callable[[str], bool] = lambda topic: True,
+        prepare: Callable[[RawMessages], RawMessages] = lambda messages: messages,
     ) -> Iterator[tuple[Sequence[ChunkPlace], RawMessages]]:
         """Yield the messages in all places, some places at once; what is lost of them goes to the faults.
 
         Args:
             is_wanted: which topics matter; messages of others may be left out.
+            prepare: what is done with messages on the threads that read them; see `iter_records`.
         """
         passed_over = [n for n, each in self.channels.items() if not is_wanted(each.topic)]
-        for several, found in iter_records(self.stream, places, passed_over):
+        for several, found in iter_records(self.stream, places, passed_over, prepare):
             yield several, self._messages(several, found)
 
     def numbers(self, is_chosen: Callable[[str], bool]) -> Booleans:

@@ -9,23 +9,30 @@ from __future__ import annotations
 
 import struct
 from collections import deque
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+from itertools import accumulate, pairwise
 from threading import Lock, local
 from typing import BinaryIO, NamedTuple, TypeAlias
 
 import lz4.frame
+import numpy as np
 import zstandard
 
+from spatial_replay.compiled import bytes_at, copying_kernel, integers_at
 from spatial_replay.cores import cores
+from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.byte_ranges import is_planned, plan_reads
 from spatial_replay.logs.checksums import crc32, joined_checksum
 from spatial_replay.logs.mcap.chunk_records import (
     RECORD_HEAD,
     DamageError,
+    RawMessages,
     Records,
     Splitter,
 )
+from spatial_replay.logs.payloads import Bytes
 
 LARGEST_CHUNK = 2**30
 """Bytes, uncompressed; a chunk that claims more is damaged."""
@@ -36,9 +43,16 @@ _ALWAYS_ALLOWED, _MOST_TIMES_LARGER = 2**26, 1_000
 _CHUNK_HEAD = struct.Struct("<QQQII")
 _FIXED_HEAD = RECORD_HEAD.size + _CHUNK_HEAD.size
 _LONGEST_HEAD = 80
-_TOGETHER, _TOGETHER_BYTES = 16, 2**20
-"""Chunks, and their bytes, that a thread takes at once: what it decompresses stays in the cache."""
-_AHEAD, _AHEAD_BYTES = 48, 2**24
+_RECORD_HEAD = RECORD_HEAD.size
+_ZSTD = 4 | int.from_bytes(b"zstd", "little") << 32
+"""The compression of our own chunks in their heads: a length, and a name."""
+_OUR_HEAD = _FIXED_HEAD + 4 + 8
+"""How long these heads are."""
+_TOGETHER, _TOGETHER_BYTES = 32, 2**20
+"""Chunks, and their bytes, that a thread takes at once."""
+_CACHED_BYTES = 2**20
+"""So many are decompressed before they are split: they stay in the cache."""
+_AHEAD, _AHEAD_BYTES = 24, 2**24
 """How many times as many are read ahead, at most, and their bytes: more than a block of samples has."""
 _LEAST_AHEAD = 8
 """So many are read ahead however large they are, so that each thread has work."""
@@ -96,23 +110,45 @@ def read_records(stream: BinaryIO, place: ChunkPlace) -> bytes:
     Raises:
         DamageError: the chunk is cut off, does not decompress, or has another checksum than it says.
     """
-    (record,) = _read_places(stream, [place])
-    return _content(place, record, zstandard.ZstdDecompressor())
+    data, _ = _read_places(stream, [place], _Room())
+    return _content(place, data, zstandard.ZstdDecompressor())
 
 
-def _read_places(stream: BinaryIO, places: Sequence[ChunkPlace]) -> list[memoryview]:
-    """Read what is in some places, at once where they follow each other closely, as on this machine."""
+class _Room:
+    """A buffer that serves again and again: new memory costs as much as filling it."""
+
+    def __init__(self) -> None:
+        self._bytes = np.empty(0, np.uint8)
+
+    def of(self, size: int) -> Bytes:
+        """Return (size,) bytes, in which anything may be, and which are the same ones each time."""
+        if len(self._bytes) < size:
+            self._bytes = np.empty(size + size // 8, np.uint8)
+        return self._bytes[:size]
+
+
+def _read_places(
+    stream: BinaryIO, places: Sequence[ChunkPlace], room: _Room
+) -> tuple[memoryview, list[tuple[int, int]]]:
+    """Read what is in some places, at once where they follow each other closely, as on this machine.
+
+    Returns:
+        what was read, which may be in the room, and where each place begins and ends in it: too early, if the
+        file ends before.
+    """
     begin, end = places[0].offset, max(place.offset + place.length for place in places)
     is_near = end - begin <= _MOST_SPREAD * sum(place.length for place in places)
-    if len(places) == 1 or not is_near or begin > min(place.offset for place in places) or is_planned(stream):
-        return [_read(stream, place.offset, place.length) for place in places]
-    data = _read(stream, begin, end - begin)
-    return [data[place.offset - begin : place.offset - begin + place.length] for place in places]
-
-
-def _read(stream: BinaryIO, offset: int, length: int) -> memoryview:
-    stream.seek(offset)
-    return memoryview(stream.read(length))
+    if not is_near or is_planned(stream) or begin > min(place.offset for place in places):
+        parts = list[bytes]()
+        for place in places:
+            stream.seek(place.offset)
+            parts.append(stream.read(place.length))
+        return memoryview(b"".join(parts)), list(pairwise(accumulate(map(len, parts), initial=0)))
+    stream.seek(begin)
+    whole = room.of(end - begin).data
+    size = stream.readinto(whole)  # type: ignore[attr-defined]
+    bounds = ((place.offset - begin, place.offset - begin + place.length) for place in places)
+    return whole[:size], [(min(first, size), min(last, size)) for first, last in bounds]
 
 
 def _content(place: ChunkPlace, record: memoryview, decompressor: zstandard.ZstdDecompressor) -> bytes:
@@ -134,8 +170,15 @@ def _content(place: ChunkPlace, record: memoryview, decompressor: zstandard.Zstd
     return content
 
 
+def _unchanged(messages: RawMessages) -> RawMessages:
+    return messages
+
+
 def iter_records(
-    stream: BinaryIO, places: Sequence[ChunkPlace], passed_over: Collection[int] = ()
+    stream: BinaryIO,
+    places: Sequence[ChunkPlace],
+    passed_over: Collection[int] = (),
+    prepare: Callable[[RawMessages], RawMessages] = _unchanged,
 ) -> Iterator[tuple[Sequence[ChunkPlace], Records | DamageError]]:
     """Yield places with their records, or with the damage that `read_records` raised, in this order.
 
@@ -145,21 +188,26 @@ def iter_records(
 
     Args:
         passed_over: channels whose messages are not wanted.
+        prepare: what else these threads do with the messages of some places.
     """
     plan_places(stream, places)
-    reader = _GroupReader(stream, passed_over)
+    reader = _GroupReader(stream, passed_over, prepare)
     waiting: deque[tuple[int, Future[_Found]]] = deque()
-    ahead = 0
+    ahead = several = 0
     with ThreadPoolExecutor(min(cores(), _MOST_THREADS), "chunk-reading") as readers:
         try:
             for group in _groups(places):
                 size = sum(place.length for place in group)
                 waiting.append((size, readers.submit(reader.read, group)))
                 ahead += size
-                while len(waiting) > _AHEAD or (ahead > _AHEAD_BYTES and len(waiting) > _LEAST_AHEAD):
-                    size, ready = waiting.popleft()
-                    ahead -= size
-                    yield from ready.result()
+                if len(waiting) > _AHEAD or (ahead > _AHEAD_BYTES and len(waiting) > _LEAST_AHEAD):
+                    # several at once: when the caller wakes up, a thread that reads may have to wait
+                    several = min(several + 1, len(waiting) // 2)
+                    waiting[several - 1][1].result()
+                    for _ in range(several):
+                        size, ready = waiting.popleft()
+                        ahead -= size
+                        yield from ready.result()
             for _, ready in waiting:
                 yield from ready.result()
         finally:
@@ -185,81 +233,159 @@ def plan_places(stream: BinaryIO, places: Iterable[ChunkPlace]) -> None:
 _Found: TypeAlias = "list[tuple[Sequence[ChunkPlace], Records | DamageError]]"
 
 
+class _Buffers:
+    """What a thread that reads has for itself."""
+
+    def __init__(self, passed_over: Collection[int]) -> None:
+        self.read, self.frames, self.content = _Room(), _Room(), _Room()
+        self.decompressor = zstandard.ZstdDecompressor()
+        self.splitter = Splitter(passed_over)
+
+
 class _GroupReader:
     """Reads groups of chunks on several threads, each with buffers that serve again and again."""
 
-    def __init__(self, stream: BinaryIO, passed_over: Collection[int]) -> None:
-        self._stream, self._passed_over = stream, passed_over
+    def __init__(
+        self,
+        stream: BinaryIO,
+        passed_over: Collection[int],
+        prepare: Callable[[RawMessages], RawMessages],
+    ) -> None:
+        self._stream, self._passed_over, self._prepare = stream, passed_over, prepare
         self._reading = Lock()
         self._own = local()
 
     def read(self, places: Sequence[ChunkPlace]) -> _Found:
         """Return the records in all places, or in each, with its damage."""
+        own: _Buffers | None = getattr(self._own, "buffers", None)
+        if own is None:
+            self._own.buffers = own = _Buffers(self._passed_over)
         with self._reading:
-            read = _read_places(self._stream, places)
-        decompressor, splitter = zstandard.ZstdDecompressor(), self._splitter()
-        if (content := self._content(places, read, decompressor)) is not None:
-            records = splitter.split(*content)
-            if records.damage is None:
-                return [(places, records)]
+            data, bounds = _read_places(self._stream, places, own.read)
+        if (records := _records_together(places, data, bounds, own)) is not None:
+            return [(places, self._prepared(records))]
         found: _Found = []
-        for place, record in zip(places, read, strict=True):
+        for place, (begin, end) in zip(places, bounds, strict=True):
             try:
-                found.append(([place], splitter.split(_content(place, record, decompressor))))
+                records = own.splitter.split(_content(place, data[begin:end], own.decompressor))
+                found.append(([place], self._prepared(records)))
             except DamageError as damage:
                 found.append(([place], damage))
         return found
 
-    def _content(
-        self,
-        places: Sequence[ChunkPlace],
-        read: Sequence[memoryview],
-        decompressor: zstandard.ZstdDecompressor,
-    ) -> tuple[memoryview, list[int]] | None:
-        """Decompress and check all chunks in one step each, so that threads seldom wait for the interpreter.
+    def _prepared(self, records: Records) -> Records:
+        return replace(records, messages=self._prepare(records.messages))
 
-        Returns:
-            all contents and their sizes; None if they are not all sound and compressed as ours: then each is
-            looked at by itself.
-        """
-        frames, sizes, checksums = list[memoryview](), list[int](), list[int]()
-        for place, record in zip(places, read, strict=True):
-            if not place.compressed or len(record) < max(place.length, _LONGEST_HEAD):
-                return None
-            _, _, size, checksum, name_length = _CHUNK_HEAD.unpack_from(record, RECORD_HEAD.size)
-            begin = _FIXED_HEAD + name_length
-            if bytes(record[_FIXED_HEAD:begin]) != b"zstd" or not checksum or size > _TOGETHER_BYTES:
-                return None
-            frames.append(record[begin + 8 :])
-            sizes.append(size)
-            checksums.append(checksum)
-        try:
-            for place, record in zip(places, read, strict=True):
-                chunk_place(place.offset, bytes(record[:_LONGEST_HEAD]), len(record))
-            if list(map(zstandard.frame_content_size, frames)) != sizes:
-                return None
-            whole = self._buffer(sum(sizes))
-            reader = decompressor.stream_reader(b"".join(frames), read_across_frames=True)
-            if reader.readinto(whole) != len(whole):  # type: ignore[attr-defined, unused-ignore]
-                return None
-        except (DamageError, zstandard.ZstdError):
+
+def _records_together(
+    places: Sequence[ChunkPlace], data: memoryview, bounds: Sequence[tuple[int, int]], own: _Buffers
+) -> Records | None:
+    """Return the records of several chunks, a few of which are decompressed, checked and split in one step.
+
+    Threads then seldom wait for the interpreter, and what is decompressed is still in the processor's cache
+    when it is split.
+
+    Returns:
+        None if not all are sound and compressed as ours: then each is looked at by itself.
+    """
+    if not all(place.compressed for place in places):
+        return None
+    if [end - begin for begin, end in bounds] != [place.length for place in places]:
+        return None
+    table = np.empty((len(places), 5), np.int64)
+    table[:, :2] = bounds
+    # not only as much as was read: an index may name the same bytes several times
+    frames = own.frames.of(sum(place.length for place in places))
+    if not _gather_frames(np.frombuffer(data, np.uint8), table, frames):
+        return None
+    lengths, sizes, checksums = table[:, 2:].T.tolist()
+    ends = list(accumulate(lengths, initial=0))
+    view = frames.data
+    checksum = 0
+    own.splitter.begin(sum(sizes))
+    try:
+        if [zstandard.frame_content_size(view[begin:end]) for begin, end in pairwise(ends)] != sizes:
             return None
-        if crc32(whole) != joined_checksum(checksums, sizes):
-            return None
-        return whole, sizes
+        for first, last in _batches(sizes):
+            content = own.content.of(sum(sizes[first:last])).data
+            reader = own.decompressor.stream_reader(view[ends[first] : ends[last]], read_across_frames=True)
+            if reader.readinto(content) != len(content):  # type: ignore[attr-defined, unused-ignore]
+                return None
+            checksum = crc32(content, checksum)
+            if not own.splitter.add(content, sizes[first:last]):
+                return None
+    except zstandard.ZstdError:
+        return None
+    return own.splitter.records() if checksum == joined_checksum(checksums, sizes) else None
 
-    def _splitter(self) -> Splitter:
-        """Return the splitter of this thread: new memory costs as much as filling it."""
-        splitter: Splitter | None = getattr(self._own, "splitter", None)
-        if splitter is None:
-            self._own.splitter = splitter = Splitter(self._passed_over)
-        return splitter
 
-    def _buffer(self, size: int) -> memoryview:
-        buffer: bytearray | None = getattr(self._own, "buffer", None)
-        if buffer is None or len(buffer) < size:
-            self._own.buffer = buffer = bytearray(size + size // 8)
-        return memoryview(buffer)[:size]
+def _batches(sizes: Sequence[int]) -> Iterator[tuple[int, int]]:
+    """Yield which chunks are decompressed together, as a range."""
+    begin = size = 0
+    for number, each in enumerate(sizes):
+        if number > begin and size + each > _CACHED_BYTES:
+            yield begin, number
+            begin, size = number, 0
+        size += each
+    yield begin, len(sizes)
+
+
+def _gathered_by_struct(data: Bytes, table: Integers, frames: Bytes) -> bool:
+    """See `_gather_frames`."""
+    at = 0
+    for row in table:
+        begin, end = row[:2].tolist()
+        record = data.data[begin:end]
+        if len(record) < _LONGEST_HEAD:
+            return False
+        start, stop, size, checksum, _ = _CHUNK_HEAD.unpack_from(record, RECORD_HEAD.size)
+        name, stored = struct.unpack_from("<QQ", record, _OUR_HEAD - 16)
+        if name != _ZSTD or not checksum or size > _TOGETHER_BYTES or not start <= stop < 2**63:
+            return False
+        if stored != len(record) - _OUR_HEAD:
+            return False
+        frames[at : at + stored] = data[begin + _OUR_HEAD : end]
+        row[2:] = stored, size, checksum
+        at += stored
+    return True
+
+
+@copying_kernel(_gathered_by_struct, times=1.0)
+def _gather_frames(data: Bytes, table: Integers, frames: Bytes) -> bool:
+    """Put the compressed contents of chunks side by side; return whether all are plainly as ours.
+
+    Args:
+        data: the chunks.
+        table: (C, 5), where each begins and ends; to be filled in: the length of its compressed content, the
+            size of its content, and its checksum.
+        frames: to be filled in; as long as all chunks together.
+    """
+    source, target, used = data.ctypes.data, frames.ctypes.data, 0
+    for k in range(table.shape[0]):
+        length = table[k, 1] - table[k, 0]
+        if length < _LONGEST_HEAD:
+            return False
+        at = source + table[k, 0]
+        start, stop, size = (
+            integers_at(at + _RECORD_HEAD, 3)[0],
+            integers_at(at + _RECORD_HEAD, 3)[1],
+            integers_at(at + _RECORD_HEAD, 3)[2],
+        )
+        checksum = integers_at(at + _RECORD_HEAD + 24, 1)[0] & 0xFFFFFFFF
+        stored = integers_at(at + _OUR_HEAD - 8, 1)[0]
+        if integers_at(at + _OUR_HEAD - 16, 1)[0] != _ZSTD or checksum == 0 or stored != length - _OUR_HEAD:
+            return False
+        if size < 0 or size > _TOGETHER_BYTES or start < 0 or stop < start:
+            return False
+        frame, to = at + _OUR_HEAD, target + used
+        words = stored // 8
+        for i in range(words):
+            integers_at(to, words)[i] = integers_at(frame, words)[i]
+        for i in range(8 * words, stored):
+            bytes_at(to, stored)[i] = bytes_at(frame, stored)[i]
+        used += stored
+        table[k, 2], table[k, 3], table[k, 4] = stored, size, checksum
+    return True
 
 
 def _decompressed(

@@ -16,7 +16,7 @@ from types import MappingProxyType
 import numpy as np
 
 from spatial_replay.errors import LogError, UsageError
-from spatial_replay.geometry.arrays import Booleans
+from spatial_replay.geometry.arrays import Booleans, Integers
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.byte_ranges import plan_reads
 from spatial_replay.logs.mcap.chunk_records import RawMessages
@@ -37,7 +37,7 @@ from spatial_replay.logs.messages import (
     select,
 )
 from spatial_replay.logs.objects.decode import decode_objects
-from spatial_replay.logs.payloads import chosen_payloads
+from spatial_replay.logs.objects.sample_columns import ColumnReader, trace_of
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.logs.remote import LogFile, RemoteFile, open_file
 from spatial_replay.logs.sample_cache import DamagedEntryError, cached_samples
@@ -111,7 +111,7 @@ class McapSource:
         with self.open_walk() as walk:
             window = (0 if start_ns is None else start_ns, AFTER_ALL_NS if end_ns is None else end_ns)
             decoder = _BlockDecoder(self, walk)
-            for messages in _blocks(walk, window, self.is_wanted):
+            for messages in _blocks(walk, window, self.is_wanted, _SampleReader(walk)):
                 yield decoder.block(messages)
             if not isinstance(self.path, RemoteFile) or window == (0, AFTER_ALL_NS):
                 # some seconds of a log elsewhere are not worth all its attachments
@@ -227,9 +227,16 @@ def recovery_remarks(name: str, metadata: Sequence[tuple[str, Mapping[str, str]]
 
 
 def _blocks(
-    walk: ChunkWalk, window: tuple[int, int], is_wanted: Callable[[str], bool]
+    walk: ChunkWalk,
+    window: tuple[int, int],
+    is_wanted: Callable[[str], bool],
+    prepare: Callable[[RawMessages], RawMessages] = lambda messages: messages,
 ) -> Iterator[RawMessages]:
-    """Yield the messages of the topics wanted, in order, in blocks of bounded size."""
+    """Yield the messages of the topics wanted, in order, in blocks of bounded size.
+
+    Args:
+        prepare: what the threads that read do with messages.
+    """
     start_ns, end_ns = window
     declared = 0
     wanted = objects = walk.numbers(is_wanted)
@@ -244,7 +251,7 @@ def _blocks(
     waiting: list[RawMessages] = []
     size = samples = number = 0
     enough = FIRST_SAMPLES
-    for several, messages in walk.iter_messages(places, is_wanted):
+    for several, messages in walk.iter_messages(places, is_wanted, prepare):
         number += len(several)
         if declared < len(walk.channels):
             declared = len(walk.channels)
@@ -258,18 +265,17 @@ def _blocks(
             if not is_chosen.all():
                 messages = messages.take(np.flatnonzero(is_chosen))
         waiting.append(messages)
-        size += len(messages.payloads.data) if messages.channel >= 0 else messages.payloads.nbytes
+        size += messages.buffer_bytes if messages.channel >= 0 else messages.payloads.nbytes
         samples += _count(messages, objects)
         if number < len(places) and (size >= BLOCK_BYTES or samples >= enough):
             ordered = _in_order(waiting)
             ready = int(np.searchsorted(ordered.heads["log_time"], places[number].start_ns))
             waiting = [ordered]
             if ready:
-                yield ordered[:ready]
+                block, rest = ordered.divided(ready, objects)
+                yield block
                 enough = min(2 * enough, BLOCK_SAMPLES)
-                # not the whole buffer for the few that are left
-                rest = ordered[ready:].compact()
-                waiting, size, samples = [rest], rest.payloads.nbytes, _count(rest, objects)
+                waiting, size, samples = [rest], rest.buffer_bytes, _count(rest, objects)
     rest = _in_order(waiting)
     if len(rest):
         yield rest
@@ -288,7 +294,29 @@ def _in_order(several: Sequence[RawMessages]) -> RawMessages:
     times = joined.heads["log_time"]
     if (times[1:] > times[:-1]).all():
         return joined
-    return joined.take(np.lexsort((joined.heads["sequence"], joined.heads["channel"], times)))
+    ordered = joined.take(np.lexsort((joined.heads["sequence"], joined.heads["channel"], times)))
+    # samples are mostly in order among themselves, which is compared once more where they are used
+    return replace(ordered, samples=joined.samples)
+
+
+class _SampleReader:
+    """Reads the samples among messages as columns, on the threads that read these."""
+
+    def __init__(self, walk: ChunkWalk) -> None:
+        own = [number for number, channel in walk.channels.items() if channel.topic == OBJECTS]
+        self._number = own[0] if len(own) == 1 and is_samples(walk.channels[own[0]]) else None
+        self._columns = ColumnReader()
+
+    def __call__(self, messages: RawMessages) -> RawMessages:
+        """Return the same messages, with their samples as columns if they are all sound."""
+        if self._number is None:
+            return messages
+        payloads, heads = messages.payloads, messages.heads
+        if messages.channel != self._number:
+            own = np.flatnonzero(heads["channel"] == self._number)
+            payloads, heads = payloads.take(own), heads[own]
+        samples = self._columns.read(payloads, heads["log_time"].astype(np.int64))
+        return messages if samples is None else replace(messages, samples=samples)
 
 
 class _BlockDecoder:
@@ -312,11 +340,10 @@ class _BlockDecoder:
         for time_ns in times[times <= before[:-1]].tolist():
             self._fault(Sentence("sample at ", Instant(time_ns, 0), ": there is one at this time already"))
         own, self._latest_ns = own[times > before[:-1]], int(before[-1])
-        payloads = chosen_payloads(columns.payloads, own)
-        trace, faults = decode_objects(payloads, columns.log_time_ns[own], concave=self._source.concave)
+        trace, faults = self._trace(messages, own, columns.log_time_ns[own])
         for fault in faults:
             self._fault(fault)
-        if len(trace) < int(is_own.sum()):
+        if len(trace) < int(is_own.sum()) and not self._source.without_messages:
             # a copy holds the samples that were read, and is sound
             read = own[np.isin(columns.log_time_ns[own], trace.times_ns)]
             columns = select(columns, np.union1d(np.flatnonzero(~is_own), read))
@@ -324,6 +351,16 @@ class _BlockDecoder:
         lost = self._walk.faults.take()
         self.first_fault = self.first_fault or next(iter(lost), None)
         return Block(replace(trace, faults=lost), columns)
+
+    def _trace(
+        self, messages: RawMessages, own: Integers, times_ns: Integers
+    ) -> tuple[Trace, list[Sentence]]:
+        """Return the samples that some messages are, and what is wrong with them."""
+        samples = messages.samples
+        if samples and np.array_equal(np.concatenate([each.times_ns for each in samples]), times_ns):
+            return trace_of(samples), []
+        payloads = messages.payloads.take(own)
+        return decode_objects(payloads, times_ns, concave=self._source.concave)
 
     def _is_objects(self, channel: Channel) -> bool:
         if channel.topic != OBJECTS or is_samples(channel):
@@ -344,7 +381,7 @@ class _BlockDecoder:
             sequence=heads["sequence"].astype(np.int64),
             log_time_ns=heads["log_time"].astype(np.int64),
             publish_time_ns=heads["publish_time"].astype(np.int64),
-            payloads=messages.payloads,
+            payloads=() if self._source.without_messages else messages.payloads,
         )
 
     def _fault(self, what: str) -> None:

@@ -83,6 +83,15 @@ class WireTemplate:
         """The payload as bytes."""
         return self.payload.tobytes()
 
+    @cached_property
+    def fixed(self) -> Bytes:
+        """(L,) uint8, 0 in all slots, 0xFF elsewhere."""
+        fixed = np.full(len(self), 0xFF, np.uint8)
+        fixed[self.mark_offsets] = 0
+        for offset in self.word_offsets.tolist():
+            fixed[offset : offset + 8] = 0
+        return fixed
+
     def fill(self, words: Words, marks: Bytes | None = None) -> Bytes:
         """Encode n messages: words (n, W) and marks (n, M) → (n, L) uint8."""
         rows = np.empty((len(words), len(self)), np.uint8)
@@ -97,14 +106,10 @@ class WireTemplate:
 
     def matches(self, rows: Bytes) -> NDArray[np.bool_]:
         """Return (n,) which of n encoded messages (n, L) have this layout."""
-        fixed = np.full(len(self), 0xFF, np.uint8)
-        fixed[self.mark_offsets] = 0
-        for offset in self.word_offsets.tolist():
-            fixed[offset : offset + 8] = 0
         same = np.ones(len(rows), np.bool_)
         for begin in range(0, len(rows), _TOGETHER):
             # so few that all passes over them stay within the processor's cache
-            differing = (rows[begin : begin + _TOGETHER] ^ self.payload) & fixed
+            differing = (rows[begin : begin + _TOGETHER] ^ self.payload) & self.fixed
             if differing.any():
                 same[begin : begin + _TOGETHER] = ~differing.any(axis=1)
         return same
