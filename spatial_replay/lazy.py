@@ -14,15 +14,16 @@ def loaded_when_used(
 
     Args:
         package: its `globals()`, where loaded names are stored.
-        names_by_module: the names that each module defines; modules are relative to the package.
+        names_by_module: the names that each module defines; modules are relative to the package,
+            one that begins with a dot to the package above.
     """
     home = package["__name__"]
-    modules = {name: f"{home}.{module}" for module, names in names_by_module.items() for name in names}
+    modules = {name: f".{module}" for module, names in names_by_module.items() for name in names}
 
     def load(name: str) -> Any:
         if name not in modules:
             raise AttributeError(f"module {home!r} has no attribute {name!r}")
-        package[name] = getattr(import_module(modules[name]), name)
+        package[name] = getattr(import_module(modules[name], home), name)
         return package[name]
 
     def names() -> list[str]:

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Literal, TypeAlias, get_args
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
 from spatial_replay.compiled import inlined, kernel
 from spatial_replay.cores import over_cores
 from spatial_replay.errors import GeometryError
-from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.geometry.arrays import Floats, Integers, read_only_floats
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.kernels import NOTHING, measure_rows
 
@@ -74,6 +75,48 @@ def measure(batch: FootprintBatch, operands: Sequence[Operand], requests: Sequen
         GeometryError: operands over different numbers of samples, a row the batch does not have, a
             request for an operand that does not exist.
     """
+    values, prepared = _prepared(batch, operands, requests)
+    arguments = (*prepared, np.empty((len(batch.vertices), 4)), values)
+    least = _SHARE // max(len(requests), 1) + 1
+    over_cores(measure_rows, lambda *share: measure_rows(*arguments, *share), values.shape[1], least)
+    return values
+
+
+class Remeasured:
+    """Requests that are measured again and again, of footprints with other outlines each time.
+
+    Each thread needs its own, since it measures in the same room each time.
+    """
+
+    def __init__(
+        self, batch: FootprintBatch, operands: Sequence[Operand], requests: Sequence[MeasureRequest]
+    ) -> None:
+        self._values, prepared = _prepared(batch, operands, requests)
+        self._before, self._after = prepared[:2], prepared[3:]
+        self._edges = np.empty((len(batch.vertices), 4))
+
+    def another(self) -> Remeasured:
+        """Return the same with room of its own."""
+        made = copy(self)
+        made._values, made._edges = self._values.copy(), np.empty_like(self._edges)
+        return made
+
+    def measure(self, vertices: Floats) -> Floats:
+        """Return (K, T), kept until the next call; between footprints that rest nothing is measured again.
+
+        Args:
+            vertices: (V or more, 2), in the places of the batch's.
+        """
+        values, room = self._values, (self._edges, self._values)
+        arguments: Any = (*self._before, read_only_floats(vertices), *self._after, *room, 0, values.shape[1])
+        measure_rows(*arguments)
+        return values
+
+
+def _prepared(
+    batch: FootprintBatch, operands: Sequence[Operand], requests: Sequence[MeasureRequest]
+) -> tuple[Floats, Any]:
+    """Return values (K, T), of requests that rest already measured, and what `measure_rows` takes first."""
     samples = {operand.rows.shape[0] for operand in operands}
     if len(samples) > 1:
         raise GeometryError(f"operands span {sorted(samples)} samples; give each the same number")
@@ -93,7 +136,7 @@ def measure(batch: FootprintBatch, operands: Sequence[Operand], requests: Sequen
             once = [Operand(operand.rows[:1], operand.enlargement) for operand in operands]
             values[still] = measure(batch, once, [requests[k] for k in still])
             codes[still] = NOTHING
-    arguments = (
+    return values, (
         batch.part_start,
         batch.vertex_start,
         batch.vertices,
@@ -107,12 +150,7 @@ def measure(batch: FootprintBatch, operands: Sequence[Operand], requests: Sequen
         codes,
         np.array([request.first for request in requests], dtype=np.int64),
         np.array([request.second for request in requests], dtype=np.int64),
-        np.empty((len(batch.vertices), 4)),
-        values,
     )
-    least = _SHARE // max(len(requests), 1) + 1
-    over_cores(measure_rows, lambda begin, end: measure_rows(*arguments, begin, end), values.shape[1], least)
-    return values
 
 
 def _rests(operand: Operand) -> bool:

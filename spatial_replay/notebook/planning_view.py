@@ -11,6 +11,7 @@ import numpy as np
 
 from spatial_replay.annotate.rings import outlines_of
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
+from spatial_replay.geometry.poses import moved_object
 from spatial_replay.notebook import html, plot
 from spatial_replay.notebook.figures import (
     INK,
@@ -24,7 +25,7 @@ from spatial_replay.notebook.figures import (
     table,
 )
 from spatial_replay.planning.decisions import Candidate, Consideration, Step
-from spatial_replay.planning.maps import FREE, REASONS, GradientMap, moved_object
+from spatial_replay.planning.maps import FREE, REASONS, GradientMap
 from spatial_replay.planning.read import LoggedStep
 from spatial_replay.planning.redo import Redone
 from spatial_replay.text import counted

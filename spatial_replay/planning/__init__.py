@@ -10,20 +10,14 @@ from typing import TYPE_CHECKING
 from spatial_replay.lazy import loaded_when_used
 
 if TYPE_CHECKING:
+    from spatial_replay.geometry.poses import centre_of, moved_object
     from spatial_replay.logs.topics import PLAN_METADATA
     from spatial_replay.planning.decision_log import BlackBox, plan_metadata
     from spatial_replay.planning.decisions import Candidate, Executor, Outcome, Reason, Step, Target
     from spatial_replay.planning.edges import MOST_MOTIONS
     from spatial_replay.planning.map_layers import MapLayers, map_layers
     from spatial_replay.planning.map_messages import map_fields
-    from spatial_replay.planning.maps import (
-        FREE,
-        GradientMap,
-        centre_of,
-        gradient_map,
-        moved_object,
-        proposition_maps,
-    )
+    from spatial_replay.planning.maps import FREE, GradientMap, gradient_map, proposition_maps
     from spatial_replay.planning.paths import shortest_path
     from spatial_replay.planning.planner import Planner
     from spatial_replay.planning.read import LoggedStep, planner_of, read_decisions, read_steps
@@ -86,9 +80,10 @@ __getattr__, __dir__ = loaded_when_used(
         "map_layers": ("MapLayers", "map_layers"),
         "map_messages": ("map_fields",),
         "edges": ("MOST_MOTIONS",),
-        "maps": ("FREE", "GradientMap", "centre_of", "gradient_map", "moved_object", "proposition_maps"),
+        "maps": ("FREE", "GradientMap", "gradient_map", "proposition_maps"),
         "paths": ("shortest_path",),
         "planner": ("Planner",),
+        ".geometry.poses": ("centre_of", "moved_object"),
         "read": ("PLAN_METADATA", "LoggedStep", "planner_of", "read_decisions", "read_steps"),
         "recompute": ("recompute_decisions",),
         "redo": ("Redone", "redo_decisions"),

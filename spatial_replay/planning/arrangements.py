@@ -20,8 +20,9 @@ import numpy as np
 
 from spatial_replay.geometry.arrays import Booleans, Floats
 from spatial_replay.geometry.footprint import TrackedObject
+from spatial_replay.geometry.poses import centre_of, moved_object, radius_of
 from spatial_replay.planning.demands import Budget, Demand, surplus, values_in, with_moved
-from spatial_replay.planning.maps import centre_of, concerns, moved_object, proposition_maps, radius_of
+from spatial_replay.planning.maps import concerns, proposition_maps
 from spatial_replay.planning.settings import Settings
 from spatial_replay.planning.targets import cell_hint
 from spatial_replay.planning.workspace import Grid, Workspace

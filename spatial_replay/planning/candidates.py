@@ -12,6 +12,7 @@ import numpy as np
 from spatial_replay.errors import TraceError
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.geometry.footprint import TrackedObject
+from spatial_replay.geometry.poses import centre_of, moved_object
 from spatial_replay.planning.decisions import Candidate, Consideration, Guards, Reason, Target
 from spatial_replay.planning.demands import Pose, with_moved, with_objects
 from spatial_replay.planning.edges import Attempts
@@ -23,11 +24,9 @@ from spatial_replay.planning.maps import (
     GradientMap,
     MapParts,
     PropositionMaps,
-    centre_of,
     concerns,
     danger_of,
     gradient_map,
-    moved_object,
     proposition_maps,
 )
 from spatial_replay.planning.paths import shortest_path

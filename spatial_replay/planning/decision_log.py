@@ -19,6 +19,7 @@ from spatial_replay.annotate.rings import outlines_of
 from spatial_replay.annotate.scene.scene_entities import FRAME
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.footprint import TrackedObject
+from spatial_replay.geometry.poses import centre_of, moved_object
 from spatial_replay.logs.messages import Messages, merge, messages_of
 from spatial_replay.logs.schemas.PlanDecision_pb2 import (
     PlanCandidate,
@@ -51,7 +52,6 @@ from spatial_replay.planning.decisions import (
 )
 from spatial_replay.planning.map_layers import MapLayers, map_layers
 from spatial_replay.planning.map_messages import TurnedMap, explain, map_digest, map_message, maps_of
-from spatial_replay.planning.maps import centre_of, moved_object
 from spatial_replay.planning.planner import Planner
 from spatial_replay.planning.settings import text_from_settings
 from spatial_replay.trace.sample import Sample

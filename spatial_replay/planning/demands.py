@@ -7,9 +7,10 @@ from itertools import product
 from typing import Final, NamedTuple, TypeAlias
 
 from spatial_replay.geometry.footprint import TrackedObject
+from spatial_replay.geometry.poses import moved_object
 from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene
-from spatial_replay.planning.maps import Cube, moved_object
+from spatial_replay.planning.maps import Cube
 from spatial_replay.spec.formula import Boolean, Formula, Outline, Truth, expand
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace

@@ -16,9 +16,10 @@ from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.guards import MAX_CUBES, Transition
 from spatial_replay.errors import NoAutomatonError, UsageError
 from spatial_replay.geometry.footprint import TrackedObject
+from spatial_replay.geometry.poses import centre_of, radius_of
 from spatial_replay.monitor.atoms.live import SampleLeaves
 from spatial_replay.planning.decisions import Consideration, Edge, Guards, Outcome, Reason, Target
-from spatial_replay.planning.maps import Cubes, centre_of, concerns, radius_of
+from spatial_replay.planning.maps import Cubes, concerns
 from spatial_replay.planning.settings import Settings
 from spatial_replay.spec.formula import Formula, Outline, Specification
 from spatial_replay.trace.sample import Sample

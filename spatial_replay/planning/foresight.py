@@ -17,6 +17,7 @@ from typing import Final
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.guards import Transition
 from spatial_replay.geometry.footprint import TrackedObject
+from spatial_replay.geometry.poses import centre_of
 from spatial_replay.planning.arrangements import Arranger, Cell
 from spatial_replay.planning.candidates import Movables, by_cost
 from spatial_replay.planning.decisions import Candidate, Consideration, Edge, Reason, Target
@@ -39,7 +40,7 @@ from spatial_replay.planning.edges import (
 )
 from spatial_replay.planning.expectations import Expectations, Foreseen
 from spatial_replay.planning.map_layers import AVOIDED_CELLS
-from spatial_replay.planning.maps import centre_of, concerns, gradient_map, proposition_maps
+from spatial_replay.planning.maps import concerns, gradient_map, proposition_maps
 from spatial_replay.planning.ordering import MotionOrder
 from spatial_replay.planning.settings import Settings
 from spatial_replay.spec.format import format_formula

@@ -1,26 +1,30 @@
 """Gradient maps (Def. 19): robustness of guards with one object at every cell of a grid.
 
-The positions of the grid become the samples of a trace in which only that object moves. So the kernels that
-evaluate a log evaluate a map, all relations in one call, and a cell has the number that a log's sample would.
+The positions of the grid become the samples of traces in which only that object moves . So the
+kernels that evaluate a log evaluate a map, and a cell has the number that a log's sample would.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass, field
 from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from spatial_replay.cores import over_cores
 from spatial_replay.errors import UsageError
-from spatial_replay.geometry.arrays import Floats, starts_from_counts
+from spatial_replay.geometry.arrays import Floats
 from spatial_replay.geometry.batch import FootprintBatch
-from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
-from spatial_replay.geometry.measure import MeasureRequest, Operand, measure
+from spatial_replay.geometry.footprint import Footprint, TrackedObject
+from spatial_replay.geometry.kernels import measure_rows
+from spatial_replay.geometry.measure import MeasureRequest, Operand, Remeasured
+from spatial_replay.geometry.poses import centre_of, fill_placed, with_poses
 from spatial_replay.lazy import Displayed
-from spatial_replay.monitor.atoms.measurements import leaf_values
+from spatial_replay.monitor.atoms.measurements import MovedLeaves, leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.planning.workspace import Grid, Workspace, refuse_faults
 from spatial_replay.spec.diagnostics import nearest_hint
@@ -53,8 +57,8 @@ UNKNOWN: Final = 4
 REASONS: Final = ("free", "a constraint would hold", "an obstacle is there", "out of reach", "unknown")
 """Why a cell is blocked, by its number in `GradientMap.blocked`."""
 
-_FLAT: Final = 1e-12
-"""Twice the area over the squared perimeter; a polygon with less has no centroid of its area."""
+_TILE: Final = 2048
+"""So many poses at most are measured together: what that takes stays in the processor's cache."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,9 +121,7 @@ def gradient_map(
     """
     shape = maps.clearance.shape
     then = maps if after is None else after
-    robustness = np.full(shape, -np.inf)
-    for cube in progress:
-        np.maximum(robustness, cube_robustness(then.lower, then.upper, cube, shape), out=robustness)
+    robustness = _greatest(then.lower, then.upper, progress, shape)
     danger = danger_of(maps, constraints)
     blocked = np.zeros(shape, np.uint8)
     # later assignments win: a cell is reported as constrained even if it is also occupied or out of reach
@@ -133,10 +135,18 @@ def gradient_map(
 
 def danger_of(maps: PropositionMaps, constraints: Cubes) -> Floats:
     """Return (A, rows, columns): the greatest robustness that a constraint may have in each cell."""
-    danger = np.full(maps.clearance.shape, -np.inf)
-    for cube in constraints:
-        np.maximum(danger, cube_robustness(maps.upper, maps.lower, cube, danger.shape), out=danger)
-    return danger
+    return _greatest(maps.upper, maps.lower, constraints, maps.clearance.shape)
+
+
+def _greatest(positive: Floats, negative: Floats, cubes: Cubes, shape: tuple[int, ...]) -> Floats:
+    """Return the greatest robustness of a cube (see `cube_robustness`); -inf without cubes."""
+    if not cubes:
+        return np.full(shape, -np.inf)
+    first, *others = cubes
+    greatest = cube_robustness(positive, negative, first, shape)
+    for cube in others:
+        np.maximum(greatest, cube_robustness(positive, negative, cube, shape), out=greatest)
+    return greatest
 
 
 def cube_robustness(positive: Floats, negative: Floats, cube: Cube, shape: tuple[int, ...]) -> Floats:
@@ -145,8 +155,11 @@ def cube_robustness(positive: Floats, negative: Floats, cube: Cube, shape: tuple
     Args:
         positive, negative: bounds of propositions, for those that have to hold, and that must not.
     """
-    least = np.full(shape, np.inf)
-    for number, wanted in cube:
+    if not cube:
+        return np.full(shape, np.inf)
+    (number, wanted), *others = cube
+    least: Floats = positive[number].copy() if wanted else -negative[number]
+    for number, wanted in others:
         np.minimum(least, positive[number] if wanted else -negative[number], out=least)
     return least
 
@@ -221,40 +234,65 @@ def proposition_maps(
         present = ", ".join(sample.objects) or "none"
         raise UsageError(f"there is no object {name!r} to move; the sample has: {present}")
     cells = workspace.grid if grid is None else grid
-    turns = workspace.turns(tracked.yaw)
-    here = Trace.from_samples([sample])
-    everywhere = _trace_over_cells(here, tracked, name, cells, turns)
+    turns, centres = workspace.turns(tracked.yaw), cells.centres()
     moves = np.array([concerns(each, name) for each in propositions], np.bool_)
     concerned = [each for each, is_moving in zip(propositions, moves, strict=True) if is_moving]
     others = [each for each, is_moving in zip(propositions, moves, strict=True) if not is_moving]
     obstacles = [each for each in sorted(sample.objects) if each not in (name, *workspace.supports)]
-    distances = _obstacle_distances(propositions, name, obstacles)
-    shape = (len(turns), *cells.shape)
-    over_cells = _intervals(everywhere, [*concerned, *distances], regions)
+    formulas = [*concerned, *_obstacle_distances(propositions, name, obstacles)]
+    here = Trace.from_samples([sample])
+    lower, upper = (np.empty((len(propositions), len(turns), len(centres))) for _ in range(2))
+    distances = np.empty((len(obstacles) + 1, len(turns), len(centres)))
     # propositions that do not depend on the object have the same value in every cell
-    fixed = _intervals(here, others, regions)
-    ends = []
-    for moving, still in zip(over_cells, fixed, strict=True):
-        values = np.empty((len(propositions), len(everywhere)))
-        values[moves], values[~moves] = moving[: len(concerned)], still
-        ends.append(values.reshape(len(propositions), *shape))
-    static = np.full(len(everywhere), np.inf)
-    if workspace.obstacles:
-        static = _to_static(everywhere, name, workspace)
-    clearances = np.vstack((over_cells[0][len(concerned) :], static))
-    clearance = clearances.min(axis=0).reshape(shape)
-    lower, upper = ends
+    fixed = leaf_values(TraceScene(here, regions), others, {})[:2]
+    tiles = list(_tiles(len(turns), len(centres)))
+    differ = [False] * len(tiles)
+
+    def poses_of(tile: tuple[slice, slice]) -> _Poses:
+        some = centres[tile[1]], turns[tile[0]]
+        return _Poses(here, tracked, name, formulas, regions, workspace.obstacles, *some)
+
+    first = poses_of(tiles[0])
+
+    def measure_tiles(begin: int, end: int) -> None:
+        poses = first if begin == 0 else first.another()
+        for number in range(begin, end):
+            turn, cell = tiles[number]
+            if not poses.suits(turns[turn]):
+                poses = poses_of(tiles[number])
+            found, distances[-1, turn, cell] = poses.measure(centres[cell], turns[turn])
+            lower[moves, turn, cell] = found[0, : len(concerned)]
+            distances[:-1, turn, cell] = found[0, len(concerned) :]
+            differ[number] = len(found) > 1
+            if differ[number]:
+                upper[moves, turn, cell] = found[1, : len(concerned)]
+
+    over_cores(measure_rows, measure_tiles, len(tiles), 1)
+    lower[~moves] = fixed[0][..., None]
+    # where all is known, as in most maps, there is one array
+    if any(differ) or len(fixed) > 1:
+        for (turn, cell), is_set in zip(tiles, differ, strict=True):
+            if not is_set:
+                upper[:, turn, cell] = lower[:, turn, cell]
+        upper[~moves] = fixed[-1][..., None]
+    else:
+        upper = lower
+    shape = (-1, len(turns), *cells.shape)
+    distances = distances.reshape(shape)
     about = MapSubject(tuple(propositions), regions, sample)
-    ways = clearances.reshape(-1, *shape), turns, (*obstacles, "")
-    return PropositionMaps(name, cells, lower, upper, clearance, *ways, about)
+    ways = distances.min(axis=0), distances, turns, (*obstacles, "")
+    return PropositionMaps(name, cells, lower.reshape(shape), upper.reshape(shape), *ways, about)
 
 
-def _intervals(
-    trace: Trace, formulas: Sequence[Formula], regions: Mapping[str, Outline]
-) -> tuple[Floats, Floats]:
-    """Return the lower and the upper robustness, (K, T) each, of formulas without temporal operators."""
-    leaves = leaf_values(TraceScene(trace, regions), formulas, {})
-    return leaves[0], leaves[min(1, len(leaves) - 1)]
+def _tiles(turns: int, cells: int) -> Iterator[tuple[slice, slice]]:
+    """Yield the turns and the cells of each tile: all tiles are of one size, so some may overlap."""
+    most = min(max(_TILE // cells, 1), turns)
+    size = math.ceil(cells / math.ceil(cells / _TILE))
+    for turn in range(0, turns, most):
+        first = min(turn, turns - most)
+        for cell in range(0, cells, size):
+            begin = min(cell, cells - size)
+            yield slice(first, first + most), slice(begin, begin + size)
 
 
 def _obstacle_distances(propositions: Sequence[Formula], name: str, obstacles: Sequence[str]) -> list[Atom]:
@@ -274,19 +312,83 @@ def _obstacle_distances(propositions: Sequence[Formula], name: str, obstacles: S
     return atoms
 
 
-def _to_static(trace: Trace, name: str, workspace: Workspace) -> Floats:
-    """Return (T,) distances from the object to the workspace's obstacles."""
-    own = trace.rows[:, [trace.names.index(name)]]
-    static = np.arange(len(workspace.obstacles), dtype=np.int64) + len(trace.footprints)
-    obstacles = FootprintBatch.from_footprints(workspace.obstacles)
-    batch = FootprintBatch.concatenate([trace.footprints, obstacles])
-    operands = (Operand(own), Operand(np.tile(static, (len(trace), 1))))
-    return np.asarray(measure(batch, operands, [MeasureRequest("signed_distance", 0, 1)])[0])
+class _Poses:
+    """What is measured with one object of a sample in as many poses at a time, everything else as it is.
+
+    Each thread needs its own, since it measures in the same room each time.
+
+    Args:
+        here: a trace of the one sample.
+        tracked, name: the object.
+        formulas: without temporal operators, with `regions`.
+        obstacles: those that are no objects of the sample.
+        centres, turns: (M, 2) and (A,), poses of which all others have the number.
+    """
+
+    def __init__(
+        self,
+        here: Trace,
+        tracked: TrackedObject,
+        name: str,
+        formulas: Sequence[Formula],
+        regions: Mapping[str, Outline],
+        obstacles: Sequence[Footprint],
+        centres: Floats,
+        turns: Floats,
+    ) -> None:
+        everywhere = _trace_over_poses(here, tracked, name, centres, turns)
+        scene = TraceScene(everywhere, regions)
+        self._leaves, self._turns = MovedLeaves(scene, formulas, {}), turns
+        batch = scene.batch
+        self._static = None
+        if obstacles:
+            # after all others, so that these stay in their places
+            rows = np.tile(np.arange(len(obstacles), dtype=np.int64) + len(batch), (len(everywhere), 1))
+            batch = FootprintBatch.concatenate([batch, FootprintBatch.from_footprints(obstacles)])
+            operands = (Operand(everywhere.rows[:, [everywhere.names.index(name)]]), Operand(rows))
+            self._static = Remeasured(batch, operands, [MeasureRequest("signed_distance", 0, 1)])
+        self._vertices = batch.vertices.copy()
+        self._corners = np.concatenate([part.vertices for part in tracked.footprint.parts])
+        self._centre = np.array(centre_of(tracked.footprint))
+        self._first = len(here.footprints.vertices)
+        self._shape = (len(turns), len(centres))
+
+    def another(self) -> _Poses:
+        """Return the same with room of its own."""
+        made = copy(self)
+        made._vertices, made._leaves = self._vertices.copy(), self._leaves.another()
+        made._static = self._static and self._static.another()
+        return made
+
+    def suits(self, turns: Floats) -> bool:
+        """Return whether these poses can be turned by the given angles (A,), too."""
+        return not self._leaves.compares_turns or np.array_equal(turns, self._turns)
+
+    def measure(self, centres: Floats, turns: Floats) -> tuple[Floats, Floats]:
+        """Return the lower and the upper end of K formulas, and the distance to the nearest obstacle.
+
+        Args:
+            centres, turns: (M, 2) and (A,).
+
+        Returns:
+            (C, K, A, M), with C = 1 where both ends are equal everywhere, and (A, M), +inf without obstacles.
+        """
+        places = self._vertices[self._first : self._first + math.prod(self._shape) * len(self._corners)]
+        placed = places.reshape(*self._shape, *self._corners.shape)
+        for number, turn in enumerate(turns.tolist()):
+            fill_placed(self._corners, self._centre, centres, turn, placed[number])
+        found = self._leaves.values(self._vertices)[:2]
+        static = np.full(self._shape, np.inf)
+        if self._static is not None:
+            static = self._static.measure(self._vertices)[0].reshape(self._shape)
+        return found.reshape(*found.shape[:2], *self._shape), static
 
 
-def _trace_over_cells(here: Trace, tracked: TrackedObject, name: str, grid: Grid, turns: Floats) -> Trace:
-    """Return a trace with the sample of `here` for each turn, row and column, the object moved there."""
-    footprints = _with_moved(here.footprints, tracked, grid.centres(), turns)
+def _trace_over_poses(
+    here: Trace, tracked: TrackedObject, name: str, centres: Floats, turns: Floats
+) -> Trace:
+    """Return a trace with the sample of `here` for each turn and position, the object moved there."""
+    footprints = with_poses(here.footprints, tracked, centres, turns)
     count, column = len(footprints) - len(here.footprints), here.names.index(name)
     own = np.full(count, here.rows[0, column])
     rows = np.repeat(here.rows, count, axis=0)
@@ -352,101 +454,3 @@ def refuse_unknown(names: Sequence[str], sample: Sample, propositions: Sequence[
                 f"{hint or 'the sample has: ' + (', '.join(sample.objects) or 'none')}"
             )
     refuse_faults(faults)
-
-
-def centre_of(footprint: Footprint) -> tuple[float, float]:
-    """Return the centre (x, y) of an object: the centroid of its parts' areas.
-
-    A part is weighted by its area, and has the centroid of its polygon before rounding, or the mean of the
-    vertices if that polygon has no area. Areas of overlap count twice.
-    """
-    weights, centres = zip(*map(_weight_and_centre, footprint.parts), strict=True)
-    if sum(weights) <= 0.0:
-        weights = (1.0,) * len(centres)
-    total = sum(weights)
-    x, y = (sum(w * each[axis] for w, each in zip(weights, centres, strict=True)) / total for axis in (0, 1))
-    return x, y
-
-
-def radius_of(tracked: TrackedObject) -> float:
-    """Return the distance from an object's centre to its farthest point."""
-    centre = np.array(centre_of(tracked.footprint))
-    return max(float(np.hypot(*(p.vertices - centre).T).max()) + p.radius for p in tracked.footprint.parts)
-
-
-def moved_object(tracked: TrackedObject, x: float, y: float, turn: float = 0.0) -> TrackedObject:
-    """Return the object with its centre at (x, y), turned by an angle in radians; heights stay."""
-    footprint = tracked.footprint
-    centre = np.array(centre_of(footprint))
-    place = np.array([[x, y]])
-    parts = []
-    for part in footprint.parts:
-        corners = part.vertices
-        placed = np.empty((1, *corners.shape))
-        _place(corners, centre, place, turn, placed)
-        parts.append(ConvexPart(placed[0], part.radius))
-    yaw = None if tracked.yaw is None else tracked.yaw + turn
-    return replace(tracked, footprint=Footprint(tuple(parts)), yaw=yaw)
-
-
-def _with_moved(
-    batch: FootprintBatch, tracked: TrackedObject, positions: Floats, turns: Floats
-) -> FootprintBatch:
-    """Return a batch, and A * M more rows: the object turned by each angle (A,), at each position (M, 2)."""
-    parts = tracked.footprint.parts
-    centre = np.array(centre_of(tracked.footprint))
-    count = len(positions) * len(turns)
-    outlines = [part.vertices for part in parts]
-    corners = np.concatenate(outlines)
-    sizes = np.array([len(outline) for outline in outlines], np.int64)
-    bottom, top = tracked.height or (math.nan, math.nan)
-    part_start = batch.part_start[-1] + np.arange(count + 1, dtype=np.int64) * len(sizes)
-    vertex_start = batch.vertex_start[-1] + starts_from_counts(np.tile(sizes, count))
-    # of many cells, they are written where they stay
-    vertices = np.empty((len(batch.vertices) + count * len(corners), 2))
-    vertices[: len(batch.vertices)] = batch.vertices
-    placed = vertices[len(batch.vertices) :].reshape(len(turns), len(positions), len(corners), 2)
-    for number, turn in enumerate(turns.tolist()):
-        _place(corners, centre, positions, turn, placed[number])
-    return FootprintBatch.trusted(
-        part_start=np.concatenate((batch.part_start[:-1], part_start)),
-        vertex_start=np.concatenate((batch.vertex_start[:-1], vertex_start)),
-        vertices=vertices,
-        radius=np.concatenate((batch.radius, np.tile([part.radius for part in parts], count))),
-        bottom=np.concatenate((batch.bottom, np.full(count, bottom))),
-        top=np.concatenate((batch.top, np.full(count, top))),
-    )
-
-
-def _place(vertices: Floats, centre: Floats, positions: Floats, turn: float, placed: Floats) -> None:
-    """Fill `placed` (M, n, 2): vertices (n, 2) turned around the centre, moved to each position (M, 2)."""
-    local = vertices - centre
-    if turn != 0.0:
-        cosine, sine = math.cos(turn), math.sin(turn)
-        x, y = local[:, 0], local[:, 1]
-        local = np.stack((x * cosine - y * sine, x * sine + y * cosine), axis=1)
-    # both coordinates in one go, as complex numbers, and along the many positions, not along the few vertices
-    at = np.ascontiguousarray(positions, np.float64).view(np.complex128)[..., 0]
-    filled = placed.view(np.complex128)[..., 0]
-    for number, (x, y) in enumerate(local.tolist()):
-        np.add(at, complex(x, y), out=filled[:, number])
-
-
-def _weight_and_centre(part: ConvexPart) -> tuple[float, tuple[float, float]]:
-    """Return a part's area, and the centroid of its polygon before rounding."""
-    # plain numbers are quicker than arrays for the few vertices of a part
-    corners = part.vertices.tolist()
-    (x0, y0), *_ = corners
-    doubled = sum_x = sum_y = length = 0.0
-    for (ax, ay), (bx, by) in zip(corners, corners[1:] + corners[:1], strict=True):
-        cross = (ax - x0) * (by - y0) - (bx - x0) * (ay - y0)
-        doubled += cross
-        sum_x += cross * (ax + bx - 2.0 * x0)
-        sum_y += cross * (ay + by - 2.0 * y0)
-        length += math.hypot(bx - ax, by - ay)
-    # a rounded polygon is the polygon, a strip along its sides, and sectors at its corners that make a disc
-    area = doubled / 2 + length * part.radius + math.pi * part.radius**2
-    if len(corners) > 2 and doubled > _FLAT * length**2:
-        return area, (x0 + sum_x / (3.0 * doubled), y0 + sum_y / (3.0 * doubled))
-    count = len(corners)
-    return area, (sum(x for x, _ in corners) / count, sum(y for _, y in corners) / count)

@@ -15,6 +15,7 @@ import numpy as np
 from spatial_replay.automata.guards import Transition
 from spatial_replay.geometry.arrays import Booleans
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
+from spatial_replay.geometry.poses import centre_of, moved_object, radius_of
 from spatial_replay.planning.decisions import Consideration, Target
 from spatial_replay.planning.demands import Budget, Demand, Pose, demands_of, with_moved, with_objects
 from spatial_replay.planning.edges import BESIDE
@@ -24,13 +25,10 @@ from spatial_replay.planning.maps import (
     FREE,
     Cubes,
     PropositionMaps,
-    centre_of,
     concerns,
     danger_of,
     gradient_map,
-    moved_object,
     proposition_maps,
-    radius_of,
 )
 from spatial_replay.planning.paths import reachable
 from spatial_replay.planning.targets import nearest_target, points_along, target_in

@@ -13,6 +13,7 @@ from spatial_replay.automata.guards import Transition
 from spatial_replay.automata.ltlf import bounds_in_samples, counts_seconds
 from spatial_replay.errors import TraceError, UsageError
 from spatial_replay.geometry.footprint import TrackedObject
+from spatial_replay.geometry.poses import centre_of, moved_object
 from spatial_replay.planning.candidates import Movables, with_choice
 from spatial_replay.planning.decisions import (
     Consideration,
@@ -38,7 +39,7 @@ from spatial_replay.planning.edges import (
     worst_state,
 )
 from spatial_replay.planning.foresight import Foresight
-from spatial_replay.planning.maps import centre_of, moved_object, refuse_delays, refuse_unknown
+from spatial_replay.planning.maps import refuse_delays, refuse_unknown
 from spatial_replay.planning.settings import Settings
 from spatial_replay.planning.workspace import Workspace, kind_faults, refuse_faults
 from spatial_replay.spec.formula import Specification

@@ -15,6 +15,7 @@ import numpy as np
 
 from spatial_replay.geometry.arrays import Booleans, Floats
 from spatial_replay.geometry.footprint import TrackedObject
+from spatial_replay.geometry.poses import centre_of, radius_of
 from spatial_replay.planning.decisions import Target
 from spatial_replay.planning.map_layers import avoided_cells
 from spatial_replay.planning.maps import (
@@ -23,10 +24,8 @@ from spatial_replay.planning.maps import (
     OUT_OF_REACH,
     REASONS,
     GradientMap,
-    centre_of,
     danger_of,
     proposition_maps,
-    radius_of,
 )
 from spatial_replay.planning.paths import Path, shortest_path
 from spatial_replay.planning.settings import Settings

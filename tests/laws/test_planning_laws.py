@@ -84,6 +84,31 @@ def test_a_cell_is_the_robustness_of_the_sample_with_the_object_moved_there(samp
         assert np.isclose(low, node.now, rtol=1e-12, atol=1e-12)
 
 
+@given(
+    scenes(),
+    st.sampled_from([*TEXTS, "forall x, y in all: x dist y >= 0.5"]),
+    st.sampled_from([(), (0.5,), (-1.0, 2.0)]),
+    st.booleans(),
+)
+@settings(max_examples=30)
+def test_many_cells_have_the_bits_that_few_have(sample, text, yaws, is_obstructed):
+    # 4,480 cells are measured in three tiles, a quarter of them in one; corners of cells are exact numbers
+    specification = sr.parse_specification(f"{REGION}spec s = {text}")
+    obstacles = (sr.Footprint.disc(1.0, 2.0, 0.5), sr.Footprint.box(-3, -3, -2, 1)) if is_obstructed else ()
+
+    def maps(grid):
+        workspace = Workspace(grid, yaws, obstacles=obstacles)
+        return proposition_maps(
+            [specification.specs[0].formula], specification.regions, sample, "a", workspace
+        )
+
+    whole = maps(Grid(-8.0, -8.0, 0.25, 70, 64))
+    quarters = [maps(Grid(-8.0, -8.0 + 4.0 * number, 0.25, 70, 16)) for number in range(4)]
+    for name in ("lower", "upper", "distances", "clearance"):
+        joined = np.concatenate([getattr(each, name) for each in quarters], axis=-2)
+        assert getattr(whole, name).tobytes() == joined.tobytes()
+
+
 @given(bodies(), st.floats(-9, 9), st.floats(-9, 9), st.floats(-7, 7))
 def test_a_moved_object_is_where_it_was_moved_to(body, x, y, turn):
     moved = moved_object(body, x, y, turn)
