@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from spatial_replay.compiled import elementwise, inlined, long_kernel
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.geometry.calipers import are_many, walked_distance, walked_protrusion
+from spatial_replay.geometry.calipers import are_many, walked
 
 NOTHING, SIGNED_DISTANCE, PROTRUSION = -1, 0, 1
 MIN_X, MAX_X, MIN_Y, MAX_Y, MIN_Z, MAX_Z = 2, 3, 4, 5, 6, 7
@@ -84,6 +84,13 @@ def fill_row(rows: Rows, row: int) -> None:
             )
             squared = max(squared, dx * dx + dy * dy)
         rows.edges[start, 3] = math.sqrt(squared)
+
+
+@inlined
+def _is_box(rows: Rows, row: int) -> bool:
+    """Return whether a row, of rows that have one part each, has the corners of a box."""
+    p = rows.part_start[row]
+    return bool(rows.vertex_start[p + 1] - rows.vertex_start[p] == BOX)
 
 
 @inlined
@@ -178,7 +185,7 @@ def _convex_distance(
     if a_stop - a_start == BOX and b_stop - b_start == BOX:
         return _distance_by_edges(vertices, edges, a_start, a_start + BOX, b_start, b_start + BOX)
     if are_many(a_stop - a_start, b_stop - b_start):
-        return walked_distance(vertices, edges, a_start, a_stop, b_start, b_stop)
+        return walked(vertices, edges, False, a_start, a_stop, b_start, b_stop)
     return _distance_by_edges(vertices, edges, a_start, a_stop, b_start, b_stop)
 
 
@@ -194,7 +201,9 @@ def _convex_protrusion(
             greatest = max(greatest, distance)
         return greatest
     if are_many(a_stop - a_start, b_stop - b_start):
-        return walked_protrusion(vertices, edges, a_start, a_stop, b_start, b_stop)
+        if a_stop - a_start == BOX:
+            _fill_edges(vertices, edges, a_start, a_start + BOX)
+        return walked(vertices, edges, True, a_start, a_stop, b_start, b_stop)
     for i in range(a_start, a_stop):
         greatest = max(greatest, _distance_by_edges(vertices, edges, i, i + 1, b_start, b_stop))
     return greatest
@@ -363,14 +372,19 @@ def measure_rows(
     # edges only of rows that distances need: a log has many more that are projected or unused
     is_filled = np.zeros(len(part_start), dtype=np.bool_)
     rows = Rows(part_start, vertex_start, vertices, edges, radius, bottom, top)
+    is_one_each = len(radius) == len(bottom)
     for block in range(begin, end, BLOCK):
         block_end = min(block + BLOCK, end)
         for k in range(len(quantity)):
             if SIGNED_DISTANCE <= quantity[k] <= PROTRUSION:
-                for operand in (first[k], second[k]):
+                for side in range(2):
+                    operand = first[k] if side == 0 else second[k]
+                    # how far the few corners of a box stick out does not depend on its edges
+                    leaves_boxes = is_one_each and quantity[k] == PROTRUSION and side == 0
                     of_first = member_start[operand]
                     for m in range(of_first + block * width[operand], of_first + block_end * width[operand]):
-                        _fill_if_not(rows, members[m], is_filled)
+                        if not (leaves_boxes and members[m] >= 0 and _is_box(rows, members[m])):
+                            _fill_if_not(rows, members[m], is_filled)
         for t in range(block, block_end):
             for k in range(values.shape[0]):
                 a, b = first[k], second[k]

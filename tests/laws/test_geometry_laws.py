@@ -118,6 +118,26 @@ def test_outlines_of_many_corners_are_measured_like_others(first, second):
     assert protrusion(sharp(first), sharp(second)) == pytest.approx(max(corners), abs=TOLERANCE)
 
 
+@settings(max_examples=60)
+@given(
+    round_parts(),
+    st.sampled_from([1.0, 1.0 - 1e-6, 0.999, 0.5]),
+    st.sampled_from([0.0, 1e-6, 0.01, 1.0]),
+    st.sampled_from([0.0, 1e-9, 1e-3, 0.25]),
+)
+def test_outlines_that_are_nearly_alike_are_measured_like_others(part, size, turn, aside):
+    # nearly all edges separate them equally, and nearly all corners are equally far
+    x, y = part.vertices.mean(axis=0).tolist()
+    smaller = Footprint.polygon((part.vertices - (x, y)) * size)
+    (other,) = moved(smaller, turn, x + aside, y + 0.5 * aside).parts
+    assert signed_distance(sharp(part), sharp(other)) == pytest.approx(
+        signed_distance_by_differences(part, other), abs=TOLERANCE
+    )
+    for first, second in ((part, other), (other, part)):
+        corners = [signed_distance(Footprint.polygon([corner]), sharp(second)) for corner in first.vertices]
+        assert protrusion(sharp(first), sharp(second)) == pytest.approx(max(corners), abs=1e-13)
+
+
 @given(footprints, footprints, radii)
 def test_signed_distance_is_symmetric_to_the_bit(first, second, radius):
     there = signed_distance(first, second, grow=(radius, 0.0))

@@ -62,18 +62,19 @@ def bench_corners(bench: Any) -> None:
     at, turns = np.random.default_rng(1), np.linspace(0, 2 * np.pi, CORNERS, endpoint=False)
     circle = np.column_stack((np.cos(turns), np.sin(turns)))
     star = circle * (1 + 0.3 * np.sin(9 * turns))[:, None]
-    # outline, how far around, how many samples
+    # outline, how far around, how much smaller each is than the one before, how many samples
     shapes = {
-        "convex": (circle, 9.0, 20),
-        "convex, overlapping": (circle, 0.5, 20),
-        "concave": (star, 9.0, 1),
+        "convex": (circle, 9.0, 1.0, 20),
+        "convex, overlapping": (circle, 0.5, 1.0, 20),
+        "convex, around one centre": (circle, 0.0, 0.9, 20),
+        "concave": (star, 9.0, 1.0, 1),
     }
-    for shape, (outline, around, count) in shapes.items():
+    for shape, (outline, around, smaller, count) in shapes.items():
         samples = [
             sr.Sample(
                 number,
                 {
-                    f"o{each}": sr.TrackedObject(sr.Footprint.polygon(outline + place))
+                    f"o{each}": sr.TrackedObject(sr.Footprint.polygon(outline * smaller**each + place))
                     for each, place in enumerate(at.uniform(-around, around, (12, 2)))
                 },
             )
