@@ -7,6 +7,8 @@ same bits, because the only arithmetic is minima, maxima and negation.
 
 from __future__ import annotations
 
+from typing import Any, cast
+
 import numpy as np
 
 from spatial_replay.compiled import apart, floats_at, inlined, integers_at
@@ -197,7 +199,10 @@ class OnlineRun:
         position, offset = int(clock[POSITION]), int(clock[OFFSET])
         used = position - offset
         if used + wanted > room:
-            if forget(self._table_at, self._channels):
+            # given addresses, a kernel does not see how much there is to move, and is interpreted long
+            is_ready = getattr(self.step, "is_compiled", False)
+            drop = cast(Any, forget).compiled() if is_ready else forget
+            if drop(self._table_at, self._channels):
                 offset = int(clock[OFFSET])
             elif used == room:
                 self._memory = doubled(self._memory, self._channels, self._program.signals)
