@@ -13,6 +13,7 @@ from spatial_replay.monitor.online.sliding import (
     STRIDE,
     Recent,
     beyond,
+    copy,
     either,
     extremum,
     fill,
@@ -28,6 +29,9 @@ from spatial_replay.monitor.online.state import OFFSET, behind
 
 FEW = 8
 """So many new samples are joined with open windows one by one; of more, windows are computed again."""
+
+MANY = 16
+"""So many windows that have ended are looked through together, by vector instructions."""
 
 
 @apart
@@ -157,15 +161,19 @@ def _run_ended(
     ones after it.
     """
     nothing, before, changed = -np.inf if is_greatest else np.inf, recent.extrema[0], end
+    if node[codes.NODE_UNIT] == codes.SAMPLES and end - begin >= MANY:
+        width, first = node[codes.NODE_HIGH] - node[codes.NODE_LOW] + 1, begin + node[codes.NODE_LOW]
+        kept = recent.extrema[0, len(recent.stamps) :]
+        copy(target[begin - offset : end - offset], kept[: end - begin])
+        slide_evenly(is_greatest, source, target, begin, end, first, width, recent.extrema, offset, last)
+        changed = begin
+        while changed < min(end, since) and kept[changed - begin] == target[changed - offset]:
+            changed += 1
+        return changed
     while begin < end:
         middle = _window_after(node, recent, begin, offset, last)
         at = window_start(node, recent, end - 1, offset, last)
         beyond_last = end
-        if at >= middle and node[codes.NODE_UNIT] == codes.SAMPLES:  # they have nothing in common
-            width = node[codes.NODE_HIGH] - node[codes.NODE_LOW] + 1
-            first, extrema = begin + node[codes.NODE_LOW], recent.extrema
-            slide_evenly(is_greatest, source, target, begin, end, first, width, extrema, offset, last)
-            return begin
         if at >= middle:
             beyond_last, at = begin + 1, window_start(node, recent, begin, offset, last)
             while window_start(node, recent, beyond_last, offset, last) < middle:
