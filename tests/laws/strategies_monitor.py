@@ -111,6 +111,18 @@ nested_windows = responses(
     )
 )
 """Windows below windows, which are kept at each position that is open."""
+_short = st.one_of(sample_bounds(), time_bounds())
+_ahead = windows_of(_literals, _short)
+alternative_windows = responses(
+    st.one_of(
+        st.builds(Boolean, st.sampled_from(["and", "or", "xor", "<->"]), st.tuples(_ahead, _ahead)),
+        st.builds(Boolean, st.just("or"), st.tuples(_ahead, _ahead, _ahead)),
+        windows_of(st.builds(Boolean, st.sampled_from(["and", "or"]), st.tuples(_literals, _ahead)), _short),
+        st.builds(Temporal, st.sampled_from(["O", "H"]), st.tuples(_ahead), bounds),
+        st.builds(Temporal, st.just("S"), st.tuples(_literals, _ahead), bounds),
+    )
+)
+"""Windows beside windows, of which some say the same as one, and below past operators."""
 _lasting = st.one_of(responses(windows_of(_literals, bounds)), windows_of(_literals, bounds))
 _from_later = st.one_of(
     st.builds(Bound, st.integers(1, 3), st.none(), st.just("samples")),

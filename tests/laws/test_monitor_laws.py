@@ -18,6 +18,7 @@ from laws.strategies_monitor import (
     NAMES,
     WORDS,
     Recording,
+    alternative_windows,
     bounds,
     cuts,
     formulas_of_leaves,
@@ -105,6 +106,15 @@ def test_every_node_on_every_prefix_equals_the_definitions(data, formula, run, r
 @given(data=st.data(), formula=nested_windows, run=leaf_runs(max_size=40), room=st.integers(2, 64))
 def test_windows_below_windows_equal_the_definitions(data, formula, run, room):
     """On runs so long that windows close while others are open."""
+    series, final = run_of(formula, run, room=room, cuts=data.draw(cuts(len(run))))
+    wide_leaf = run.wide_leaf if run.channels == 4 else run.nominal_leaf
+    expected = numbers_of(formula, run.times_ns, run.nominal_leaf, wide_leaf)
+    assert_same((series, final), (expected.series, expected.final))
+
+
+@settings(max_examples=120)
+@given(data=st.data(), formula=alternative_windows, run=leaf_runs(max_size=30), room=st.integers(2, 64))
+def test_windows_beside_windows_equal_the_definitions(data, formula, run, room):
     series, final = run_of(formula, run, room=room, cuts=data.draw(cuts(len(run))))
     wide_leaf = run.wide_leaf if run.channels == 4 else run.nominal_leaf
     expected = numbers_of(formula, run.times_ns, run.nominal_leaf, wide_leaf)
@@ -235,6 +245,43 @@ def test_windows_at_a_constant_cost_equal_windows_run_backwards(data, shape, run
     slow = replace(ahead, operands=tuple(both(operand, always) for operand in ahead.operands))
     leaf = data.draw(st.sampled_from(LEAVES))
     assert_same(*(root_of(with_window(shape, leaf, window), run) for window in (ahead, slow)))
+
+
+@settings(max_examples=60)
+@given(data=st.data(), seed=st.integers(0, 2**32 - 1), channels=st.sampled_from([1, 2]))
+def test_windows_in_samples_equal_windows_in_seconds_of_even_samples(data, seed, channels):
+    """Wide ones, below each other, for which there are other rules in samples."""
+    wide = st.builds(
+        lambda low, more: Bound(low, low + more, "samples"), st.integers(0, 3), st.integers(0, 40)
+    )
+    ahead = windows_of(st.sampled_from(LEAVES), wide)
+    joined = st.builds(
+        Boolean, st.sampled_from(["and", "or", "->"]), st.tuples(st.sampled_from(LEAVES), ahead)
+    )
+    formula = data.draw(responses(windows_of(st.one_of(ahead, joined), wide)))
+    source = np.random.default_rng(seed)
+    # quantities that go one way for a while, so that much of what windows hold changes, or none
+    leaves = np.cumsum(source.integers(-2, 3, (channels, len(LEAVES), 120)), axis=2).astype(float)
+    leaves.sort(axis=0)
+    both_ways = []
+    for each in (formula, in_seconds(formula)):
+        program = compile_formula(each)
+        order = [LEAVES.index(leaf) for leaf in program.leaves]
+        run = OnlineRun(program)
+        series = run.extend(leaves[:, order], np.arange(120) * 100)
+        both_ways.append((series, run.final))
+    assert_same(*both_ways)
+
+
+def in_seconds(formula):
+    """A formula with each of its windows in ns, over samples 100 ns apart."""
+    if not isinstance(formula, Boolean | Temporal):
+        return formula
+    operands = tuple(map(in_seconds, formula.operands))
+    if isinstance(formula, Boolean) or formula.bound is None:
+        return replace(formula, operands=operands)
+    bound = formula.bound
+    return replace(formula, operands=operands, bound=Bound(bound.lower * 100, bound.upper * 100, "ns"))
 
 
 def with_window(formula, leaf, window):

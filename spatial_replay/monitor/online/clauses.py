@@ -10,8 +10,8 @@ may be taken in any order: G (x and y) is G x and G y. So consider one clause, `
   windows that have begun and are open, so those over which it is the greatest so far form a single segment.
 
 With a left operand, `a R (…)`, p counts as the greater of p and every a before, and before the next sample,
-where what is open begins, that is all. `F` and `U` are the same upside down. Two windows in a clause, or a
-window below another, are none of this: they stay with `windows`.
+where what is open begins, that is all. `F` and `U` are the same upside down. Two windows of different kinds
+in a clause, or one of the other kind over a window, are none of this: they stay with `windows`.
 """
 
 from __future__ import annotations
@@ -59,11 +59,11 @@ def clauses_of(signals: SignalTable, part: PartRows) -> Clauses | None:
     clauses = _normal_form(part.fields, body, is_weak=bool(is_weak))
     if clauses is None:
         return None
-    builder = _Builder(signals, part.fields, left, is_weak=bool(is_weak))
-    for clause in clauses:
-        if not builder.add(clause):
-            return None
-    return builder.result()
+    builder, before = _Builder(signals, part.fields, left, is_weak=bool(is_weak)), len(signals)
+    found = builder.result() if all(map(builder.add, clauses)) else None
+    if found is None:
+        signals.drop(before)
+    return found
 
 
 def _normal_form(rows: tuple[Row, ...], body: int, *, is_weak: bool) -> list[Clause] | None:
@@ -109,22 +109,27 @@ class _Builder:
         self._settled: list[int] = []
         self._ending: list[int] = []
         self._open: list[int] = []
-        self._tabled: list[Clause] = []
+        # with each, the signal that stands for its literals, if there is one
+        self._tabled: list[tuple[Clause, int]] = []
 
-    def add(self, clause: Clause) -> bool:
-        """Add a clause; return whether there is a rule for it."""
+    def add(self, clause: Clause, beside: int = NOTHING) -> bool:
+        """Add a clause, joined with a signal beside it; return whether there is a rule for it."""
         rows = self._rows
         literals = sorted(each for each in clause if rows[each][0] == codes.LITERAL)
         others = sorted(clause.difference(literals), key=lambda each: rows[each][0])
-        condition = self._condition(literals)
+        condition = self._condition(literals, beside)
         if not others:
             self._add_same(self._signals.row(self._running, condition))
             return True
         if len(others) == 1 and rows[others[0]][0] in (self._same, self._other):
             return self._add_window(condition, rows[others[0]])
+        if {rows[each][0] for each in others} == {self._other}:
+            return self._add_windows(condition, [rows[each] for each in others])
         if all(self._unbounded(each) is not None for each in others):
-            self._tabled.append(clause)
+            self._tabled.append((clause, NOTHING if beside == NOTHING else condition))
             return True
+        if len(others) == 1 and rows[others[0]][0] == codes.SHIFT:
+            return self._add_later(condition, others[0])
         return self._add_release(condition, [rows[each] for each in others])
 
     def result(self) -> Clauses | None:
@@ -132,7 +137,8 @@ class _Builder:
         beside = self._table() if self._tabled else None
         if not self._ending or (beside is not None and beside.variables > MAX_TABLE):
             return None
-        ending, settled = self._joined(self._ending), self._joined(self._settled)
+        best = self._signals.row(codes.CONSTANT, low=1 if self._is_weak else -1)
+        ending, settled = self._joined(self._ending), self._joined(self._settled or [best])
         if self._left == NOTHING:
             last = self._nothing()
         else:  # what is open may begin with the next sample
@@ -143,7 +149,7 @@ class _Builder:
     def _add_window(self, condition: int, window: Row) -> bool:
         code, operand, _, _, unit, low, high, *_ = window
         if self._rows[operand][0] != codes.LITERAL:
-            return False
+            return code == self._same and self._add_within(condition, window)
         number = self._literal(operand)
         if code == self._same:
             behind = self._signals.row(self._window, condition, 0, unit, low, high)
@@ -158,6 +164,64 @@ class _Builder:
         self._settled.append(closed)
         self._ending.append(self._joined(ending))
         self._open.append(self._ending[-1])
+        return True
+
+    def _add_within(self, condition: int, window: Row) -> bool:
+        """Add a clause with a window of the same kind over more than a literal.
+
+        That counts for all positions whose window holds it, so that their conditions are its own, together.
+        """
+        _, operand, _, _, unit, low, high, *_ = window
+        clauses = _normal_form(self._rows, operand, is_weak=self._is_weak)
+        if clauses is None or self._left != NOTHING:
+            return False
+        behind = self._signals.row(self._window, condition, 0, unit, low, high)
+        return all(self.add(clause, behind) for clause in clauses)
+
+    def _add_windows(self, condition: int, windows: list[Row]) -> bool:
+        """Add a clause with several windows of the other kind, which begin alike.
+
+        Until the first of them closes, a number counts in whichever it is. Then what a position has found is
+        a condition, with which it goes on to look for what the others hold.
+        """
+        starts = {(unit, low) for _, _, _, _, unit, low, *_ in windows}
+        if len(starts) > 1 or self._left != NOTHING:
+            return False
+        if {self._rows[window[1]][0] for window in windows} != {codes.LITERAL}:
+            return False
+        ((unit, low),) = starts
+        row, kind = self._signals.row, codes.CLOSED_MIN_OF_MAX if self._is_weak else codes.CLOSED_MAX_OF_MIN
+        begun = codes.BEGUN_MIN if self._is_weak else codes.BEGUN_MAX
+        each = codes.CLOSED_EACH_MAX if self._is_weak else codes.CLOSED_EACH_MIN
+        if low > 0:
+            self._ending.append(row(self._window, condition, 0, unit, 0, low - 1))
+        near, ends = low, sorted({window[6] for window in windows})
+        for high in ends:
+            numbers = [self._literal(window[1]) for window in windows if window[6] >= high]
+            number = reduce(lambda one, other: row(self._either, one, other), numbers)
+            self._ending.append(row(begun, condition, number, unit, near, high))
+            if high < ends[-1]:
+                condition = row(each, condition, number, unit, near, high)
+            else:
+                closed = row(kind, condition, number, unit, near, high)
+                self._settled.append(closed)
+                self._ending.append(closed)
+            near = high
+        return True
+
+    def _add_later(self, condition: int, row: int) -> bool:
+        """Add a clause with an until (a release, below a strong root) of literals that begins later.
+
+        Until it begins, nothing is found, and then it counts where it begins.
+        """
+        _, a, _, _, unit, low, *_ = self._rows[row]
+        kind = codes.UNTIL if self._is_weak else codes.RELEASE
+        if self._left != NOTHING or self._rows[a][0] != kind or self._unbounded(row, later=True) is None:
+            return False
+        code = codes.ARRIVED_MIN if self._is_weak else codes.ARRIVED_MAX
+        arrived = self._signals.row(code, condition, 0, unit, low)
+        self._tabled.append((frozenset((row,)), arrived))
+        self._ending.append(self._signals.row(self._window, condition, 0, unit, 0, low - 1))
         return True
 
     def _add_joined(self, behind: int, number: int, condition: int, window: tuple[int, int, int]) -> None:
@@ -210,8 +274,10 @@ class _Builder:
         self._add_joined(behind, self._literal(b), condition, (unit, low, high))
         return True
 
-    def _condition(self, literals: list[int]) -> int:
+    def _condition(self, literals: list[int], beside: int) -> int:
         found = [self._literal(each) for each in literals]
+        if beside != NOTHING:
+            found.append(beside)
         if self._left != NOTHING:
             before = self._signals.row(self._before, self._literal(self._left))
             # what stands before the first sample is the least that it can be
@@ -230,14 +296,15 @@ class _Builder:
     def _joined(self, values: list[int]) -> int:
         return reduce(lambda one, other: self._signals.row(self._both, one, other), values)
 
-    def _unbounded(self, row: int) -> Row | None:
+    def _unbounded(self, row: int, *, later: bool = False) -> Row | None:
         """Return an until or a release of literals without a window; None for anything else.
 
-        One with a window is expanded to the extremum over it, and the same operator without. Where the first
-        holds, it makes no difference how the second goes on behind the window.
+        It begins at once, unless `later`. One with a window is expanded to the extremum over it, and the same
+        operator without. Where the first holds, it makes no difference how the second goes on behind the
+        window.
         """
         code, a, _, _, _, low, *_ = self._rows[row]
-        if code == codes.SHIFT and low == 0:
+        if code == codes.SHIFT and (low == 0 or later):
             code = self._rows[a][0]
             kind = codes.UNTIL if self._is_weak else codes.RELEASE
             if code != kind:
@@ -260,17 +327,19 @@ class _Builder:
             return part.row(codes.LITERAL, signal, is_negated)
 
         def added(row: int) -> int:
-            operator = self._unbounded(row) if self._rows[row][0] != codes.LITERAL else None
+            operator = self._unbounded(row, later=True) if self._rows[row][0] != codes.LITERAL else None
             if operator is None:
                 return literal(row)
             code, a, b, weak, *_ = operator
             return part.row(code, literal(a), literal(b), weak, variable=True)
 
         both, either = (codes.PART_AND, codes.PART_OR) if self._is_weak else (codes.PART_OR, codes.PART_AND)
-        bodies = [
-            reduce(lambda one, other: part.row(either, one, other), map(added, sorted(clause)))
-            for clause in self._tabled
-        ]
+        bodies = []
+        for clause, signal in self._tabled:
+            rows = [row for row in sorted(clause) if signal == NOTHING or self._rows[row][0] != codes.LITERAL]
+            joined = [part.row(codes.LITERAL, signal)] if signal != NOTHING else []
+            joined += map(added, rows)
+            bodies.append(reduce(lambda one, other: part.row(either, one, other), joined))
         body = reduce(lambda one, other: part.row(both, one, other), bodies)
         root = codes.RELEASE if self._is_weak else codes.UNTIL
         part.row(root, literal(self._left), body, int(self._is_weak), variable=True)

@@ -31,8 +31,14 @@ DELAY = 12  # a, low back; high times infinity where there is none
 # `clauses`): over positions whose window has begun, and over those whose window has closed
 BEGUN_MIN, BEGUN_MAX = 13, 14  # min of max(a, max of b); max of min(a, min of b)
 CLOSED_MIN_OF_MAX, CLOSED_MIN_OF_MIN, CLOSED_MAX_OF_MAX, CLOSED_MAX_OF_MIN = 17, 18, 19, 20
+# of each position whose window has closed, at that position: max(a, max of b); min(a, min of b)
+CLOSED_EACH_MAX, CLOSED_EACH_MIN = 29, 30
+# of a, over the positions that have come to be low back with the sample; infinite if there are none
+ARRIVED_MIN, ARRIVED_MAX = 21, 22
+DELAYED = (DELAY, ARRIVED_MIN, ARRIVED_MAX)
 BEGUN = (BEGUN_MIN, BEGUN_MAX)
-CLOSED = (CLOSED_MIN_OF_MAX, CLOSED_MIN_OF_MIN, CLOSED_MAX_OF_MAX, CLOSED_MAX_OF_MIN)
+CLOSED_EACH = (CLOSED_EACH_MAX, CLOSED_EACH_MIN)
+CLOSED = (CLOSED_MIN_OF_MAX, CLOSED_MIN_OF_MIN, CLOSED_MAX_OF_MAX, CLOSED_MAX_OF_MIN, *CLOSED_EACH)
 RINGS = (WINDOW_MAX, WINDOW_MIN, *BEGUN, *CLOSED)  # keep positions in a ring
 AHEAD = 16  # added to a code from ONCE on: its mirror image in time (see `finished`)
 
@@ -77,6 +83,8 @@ REPORT_WIDTH = 5
 # codes of reports: a row is a node as written, so that here, alone, `xor`, `->` and `<->` have codes;
 # rows for their expansions would cost eight numbers a sample each
 REPORT_SIGNAL, REPORT_PART = 0, 1
+# a past operator that is, at the first sample, its operand; now it is a signal, or what a part is at first
+REPORT_PAST = 9
 REPORT_NOT, REPORT_AND, REPORT_OR, REPORT_XOR, REPORT_IMPLIES, REPORT_IFF, REPORT_SPEC = 2, 3, 4, 5, 6, 7, 8
 REPORT_OF_BOOLEAN = MappingProxyType(
     {
@@ -90,6 +98,7 @@ REPORT_OF_BOOLEAN = MappingProxyType(
     }
 )
 NOW_LAST_OPERAND, NOW_EITHER, NOW_TRUE, NOW_FALSE, NOW_OF_PART = 0, 1, 2, 3, 4
+NOW_OF_SIGNAL, NOW_OF_VALUE = 5, 6  # of `REPORT_PAST`
 
 # how a run over the recent samples treats what lies beyond the last one
 OPEN_END, OPEN_LOW, OPEN_HIGH, OPEN_CORNER = 0, 1, 2, 3

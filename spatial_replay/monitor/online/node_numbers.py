@@ -186,6 +186,14 @@ def _report_known(
             else:
                 for k in range(count):
                     now[k] = np.inf if rule == codes.NOW_TRUE else -np.inf
+        elif code == codes.REPORT_PAST:
+            of = operands[start]
+            for which in (0, 2, 3):
+                _copy_known(series[of, which, t:end], series[n, which, t:end])
+            if rule == codes.NOW_OF_SIGNAL:
+                _copy_known(memory.history[0, index, begin : begin + count], now)
+            else:
+                _copy_known(scratch.parts[index, 0, :count], now)
         elif code == codes.REPORT_NOT:
             of = operands[start]
             _oppose_known(series[of, 0, t:end], value)
@@ -245,6 +253,14 @@ def report(
         elif code == codes.REPORT_PART:
             _copy_numbers(scratch.parts[index], rows, count)
             _set_now(rule, rows, numbers[operands[start]], numbers[operands[stop - 1]], count)
+        elif code == codes.REPORT_PAST:
+            _copy_numbers(numbers[operands[start]], rows, count)
+            for end in range(2):
+                for k in range(count):
+                    if rule == codes.NOW_OF_SIGNAL:
+                        rows[2 + end, k] = memory.history[end * nominal_high, index, begin + k]
+                    else:
+                        rows[2 + end, k] = scratch.parts[index, end, k]
         elif code == codes.REPORT_NOT:
             child = numbers[operands[start]]
             for pair in range(0, NUMBERS, 2):

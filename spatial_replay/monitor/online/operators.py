@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from functools import partial, reduce
+from itertools import islice
 
 import numpy as np
 
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.monitor.online import codes
-from spatial_replay.monitor.online.rewriting import from_first, looks_ahead, recurring
+from spatial_replay.monitor.online.rewriting import from_all, from_first, looks_ahead, simplified
 from spatial_replay.spec.formula import (
     FUTURE_OPERATORS,
     Atom,
@@ -64,6 +65,10 @@ class SignalTable:
         for leaf in leaves:
             self._leaf_number(leaf)
 
+    def __len__(self) -> int:
+        """Return how many rows there are."""
+        return len(self._rows)
+
     @property
     def windows(self) -> int:
         """How many rows keep a ring of positions."""
@@ -72,7 +77,7 @@ class SignalTable:
     @property
     def keeps_history(self) -> bool:
         """Whether any row looks at more than the newest sample."""
-        return any(row[0] in codes.RINGS or row[0] == codes.DELAY for row in self._rows)
+        return any(row[0] in codes.RINGS or row[0] in codes.DELAYED for row in self._rows)
 
     def array(self, kept: Iterable[int]) -> Integers:
         """Return the table (S, SIGNAL_WIDTH), with its rings numbered: first those with numbers beside.
@@ -85,7 +90,7 @@ class SignalTable:
         numbers = {row: number for number, row in enumerate(rings)}
         looked_at = set(kept)
         for code, a, b, *_ in self._rows:
-            if code == codes.DELAY or code in codes.RINGS:
+            if code in codes.DELAYED or code in codes.RINGS:
                 looked_at.update((a, b) if code in (*codes.BEGUN, *codes.CLOSED) else (a,))
         rows = [
             (*row, numbers.get(row, NOTHING), int(number in looked_at))
@@ -115,6 +120,10 @@ class SignalTable:
     def row(self, code: int, a: int = 0, b: int = 0, unit: int = 0, low: int = 0, high: int = 0) -> int:
         """Return the place of a row, which is added unless there is one like it."""
         return self._rows.setdefault((code, a, b, unit, low, high), len(self._rows))
+
+    def drop(self, kept: int) -> None:
+        """Drop all rows but the first ones, after which none was added for a formula."""
+        self._rows = dict(islice(self._rows.items(), kept))
 
     def _leaf_number(self, formula: Atom | Quantified) -> int:
         key: tuple[object, ...]
@@ -185,7 +194,7 @@ def part_of(signals: SignalTable, node: Temporal) -> WindowedPart:
         UsageError: more than `MAX_VARIABLES` unbounded future operators.
     """
     bounded = node.operator in FUTURE_OPERATORS and (node.bound is not None or node.operator in ("X", "WX"))
-    part = WindowedPart(signals, node, anchored=bounded)
+    part = WindowedPart(signals, node if bounded else from_all(node), anchored=bounded)
     if bounded and not part.is_flat:
         # what a past operator over a future one is now is read at the last sample, too
         asked = node if part.is_remembering else from_first(node)
@@ -211,6 +220,7 @@ class PartRows:
         self.variables = 0
         self.tables = 1
         self._rows: dict[Row, int] = {}
+        self._is_past = False
 
     @property
     def fields(self) -> tuple[Row, ...]:
@@ -250,8 +260,8 @@ class PartRows:
 
     @property
     def is_remembering(self) -> bool:
-        """Whether a past operator stands over a future one."""
-        return any(row[0] in _PAST for row in self._rows)
+        """Whether it is asked for at the last sample, too: a past operator stands over a future one."""
+        return self._is_past or any(row[0] in _PAST for row in self._rows)
 
     @property
     def end_corner(self) -> int:
@@ -292,6 +302,7 @@ class WindowedPart(PartRows):
         """
         super().__init__()
         self._signals = signals
+        self._is_past = root.operator not in FUTURE_OPERATORS
         self._added: dict[tuple[int, bool], tuple[Formula, int]] = {}
         if anchored:
             self._anchored(root, True)
@@ -314,7 +325,7 @@ class WindowedPart(PartRows):
     def _built(self, formula: Formula, positive: bool) -> int:
         if isinstance(formula, Boolean | Temporal) and looks_ahead(formula):
             if isinstance(formula, Temporal):
-                formula = recurring(formula)
+                formula = simplified(formula)
             operands = [self._add(each, positive) for each in formula.operands]
             if isinstance(formula, Boolean):
                 is_both = (formula.operator == "and") == positive

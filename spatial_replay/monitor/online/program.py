@@ -29,8 +29,16 @@ from spatial_replay.monitor.online.operators import (
     array_of_rows,
     part_of,
 )
-from spatial_replay.monitor.online.rewriting import looks_ahead
-from spatial_replay.spec.formula import Atom, Boolean, Formula, Quantified, Temporal, iter_nodes
+from spatial_replay.monitor.online.rewriting import at_last, looks_ahead
+from spatial_replay.spec.formula import (
+    FUTURE_OPERATORS,
+    Atom,
+    Boolean,
+    Formula,
+    Quantified,
+    Temporal,
+    iter_nodes,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,10 +89,15 @@ def compile_formula(formula: Formula) -> Program:
         elif isinstance(node, Boolean):
             reports.append((codes.REPORT_OF_BOOLEAN[node.operator], 0, 0, *ends))
         elif isinstance(node, Temporal):
-            part = part_of(signals, node)
-            clauses = clauses_of(signals, part)
-            number = parts.add(part, signals) if clauses is None else parts.add_clauses(clauses, signals)
-            reports.append((codes.REPORT_PART, number, _now_rule(node, part), *ends))
+            last = None if node.operator in FUTURE_OPERATORS else at_last(node)
+            if isinstance(last, Temporal) and looks_ahead(last):
+                number, _ = parts.add_node(last, signals)
+                reports.append((codes.REPORT_PAST, number, codes.NOW_OF_VALUE, *ends))
+            elif last is not None:
+                reports.append((codes.REPORT_PAST, signals.add(last), codes.NOW_OF_SIGNAL, *ends))
+            else:
+                number, part = parts.add_node(node, signals)
+                reports.append((codes.REPORT_PART, number, _now_rule(node, part), *ends))
     return Program(
         leaves=tuple(signals.leaves),
         signals=signals.array(parts.literals),
@@ -115,7 +128,13 @@ class _Parts:
         self.timed = 0
         self.keeps_history = False
         self.literals = set[int]()
-        self._built: dict[tuple[Row, ...] | Row, int] = {}
+        self._built: dict[tuple[tuple[Row, ...], bool] | Row, int] = {}
+
+    def add_node(self, node: Temporal, signals: SignalTable) -> tuple[int, WindowedPart]:
+        """Add the part of a node that looks ahead; return its number, and the part as it would be run."""
+        part = part_of(signals, node)
+        clauses = clauses_of(signals, part)
+        return self.add(part, signals) if clauses is None else self.add_clauses(clauses, signals), part
 
     def add_clauses(self, clauses: Clauses, signals: SignalTable) -> int:
         """Add a part that is made of signals, after the part beside it, and return its number."""
@@ -135,9 +154,10 @@ class _Parts:
             signals: receives those that a part with windows looks at negated.
         """
         rows = part.rows() if part.is_flat else tuple(_looked_up(row, signals) for row in part.rows())
-        if rows in self._built:
-            return self._built[rows]
-        self._built[rows] = len(self.part_rows)
+        key = rows, part.is_remembering
+        if key in self._built:
+            return self._built[key]
+        self._built[key] = len(self.part_rows)
         first, cutting = len(self.node_rows), _cutting(rows)
         self.part_rows.append(
             (
@@ -165,7 +185,7 @@ class _Parts:
         self.table_size += part.tables << part.variables
         self.cells += 1 + part.variables + part.tables
         self.keeps_history |= not part.is_flat
-        return self._built[rows]
+        return self._built[key]
 
 
 def _looked_up(row: Row, signals: SignalTable) -> Row:

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from operator import is_
+from types import MappingProxyType
+
 from spatial_replay.spec.formula import (
     FUTURE_OPERATORS,
     Boolean,
+    BooleanOperator,
     Bound,
     Formula,
     Temporal,
+    TemporalOperator,
     Truth,
     expand,
     operands_of,
@@ -38,15 +44,43 @@ def from_first(node: Temporal) -> Temporal:
     return Temporal(node.operator, (*left, counts))
 
 
+def simplified(node: Temporal) -> Temporal | Boolean:
+    """Return an operator that looks ahead in the form that costs least, of the same value at every sample."""
+    around = _around(recurring(node))
+    return around if isinstance(around, Boolean) else _divided(_merged(around))
+
+
+def from_all(node: Temporal) -> Temporal:
+    """Return `G H x` as `G x`, and `F O x` as `F x`, which have the same value at the first sample alone."""
+    inner, is_negated = _below(node)
+    wanted = {"G": "H", "F": "O"}.get(node.operator)
+    if is_negated or not isinstance(inner, Temporal) or inner.operator != wanted or not looks_ahead(inner):
+        return node
+    if node.bound is not None or not _is_at_once(inner.bound):
+        return node
+    return from_all(Temporal(node.operator, inner.operands))
+
+
+def at_last(node: Temporal) -> Formula | None:
+    """Return what, at the first sample, is what a past operator over a future one is at the last one.
+
+    That is a formula without future operators for `O F x`, of which now is what was so far; for `O x` and
+    `H x`, else, it is `F x` and `G x`. None if there is none, or if the operator is another one at the first.
+    """
+    around = _around(node)
+    if isinstance(around, Boolean) and not looks_ahead(around.operands[0]):
+        return around.operands[0]
+    if node.operator not in "OH" or node.bound is not None:
+        return None
+    return Temporal("F" if node.operator == "O" else "G", node.operands)
+
+
 def recurring(node: Temporal) -> Temporal:
     """Return `F G x` and `G F x` with, in place of x, what that is at the last sample if nothing follows.
 
     `G x` is greatest at the last sample, where only that one counts, and `F x` is least.
     """
-    other = node.operands[0]
-    is_negated = False
-    while isinstance(other := expand(other), Boolean) and other.operator == "not":
-        other, is_negated = other.operands[0], not is_negated
+    other, is_negated = _below(node)
     if not isinstance(other, Temporal) or node.bound is not None or other.bound is not None:
         return node
     wanted = node.operator if is_negated else {"F": "G", "G": "F"}.get(node.operator)
@@ -57,6 +91,78 @@ def recurring(node: Temporal) -> Temporal:
         return node
     inner: Formula = Temporal(other.operator, (last,))
     return Temporal(node.operator, (Boolean("not", (inner,)) if is_negated else inner,))
+
+
+def _around(node: Temporal) -> Temporal | Boolean:
+    """Return `O F x`, over windows that begin at once, as `O x or F x`; `H G x` as `H x and G x`.
+
+    What a sample before looks at is up to now, or ahead of now as far as now itself looks at most.
+    """
+    inner, is_negated = _below(node)
+    if node.operator not in "OH" or not isinstance(inner, Temporal) or inner.operator not in _OPPOSITE:
+        return node
+    ahead: TemporalOperator = "F" if (inner.operator == "F") != is_negated else "G"
+    if (ahead == "F") != (node.operator == "O") or not _is_at_once(node.bound, inner.bound):
+        return node
+    operand = _negated(inner.operands[0]) if is_negated else inner.operands[0]
+    sides = Temporal(node.operator, (operand,), node.bound), Temporal(ahead, (operand,), inner.bound)
+    return Boolean("or" if ahead == "F" else "and", sides)
+
+
+def _merged(node: Temporal) -> Temporal:
+    """Return `F[a,b] F[c,d] x` as `F[a+c,b+d] x`, and `G` likewise; in samples, of which none is left out."""
+    inner, is_negated = _below(node)
+    operator, low, high = _as_window(node, is_negated=False)
+    other, more_low, more_high = _as_window(inner, is_negated=is_negated)
+    if not operator or operator != other or not isinstance(inner, Temporal):
+        return node
+    operand = _negated(inner.operands[0]) if is_negated else inner.operands[0]
+    kind: TemporalOperator = "F" if operator == "F" else "G"
+    return _merged(Temporal(kind, (operand,), Bound(low + more_low, high + more_high, "samples")))
+
+
+def _divided(node: Temporal) -> Temporal | Boolean:
+    """Return `F[a,b] (x or F[c,d] y)` as `F[a,b] x or F[a+c,b+d] y`, and `G` over `and` likewise."""
+    inner, is_negated = _below(node)
+    joint: BooleanOperator = "or" if node.operator in "FX" else "and"
+    if not isinstance(inner, Boolean) or (inner.operator == joint) == is_negated or len(inner.operands) < 2:
+        return node
+    operands = map(_negated, inner.operands) if is_negated else inner.operands
+    apart = [Temporal(node.operator, (operand,), node.bound) for operand in operands]
+    merged = [_merged(each) for each in apart]
+    return node if all(map(is_, apart, merged)) else Boolean(joint, tuple(merged))
+
+
+_OPPOSITE: Mapping[str, str] = MappingProxyType({"F": "G", "G": "F"})
+
+
+def _below(node: Temporal) -> tuple[Formula, bool]:
+    """Return what stands below an operator and below `not`, and whether these negate it."""
+    other, is_negated = expand(node.operands[0]), False
+    while isinstance(other, Boolean) and other.operator == "not":
+        other, is_negated = expand(other.operands[0]), not is_negated
+    return other, is_negated
+
+
+def _negated(formula: Formula) -> Formula:
+    return Boolean("not", (formula,))
+
+
+def _is_at_once(*bounds: Bound | None) -> bool:
+    return all(bound is None or bound.lower == 0 for bound in bounds)
+
+
+def _as_window(formula: Formula, *, is_negated: bool) -> tuple[str, int, int]:
+    """Return F or G, and the window in samples, of an operator, or of its negation; no name for any other."""
+    if isinstance(formula, Temporal) and formula.operator == "X":
+        return ("G" if is_negated else "F"), 1, 1
+    if not isinstance(formula, Temporal) or formula.operator not in _OPPOSITE or formula.bound is None:
+        return "", 0, 0
+    bound = formula.bound
+    if bound.upper is None or bound.unit != "samples":
+        return "", 0, 0
+    operator = _OPPOSITE[formula.operator] if is_negated else formula.operator
+    return operator, bound.lower, bound.upper
 
 
 def _has_window(formula: Formula) -> bool:

@@ -58,6 +58,8 @@ def step_signals(
                         target[k] = history[channel, a, source - offset]
                     else:
                         target[k] = signals[s, 5] * np.inf
+            elif code in (codes.ARRIVED_MIN, codes.ARRIVED_MAX):
+                _gather_arrived(signals[s], history[channel, a], target, position, offset, count, stamps)
             elif code in codes.BEGUN:
                 ring = signals[s, 6]
                 _gather_begun(
@@ -70,7 +72,7 @@ def step_signals(
                 _gather_closed(
                     signals[s], history[channel, a], history[channel, b], target, position, offset, count,
                     stamps, memory.wedges[ring, channel], memory.wedge_ends[ring, channel],
-                    running[channel, s],
+                    running[channel, s], history[channel, s],
                 )  # fmt: skip
             else:
                 _slide(
@@ -143,17 +145,39 @@ def _apart(stamps: Integers, offset: int, unit: int, position: int, later: int) 
 
 
 @uncounted
+def _gather_arrived(
+    signal: Integers, source: Floats, target: Floats, position: int, offset: int, count: int, stamps: Integers
+) -> None:
+    """Compute an extremum over the positions that have come to be a distance behind since the last sample."""
+    unit, distance, is_least = signal[3], signal[4], signal[0] == codes.ARRIVED_MIN
+    for k in range(count):
+        here = position + k
+        at = behind(stamps, offset, here, unit, distance)
+        before = behind(stamps, offset, here - 1, unit, distance) if here > offset else offset - 1
+        value = np.inf if is_least else -np.inf
+        while at > before and at >= offset:
+            number = source[at - offset]
+            value = min(value, number) if is_least else max(value, number)
+            at -= 1
+        target[k] = value
+
+
+@uncounted
 def _gather_closed(
     signal: Integers, conditions: Floats, source: Floats, target: Floats, position: int, offset: int,
-    count: int, stamps: Integers, wedge: Integers, state: Integers, before: float,
+    count: int, stamps: Integers, wedge: Integers, state: Integers, before: float, by_position: Floats,
 ) -> None:  # fmt: skip
     """Compute the extremum of the responses of all positions whose window ahead has closed.
 
     The wedge is that of a sliding window, which moves on to the next position as soon as its window closes.
-    """  # fmt: skip
+
+    Args:
+        by_position: receives each response, where these are asked for one by one.
+    """
     code, unit, near, far = signal[0], signal[3], signal[4], signal[5]
     is_least = code in (codes.CLOSED_MIN_OF_MAX, codes.CLOSED_MIN_OF_MIN)
-    sign = 1.0 if code in (codes.CLOSED_MIN_OF_MAX, codes.CLOSED_MAX_OF_MAX) else -1.0
+    of_greatest = (codes.CLOSED_MIN_OF_MAX, codes.CLOSED_MAX_OF_MAX, codes.CLOSED_EACH_MAX)
+    sign = 1.0 if code in of_greatest else -1.0
     size = wedge.shape[0]
     head, tail, asking, entering = state[0], state[1], state[2], state[3]
     value = before
@@ -177,9 +201,15 @@ def _gather_closed(
                 entering += 1
             found = source[wedge[head % size] - offset] if tail > head else -sign * np.inf
             condition = conditions[asking - offset]
-            value = min(value, max(condition, found)) if is_least else max(value, min(condition, found))
+            if code == codes.CLOSED_EACH_MAX:
+                by_position[asking - offset] = max(condition, found)
+            elif code == codes.CLOSED_EACH_MIN:
+                by_position[asking - offset] = min(condition, found)
+            else:
+                value = min(value, max(condition, found)) if is_least else max(value, min(condition, found))
             asking += 1
-        target[k] = value
+        if code not in codes.CLOSED_EACH:
+            target[k] = value
     state[0], state[1], state[2], state[3] = head, tail, asking, entering
 
 

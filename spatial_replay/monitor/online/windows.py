@@ -209,7 +209,7 @@ def _kept_from(table_at: int, last: int) -> int:
     signals, parts, offset, keep = tables.signals, tables.parts, memory.clock[OFFSET], last
     for s in range(signals.shape[0]):
         code, unit = signals[s, codes.SIGNAL_CODE], signals[s, codes.SIGNAL_UNIT]
-        if code == codes.DELAY:
+        if code in codes.DELAYED:
             keep = min(keep, behind(memory.stamps, offset, last, unit, signals[s, codes.SIGNAL_LOW]))
         elif code in codes.RINGS:
             keep = min(keep, first_behind(memory.stamps, offset, last, unit, signals[s, codes.SIGNAL_HIGH]))
