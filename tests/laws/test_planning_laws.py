@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import count, pairwise
 
 import numpy as np
@@ -209,27 +210,37 @@ def test_a_planner_terminates_with_a_reason_for_each_pruned_edge(specification, 
         assert all(reason.kind for _, reason in step.pruned)
 
 
-@given(tasks(), settings_of_planners(), st.integers(0, 2**32 - 1))
-@settings(max_examples=40)
+@st.composite
+def easy_tasks(draw):
+    """Specifications of one goal, which most scenes leave to be done and allow."""
+    names = draw(st.permutations(THINGS))
+    return sr.parse_specification(f"{REGION}spec s = F ({draw(st.sampled_from(GOALS[:6])).format(*names)})")
+
+
+@given(st.one_of(easy_tasks(), tasks()), settings_of_planners(), st.integers(0, 2**32 - 1))
+@settings(max_examples=60)
 def test_a_target_is_free_and_has_the_robustness_that_it_states(specification, options, seed):
     random = np.random.default_rng(seed)
-    planner = Planner(specification, options)
     shape = sr.TrackedObject(sr.Footprint.box(0, 0, 1, 1))
     scene = {name: moved_object(shape, *random.uniform(-5, 5, 2)) for name in THINGS}
+    planner, coarse = Planner(specification, options), Planner(specification, replace(options, refine=False))
     planner.observe(sr.Sample(0, scene))
-    step = planner.next_step()
+    coarse.observe(sr.Sample(0, scene))
+    step, plain = planner.next_step(), coarse.next_step()
     if step.target is None:
         return
     aim, target = step.considered[-1], step.target
     motions = aim.motions if aim.is_joint else (target,)
     assert motions[0] == target
-    (chosen,) = [each for each in step.candidates if each.is_chosen]
-    values = chosen.map.values
-    if options.skill == "push":
-        assert target.robustness == values[chosen.map.cell_of(target.x, target.y, 0.0)]
-    elif not aim.is_joint:
-        # a refined target has at least as much as the best cell
-        assert target.robustness >= np.nanmax(values)
+    if not aim.is_joint:
+        # a refined target lies near the one in the middle of a cell, and has at least as much
+        middles = [each.target for each in plain.candidates if each.name == target.name]
+        if plain.considered and plain.considered[-1].edge == aim.edge and middles and middles[0] is not None:
+            assert target.robustness >= middles[0].robustness
+            assert max(abs(target.x - middles[0].x), abs(target.y - middles[0].y)) <= 2.0 + 1e-9
+        if options.skill == "place":
+            (chosen,) = [each for each in step.candidates if each.is_chosen]
+            assert target.robustness >= np.nanmax(chosen.map.values)
     is_parked = any(each.name == target.name for each in motions[1:])
     assert is_parked or target.robustness >= options.margin
     assert math.dist((target.x, target.y), (0.0, 0.0)) >= options.workspace.nearest
@@ -245,6 +256,10 @@ def test_a_target_is_free_and_has_the_robustness_that_it_states(specification, o
     visited = []
     for time_ns, each in enumerate(motions, 1):
         scene = {**scene, each.name: moved_object(scene[each.name], each.x, each.y)}
+        others = [name for name in THINGS if name != each.name]
+        apart = " and ".join(f"{each.name} dist {name} >= 0" for name in others)
+        room = sr.Monitor(sr.parse_specification(apart)).update(sr.Sample(0, scene)).node("spec").now
+        assert room > options.workspace.clearance
         planner.observe(sr.Sample(time_ns, scene))
         visited.append(planner.states)
     if options.margin > 0.0:
