@@ -161,8 +161,9 @@ def _run_ended(
     ones after it.
     """
     nothing, before, changed = -np.inf if is_greatest else np.inf, recent.extrema[0], end
-    if node[codes.NODE_UNIT] == codes.SAMPLES and end - begin >= MANY:
-        width, first = node[codes.NODE_HIGH] - node[codes.NODE_LOW] + 1, begin + node[codes.NODE_LOW]
+    width, first = node[codes.NODE_HIGH] - node[codes.NODE_LOW] + 1, begin + node[codes.NODE_LOW]
+    # the wider these are, the more of what they hold is common to them, and looked through once below
+    if node[codes.NODE_UNIT] == codes.SAMPLES and end - begin >= max(MANY, width // 2):
         kept = recent.extrema[0, len(recent.stamps) :]
         copy(target[begin - offset : end - offset], kept[: end - begin])
         slide_evenly(is_greatest, source, target, begin, end, first, width, recent.extrema, offset, last)
