@@ -36,10 +36,10 @@ _Result = TypeVar("_Result")
 _Making: TypeAlias = Callable[[Callable[_Arguments, _Result]], Callable[_Arguments, _Result]]
 
 _COLD_S: Final = 2.0
-_WARM_S: Final = 0.15
+_WARM_S: Final = 0.02
 """How long a kernel may be interpreted before it is compiled, or loaded from the cache."""
 _COMPILER_S: Final = 0.25
-"""What loading the compiler costs besides, once in a process."""
+"""What loading the compiler costs besides, once in a process; all kernels together may take so long before."""
 _GUESS_S: Final = 2e-6
 """For each element of its arrays, the time a kernel is expected to take when it was never run."""
 _LONG: Final = 3.0
@@ -213,6 +213,7 @@ class _Kernel(Generic[_Arguments, _Result]):
             result = run(*taken, **named)
         took = time.thread_time() - begin
         self._spent_s += took
+        _process.spent_s += took
         self._element_s = max(took / elements, self._element_s or 0.0)
         return result
 
@@ -234,7 +235,7 @@ class _Kernel(Generic[_Arguments, _Result]):
         guess = _GUESS_S * self.times if self._element_s is None else self._element_s
         cost = self._spent_s + elements * guess
         if not _process.has_compiler:
-            cost -= _COMPILER_S
+            cost -= max(_COMPILER_S - _process.spent_s, 0.0)
         # asked last, since looking for the cache takes its time, too
         return cost <= _WARM_S or (cost <= _COLD_S and not _process.holds(self))
 
@@ -379,6 +380,7 @@ class _Process:
     def __init__(self) -> None:
         self.only = _required_form()
         self.interprets = True
+        self.spent_s = 0.0
         self.listeners: list[Callable[[], None]] = []
         # a module that another thread is still importing is in `sys.modules`, too
         self._compiler: Any = None

@@ -28,7 +28,8 @@ from spatial_replay.trace.trace import ABSENT, Trace
 
 _MOST_WAITING = 8
 _MOST_WAITING_BYTES = 64 * 2**20
-"""Pieces of an evaluation, and bytes of them, that may wait to be hashed, so that memory stays bounded."""
+"""Pieces of an evaluation, and bytes of them, that may wait to be hashed when another one comes, so that
+memory stays bounded."""
 
 
 class Hashing:
@@ -44,11 +45,14 @@ class Hashing:
         self._waiting_bytes = 0
 
     def take(self, size: int, add: Callable[[], None]) -> None:
-        """Call `add` for a piece of so many bytes, which must not change afterwards."""
+        """Call `add` for a piece of so many bytes, which must not change afterwards.
+
+        The piece itself is in memory anyway: however large, it waits only for those before it.
+        """
         while self._waiting and (
             self._waiting[0][1].done()
             or len(self._waiting) >= _MOST_WAITING
-            or self._waiting_bytes + size > _MOST_WAITING_BYTES
+            or self._waiting_bytes > _MOST_WAITING_BYTES
         ):
             self._await_first()
         self._waiting_bytes += size
@@ -211,22 +215,26 @@ class EvaluationHashes:
 
     def add(self, trace: Trace, own: Messages, results: Sequence[SeriesBlock]) -> None:
         """Take in the next samples, the log's own messages, and the numbers of each result."""
-        self.add_samples(trace, own)
-        self.add_results(results)
+        size = _size(trace, own) + sum(block.series.nbytes for block in results)
+        self._hashing.take(size, partial(self._take_in, trace, own, results))
 
     def add_samples(self, trace: Trace, own: Messages) -> None:
         """Take in the next samples and the log's own messages; their results follow, in any pieces."""
-        size = trace.nbytes + int(columns_of(own.payloads).sizes.sum())
-        self._hashing.take(size, partial(self._take_in, trace, own))
-
-    def _take_in(self, trace: Trace, own: Messages) -> None:
-        self._samples.add(trace)
-        self._messages.add(own)
+        self._hashing.take(_size(trace, own), partial(self._take_in, trace, own, ()))
 
     def add_results(self, results: Sequence[SeriesBlock]) -> None:
         """Take in the next numbers of each result."""
+        size = sum(block.series.nbytes for block in results)
+        self._hashing.take(size, partial(self._take_in_results, results))
+
+    def _take_in(self, trace: Trace, own: Messages, results: Sequence[SeriesBlock]) -> None:
+        self._samples.add(trace)
+        self._messages.add(own)
+        self._take_in_results(results)
+
+    def _take_in_results(self, results: Sequence[SeriesBlock]) -> None:
         for index, block in enumerate(results):
-            self._hashing.take(block.series.nbytes, partial(self._results.add, index, block.series))
+            self._results.add(index, block.series)
 
     def certificate(
         self, files: Sequence[Specification], plan: Mapping[str, str] | None = None
@@ -245,6 +253,10 @@ class EvaluationHashes:
             **({} if plan is None else {PLAN_SHA256: plan_sha256(plan)}),
             "spatial_replay_version": __version__,
         }
+
+
+def _size(trace: Trace, own: Messages) -> int:
+    return trace.nbytes + int(columns_of(own.payloads).sizes.sum())
 
 
 def _take_in(hashed: hashlib._Hash, buffer: bytes | memoryview | NDArray[np.generic]) -> None:

@@ -49,8 +49,8 @@ from spatial_replay.trace.sample import LATEST_NS
 from spatial_replay.trace.trace import Trace, within
 
 FIRST_SAMPLES = 1_024
-"""Samples of the first block; each one after it has twice as many, up to those of a block. Other threads wait
-for the first."""
+"""Samples of the first block; each one after it has half as many again, up to those of a block. Other threads
+wait for the first, and with twice as many they would wait for those after it, too."""
 BLOCK_BYTES = 64 * 2**20
 """A block of messages is closed when it holds this much, however few its samples are."""
 AFTER_ALL_NS = 2**64
@@ -274,7 +274,7 @@ def _blocks(
             if ready:
                 block, rest = ordered.divided(ready, objects)
                 yield block
-                enough = min(2 * enough, BLOCK_SAMPLES)
+                enough = min(3 * enough // 2, BLOCK_SAMPLES)
                 waiting, size, samples = [rest], rest.buffer_bytes, _count(rest, objects)
     rest = _in_order(waiting)
     if len(rest):
