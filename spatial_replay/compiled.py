@@ -39,7 +39,7 @@ _COLD_S: Final = 2.0
 _WARM_S: Final = 0.02
 """How long a kernel may be interpreted before it is compiled, or loaded from the cache."""
 _COMPILER_S: Final = 0.25
-"""What loading the compiler costs besides, once in a process; all kernels together may take so long before."""
+"""What loading the compiler costs besides, once in a process: as much as all kernels may take before."""
 _GUESS_S: Final = 2e-6
 """For each element of its arrays, the time a kernel is expected to take when it was never run."""
 _LONG: Final = 3.0
