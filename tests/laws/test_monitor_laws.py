@@ -39,7 +39,7 @@ from spatial_replay.monitor.online.program import compile_formula
 from spatial_replay.monitor.online.step import OnlineRun
 from spatial_replay.monitor.stream import EvaluationStream
 from spatial_replay.monitor.verdict import final_verdict, online_verdict
-from spatial_replay.spec.formula import Boolean, Bound, Temporal, Truth
+from spatial_replay.spec.formula import Boolean, Bound, Temporal, Truth, iter_nodes
 from spatial_replay.trace.sample import FOREVER
 
 VALUE, NOW, LOWER, UPPER = range(4)
@@ -292,7 +292,21 @@ def with_window(formula, leaf, window):
     return replace(formula, operands=operands) if operands else formula
 
 
-small = st.one_of(st.sampled_from(LEAVES), formulas_of_leaves)
+def unbounded(formula):
+    """How many operators go on without end."""
+    nodes = (node for _, _, node in iter_nodes(formula))
+    return sum(isinstance(node, Temporal) and node.bound is None for node in nodes)
+
+
+@st.composite
+def of_few_operators(draw):
+    """A formula of which two below one operator stay within what a part may nest."""
+    formula = draw(st.one_of(st.sampled_from(LEAVES), formulas_of_leaves))
+    assume(unbounded(formula) <= 5)
+    return formula
+
+
+small = of_few_operators()
 
 
 @given(p=small, q=small, run=leaf_runs())
