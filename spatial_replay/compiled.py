@@ -411,9 +411,10 @@ class _Process:
 
         What only kernels call is optimised with these, and not before, which takes a third of the time.
         """
+        made = self._compile(lambda numba: numba.njit, function, options)
+        # parts of it once all of it is there: threads that import both at the same time block each other
         from numba.core.compiler_lock import global_compiler_lock
 
-        made = self._compile(lambda numba: numba.njit, function, options)
         settings, compile_it = self._compiler.config, made.compile
         level = type(settings.OPT)(1) if "no_cpython_wrapper" in options else settings.OPT
 
@@ -448,6 +449,7 @@ class _Process:
 
     def array_at(self, kind: type) -> Any:
         """Return what machine code calls to see numbers at an address as an array."""
+        self._loaded()
         from numba.core import cgutils, types
         from numba.extending import intrinsic
         from numba.np import arrayobj
@@ -483,9 +485,7 @@ class _Process:
         self, form: Callable[[Any], Callable[..., Any]], function: Callable[..., Any], options: dict[str, Any]
     ) -> Any:
         with self._lock:
-            if self._compiler is None:
-                self._compiler = self._load()
-            numba = self._compiler
+            numba = self._loaded()
             if self._folder is None:
                 return form(numba)(error_model="numpy", **options)(function)
             # the folder is read from the compiler's settings when a function is decorated; they belong to
@@ -495,6 +495,13 @@ class _Process:
                 return form(numba)(cache=True, error_model="numpy", **options)(function)
             finally:
                 numba.config.CACHE_DIR = before
+
+    def _loaded(self) -> Any:
+        """Return the compiler, which the first thread that needs it imports, while others wait."""
+        with self._lock:
+            if self._compiler is None:
+                self._compiler = self._load()
+            return self._compiler
 
     def _load(self) -> Any:
         import numba

@@ -9,6 +9,7 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
+import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
@@ -119,6 +120,16 @@ def test_windows_beside_windows_equal_the_definitions(data, formula, run, room):
     wide_leaf = run.wide_leaf if run.channels == 4 else run.nominal_leaf
     expected = numbers_of(formula, run.times_ns, run.nominal_leaf, wide_leaf)
     assert_same((series, final), (expected.series, expected.final))
+
+
+@pytest.mark.parametrize("past", ["O", "H"])
+@pytest.mark.parametrize("outer", ["F", "G"])
+@given(run=leaf_runs(max_size=6))
+def test_what_implies_a_window_ahead_has_its_own_number_now(outer, past, run):
+    first, second = LEAVES[:2]
+    ahead = Temporal(past, (Temporal("F", (second,), Bound(1, None, "samples")),))
+    formula = Temporal(outer, (both(either(first, ahead), first),))
+    assert_same([root_of(formula, run)[0]], [root_of(Temporal(outer, (first,)), run)[0]])
 
 
 @settings(max_examples=60)

@@ -210,7 +210,8 @@ class MovedLeaves:
         """
         values = self._measured.measure(vertices)
         if self.compares_turns:
-            self._values[self._of_footprints] = values
+            if len(values):
+                self._values[self._of_footprints] = values
             values = self._values
         for place, where in self._unknown:
             values[place, where] = np.nan

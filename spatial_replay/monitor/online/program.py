@@ -25,7 +25,6 @@ from spatial_replay.monitor.online.operators import (
     PartRows,
     Row,
     SignalTable,
-    WindowedPart,
     array_of_rows,
     part_of,
 )
@@ -91,13 +90,13 @@ def compile_formula(formula: Formula) -> Program:
         elif isinstance(node, Temporal):
             last = None if node.operator in FUTURE_OPERATORS else at_last(node)
             if isinstance(last, Temporal) and looks_ahead(last):
-                number, _ = parts.add_node(last, signals)
+                number = parts.add_node(last, signals)
                 reports.append((codes.REPORT_PAST, number, codes.NOW_OF_VALUE, *ends))
             elif last is not None:
                 reports.append((codes.REPORT_PAST, signals.add(last), codes.NOW_OF_SIGNAL, *ends))
             else:
-                number, part = parts.add_node(node, signals)
-                reports.append((codes.REPORT_PART, number, _now_rule(node, part), *ends))
+                number = parts.add_node(node, signals)
+                reports.append((codes.REPORT_PART, number, _now_rule(node), *ends))
     return Program(
         leaves=tuple(signals.leaves),
         signals=signals.array(parts.literals),
@@ -130,11 +129,11 @@ class _Parts:
         self.literals = set[int]()
         self._built: dict[tuple[tuple[Row, ...], bool] | Row, int] = {}
 
-    def add_node(self, node: Temporal, signals: SignalTable) -> tuple[int, WindowedPart]:
-        """Add the part of a node that looks ahead; return its number, and the part as it would be run."""
+    def add_node(self, node: Temporal, signals: SignalTable) -> int:
+        """Add the part of a node that looks ahead, and return its number."""
         part = part_of(signals, node)
         clauses = clauses_of(signals, part)
-        return self.add(part, signals) if clauses is None else self.add_clauses(clauses, signals), part
+        return self.add(part, signals) if clauses is None else self.add_clauses(clauses, signals)
 
     def add_clauses(self, clauses: Clauses, signals: SignalTable) -> int:
         """Add a part that is made of signals, after the part beside it, and return its number."""
@@ -237,9 +236,12 @@ def _nodes_with_operands(formula: Formula) -> list[tuple[Formula, list[int]]]:
     return nodes
 
 
-def _now_rule(node: Temporal, part: WindowedPart) -> int:
-    """Return how a future operator follows from its operands on the newest sample alone (`now`)."""
-    if part.is_remembering:
+def _now_rule(node: Temporal) -> int:
+    """Return where an operator's number on the newest sample alone (`now`) comes from.
+
+    That of a future operator follows from its operands' own, that of a past one is kept in its part.
+    """
+    if node.operator not in FUTURE_OPERATORS:
         return codes.NOW_OF_PART
     weak = node.operator in ("G", "R", "W", "WX")
     if node.operator in ("X", "WX") or (node.bound is not None and node.bound.lower > 0):
