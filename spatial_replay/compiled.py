@@ -207,10 +207,9 @@ class _Kernel(Generic[_Arguments, _Result]):
             return self.compiled()(*arguments, **named)
         run = cast(Callable[..., _Result], self.interpreted())
         begin = time.thread_time()
-        taken = self._taken(arguments)
         # as in machine code: a quotient by zero or a product out of range is no error and no warning
         with np.errstate(all="ignore"):
-            result = run(*taken, **named)
+            result = run(*self._taken(arguments), **named)
         took = time.thread_time() - begin
         self._spent_s += took
         _process.spent_s += took
@@ -454,8 +453,7 @@ class _Process:
         from numba.extending import intrinsic
         from numba.np import arrayobj
 
-        tools, arrays = cast(Any, cgutils), cast(Any, arrayobj)
-        number: Any = getattr(types, kind.__name__)
+        tools, arrays, number = cast(Any, cgutils), cast(Any, arrayobj), getattr(types, kind.__name__)
 
         @intrinsic
         def array_at(_context, address, shape):  # type: ignore[no-untyped-def]
@@ -466,9 +464,8 @@ class _Process:
                 at, extent = arguments
                 lengths = [extent] if dimensions == 1 else tools.unpack_tuple(builder, extent)
                 kinds = signature.args[1:] if dimensions == 1 else signature.args[1]
-                lengths = [
-                    context.cast(builder, *each, types.intp) for each in zip(lengths, kinds, strict=True)
-                ]
+                sizes = zip(lengths, kinds, strict=True)
+                lengths = [context.cast(builder, *each, types.intp) for each in sizes]
                 strides = [context.get_constant(types.intp, np.dtype(kind).itemsize)]
                 for length in lengths[:0:-1]:
                     strides.insert(0, builder.mul(strides[0], length))
@@ -500,23 +497,19 @@ class _Process:
         """Return the compiler, which the first thread that needs it imports, while others wait."""
         with self._lock:
             if self._compiler is None:
-                self._compiler = self._load()
+                import numba
+                from numba.core import event
+
+                class Listener(event.Listener):  # type: ignore[misc, unused-ignore]
+                    def on_start(self, event: object) -> None:
+                        for hear in tuple(_process.listeners):
+                            hear()
+
+                    def on_end(self, event: object) -> None: ...
+
+                cast(Any, event).register("numba:compile", Listener())
+                self._compiler = numba
             return self._compiler
-
-    def _load(self) -> Any:
-        import numba
-        from numba.core import event
-
-        class Listener(event.Listener):  # type: ignore[misc, unused-ignore]
-            def on_start(self, event: object) -> None:
-                for hear in tuple(_process.listeners):
-                    hear()
-
-            def on_end(self, event: object) -> None:
-                pass
-
-        cast(Any, event).register("numba:compile", Listener())
-        return numba
 
 
 def _required_form() -> str | None:
