@@ -22,6 +22,8 @@ BLOCKS = 64
 """Edges are left out by blocks, at most twice as many; vertices are looked for by as many strides."""
 CLOSE = 1e-9
 """What coordinates may be off by from rounding, to their size, with much to spare."""
+MISSES = 3
+"""So often an enclosure finds corners that do not go in step, and then looks for no more."""
 DIRECTIONS = 8
 """In so many directions the first look is for a vertex that sticks out far."""
 
@@ -55,33 +57,88 @@ def _before(k: int, start: int, stop: int) -> int:
 
 
 @inlined
-def _low_vertex(vertices: Floats, edges: Floats, i: int, j: int, b_start: int, b_stop: int) -> int:
-    """Return a vertex of B low above the edge i of A; above those before it, j was one."""
-    stride = _stride(b_stop - b_start)
+def _low_vertex(
+    vertices: Floats, edges: Floats, i: int, j: int, b_start: int, b_stop: int
+) -> tuple[int, float]:
+    """Return a vertex of B low above the edge i of A, and its height; above those before it, j was one."""
+    stride, height = _stride(b_stop - b_start), _height(vertices, edges, i, j)
     for _ in range(b_start, b_stop, stride):
-        ahead = j + stride if j + stride < b_stop else j + stride - (b_stop - b_start)
-        if _height(vertices, edges, i, ahead) >= _height(vertices, edges, i, j):
+        following = j + stride if j + stride < b_stop else j + stride - (b_stop - b_start)
+        ahead = _height(vertices, edges, i, following)
+        if ahead >= height:
             break
-        j = ahead
-    return j
+        j, height = following, ahead
+    return j, height
+
+
+@inlined
+def _in_step(
+    vertices: Floats, edges: Floats, begin: int, end: int, k: int, b_start: int, b_stop: int
+) -> tuple[float, int, int, int]:
+    """Return what `_most_separating` finds where B's lowest vertex goes on by one with each edge.
+
+    Of outlines that are alike, two vertices are as low but for rounding, and a processor cannot guess which
+    of them is lower. Here both are looked at, k and the next for the first edge, and no branch depends on it.
+
+    Returns:
+        (separation, i, j, k): of the edges before i, above the last of which j is lowest, and what k is for
+        i. They end where an edge separates them: only then it matters which one separates most.
+    """
+    separation, i, j = -np.inf, begin, k - 1
+    while i < end and k > b_start and k + 2 < b_stop:
+        low, following = _height(vertices, edges, i, k), _height(vertices, edges, i, k + 1)
+        leads_here = low <= _height(vertices, edges, i, k - 1)
+        if not (leads_here and _height(vertices, edges, i, k + 2) > following):
+            break
+        is_next = following <= low
+        height = following if is_next else low
+        if height >= 0.0:
+            break
+        separation = height if height > separation else separation
+        j = k + 1 if is_next else k
+        i, k = i + 1, k + 1
+    return separation, i, j, k
+
+
+@inlined
+def _leads_down(vertices: Floats, edges: Floats, i: int, j: int, k: int) -> bool:
+    """Return whether from vertex j back to k each is lower above the edge i."""
+    is_lower = j >= k
+    height = _height(vertices, edges, i, k)
+    for at in range(k + 1, j + 1):
+        ahead = _height(vertices, edges, i, at)
+        is_lower &= height < ahead
+        height = ahead
+    return is_lower
 
 
 @piece
 def _most_separating(
-    vertices: Floats, edges: Floats, begin: int, end: int, j: int, b_start: int, b_stop: int
-) -> tuple[float, int, int]:
+    vertices: Floats, edges: Floats, begin: int, end: int, j: int, k: int, b_start: int, b_stop: int
+) -> tuple[float, int, int, int]:
     """Return how far the edges from `begin` to before `end` separate A from B, which one, and B's lowest.
+
+    Which, and B's lowest, are only known where an edge separates them. The fourth number is `k` for
+    the edge at `end`.
 
     Args:
         j: a vertex of B low above these edges.
+        k: the first of the two lowest, if all edges before these went in step (see `_in_step`), or -1.
     """
-    separation, best, lowest = -np.inf, begin, j
-    for _ in range(b_stop - b_start):
-        before = _before(j, b_start, b_stop)
-        if _height(vertices, edges, begin, before) >= _height(vertices, edges, begin, j):
-            break
-        j = before
-    for i in range(begin, end):
+    separation, best, lowest, i = -np.inf, begin, j, begin
+    if k >= 0 and k + 1 < b_stop and _leads_down(vertices, edges, begin, j, k + 1):
+        separation, i, low, k = _in_step(vertices, edges, begin, end, k, b_start, b_stop)
+        if i == end:
+            return separation, best, low, k
+        j = low if i > begin else j
+    if i == begin:
+        for _ in range(b_stop - b_start):
+            before = _before(j, b_start, b_stop)
+            if _height(vertices, edges, begin, before) >= _height(vertices, edges, begin, j):
+                break
+            j = before
+    k = -1
+    while i < end:
         height = _height(vertices, edges, i, j)
         for _ in range(b_stop - b_start):
             following = _after(j, b_start, b_stop)
@@ -91,7 +148,16 @@ def _most_separating(
             j, height = following, ahead
         if height > separation:
             separation, best, lowest = height, i, j
-    return separation, best, lowest
+        i += 1
+        if i == begin + 1 and i < end and j + 2 < b_stop:
+            # of two as low, j is the first or the second
+            is_first = _height(vertices, edges, i, j) > _height(vertices, edges, i, j + 2)
+            next_pair = j + 1 if is_first else j
+            found, stop, low, next_pair = _in_step(vertices, edges, i, end, next_pair, b_start, b_stop)
+            if stop > i:
+                separation, i, j = max(separation, found), stop, low
+            k = next_pair if i == end else -1
+    return separation, best, lowest, k
 
 
 @piece
@@ -115,17 +181,18 @@ def _separate(
     j, begin, most, low = first, a_start, -np.inf, first
     for at in range(a_start, a_stop, block):
         middle = min(at + block // 2, a_stop - 1)
-        j = _low_vertex(vertices, edges, middle, j, b_start, b_stop)
-        if _height(vertices, edges, middle, j) > most:
-            most, begin, low = _height(vertices, edges, middle, j), at, j
+        j, height = _low_vertex(vertices, edges, middle, j, b_start, b_stop)
+        is_most = height > most
+        most = height if is_most else most
+        begin = at if is_most else begin
+        low = j if is_most else low
     end = min(begin + block, a_stop)
-    least, best, lowest = _most_separating(vertices, edges, begin, end, low, b_start, b_stop)
-    j = first
+    least, best, lowest, _ = _most_separating(vertices, edges, begin, end, low, -1, b_start, b_stop)
+    j, k = first, -1
     for at in range(a_start, a_stop, block):
         end, middle = min(at + block, a_stop), min(at + block // 2, a_stop - 1)
-        j = _low_vertex(vertices, edges, middle, j, b_start, b_stop)
         # no edge separates A from B by more than any one vertex of B is above it
-        bound = _height(vertices, edges, middle, j)
+        j, bound = _low_vertex(vertices, edges, middle, j, b_start, b_stop)
         if bound < least:
             for i in range(at, end):
                 bound = max(bound, _height(vertices, edges, i, j))
@@ -133,9 +200,11 @@ def _separate(
             bound = np.inf
         # the first of those that separate equally counts, as if all were looked at
         if bound >= least and bound > separation:
-            found, i, k = _most_separating(vertices, edges, at, end, j, b_start, b_stop)
+            found, i, v, k = _most_separating(vertices, edges, at, end, j, k, b_start, b_stop)
             if found > separation:
-                separation, best, lowest = found, i, k
+                separation, best, lowest = found, i, v
+        else:
+            k = -1
     if separation < 0.0:
         return separation, nearest, squared
     # edges that are parallel to others separate as much as their neighbours, at several vertices
@@ -306,9 +375,18 @@ def _walked_protrusion(
         if most < 0.0:
             return most
     greatest, to_spare, edge, w, at = 0.0, 0.0, b_start, -1, a_start
-    for _ in range(a_stop - a_start):
+    left, misses = a_stop - a_start, 0
+    while left > 0:
         # on the way from vertex to vertex the distance grows by no more than the way
         if to_spare <= 0.0:
+            if misses < MISSES and b_start < edge and edge + 3 < b_stop:
+                end = min(v + left, a_stop)
+                greatest, edge, k = _corners_in_step(vertices, edges, greatest, edge, v, end, b_start, b_stop)
+                misses += int(k == v)
+                left -= k - v
+                v = k if k < a_stop else a_start
+                if left == 0:
+                    break
             height = _height(vertices, edges, edge, v)
             if height >= 0.0:
                 edge, height = _most_below(vertices, edges, edge, height, v, b_start, b_stop)
@@ -336,7 +414,53 @@ def _walked_protrusion(
                 to_spare -= CLOSE * (abs(vertices[v, 0]) + abs(vertices[v, 1]) + to_spare)
         to_spare -= edges[v, 2]
         v = _after(v, a_start, a_stop)
+        left -= 1
     return greatest
+
+
+@inlined
+def _corners_in_step(
+    vertices: Floats,
+    edges: Floats,
+    greatest: float,
+    edge: int,
+    begin: int,
+    end: int,
+    b_start: int,
+    b_stop: int,
+) -> tuple[float, int, int]:
+    """Return what `_walked_protrusion` finds where B's nearest corner goes on by one with each vertex of A.
+
+    Above both edges at that corner, a vertex is as high but for rounding; see `_in_step`.
+
+    Returns:
+        (greatest, edge, v): the greatest distance so far, of the vertices before v, and the edge of B above
+        which the last of them is highest. None of them is one that the walk leaves out.
+    """
+    # the corner is at the end of this edge, or at that of the next one
+    v = begin
+    k = edge + int(_height(vertices, edges, edge, v) < _height(vertices, edges, edge + 2, v))
+    while v < end and k > b_start and k + 2 < b_stop:
+        before = _height(vertices, edges, k - 1, v)
+        high, along, of_start = _along(vertices, edges, k, v)
+        following, beside, squared = _along(vertices, edges, k + 1, v)
+        beyond, _, of_end = _along(vertices, edges, k + 2, v)
+        if not (0.0 <= before < high and beyond < following and squared <= min(of_start, of_end)):
+            break
+        # surely neither edge has a point that is nearer than the corner, as `_from_edge` would see it
+        length, slack = edges[k, 2], CLOSE * (edges[k, 2] + high)
+        is_beyond = along > length and min(along, along - length) > slack
+        if not (is_beyond and beside < -CLOSE * (edges[k + 1, 2] + following)):
+            break
+        distance = math.sqrt(squared)
+        most = max(greatest, distance)
+        to_spare = most - distance
+        to_spare -= CLOSE * (abs(vertices[v, 0]) + abs(vertices[v, 1]) + to_spare)
+        if not to_spare - edges[v, 2] <= 0.0:
+            break
+        greatest, edge = most, k + 1 if following > high else k
+        v, k = v + 1, k + 1
+    return greatest, edge, v
 
 
 @apart
