@@ -94,32 +94,31 @@ def either(*formulas):
 # ------------------------------------------------------------------------------------- the definitions
 
 
-@settings(max_examples=500)
-@given(data=st.data(), formula=formulas_of_leaves, run=leaf_runs(), room=st.integers(2, 8))
-def test_every_node_on_every_prefix_equals_the_definitions(data, formula, run, room):
+def assert_as_defined(data, formula, run, room):
+    """Every number of every node, in stretches of a run, is that of the definitions."""
     series, final = run_of(formula, run, room=room, cuts=data.draw(cuts(len(run))))
     wide_leaf = run.wide_leaf if run.channels == 4 else run.nominal_leaf
     expected = numbers_of(formula, run.times_ns, run.nominal_leaf, wide_leaf)
     assert_same((series, final), (expected.series, expected.final))
+
+
+@settings(max_examples=500)
+@given(data=st.data(), formula=formulas_of_leaves, run=leaf_runs(), room=st.integers(2, 8))
+def test_every_node_on_every_prefix_equals_the_definitions(data, formula, run, room):
+    assert_as_defined(data, formula, run, room)
 
 
 @settings(max_examples=60)
 @given(data=st.data(), formula=nested_windows, run=leaf_runs(max_size=40), room=st.integers(2, 64))
 def test_windows_below_windows_equal_the_definitions(data, formula, run, room):
     """On runs so long that windows close while others are open."""
-    series, final = run_of(formula, run, room=room, cuts=data.draw(cuts(len(run))))
-    wide_leaf = run.wide_leaf if run.channels == 4 else run.nominal_leaf
-    expected = numbers_of(formula, run.times_ns, run.nominal_leaf, wide_leaf)
-    assert_same((series, final), (expected.series, expected.final))
+    assert_as_defined(data, formula, run, room)
 
 
 @settings(max_examples=120)
 @given(data=st.data(), formula=alternative_windows, run=leaf_runs(max_size=30), room=st.integers(2, 64))
 def test_windows_beside_windows_equal_the_definitions(data, formula, run, room):
-    series, final = run_of(formula, run, room=room, cuts=data.draw(cuts(len(run))))
-    wide_leaf = run.wide_leaf if run.channels == 4 else run.nominal_leaf
-    expected = numbers_of(formula, run.times_ns, run.nominal_leaf, wide_leaf)
-    assert_same((series, final), (expected.series, expected.final))
+    assert_as_defined(data, formula, run, room)
 
 
 @pytest.mark.parametrize("past", ["O", "H"])
@@ -135,10 +134,7 @@ def test_what_implies_a_window_ahead_has_its_own_number_now(outer, past, run):
 @settings(max_examples=60)
 @given(data=st.data(), formula=lasting_windows, run=leaf_runs(max_size=20), room=st.integers(2, 64))
 def test_windows_that_recur_or_begin_later_equal_the_definitions(data, formula, run, room):
-    series, final = run_of(formula, run, room=room, cuts=data.draw(cuts(len(run))))
-    wide_leaf = run.wide_leaf if run.channels == 4 else run.nominal_leaf
-    expected = numbers_of(formula, run.times_ns, run.nominal_leaf, wide_leaf)
-    assert_same((series, final), (expected.series, expected.final))
+    assert_as_defined(data, formula, run, room)
 
 
 @settings(max_examples=150)
