@@ -181,6 +181,8 @@ def run_windows(table_at: int, channels: int, count: int) -> int:
                 )
             if k == count - 1 and channels == 4:
                 looks |= 1 << 6 | 1 << 7
+            if part[codes.PART_VARIABLES] == 0 and memory.cells[part[codes.PART_CELL_START]] > 0:
+                looks &= 1 | 2  # its numbers at the first sample stand in its table
             bring_columns_up(table_at, number, looks, channels, last)
             for which in range(NUMBERS):
                 if which in (2, 3) or (which >= 6 and k < count - 1):
