@@ -10,7 +10,6 @@ import hashlib
 import json
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from typing import cast
 
@@ -18,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spatial_replay import __version__
+from spatial_replay.cores import Work
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.messages import Messages
 from spatial_replay.logs.payloads import columns_of, side_by_side
@@ -33,15 +33,11 @@ memory stays bounded."""
 
 
 class Hashing:
-    """Hashes pieces of an evaluation in their order on a thread of its own.
-
-    `hashlib` and copies of columns release the interpreter lock, so that on two cores a replay does not wait
-    for its certificate.
-    """
+    """Hashes pieces of an evaluation in their order, on whichever core is free."""
 
     def __init__(self) -> None:
-        self._thread = ThreadPoolExecutor(1, "hashing")
-        self._waiting: deque[tuple[int, Future[None]]] = deque()
+        self._last: Work[None] | None = None
+        self._waiting: deque[tuple[int, Work[None]]] = deque()
         self._waiting_bytes = 0
 
     def take(self, size: int, add: Callable[[], None]) -> None:
@@ -50,13 +46,14 @@ class Hashing:
         The piece itself is in memory anyway: however large, it waits only for those before it.
         """
         while self._waiting and (
-            self._waiting[0][1].done()
+            self._waiting[0][1].is_done
             or len(self._waiting) >= _MOST_WAITING
             or self._waiting_bytes > _MOST_WAITING_BYTES
         ):
             self._await_first()
         self._waiting_bytes += size
-        self._waiting.append((size, self._thread.submit(add)))
+        self._last = Work(partial(_after, self._last, add), waits=True)
+        self._waiting.append((size, self._last))
 
     def finish(self) -> None:
         """Wait until everything was taken in."""
@@ -67,6 +64,12 @@ class Hashing:
         size, hashed = self._waiting.popleft()
         hashed.result()
         self._waiting_bytes -= size
+
+
+def _after(before: Work[None] | None, add: Callable[[], None]) -> None:
+    if before is not None:
+        before.result()
+    add()
 
 
 class SampleHash:
@@ -211,26 +214,23 @@ class EvaluationHashes:
     def __init__(self, names: Sequence[tuple[str, str | None]]) -> None:
         """Start before the first sample; each result has a name and, of a template, an object."""
         self._samples, self._messages, self._results = SampleHash(), MessageHash(), ResultHash(names)
-        self._hashing = Hashing()
+        self._hashing = Hashing(), Hashing(), Hashing()
 
     def add(self, trace: Trace, own: Messages, results: Sequence[SeriesBlock]) -> None:
         """Take in the next samples, the log's own messages, and the numbers of each result."""
-        size = _size(trace, own) + sum(block.series.nbytes for block in results)
-        self._hashing.take(size, partial(self._take_in, trace, own, results))
+        self.add_samples(trace, own)
+        self.add_results(results)
 
     def add_samples(self, trace: Trace, own: Messages) -> None:
         """Take in the next samples and the log's own messages; their results follow, in any pieces."""
-        self._hashing.take(_size(trace, own), partial(self._take_in, trace, own, ()))
+        samples, messages, _ = self._hashing
+        samples.take(trace.nbytes, partial(self._samples.add, trace))
+        messages.take(int(columns_of(own.payloads).sizes.sum()), partial(self._messages.add, own))
 
     def add_results(self, results: Sequence[SeriesBlock]) -> None:
         """Take in the next numbers of each result."""
         size = sum(block.series.nbytes for block in results)
-        self._hashing.take(size, partial(self._take_in_results, results))
-
-    def _take_in(self, trace: Trace, own: Messages, results: Sequence[SeriesBlock]) -> None:
-        self._samples.add(trace)
-        self._messages.add(own)
-        self._take_in_results(results)
+        self._hashing[2].take(size, partial(self._take_in_results, results))
 
     def _take_in_results(self, results: Sequence[SeriesBlock]) -> None:
         for index, block in enumerate(results):
@@ -244,7 +244,8 @@ class EvaluationHashes:
         Args:
             plan: the metadata of a planned run.
         """
-        self._hashing.finish()
+        for hashing in self._hashing:
+            hashing.finish()
         return {
             "samples_sha256": self._samples.hexdigest(),
             "messages_sha256": self._messages.hexdigest(),
@@ -253,10 +254,6 @@ class EvaluationHashes:
             **({} if plan is None else {PLAN_SHA256: plan_sha256(plan)}),
             "spatial_replay_version": __version__,
         }
-
-
-def _size(trace: Trace, own: Messages) -> int:
-    return trace.nbytes + int(columns_of(own.payloads).sizes.sum())
 
 
 def _take_in(hashed: hashlib._Hash, buffer: bytes | memoryview | NDArray[np.generic]) -> None:

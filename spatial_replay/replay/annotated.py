@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from spatial_replay import __version__
 from spatial_replay.annotate.certificate import specifications_json
+from spatial_replay.cores import Work, drop
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.messages import Messages, Sink
 from spatial_replay.logs.source import Source, reading_options, units_metadata
@@ -105,20 +106,21 @@ def run_replay(
 
 @contextmanager
 def _behind(write: Callable[[Messages], None]) -> Iterator[Callable[[Messages], None]]:
-    """Give what writes messages on a thread of its own, in order, while the next ones are made."""
-    waiting: Future[None] | None = None
-    with ThreadPoolExecutor(1, "writing") as thread:
+    """Give what writes messages in order, while the next ones are made, if a core is free for that."""
+    waiting = list[Work[None]]()
 
-        def write_behind(messages: Messages) -> None:
-            nonlocal waiting
-            if waiting is not None:
-                # no more than these wait, so that memory stays bounded
-                waiting.result()
-            waiting = thread.submit(write, messages)
+    def write_behind(messages: Messages) -> None:
+        # no more than these wait, so that memory stays bounded
+        while waiting:
+            waiting.pop().result()
+        waiting.append(Work(partial(write, messages), waits=True))
 
+    try:
         yield write_behind
-        if waiting is not None:
-            waiting.result()
+        for each in waiting:
+            each.result()
+    finally:
+        drop(waiting)
 
 
 def load_files(

@@ -10,8 +10,8 @@ from __future__ import annotations
 import struct
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from itertools import accumulate, pairwise
 from threading import Lock, local
 from typing import BinaryIO, NamedTuple, TypeAlias
@@ -21,7 +21,7 @@ import numpy as np
 import zstandard
 
 from spatial_replay.compiled import bytes_at, copying_kernel, integers_at
-from spatial_replay.cores import cores
+from spatial_replay.cores import Work, drop
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.byte_ranges import is_planned, plan_reads
 from spatial_replay.logs.checksums import crc32, joined_checksum
@@ -56,8 +56,6 @@ _AHEAD, _AHEAD_BYTES = 24, 2**24
 """How many times as many are read ahead, at most, and their bytes: more than a block of samples has."""
 _LEAST_AHEAD = 8
 """So many are read ahead however large they are, so that each thread has work."""
-_MOST_THREADS = 4
-"""More would wait for the one that takes what they have read."""
 _MOST_SPREAD = 1.5
 """Times their own bytes that chunks and what lies between them may have, to be read at once."""
 
@@ -192,27 +190,22 @@ def iter_records(
     """
     plan_places(stream, places)
     reader = _GroupReader(stream, passed_over, prepare)
-    waiting: deque[tuple[int, Future[_Found]]] = deque()
-    ahead = several = 0
-    with ThreadPoolExecutor(min(cores(), _MOST_THREADS), "chunk-reading") as readers:
-        try:
-            for group in _groups(places):
-                size = sum(place.length for place in group)
-                waiting.append((size, readers.submit(reader.read, group)))
-                ahead += size
-                if len(waiting) > _AHEAD or (ahead > _AHEAD_BYTES and len(waiting) > _LEAST_AHEAD):
-                    # several at once: when the caller wakes up, a thread that reads may have to wait
-                    several = min(several + 1, len(waiting) // 2)
-                    waiting[several - 1][1].result()
-                    for _ in range(several):
-                        size, ready = waiting.popleft()
-                        ahead -= size
-                        yield from ready.result()
-            for _, ready in waiting:
+    waiting: deque[tuple[int, Work[_Found]]] = deque()
+    ahead = 0
+    try:
+        for group in _groups(places):
+            size = sum(place.length for place in group)
+            waiting.append((size, Work(partial(reader.read, group), waits=is_planned(stream))))
+            ahead += size
+            if len(waiting) > _AHEAD or (ahead > _AHEAD_BYTES and len(waiting) > _LEAST_AHEAD):
+                size, ready = waiting.popleft()
+                ahead -= size
                 yield from ready.result()
-        finally:
-            # a caller that has seen enough does not wait for the rest
-            readers.shutdown(cancel_futures=True)
+        while waiting:
+            yield from waiting.popleft()[1].result()
+    finally:
+        # a caller that has seen enough does not wait for the rest
+        drop(work for _, work in waiting)
 
 
 def _groups(places: Sequence[ChunkPlace]) -> Iterator[Sequence[ChunkPlace]]:

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, Self
@@ -20,7 +20,7 @@ import numpy as np
 from mcap import records
 
 from spatial_replay.compiled import elementwise, long_kernel
-from spatial_replay.cores import cores
+from spatial_replay.cores import Work, drop
 from spatial_replay.errors import OutputError
 from spatial_replay.geometry.arrays import Integers, counts_from_starts
 from spatial_replay.logs.mcap.chunk_content import Batch, MessageRange, OpenChunk
@@ -42,10 +42,8 @@ REPEAT_NS = 5 * 10**9
 declares it. In every chunk, schemas would add 15 % to an annotated log; so they add up to 5 %."""
 TOGETHER_BYTES = 4 * CHUNK_BYTES
 """So much is packed at once: messages are encoded together, and stay in the cache of the processor."""
-WAITING_BYTES = 256 * 2**20
+WAITING_BYTES = 64 * 2**20
 """Bytes of chunks that may wait for their compression: pictures and clouds of points make large ones."""
-THREADS = 4
-"""The most threads that pack chunks, if there are so many processors."""
 
 
 @dataclass(slots=True)
@@ -106,8 +104,7 @@ class LogWriter:
         self._lanes = (_Lane(), _Lane())
         self._began_ns = np.zeros(len(self._lanes), np.int64)
         self._undue: tuple[frozenset[int], int] = frozenset(), 0
-        self._workers = ThreadPoolExecutor(min(THREADS, cores()), "chunk-packing")
-        self._packing: deque[tuple[int, Future[PackedChunks]]] = deque()
+        self._packing: deque[tuple[int, Work[PackedChunks]]] = deque()
         self._packing_bytes = 0
         self._closed = False
         self._write(MAGIC)
@@ -120,7 +117,7 @@ class LogWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if isinstance(error, OutputError):
-            self._workers.shutdown(cancel_futures=True)
+            drop(work for _, work in self._packing)
         else:
             self.close()
 
@@ -204,7 +201,7 @@ class LogWriter:
             self._write(self._summary.section(self._offset) + MAGIC)
             self._flush_stream()
         finally:
-            self._workers.shutdown(cancel_futures=True)
+            drop(work for _, work in self._packing)
 
     def _numbers(self, messages: Messages) -> tuple[Integers, Integers]:
         """Return (M,) channel numbers and (M,) lanes; channels that are new are numbered as they come."""
@@ -258,7 +255,7 @@ class LogWriter:
             together.append(chunk)
             size += chunk.size
             if size >= TOGETHER_BYTES or number == len(closed):
-                self._packing.append((size, self._workers.submit(pack, together)))
+                self._packing.append((size, Work(partial(pack, together))))
                 self._packing_bytes += size
                 self._write_packed(WAITING_BYTES)
                 together, size = [], 0
@@ -280,7 +277,7 @@ class LogWriter:
 
     def _write_packed(self, waiting_bytes: int) -> None:
         """Write chunks in their order until no more bytes are waiting, and those that are ready."""
-        while self._packing and (self._packing_bytes > waiting_bytes or self._packing[0][1].done()):
+        while self._packing and (self._packing_bytes > waiting_bytes or self._packing[0][1].is_done):
             size, packing = self._packing.popleft()
             packed = packing.result()
             self._summary.add(packed, self._offset)
