@@ -1,4 +1,4 @@
-"""Work that is handed out is done once, by whichever thread, and nobody waits forever."""
+"""Work that is handed out is done once, by one thread or another, and no thread waits forever."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def count(done, tree):
 
 
 @given(st.lists(TREES, min_size=1, max_size=4))
-def test_work_within_work_is_done_once_whoever_hands_it_out(trees):
+def test_work_within_work_is_done_once_on_one_thread_or_another(trees):
     done = [[] for _ in trees]
     with ThreadPoolExecutor(len(trees)) as threads:
         counted = list(threads.map(count, done, trees))

@@ -27,7 +27,7 @@ from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.trace import ABSENT, Trace
 
 _MOST_WAITING = 8
-_MOST_WAITING_BYTES = 64 * 2**20
+_MOST_WAITING_BYTES = 16 * 2**20
 """Pieces of an evaluation, and bytes of them, that may wait to be hashed when another one comes, so that
 memory stays bounded."""
 

@@ -7,11 +7,14 @@ import os
 import random
 import re
 from contextlib import suppress
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 import pytest
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from mcap.exceptions import EndOfFile
 from mcap.reader import make_reader
 from mcap.records import Message
@@ -289,6 +292,41 @@ def test_an_index_lets_a_window_skip_the_rest(log):
     part = Trace.concatenate([b.trace for b in source.iter_blocks(4 * 10**9, 8 * 10**9)])
     assert part == trace.slice(10, 20)
     assert not part.faults
+
+
+# of each stretch of chunks, which channels have messages in it, and how many chunks it has
+STRETCHES = st.lists(
+    st.tuples(st.sets(st.integers(0, 3), min_size=1), st.sampled_from([1, 2, 3, 7, 130, 260])),
+    min_size=1,
+    max_size=6,
+)
+
+
+@given(STRETCHES, st.integers(0, 3))
+@settings(max_examples=25)
+def test_of_many_chunks_those_with_a_topic_are_found(tmp_path_factory, stretches, wanted):
+    channels = [Channel(f"/camera{number}", "json", None) for number in range(4)]
+    path = tmp_path_factory.mktemp("stretches") / "run.mcap"
+    with path.open("wb") as stream, LogWriter(stream, chunk_ns=10**9) as writer:
+        writer.write_messages(messages(SAMPLES, [0], encode_objects(moving_cup(1))))
+        seconds = iter(range(10_000))
+        for numbers, count in stretches:
+            for second in islice(seconds, count):
+                for number in sorted(numbers):
+                    times = [second * 10**9 + number * 10**8, second * 10**9 + 5 * 10**8 + number]
+                    writer.write_messages(messages(channels[number], times, [b"{}", b"[]"]))
+    topic = channels[wanted].topic
+    with path.open("rb") as stream:
+        expected = [(m.log_time, m.data) for _, _, m in make_reader(stream).iter_messages([topic])]
+    found = list[tuple[int, bytes]]()
+    for block in McapSource(path, keep=(topic,)).iter_blocks():
+        times = block.messages.log_time_ns
+        found += [
+            (int(times[place]), bytes(block.messages.payloads[place]))
+            for place, number in enumerate(block.messages.channel.tolist())
+            if block.messages.channels[number].topic == topic
+        ]
+    assert found == expected
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="the system does not say how many cores")

@@ -11,7 +11,7 @@ import tempfile
 import time
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
@@ -21,6 +21,7 @@ import numpy as np
 import zstandard
 from mcap.reader import make_reader
 
+from spatial_replay.cores import cores
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.logs.messages import Block
 from spatial_replay.logs.source import samples_only
@@ -120,12 +121,10 @@ def bench_reading(measure: Any) -> None:
             first = measure("reading", lambda _: read("0"), limit_s=5e-6, **per_sample)
             measure("reading and keeping", lambda _: read("4"), **(per_sample | {"runs": 1, "warmups": 0}))
             measure("reading again", lambda _: read("4"), limit_s=0.5e-6, **per_sample)
-            cores = os.sched_getaffinity(0)
-            if len(cores) > 1:
-                os.sched_setaffinity(0, {min(cores)})
-                one = measure("reading with one core", lambda _: read("0"), **per_sample)
-                os.sched_setaffinity(0, cores)
-                measure.ratio(f"{len(cores)} cores, time of one", first.median_s / one.median_s, 1 / 1.7)
+            if cores() > 1:
+                with _on_one_core():
+                    one = measure("reading with one core", lambda _: read("0"), **per_sample)
+                measure.ratio(f"{cores()} cores, time of one", first.median_s / one.median_s, 1 / 1.7)
         finally:
             for name, value in kept.items():
                 if value is None:
@@ -177,14 +176,27 @@ def bench_annotating(measure: Any) -> None:
         bare = measure("compressed, checksums, no more", lambda _: _compressed(chunks), **per_sample)
         first = measure("replay -o", timed, limit_s=15e-6, **per_sample)
         measure.ratio("processor time, times bare", median(processor_s) / count / bare.median_s, 6.0)
-        cores = os.sched_getaffinity(0)
-        if len(cores) > 1:
-            try:
-                os.sched_setaffinity(0, {min(cores)})
+        if cores() > 1:
+            with _on_one_core():
                 one = measure("replay -o with one core", annotate, **per_sample)
-            finally:
-                os.sched_setaffinity(0, cores)
-            measure.ratio(f"{len(cores)} cores, time of one", first.median_s / one.median_s, 1 / 1.7)
+            measure.ratio(f"{cores()} cores, time of one", first.median_s / one.median_s, 1 / 1.7)
+
+
+@contextmanager
+def _on_one_core() -> Iterator[None]:
+    """Have all threads of this process run on one core, those that it has started already, too."""
+    chosen = os.sched_getaffinity(0)
+    try:
+        _pin_threads({min(chosen)})
+        yield
+    finally:
+        _pin_threads(chosen)
+
+
+def _pin_threads(chosen: set[int]) -> None:
+    for thread in Path("/proc/self/task").iterdir():
+        with suppress(ProcessLookupError):
+            os.sched_setaffinity(int(thread.name), chosen)
 
 
 @contextmanager

@@ -11,9 +11,11 @@ import struct
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from heapq import merge
+from itertools import repeat
 from types import MappingProxyType
 from typing import BinaryIO
 
+import numpy as np
 from mcap import records
 from mcap.opcode import Opcode
 
@@ -28,6 +30,9 @@ from spatial_replay.text import Instant, Sentence
 _FOOTER_BYTES = RECORD_HEAD.size + 20
 _CHUNK_HEAD_BYTES = 64
 _CHUNK_INDEX = struct.Struct("<QQQQI")
+_CHUNK_INDEX_HEAD = RECORD_HEAD.size + _CHUNK_INDEX.size
+_MOST_ALIKE = 128
+"""Indexes of chunks that are taken in together, at most."""
 _MESSAGE_INDEX = struct.Struct("<H8x")
 """Of which only the channel matters here."""
 _LOOSE_BYTES = 2**22
@@ -122,8 +127,14 @@ def _from_summary(stream: BinaryIO, size: int) -> Directory:
     has_checksum = footer.summary_crc or _is_own(directory.header)
     if has_checksum and crc32(section + tail[: _FOOTER_BYTES - 4]) != footer.summary_crc:
         raise DamageError("the summary's checksum does not fit")
-    for opcode, body in _iter_bodies(section):
+    position = 0
+    while position < len(section):
+        if count := _take_in_alike(directory, section, position):
+            position += count * (RECORD_HEAD.size + RECORD_HEAD.unpack_from(section, position)[1])
+            continue
+        opcode, body = _body(section, position)
         _take_in(directory, opcode, body)
+        position += RECORD_HEAD.size + len(body)
     _check_complete(directory, footer.summary_start)
     directory.chunks.sort(key=lambda place: place.offset)
     return directory
@@ -141,17 +152,50 @@ def _header(stream: BinaryIO) -> records.Header | None:
     return header
 
 
-def _iter_bodies(section: bytes) -> Iterator[tuple[int, bytes]]:
-    position = 0
-    while position < len(section):
-        if len(section) - position < RECORD_HEAD.size:
-            raise DamageError("the summary breaks off")
-        opcode, length = RECORD_HEAD.unpack_from(section, position)
-        position += RECORD_HEAD.size
-        if length > len(section) - position:
-            raise DamageError("the summary breaks off")
-        yield opcode, section[position : position + length]
-        position += length
+def _body(section: bytes, position: int) -> tuple[int, bytes]:
+    """Return the opcode and the body of the record at a position."""
+    if len(section) - position < RECORD_HEAD.size:
+        raise DamageError("the summary breaks off")
+    opcode, length = RECORD_HEAD.unpack_from(section, position)
+    position += RECORD_HEAD.size
+    if length > len(section) - position:
+        raise DamageError("the summary breaks off")
+    return opcode, section[position : position + length]
+
+
+def _take_in_alike(directory: Directory, section: bytes, position: int) -> int:
+    """Take in the indexes of chunks at a position, as long as they have the channels of the first.
+
+    Together they take a third of the time: a long log has very many, and nothing is read before them.
+
+    Returns:
+        How many there are; 0 where the first two are not alike.
+    """
+    record = section[position : position + _CHUNK_INDEX_HEAD]
+    if len(record) < _CHUNK_INDEX_HEAD or record[0] != Opcode.CHUNK_INDEX:
+        return 0
+    size = RECORD_HEAD.size + RECORD_HEAD.unpack_from(record)[1]
+    if section[position + size : position + size + RECORD_HEAD.size] != record[: RECORD_HEAD.size]:
+        return 0
+    indexed = _CHUNK_INDEX.unpack_from(record, RECORD_HEAD.size)[-1]
+    count = min((len(section) - position) // size, _MOST_ALIKE)
+    if count < 2 or _CHUNK_INDEX_HEAD + indexed > size:
+        return 0
+    rows = np.frombuffer(section, np.uint8, count * size, position).reshape(count, size)
+    is_same = np.zeros(_CHUNK_INDEX_HEAD + indexed, np.bool_)
+    # opcode and length, the length of the message indexes, and of each of these its channel
+    is_same[: RECORD_HEAD.size] = is_same[_CHUNK_INDEX_HEAD - 4 : _CHUNK_INDEX_HEAD] = True
+    is_same[_CHUNK_INDEX_HEAD :: _MESSAGE_INDEX.size] = True
+    is_same[_CHUNK_INDEX_HEAD + 1 :: _MESSAGE_INDEX.size] = True
+    known = rows[:, : len(is_same)][:, is_same]
+    differing = np.flatnonzero((known != known[0]).any(axis=1))
+    count = int(differing[0]) if len(differing) else count
+    numbers = rows[:count, RECORD_HEAD.size : _CHUNK_INDEX_HEAD - 4].copy().view("<u8")
+    start_ns, end_ns, offset, length = numbers.T.tolist()
+    channels = _indexed_channels(section[position + RECORD_HEAD.size : position + size], indexed)
+    beside = repeat(True), repeat(channels), repeat(_is_own(directory.header))
+    directory.chunks += map(ChunkPlace, offset, length, start_ns, end_ns, *beside)
+    return count
 
 
 def _take_in(directory: Directory, opcode: int, body: bytes) -> None:
