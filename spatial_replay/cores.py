@@ -2,24 +2,31 @@
 
 As many threads work as there are cores, with the one that hands work out: more of them would take the
 interpreter's lock from each other, and leave cores idle while they do. So no thread waits for work that has
-not begun: the one that needs its result does it, or, while another is at it, some of the work that waits.
+not begun: the one that needs its result does it, or, while another is at it, some of its own work that waits.
+
+The main thread may be interrupted between any two steps (Ctrl-C). What it has begun then has an outcome all
+the same, or begins again elsewhere; no thread waits for it forever, and nothing that others have handed out
+is touched.
 """
 
 from __future__ import annotations
 
+import atexit
 import os
 from collections import deque
 from collections.abc import Callable, Iterable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import CancelledError
 from contextlib import suppress
 from functools import cache, partial
-from typing import Any, Generic, TypeAlias, TypeVar
+from queue import SimpleQueue
+from threading import Lock, Thread, get_ident
+from typing import Any, Final, Generic, TypeAlias, TypeVar, cast
 
 _Result = TypeVar("_Result")
-_Waiting: TypeAlias = "list[tuple[Callable[[], _Result], Future[_Result]]]"
-"""What to do, and where its result goes; empty once a thread has begun."""
+_Claim: TypeAlias = tuple[int]
+"""The thread that does the work, or 0 for none; compared by identity."""
 
-_MOST_THREADS = 7
+_MOST_THREADS: Final = 7
 """More would wait for the one that hands work out."""
 
 
@@ -29,42 +36,112 @@ def cores() -> int:
 
 
 class Work(Generic[_Result]):
-    """Something to do, on another thread or on the one that cannot go on without it."""
+    """Something to do, by another thread or by the one that cannot go on without it."""
 
     def __init__(self, run: Callable[[], _Result], *, waits: bool = False) -> None:
-        """Hand it out.
+        """Prepare it; `hand_out` is apart, so that what has to drop it can know it before it begins.
 
         Args:
-            waits: it may wait for other work, or for what is not on this machine, so no thread does it in
-                between: only one that has nothing else to do, or that needs it.
+            waits: it may wait for other work, or for another machine, so threads take it when there is no
+                other; nor may it be repeated, as all else may that was interrupted.
         """
-        self._result = Future[_Result]()
-        self._waiting = [(run, self._result)]
-        _threads().hand_out(self._waiting, waits=waits)
+        self.waits = waits
+        self._run = run
+        self._claims: dict[str, _Claim] = {}
+        self._outcome: tuple[_Result | None, BaseException | None] | None = None
+        self._waiters: list[Any] = []
 
     @property
     def is_done(self) -> bool:
         """Whether there is a result, or an error."""
-        return self._result.done()
+        return self._outcome is not None
+
+    def hand_out(self) -> None:
+        """Let other threads do it."""
+        _pool().take(self)
 
     def result(self) -> _Result:
-        """Return the result, or raise the error, once it is done."""
-        _do(self._waiting)
-        while not self.is_done and _threads().do_one():
-            pass
-        return self._result.result()
+        """Return the result, or raise the error, once it is done.
+
+        Raises:
+            CancelledError: it was dropped.
+        """
+        self.do()
+        self.wait()
+        value, error = cast("tuple[_Result, BaseException | None]", self._outcome)
+        if error is not None:
+            raise error
+        return value
+
+    def do(self) -> bool:
+        """Do it on this thread, unless a thread has begun; return whether it was done."""
+        if self._claims:
+            return False
+        _pool().forget(self)
+        return self.do_taken()
+
+    def do_taken(self) -> bool:
+        """Do what is in no line any more; see `do`."""
+        claim = (get_ident(),)
+        try:
+            if self._claims.setdefault("", claim) is not claim:
+                return False
+            self._settle(self._run(), None)
+        except BaseException as error:
+            if self._claims.get("") is not claim:
+                raise
+            if not isinstance(error, Exception) and not self.waits and self._outcome is None:
+                self._claims.clear()
+                self.hand_out()
+                raise
+            self._settle(None, error)
+            if not isinstance(error, Exception):
+                raise
+        return True
+
+    def wait(self) -> None:
+        """Wait until it is over."""
+        own = Lock()
+        own.acquire()
+        self._waiters.append(own)
+        if self._outcome is None:
+            own.acquire()
+
+    def refuse(self) -> None:
+        """Have no thread begin with it; what this one has begun, and was kept from ending, is over."""
+        claim = self._claims.setdefault("", (0,))
+        if claim[0] in (0, get_ident()):
+            self._settle(None, CancelledError("the work was dropped"))
+            _pool().forget(self)
+
+    def _settle(self, value: _Result | None, error: BaseException | None) -> None:
+        if self._outcome is None:
+            self._outcome = value, error
+        # what it holds is not needed any more
+        self._run = cast(Any, None)
+        with suppress(IndexError):
+            while True:
+                self._waiters.pop().release()
+
+
+def first_result(works: Iterable[Work[_Result]]) -> _Result:
+    """Return the result of the first; as long as another thread is at it, do the others on this one."""
+    first, *others = works
+    first.do()
+    for work in others:
+        if first.is_done:
+            break
+        work.do()
+    return first.result()
 
 
 def drop(works: Iterable[Work[Any]]) -> None:
-    """Have no thread begin with work, and wait until none is at it; it has no result unless it was done."""
+    """Have no thread begin with work, and wait until no other is at it."""
     dropped = list(works)
     for work in dropped:
-        with suppress(IndexError):
-            _, result = work._waiting.pop()
-            result.cancel()
+        work.refuse()
     for work in dropped:
-        if not work._result.cancelled():
-            work._result.exception()
+        work.wait()
 
 
 def over_cores(
@@ -83,68 +160,63 @@ def over_cores(
     ends = [count * share // shares for share in range(shares + 1)]
     others = [Work(partial(run, *ends[share : share + 2])) for share in range(1, shares)]
     try:
+        for each in others:
+            each.hand_out()
         run(0, ends[1])
-    except BaseException:
+        for each in others:
+            each.result()
+    finally:
         drop(others)
-        raise
-    for each in others:
-        each.result()
 
 
-class _Threads:
+class _Pool:
     """The threads of this process that do what others hand out."""
 
     def __init__(self) -> None:
-        self._threads = ThreadPoolExecutor(min(max(cores() - 1, 1), _MOST_THREADS), "sharing")
-        self._short: deque[_Waiting[Any]] = deque()
-        self._long: deque[_Waiting[Any]] = deque()
+        # taken from in one step each, so that an interruption leaves nothing locked
+        self._calls: SimpleQueue[bool] = SimpleQueue()
+        self._short: deque[Work[Any]] = deque()
+        self._long: deque[Work[Any]] = deque()
+        count = min(max(cores() - 1, 1), _MOST_THREADS)
+        self._threads = [Thread(target=self._do_all, name="sharing", daemon=True) for _ in range(count)]
+        for thread in self._threads:
+            thread.start()
+        atexit.register(self._end)
 
-    def hand_out(self, waiting: _Waiting[Any], *, waits: bool) -> None:
-        (self._long if waits else self._short).append(waiting)
-        # while the interpreter ends, no thread takes anything any more: then the one that needs it does it
-        with suppress(RuntimeError):
-            self._threads.submit(self._do_any)
+    def take(self, work: Work[Any]) -> None:
+        (self._long if work.waits else self._short).append(work)
+        self._calls.put(True)
 
-    def do_one(self) -> bool:
-        """Do on this thread the first that waits for nothing itself; return whether there is any."""
-        return _do_first(self._short)
+    def forget(self, work: Work[Any]) -> None:
+        """Keep no work whose result somebody has."""
+        with suppress(ValueError):
+            (self._long if work.waits else self._short).remove(work)
 
-    def _do_any(self) -> None:
-        if not self.do_one():
-            _do_first(self._long)
+    def _do_all(self) -> None:
+        while self._calls.get():
+            # errors are those of the work, and raised where its result is needed
+            with suppress(BaseException):
+                self._do_one()
+
+    def _do_one(self) -> None:
+        for works in (self._short, self._long):
+            with suppress(IndexError):
+                while not works.popleft().do_taken():
+                    pass
+                return
+
+    def _end(self) -> None:
+        for _ in self._threads:
+            self._calls.put(False)
+        for thread in self._threads:
+            thread.join()
 
 
 @cache
-def _threads() -> _Threads:
-    return _Threads()
+def _pool() -> _Pool:
+    return _Pool()
 
 
 if hasattr(os, "register_at_fork"):
     # a process that is forked has none of the threads
-    os.register_at_fork(after_in_child=_threads.cache_clear)
-
-
-def _do_first(several: deque[_Waiting[Any]]) -> bool:
-    """Do the first with which no thread has begun; return whether there is any."""
-    with suppress(IndexError):
-        while not _do(several.popleft()):
-            pass
-        return True
-    return False
-
-
-def _do(waiting: _Waiting[Any]) -> bool:
-    """Do what waits, unless a thread has begun with it; return whether it was done."""
-    try:
-        run, result = waiting.pop()
-    except IndexError:
-        return False
-    try:
-        result.set_result(run())
-    except Exception as error:
-        result.set_exception(error)
-    except BaseException as error:
-        # an interruption is for the thread that it came to, too
-        result.set_exception(error)
-        raise
-    return True
+    os.register_at_fork(after_in_child=_pool.cache_clear)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -20,13 +21,19 @@ from spatial_replay.cores import Work, drop
 TREES = st.recursive(st.just([]), lambda inner: st.lists(inner, max_size=4), max_leaves=30)
 
 
+def handed_out(run, *, waits=False):
+    work = Work(run, waits=waits)
+    work.hand_out()
+    return work
+
+
 def leaves(tree):
     return sum(map(leaves, tree)) if tree else 1
 
 
 def count(done, tree):
     done.append(tree)
-    parts = [Work(partial(count, done, each), waits=bool(each)) for each in tree]
+    parts = [handed_out(partial(count, done, each), waits=bool(each)) for each in tree]
     # the last one first: that of which nothing is done, more likely
     return sum(part.result() for part in reversed(parts)) if tree else 1
 
@@ -45,7 +52,7 @@ def nodes(tree):
 
 
 def test_an_error_is_raised_where_the_result_is_needed():
-    works = [Work(partial(divmod, 7, divisor)) for divisor in (2, 0, 4)]
+    works = [handed_out(partial(divmod, 7, divisor)) for divisor in (2, 0, 4)]
     assert works[2].result() == (1, 3)
     for _ in range(2):
         with pytest.raises(ZeroDivisionError):
@@ -54,13 +61,73 @@ def test_an_error_is_raised_where_the_result_is_needed():
     assert works[0].result() == (3, 1)
 
 
-def test_an_interruption_reaches_the_thread_that_it_came_to():
-    def interrupted():
-        raise KeyboardInterrupt
+@pytest.mark.parametrize("waits", [False, True])
+def test_an_interruption_reaches_the_thread_that_it_came_to(waits):
+    main, runs = threading.get_ident(), []
 
+    def interrupted_here():
+        runs.append(threading.get_ident())
+        if runs[-1] == main:
+            raise KeyboardInterrupt
+        return 3
+
+    work = Work(interrupted_here, waits=waits)
     with pytest.raises(KeyboardInterrupt):
-        Work(interrupted).result()
-    assert Work(lambda: 3).result() == 3
+        work.result()
+    if waits:  # what may not be repeated is over
+        with pytest.raises(KeyboardInterrupt):
+            work.result()
+    else:
+        while not work.is_done:
+            threading.Event().wait(0.001)
+        assert work.result() == 3
+    assert len(runs) == 1 + (not waits)
+
+
+@pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="the system has no timers that interrupt")
+def test_interrupted_at_any_step_nothing_waits_forever_and_no_work_of_others_is_lost():
+    program = """
+import signal, sys, threading, time, random
+from spatial_replay.cores import Work, drop, first_result
+
+def handed_out(run, **options):
+    works.append(Work(run, **options))
+    works[-1].hand_out()
+    return works[-1]
+
+def others(count):
+    for n in range(count):
+        own = [Work(lambda n=n: n * n) for _ in range(3)]
+        for each in own: each.hand_out()
+        assert [each.result() for each in own] == [n * n] * 3
+        done.append(n)
+
+done, interruptions, mixed = [], 0, random.Random(2)
+thread = threading.Thread(target=others, args=(20_000,))
+thread.start()
+signal.signal(signal.SIGALRM, signal.default_int_handler)
+end = time.monotonic() + 3
+while time.monotonic() < end:
+    works = []
+    try:
+        signal.setitimer(signal.ITIMER_REAL, mixed.uniform(5e-5, 2e-3))
+        try:
+            for n in range(1_000):
+                short = [handed_out(lambda n=n: n + 1) for _ in range(3)]
+                before = handed_out(lambda: 1, waits=True)
+                after = handed_out(lambda: before.result() + 1, waits=True)
+                assert first_result(short) == n + 1 and after.result() == 2
+        finally:
+            drop(works)
+        signal.setitimer(signal.ITIMER_REAL, 0)
+    except KeyboardInterrupt:
+        interruptions += 1
+signal.setitimer(signal.ITIMER_REAL, 0)
+thread.join()
+print(interruptions > 100, len(done))
+"""
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=120)
+    assert (result.stdout.split(), result.returncode) == (["True", "20000"], 0), result.stderr
 
 
 def test_dropped_work_is_not_done_and_what_was_begun_is_over():
@@ -72,7 +139,7 @@ def test_dropped_work_is_not_done_and_what_was_begun_is_over():
         did.append("long")
 
     # more than there are threads, so that none is left for the last
-    works = [Work(long) for _ in range(32)] + [Work(partial(did.append, "never"), waits=True)]
+    works = [handed_out(long) for _ in range(32)] + [handed_out(partial(did.append, "never"), waits=True)]
     assert begun.wait(60)
 
     def end_once_the_last_is_dropped():
@@ -97,10 +164,10 @@ def test_dropped_work_is_not_done_and_what_was_begun_is_over():
     "program",
     [
         # the last words of a process come after those of its threads
-        "import atexit; atexit.register(lambda: print(Work(lambda: 6).result()))",
+        "import atexit; atexit.register(lambda: print(handed_out(lambda: 6).result()))",
         pytest.param(
-            "import os\nWork(int).result()\n"
-            "if os.fork() == 0: print(Work(lambda: 6).result(), flush=True); os._exit(0)\n"
+            "import os\n"
+            "if os.fork() == 0: print(handed_out(lambda: 6).result(), flush=True); os._exit(0)\n"
             "os.wait()",
             marks=pytest.mark.skipif(not hasattr(os, "fork"), reason="the system does not fork processes"),
         ),
@@ -108,6 +175,16 @@ def test_dropped_work_is_not_done_and_what_was_begun_is_over():
     ids=["ending", "forked"],
 )
 def test_work_is_done_where_no_thread_takes_any(program):
-    program = f"from spatial_replay.cores import Work\nWork(int).result()\n{program}"
+    program = f"""
+from spatial_replay.cores import Work
+
+def handed_out(run):
+    work = Work(run)
+    work.hand_out()
+    return work
+
+handed_out(int).result()
+{program}
+"""
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
     assert (result.stdout.strip(), result.returncode) == ("6", 0), result.stderr

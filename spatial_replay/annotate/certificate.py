@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spatial_replay import __version__
-from spatial_replay.cores import Work
+from spatial_replay.cores import Work, drop
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.messages import Messages
 from spatial_replay.logs.payloads import columns_of, side_by_side
@@ -54,15 +54,21 @@ class Hashing:
         self._waiting_bytes += size
         self._last = Work(partial(_after, self._last, add), waits=True)
         self._waiting.append((size, self._last))
+        self._last.hand_out()
 
     def finish(self) -> None:
         """Wait until everything was taken in."""
         while self._waiting:
             self._await_first()
 
+    def give_up(self) -> None:
+        """Take in no more."""
+        drop(hashed for _, hashed in self._waiting)
+
     def _await_first(self) -> None:
-        size, hashed = self._waiting.popleft()
+        size, hashed = self._waiting[0]
         hashed.result()
+        self._waiting.popleft()
         self._waiting_bytes -= size
 
 
@@ -231,6 +237,11 @@ class EvaluationHashes:
         """Take in the next numbers of each result."""
         size = sum(block.series.nbytes for block in results)
         self._hashing[2].take(size, partial(self._take_in_results, results))
+
+    def give_up(self) -> None:
+        """Take in no more, since there will be no certificate."""
+        for hashing in self._hashing:
+            hashing.give_up()
 
     def _take_in_results(self, results: Sequence[SeriesBlock]) -> None:
         for index, block in enumerate(results):

@@ -17,7 +17,7 @@ from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.payloads import chosen_payloads, joined_payloads
 from spatial_replay.trace.trace import Trace
 
-BLOCK_SAMPLES = 8_192
+BLOCK_SAMPLES = 12_288
 """A block holds at most this many samples, so that memory stays bounded whatever the log's length."""
 
 

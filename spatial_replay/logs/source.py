@@ -189,6 +189,7 @@ def read_ahead(blocks: Generator[_Read, None, None]) -> Iterator[_Read]:
     try:
         while (block := waiting.result()) is not None:
             waiting = Work(partial(next, blocks, None), waits=True)
+            waiting.hand_out()
             yield block
     finally:
         drop([waiting])

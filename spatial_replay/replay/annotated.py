@@ -112,8 +112,10 @@ def _behind(write: Callable[[Messages], None]) -> Iterator[Callable[[Messages], 
     def write_behind(messages: Messages) -> None:
         # no more than these wait, so that memory stays bounded
         while waiting:
-            waiting.pop().result()
+            waiting[0].result()
+            waiting.clear()
         waiting.append(Work(partial(write, messages), waits=True))
+        waiting[0].hand_out()
 
     try:
         yield write_behind

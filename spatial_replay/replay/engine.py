@@ -161,8 +161,23 @@ class Replay:
             UsageError: no sample in the window.
             SpecificationError: names that the log never has, if names are strict.
         """
+        try:
+            self._pass(write, layer=layer, advance=advance)
+        except BaseException:
+            if self._hashes is not None:
+                self._hashes.give_up()
+            raise
+        replayed = self._replayed()
+        if write is not None:
+            write(self._evaluation.end(self._end_ns, [each.vacuous for each in replayed.results]))
+        return replayed
+
+    def _pass(
+        self, write: Callable[[Messages], None] | None, *, layer: bool, advance: Callable[[int], None]
+    ) -> None:
+        """Evaluate all samples; see `run`."""
         needs_messages = write is not None or self._hashes is not None
-        # on the thread that reads: the next block is evaluated while messages of this one are made
+        # the next block is evaluated while messages of this one are made, if a core is free for that
         for block, trace, stretches in read_ahead(self._evaluated(messages=needs_messages)):
             self._traces.add(trace)
             inside = self._selection.inside(trace)
@@ -179,10 +194,6 @@ class Replay:
                 derived = self._evaluation.messages(inside, stretches)
                 write(merge([*derived, *([] if layer else [own])]))
             advance(len(inside))
-        replayed = self._replayed()
-        if write is not None:
-            write(self._evaluation.end(self._end_ns, [each.vacuous for each in replayed.results]))
-        return replayed
 
     @property
     def automata(self) -> Sequence[SpecAutomaton]:

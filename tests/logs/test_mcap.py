@@ -45,7 +45,7 @@ from spatial_replay.logs import (
     summarise_mcap,
 )
 from spatial_replay.logs.mcap.writer import CHUNK_BYTES
-from spatial_replay.logs.messages import BLOCK_SAMPLES
+from spatial_replay.logs.messages import BLOCK_SAMPLES, select
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.topics import OBJECTS, ROBUSTNESS, protobuf_channel
 from spatial_replay.sources import open_source
@@ -347,6 +347,20 @@ def test_what_is_read_and_written_does_not_depend_on_the_number_of_cores(log, tm
         outputs.append((tmp_path / "out.mcap").read_bytes())
     assert outputs[0] == outputs[1]
     assert traces[0] == traces[1] == moving_cup(250)
+
+
+def test_blocks_may_end_within_chunks_of_samples_that_others_overlap(tmp_path):
+    trace, path = moving_cup(1_300, 10**7), tmp_path / "run.mcap"
+    camera = messages(Channel("/camera", "json", None), trace.times_ns + 1, [b"0" * 9_000] * len(trace))
+    with path.open("wb") as stream, LogWriter(stream) as writer:
+        for begin in range(0, len(trace), 10):
+            part = trace.slice(begin, begin + 10)
+            writer.write_messages(messages(SAMPLES, part.times_ns, encode_objects(part)))
+            writer.write_messages(select(camera, np.arange(begin, begin + 10)))
+    blocks = list(open_source(path).iter_blocks())
+    assert len(blocks) > 1
+    assert Trace.concatenate([block.trace for block in blocks]) == trace
+    assert sum(len(block.messages) for block in blocks) == 2 * len(trace)
 
 
 def test_all_messages_but_derived_ones_are_copied_as_they_are(log):

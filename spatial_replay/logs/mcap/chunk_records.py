@@ -316,7 +316,8 @@ class RawMessages:
 def _divided(
     columns: Sequence[SampleColumns], count: int
 ) -> tuple[tuple[SampleColumns, ...], tuple[SampleColumns, ...]]:
-    first, rest = list[SampleColumns](), list[SampleColumns]()
+    first: list[SampleColumns] = []
+    rest: list[SampleColumns] = []
     for each in columns:
         if own := min(count, len(each)):
             first.append(each[:own])

@@ -21,7 +21,7 @@ import numpy as np
 import zstandard
 
 from spatial_replay.compiled import bytes_at, copying_kernel, integers_at
-from spatial_replay.cores import Work, drop
+from spatial_replay.cores import Work, drop, first_result
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.byte_ranges import is_planned, plan_reads
 from spatial_replay.logs.checksums import crc32, joined_checksum
@@ -196,13 +196,17 @@ def iter_records(
         for group in _groups(places):
             size = sum(place.length for place in group)
             waiting.append((size, Work(partial(reader.read, group), waits=is_planned(stream))))
+            waiting[-1][1].hand_out()
             ahead += size
             if len(waiting) > _AHEAD or (ahead > _AHEAD_BYTES and len(waiting) > _LEAST_AHEAD):
-                size, ready = waiting.popleft()
+                found = first_result(work for _, work in waiting)
+                size, _ = waiting.popleft()
                 ahead -= size
-                yield from ready.result()
+                yield from found
         while waiting:
-            yield from waiting.popleft()[1].result()
+            found = first_result(work for _, work in waiting)
+            waiting.popleft()
+            yield from found
     finally:
         # a caller that has seen enough does not wait for the rest
         drop(work for _, work in waiting)

@@ -181,6 +181,10 @@ def _take_in_alike(directory: Directory, section: bytes, position: int) -> int:
     count = min((len(section) - position) // size, _MOST_ALIKE)
     if count < 2 or _CHUNK_INDEX_HEAD + indexed > size:
         return 0
+    bodies = (section[at + RECORD_HEAD.size : at + size] for at in (position, position + size))
+    channels, following = (_indexed_channels(body, indexed) for body in bodies)
+    if channels != following:
+        return 0
     rows = np.frombuffer(section, np.uint8, count * size, position).reshape(count, size)
     is_same = np.zeros(_CHUNK_INDEX_HEAD + indexed, np.bool_)
     # opcode and length, the length of the message indexes, and of each of these its channel
@@ -192,7 +196,6 @@ def _take_in_alike(directory: Directory, section: bytes, position: int) -> int:
     count = int(differing[0]) if len(differing) else count
     numbers = rows[:count, RECORD_HEAD.size : _CHUNK_INDEX_HEAD - 4].copy().view("<u8")
     start_ns, end_ns, offset, length = numbers.T.tolist()
-    channels = _indexed_channels(section[position + RECORD_HEAD.size : position + size], indexed)
     beside = repeat(True), repeat(channels), repeat(_is_own(directory.header))
     directory.chunks += map(ChunkPlace, offset, length, start_ns, end_ns, *beside)
     return count

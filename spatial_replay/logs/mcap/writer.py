@@ -20,7 +20,7 @@ import numpy as np
 from mcap import records
 
 from spatial_replay.compiled import elementwise, long_kernel
-from spatial_replay.cores import Work, drop
+from spatial_replay.cores import Work, drop, first_result
 from spatial_replay.errors import OutputError
 from spatial_replay.geometry.arrays import Integers, counts_from_starts
 from spatial_replay.logs.mcap.chunk_content import Batch, MessageRange, OpenChunk
@@ -255,7 +255,9 @@ class LogWriter:
             together.append(chunk)
             size += chunk.size
             if size >= TOGETHER_BYTES or number == len(closed):
-                self._packing.append((size, Work(partial(pack, together))))
+                work = Work(partial(pack, together))
+                self._packing.append((size, work))
+                work.hand_out()
                 self._packing_bytes += size
                 self._write_packed(WAITING_BYTES)
                 together, size = [], 0
@@ -278,8 +280,8 @@ class LogWriter:
     def _write_packed(self, waiting_bytes: int) -> None:
         """Write chunks in their order until no more bytes are waiting, and those that are ready."""
         while self._packing and (self._packing_bytes > waiting_bytes or self._packing[0][1].is_done):
-            size, packing = self._packing.popleft()
-            packed = packing.result()
+            packed = first_result(work for _, work in self._packing)
+            size, _ = self._packing.popleft()
             self._summary.add(packed, self._offset)
             for piece in packed.data:
                 self._write(piece)
