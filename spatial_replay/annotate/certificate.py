@@ -36,7 +36,6 @@ class Hashing:
     """Hashes pieces of an evaluation in their order, on whichever core is free."""
 
     def __init__(self) -> None:
-        self._last: Work[None] | None = None
         self._waiting: deque[tuple[int, Work[None]]] = deque()
         self._waiting_bytes = 0
 
@@ -52,9 +51,10 @@ class Hashing:
         ):
             self._await_first()
         self._waiting_bytes += size
-        self._last = Work(partial(_after, self._last, add), waits=True)
-        self._waiting.append((size, self._last))
-        self._last.hand_out()
+        before = self._waiting[-1][1] if self._waiting else None
+        work = Work(partial(_after, before, add), waits=True)
+        self._waiting.append((size, work))
+        work.hand_out()
 
     def finish(self) -> None:
         """Wait until everything was taken in."""
@@ -220,7 +220,8 @@ class EvaluationHashes:
     def __init__(self, names: Sequence[tuple[str, str | None]]) -> None:
         """Start before the first sample; each result has a name and, of a template, an object."""
         self._samples, self._messages, self._results = SampleHash(), MessageHash(), ResultHash(names)
-        self._hashing = Hashing(), Hashing(), Hashing()
+        self._of_samples, self._of_messages, self._of_results = Hashing(), Hashing(), Hashing()
+        self._hashing = self._of_samples, self._of_messages, self._of_results
 
     def add(self, trace: Trace, own: Messages, results: Sequence[SeriesBlock]) -> None:
         """Take in the next samples, the log's own messages, and the numbers of each result."""
@@ -229,14 +230,14 @@ class EvaluationHashes:
 
     def add_samples(self, trace: Trace, own: Messages) -> None:
         """Take in the next samples and the log's own messages; their results follow, in any pieces."""
-        samples, messages, _ = self._hashing
-        samples.take(trace.nbytes, partial(self._samples.add, trace))
-        messages.take(int(columns_of(own.payloads).sizes.sum()), partial(self._messages.add, own))
+        self._of_samples.take(trace.nbytes, partial(self._samples.add, trace))
+        size = int(columns_of(own.payloads).sizes.sum())
+        self._of_messages.take(size, partial(self._messages.add, own))
 
     def add_results(self, results: Sequence[SeriesBlock]) -> None:
         """Take in the next numbers of each result."""
         size = sum(block.series.nbytes for block in results)
-        self._hashing[2].take(size, partial(self._take_in_results, results))
+        self._of_results.take(size, partial(self._take_in_results, results))
 
     def give_up(self) -> None:
         """Take in no more, since there will be no certificate."""

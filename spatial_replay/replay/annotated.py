@@ -111,10 +111,9 @@ def _behind(write: Callable[[Messages], None]) -> Iterator[Callable[[Messages], 
 
     def write_behind(messages: Messages) -> None:
         # no more than these wait, so that memory stays bounded
-        while waiting:
-            waiting[0].result()
-            waiting.clear()
-        waiting.append(Work(partial(write, messages), waits=True))
+        for each in waiting:
+            each.result()
+        waiting[:] = [Work(partial(write, messages), waits=True)]
         waiting[0].hand_out()
 
     try:

@@ -180,9 +180,9 @@ def iter_records(
 ) -> Iterator[tuple[Sequence[ChunkPlace], Records | DamageError]]:
     """Yield places with their records, or with the damage that `read_records` raised, in this order.
 
-    Sound chunks that follow each other come several at once, damaged ones alone. Other threads, one for each
-    core, read, decompress, check and split the next places while the caller processes some, so the caller
-    must not use the stream in between.
+    Sound chunks that follow each other come several at once, damaged ones alone. On free cores, other threads
+    read, decompress, check and split the next places while the caller processes some, so the caller must not
+    use the stream in between.
 
     Args:
         passed_over: channels whose messages are not wanted.
