@@ -48,7 +48,8 @@ NODE_CODE, NODE_A, NODE_B, NODE_WEAK, NODE_UNIT, NODE_LOW, NODE_HIGH = range(7)
 NODE_VARIABLE, NODE_TABLE, NODE_DEPENDS = 7, 8, 9  # the first two -1 for none
 NODE_TIMED = 10  # the number of a window or shift ahead in seconds, -1 for none
 NODE_CUTS = 11  # whether its windows cut a part's bound short (see `PART_IS_CUT`)
-NODE_WIDTH = 12
+NODE_ROWS = 12  # where its rows are in a block of samples, -1 for a literal (see `rows`)
+NODE_WIDTH = 13
 # codes of parts' nodes
 LITERAL = 0  # signal a, negated if b
 PART_AND, PART_OR = 2, 3
@@ -59,6 +60,8 @@ AHEAD_OF = (PART_WINDOW_MAX, PART_WINDOW_MIN, SHIFT)
 PAST_SINCE, PAST_TRIGGER = 9, 10  # max(b, min(a, previous)); min(b, max(a, previous))
 PAST_WINDOW_MAX, PAST_WINDOW_MIN = 11, 12
 PAST_DELAY = 13
+PAST_WINDOWS = (PAST_WINDOW_MAX, PAST_WINDOW_MIN)
+PAST = (PAST_SINCE, PAST_TRIGGER, *PAST_WINDOWS, PAST_DELAY)
 ANCHORED_UNTIL, ANCHORED_RELEASE = 14, 15  # window [low, high] counted from the first sample
 BINARY_NODES = (
     PART_AND, PART_OR, UNTIL, RELEASE, PAST_SINCE, PAST_TRIGGER, ANCHORED_UNTIL, ANCHORED_RELEASE,

@@ -25,6 +25,7 @@ from spatial_replay.monitor.online.sliding import looks_ahead
 from spatial_replay.monitor.online.state import (
     NUMBERS,
     OFFSET,
+    Memory,
     ahead,
     behind,
     first_behind,
@@ -129,6 +130,35 @@ def is_plain(part: Integers) -> bool:
 def runs_root(part: Integers, root: Integers) -> bool:
     """Return whether the root has a column, which what joins everything from some position on needs not."""
     return not is_plain(part) or root[codes.NODE_A] >= 0
+
+
+@inlined
+def is_known(which: int, part: Integers, root: Integers) -> bool:
+    """Return whether what may still come outdoes all that is open, whatever that is."""
+    is_high = which in (5, 7)
+    is_bound = is_plain(part) and root[codes.NODE_A] < 0 and which in (4, 5)
+    return is_bound and is_high == (root[codes.NODE_CODE] == codes.UNTIL)
+
+
+@inlined
+def is_cut_short(which: int, part: Integers, channels: int) -> bool:
+    """Return whether a number is that of the value, cut short, which needs no columns of its own."""
+    return part[codes.PART_IS_CUT] == 1 and which in (4, 5) and channels < 4
+
+
+@inlined
+def looks_of(part: Integers, root: Integers, memory: Memory, channels: int, is_last: bool) -> int:
+    """Return which numbers of a part are computed by themselves, a bit for each.
+
+    Numbers 2 and 3 (now) come with 0 and 1; those of an ending run count for the last sample only.
+    """
+    looks = 1 | 2 if channels > 1 else 1
+    if part[codes.PART_VARIABLES] == 0 and memory.cells[part[codes.PART_CELL_START]] > 0:
+        return looks  # its numbers at the first sample stand in its table
+    for which in (4, 5):
+        if not is_known(which, part, root) and not is_cut_short(which, part, channels):
+            looks |= 1 << which
+    return looks | 1 << 6 | 1 << 7 if is_last and channels == 4 else looks
 
 
 @apart

@@ -184,7 +184,6 @@ MAX_VARIABLES = 12
 _ANCHORED = (codes.ANCHORED_UNTIL, codes.ANCHORED_RELEASE)
 _RUNNING = (codes.UNTIL, codes.RELEASE)
 _RECURRENT_PAST = (codes.PAST_SINCE, codes.PAST_TRIGGER)
-_PAST = (*_RECURRENT_PAST, codes.PAST_WINDOW_MAX, codes.PAST_WINDOW_MIN, codes.PAST_DELAY)
 
 
 def part_of(signals: SignalTable, node: Temporal) -> WindowedPart:
@@ -234,7 +233,7 @@ class PartRows:
         result: list[Row] = []
         for *fields, is_variable in self._rows:
             has_table = fields[0] in _RECURRENT_PAST
-            below = any(result[each][-1] for each in _operand_rows(*fields[:3]))
+            below = any(result[each][-1] for each in operand_rows(*fields[:3]))
             result.append(
                 (
                     *fields,
@@ -261,7 +260,7 @@ class PartRows:
     @property
     def is_remembering(self) -> bool:
         """Whether it is asked for at the last sample, too: a past operator stands over a future one."""
-        return self._is_past or any(row[0] in _PAST for row in self._rows)
+        return self._is_past or any(row[0] in codes.PAST for row in self._rows)
 
     @property
     def end_corner(self) -> int:
@@ -408,7 +407,8 @@ def _by_kind(greatest: int, least: int, is_strong: bool) -> tuple[int, int]:
     return (greatest, least) if is_strong else (least, greatest)
 
 
-def _operand_rows(code: int, a: int, b: int) -> tuple[int, ...]:
+def operand_rows(code: int, a: int, b: int) -> tuple[int, ...]:
+    """Return the rows of a node's operands."""
     if code == codes.LITERAL:
         return ()
     if code in codes.BINARY_NODES:

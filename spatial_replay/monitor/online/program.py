@@ -26,6 +26,7 @@ from spatial_replay.monitor.online.operators import (
     Row,
     SignalTable,
     array_of_rows,
+    operand_rows,
     part_of,
 )
 from spatial_replay.monitor.online.rewriting import at_last, looks_ahead
@@ -55,6 +56,7 @@ class Program:
         table_size: how many numbers the parts' tables hold for one channel.
         cells: how many rows of bookkeeping the parts need.
         timed: how many windows in seconds parts run over what is open.
+        rows: how many nodes of a part need rows at once, at most.
         keeps_history: whether any window, delay or part looks at more than the newest sample.
     """
 
@@ -68,6 +70,7 @@ class Program:
     table_size: int
     cells: int
     timed: int
+    rows: int
     keeps_history: bool
 
 
@@ -108,6 +111,7 @@ def compile_formula(formula: Formula) -> Program:
         table_size=parts.table_size,
         cells=parts.cells,
         timed=parts.timed,
+        rows=parts.rows,
         keeps_history=signals.keeps_history or parts.keeps_history,
     )
 
@@ -125,6 +129,7 @@ class _Parts:
         self.table_size = 0
         self.cells = 0
         self.timed = 0
+        self.rows = 0
         self.keeps_history = False
         self.literals = set[int]()
         self._built: dict[tuple[tuple[Row, ...], bool] | Row, int] = {}
@@ -174,13 +179,15 @@ class _Parts:
                 int(cutting is not None),
             )
         )
+        places = _places_of_rows(rows)
         for number, row in enumerate(rows):
             is_timed = row[codes.NODE_CODE] in codes.AHEAD_OF and row[codes.NODE_UNIT] != codes.SAMPLES
             cuts = cutting is not None and number in cutting
-            self.node_rows.append((*row, self.timed if is_timed else NOTHING, int(cuts)))
+            self.node_rows.append((*row, self.timed if is_timed else NOTHING, int(cuts), places[number]))
             if row[codes.NODE_CODE] == codes.LITERAL and not part.is_flat:
                 self.literals.add(row[codes.NODE_A])
             self.timed += is_timed
+        self.rows = max(self.rows, 1 + max(places))
         self.table_size += part.tables << part.variables
         self.cells += 1 + part.variables + part.tables
         self.keeps_history |= not part.is_flat
@@ -193,6 +200,29 @@ def _looked_up(row: Row, signals: SignalTable) -> Row:
     if code != codes.LITERAL or not is_negated:
         return row
     return (code, signals.row(codes.NOT, signal), 0, *rest)
+
+
+def _places_of_rows(rows: tuple[Row, ...]) -> list[int]:
+    """Return where the rows of each node are, in as few places as will do; -1 for literals.
+
+    A node takes the place of an operand that nothing else looks at again, unless it would replace what it is
+    still going to look at itself: windows that begin elsewhere than with their position do.
+    """
+    looked_at = {each: number for number, row in enumerate(rows) for each in operand_rows(*row[:3])}
+    places, free = list[int](), list[int]()
+    for number, (code, *operands) in enumerate(rows):
+        if code == codes.LITERAL:
+            places.append(NOTHING)
+            continue
+        below = operand_rows(code, *operands[:2])
+        ended = [places[each] for each in dict.fromkeys(below) if looked_at[each] == number]
+        ended = [place for place in ended if place != NOTHING]
+        is_window = code in (codes.PART_WINDOW_MAX, codes.PART_WINDOW_MIN)
+        if not ended or code in codes.PAST_WINDOWS or (is_window and operands[codes.NODE_LOW - 1] > 0):
+            ended = [free.pop() if free else 1 + max((*places, *free), default=NOTHING), *ended]
+        places.append(ended[0])
+        free += ended[1:]
+    return places
 
 
 def _cutting(rows: tuple[Row, ...]) -> set[int] | None:

@@ -306,6 +306,16 @@ def window_start(node: Integers, recent: Recent, position: int, offset: int, las
 
 
 @inlined
+def window_after(node: Integers, recent: Recent, position: int, offset: int, last: int) -> int:
+    """Return the position that comes after a window ahead, at most that after the last sample."""
+    if node[codes.NODE_UNIT] == codes.SAMPLES:
+        return int(min(position + node[codes.NODE_HIGH], last)) + 1
+    timed = node[codes.NODE_TIMED]
+    is_ended = position < recent.window_next[timed, 2]
+    return int(recent.window_ends[timed, 1, position - offset]) if is_ended else last + 1
+
+
+@inlined
 def run_to_last(
     is_greatest: bool, node: Integers, source: Floats, target: Floats, value: float, lowest: int,
     changed: int, since: int, recent: Recent, offset: int, last: int,

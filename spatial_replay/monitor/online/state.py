@@ -31,6 +31,12 @@ stay in the processor's cache."""
 LONG_TILE = 1024
 """As many where a great many come together."""
 
+BLOCK = 32
+"""So many samples are run side by side: numbers that fill the vector registers of a processor."""
+
+MOST_ROWS = 4096
+"""So many open positions at most are looked at for a block of samples."""
+
 NUMBERS = 8
 """Numbers of a node at a sample: low and high end of its value, of what it is now, of its value over every
 continuation, and of its value if the run ends there."""
@@ -107,6 +113,12 @@ class Scratch(NamedTuple):
         extrema: (2, 2 * room), extrema over windows of growing width.
         ends: (2, room), where windows start and end.
         series: (3, tile), what one part says in one channel.
+        rows: (R, positions, BLOCK), nodes of a part at open positions, for a block of samples (see `rows`).
+        running: (2, BLOCK), a row that others are joined with, before and after.
+        points: (16, BLOCK), a point at which a table is read, for each sample of a block.
+        block: (4,), where a block of samples is (see `blocks`).
+        begins, next_begins: (D,), the first position of each node that has a row, in a block and in the next.
+        closing: (positions,), the samples with which windows close.
         parts: (P, NUMBERS, tile), what each part says.
         nodes: (N, NUMBERS, tile), what each node of the tree says.
     """
@@ -125,6 +137,13 @@ class Scratch(NamedTuple):
     extrema: Floats
     ends: Integers
     series: Floats
+    rows: Floats
+    running: Floats
+    points: Floats
+    block: Integers
+    begins: Integers
+    next_begins: Integers
+    closing: Integers
     parts: Floats
     nodes: Floats
 
@@ -168,8 +187,9 @@ def scratch_for(program: Program, room: int, tile: int) -> Scratch:
     widest = max((int(end - first) for first, end, *_ in program.parts), default=0)
     largest = max(((1 << int(part[2])) * int(part[3]) for part in program.parts), default=1)
     most_tables = max((int(part[3]) for part in program.parts), default=1)
-    low, high, plain, changed = np.zeros((4, widest), np.int64)
+    low, high, plain, changed, begins, next_begins = np.zeros((6, widest), np.int64)
     open_room = room if has_windows(program) else 0
+    positions = min(open_room, MOST_ROWS) if tile > BLOCK else 0
     return Scratch(
         columns=np.zeros((widest, tile)),
         corners=np.zeros((widest if program.parts[:, PART_IS_NESTED].any() else 0, room)),
@@ -185,9 +205,24 @@ def scratch_for(program: Program, room: int, tile: int) -> Scratch:
         extrema=np.zeros((2, 2 * open_room)),
         ends=np.zeros((2, open_room), np.int64),
         series=np.zeros((3, tile)),
+        rows=_aligned((program.rows, positions, BLOCK)),
+        running=_aligned((2, BLOCK)),
+        points=np.zeros((16, BLOCK)),
+        block=np.zeros(4, np.int64),
+        begins=begins,
+        next_begins=next_begins,
+        closing=np.zeros(positions, np.int64),
         parts=np.zeros((len(program.parts), NUMBERS, tile)),
         nodes=np.zeros((len(program.reports), NUMBERS, tile)),
     )
+
+
+def _aligned(shape: tuple[int, ...]) -> Floats:
+    """Return zeros that begin where a line of the processor's cache does."""
+    size, line = int(np.prod(shape)), 64
+    room = np.zeros(size + line // 8)
+    begin = -room.ctypes.data % line // 8
+    return room[begin : begin + size].reshape(shape)
 
 
 def widen(memory: Memory, before: int) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 
 from spatial_replay.compiled import apart, floats_at, inlined, integers_at
 from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.monitor.online.blocks import run_in_blocks
 from spatial_replay.monitor.online.codes import in_channels
 from spatial_replay.monitor.online.node_numbers import Results, report
 from spatial_replay.monitor.online.program import Program
@@ -33,7 +34,7 @@ from spatial_replay.monitor.online.state import (
     widen,
 )
 from spatial_replay.monitor.online.tables import step_tables
-from spatial_replay.monitor.online.windows import forget, run_windows
+from spatial_replay.monitor.online.windows import forget
 
 _MANY_TILES = 8
 """So many long tiles of samples that come together are worth more room to work in."""
@@ -100,7 +101,7 @@ def step_with_windows(
 ) -> int:  # fmt: skip
     """`step` for any program; apart from it because windows are much more to compile and to load."""
     begin_step(table_at, leaves_at, channels, width, times_at, length, t, count)
-    run_windows(table_at, channels, count)
+    run_in_blocks(table_at, channels, count)
     end_step(table_at, channels, series_at, length, t, count)
     return 0
 

@@ -25,7 +25,15 @@ from spatial_replay.monitor.online.node_columns import (
     signal_of,
     tables_end,
 )
-from spatial_replay.monitor.online.open_windows import bring_columns_up, is_plain, reach, runs_root
+from spatial_replay.monitor.online.open_windows import (
+    bring_columns_up,
+    is_cut_short,
+    is_known,
+    is_plain,
+    looks_of,
+    reach,
+    runs_root,
+)
 from spatial_replay.monitor.online.run_arrays import arrays_at
 from spatial_replay.monitor.online.sliding import (
     beyond,
@@ -50,33 +58,6 @@ from spatial_replay.monitor.online.tables import read_table
 
 _MANY = 4
 """From so many stretches of open positions on, each is joined by itself, and only if it has changed."""
-
-
-@inlined
-def _is_known(which: int, part: Integers, root: Integers) -> bool:
-    """Return whether what may still come outdoes all that is open, whatever that is."""
-    is_high = which in (5, 7)
-    is_bound = is_plain(part) and root[codes.NODE_A] < 0 and which in (4, 5)
-    return is_bound and is_high == (root[codes.NODE_CODE] == codes.UNTIL)
-
-
-@inlined
-def _looks(part: Integers, root: Integers, channels: int) -> int:
-    """Return which numbers of a part are computed by themselves before the last sample, a bit for each.
-
-    Numbers 2 and 3 (now) come with 0 and 1; those of an ending run count for the last sample only.
-    """
-    looks = 1 | 2 if channels > 1 else 1
-    for which in (4, 5):
-        if not _is_known(which, part, root) and not _is_cut(which, part, channels):
-            looks |= 1 << which
-    return looks
-
-
-@inlined
-def _is_cut(which: int, part: Integers, channels: int) -> bool:
-    """Return whether a number is that of the value, cut short, which needs no columns of its own."""
-    return part[codes.PART_IS_CUT] == 1 and which in (4, 5) and channels < 4
 
 
 @uncounted
@@ -121,9 +102,9 @@ def _value_at_first(
         value = beyond(look.mode, root[codes.NODE_WEAK])
         if root[codes.NODE_A] >= 0:
             value = memory.columns[at, part[codes.PART_END] - 1, base - offset] if base <= last else value
-        elif not _is_known(which, part, root):
+        elif not is_known(which, part, root):
             end = last + 1
-            if _is_cut(which, part, channels):
+            if is_cut_short(which, part, channels):
                 at = look.channel
                 end = _cut_at(nodes, part, memory, scratch, offset, last)
             d = part[codes.PART_FIRST] + root[codes.NODE_B]
@@ -156,51 +137,53 @@ def _value_at_last(
 
 @apart
 def run_windows(table_at: int, channels: int, count: int) -> int:
-    """Run all parts with windows over the next `count` samples.
+    """Run all parts with windows over the next `count` samples, one by one.
 
     `scratch.parts` receives their numbers; those of an ending run are for the last sample.
     """
+    tables, _, _, _ = arrays_at(table_at)
+    for number in range(len(tables.parts)):
+        if tables.parts[number, codes.PART_KIND] == codes.WINDOWED:
+            run_part(table_at, number, channels, 0, count, count)
+    return 0
+
+
+@apart
+def run_part(table_at: int, number: int, channels: int, begin: int, end: int, count: int) -> int:
+    """Run a part over the samples number begin … end - 1 of the next `count`, one by one."""
     tables, memory, scratch, _ = arrays_at(table_at)
     position, offset = memory.clock[POSITION], memory.clock[OFFSET]
-    for number in range(len(tables.parts)):
-        part, numbers = tables.parts[number], scratch.parts[number]
-        if part[codes.PART_KIND] != codes.WINDOWED:
-            continue
-        root = tables.nodes[part[codes.PART_END] - 1]
-        looks = _looks(part, root, channels)
-        for k in range(count):
-            last = position + k
-            if is_settled(part, memory):
-                for which in range(NUMBERS):
-                    channel = look_of(which, channels).channel
-                    numbers[which, k] = memory.tables[channel, part[codes.PART_TABLE_START]]
-                continue
-            if len(memory.window_next):
-                enter_samples(
-                    tables.nodes, part, memory.stamps, memory.window_ends, memory.window_next, offset, last
-                )
-            if k == count - 1 and channels == 4:
-                looks |= 1 << 6 | 1 << 7
-            if part[codes.PART_VARIABLES] == 0 and memory.cells[part[codes.PART_CELL_START]] > 0:
-                looks &= 1 | 2  # its numbers at the first sample stand in its table
-            bring_columns_up(table_at, number, looks, channels, last)
+    part, numbers = tables.parts[number], scratch.parts[number]
+    for k in range(begin, end):
+        last = position + k
+        if is_settled(part, memory):
             for which in range(NUMBERS):
-                if which in (2, 3) or (which >= 6 and k < count - 1):
-                    continue
-                if which == 1 and channels == 1:
-                    numbers[1, k], numbers[3, k] = numbers[0, k], numbers[2, k]
-                elif which >= 6 and channels < 4:
-                    numbers[which, k] = numbers[which - 6, k]
-                else:
-                    numbers[which, k] = _value_at_first(
-                        tables.nodes, part, number, which, channels, memory, scratch, offset, last
+                channel = look_of(which, channels).channel
+                numbers[which, k] = memory.tables[channel, part[codes.PART_TABLE_START]]
+            continue
+        if len(memory.window_next):
+            enter_samples(
+                tables.nodes, part, memory.stamps, memory.window_ends, memory.window_next, offset, last
+            )
+        looks = looks_of(part, tables.nodes[part[codes.PART_END] - 1], memory, channels, k == count - 1)
+        bring_columns_up(table_at, number, looks, channels, last)
+        for which in range(NUMBERS):
+            if which in (2, 3) or (which >= 6 and k < count - 1):
+                continue
+            if which == 1 and channels == 1:
+                numbers[1, k], numbers[3, k] = numbers[0, k], numbers[2, k]
+            elif which >= 6 and channels < 4:
+                numbers[which, k] = numbers[which - 6, k]
+            else:
+                numbers[which, k] = _value_at_first(
+                    tables.nodes, part, number, which, channels, memory, scratch, offset, last
+                )
+                if which < 2 and part[codes.PART_IS_REMEMBERING]:
+                    numbers[which + 2, k] = _value_at_last(
+                        tables.nodes, part, which, look_of(which, channels).channel, memory, offset, last
                     )
-                    if which < 2 and part[codes.PART_IS_REMEMBERING]:
-                        numbers[which + 2, k] = _value_at_last(
-                            tables.nodes, part, which, look_of(which, channels).channel, memory, offset, last
-                        )
-            if last % CLOSING == CLOSING - 1:
-                absorb(table_at, number, channels, last)
+        if last % CLOSING == CLOSING - 1:
+            absorb(table_at, number, channels, last)
     return 0
 
 

@@ -23,6 +23,7 @@ from spatial_replay.monitor.online.sliding import (
     recent_of,
     run_to_last,
     slide_evenly,
+    window_after,
     window_start,
 )
 from spatial_replay.monitor.online.state import OFFSET, behind
@@ -141,16 +142,6 @@ def _first_unended(node: Integers, recent: Recent, offset: int, last: int) -> in
 
 
 @inlined
-def _window_after(node: Integers, recent: Recent, position: int, offset: int, last: int) -> int:
-    """Return the position that comes after a window ahead, at most that after the last sample."""
-    if node[codes.NODE_UNIT] == codes.SAMPLES:
-        return int(min(position + node[codes.NODE_HIGH], last)) + 1
-    timed = node[codes.NODE_TIMED]
-    is_ended = position < recent.window_next[timed, 2]
-    return int(recent.window_ends[timed, 1, position - offset]) if is_ended else last + 1
-
-
-@inlined
 def _run_ended(
     is_greatest: bool, node: Integers, source: Floats, target: Floats, begin: int, end: int, since: int,
     recent: Recent, offset: int, last: int,
@@ -172,7 +163,7 @@ def _run_ended(
             changed += 1
         return changed
     while begin < end:
-        middle = _window_after(node, recent, begin, offset, last)
+        middle = window_after(node, recent, begin, offset, last)
         at = window_start(node, recent, end - 1, offset, last)
         beyond_last = end
         if at >= middle:
@@ -189,7 +180,7 @@ def _run_ended(
             before[position - begin] = value
         value = nothing
         for position in range(begin, beyond_last):
-            after = _window_after(node, recent, position, offset, last)
+            after = window_after(node, recent, position, offset, last)
             while middle < after:
                 value = either(is_greatest, value, source[middle - offset])
                 middle += 1

@@ -1,0 +1,488 @@
+"""Parts with windows, run over a block of samples at once (see `rows`).
+
+A block says the same as its samples one by one (see `windows`), and leaves the columns as these would.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from spatial_replay.compiled import apart, inlined, uncounted
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.monitor.online import codes
+from spatial_replay.monitor.online.closing import absorb, is_settled
+from spatial_replay.monitor.online.node_columns import (
+    cells_of,
+    columns_number,
+    look_of,
+    signal_of,
+    start_of_past,
+    tables_end,
+)
+from spatial_replay.monitor.online.open_windows import (
+    is_cut_short,
+    is_known,
+    is_plain,
+    looks_of,
+    runs_root,
+)
+from spatial_replay.monitor.online.rows import (
+    Block,
+    Operand,
+    enter,
+    fill_open,
+    join_operands_rows,
+    shift_rows,
+    since_rows,
+    until_rows,
+    window_rows,
+)
+from spatial_replay.monitor.online.run_arrays import arrays_at
+from spatial_replay.monitor.online.sliding import (
+    Recent,
+    beyond,
+    copy,
+    either,
+    enter_samples,
+    extremum,
+    fill,
+    is_decided,
+    recent_of,
+    window_after,
+    window_start,
+)
+from spatial_replay.monitor.online.state import (
+    BLOCK,
+    LOOKS,
+    OFFSET,
+    POSITION,
+    Memory,
+    Scratch,
+    ahead,
+    behind,
+    first_behind,
+)
+from spatial_replay.monitor.online.tables import read_table
+from spatial_replay.monitor.online.windows import run_part
+
+SINCE, LAST, LOWEST, IS_FOLLOWED = range(4)
+"""What the numbers of a block stand for: see `Block`, and `run_block`."""
+
+WORTHWHILE = 8
+"""So many samples at least are run as a block."""
+
+
+@uncounted
+def _find_begins(
+    nodes: Integers, part: Integers, memory: Memory, since: int, last: int, begins: Integers
+) -> int:
+    """Enter the first position of each node that samples from `since` to `last` may change; return the least.
+
+    Whether they do is known before they are: by the windows that are open.
+    """
+    stamps, offset, first, lowest = memory.stamps, memory.clock[OFFSET], part[codes.PART_FIRST], since
+    for d in range(first, part[codes.PART_END]):
+        node = nodes[d]
+        code, unit, near, far = node[0], node[codes.NODE_UNIT], node[codes.NODE_LOW], node[codes.NODE_HIGH]
+        if code == codes.LITERAL:
+            begins[d - first] = last + 1
+            continue
+        begin = begins[node[codes.NODE_A]] if node[codes.NODE_A] >= 0 else last + 1
+        if code in (codes.PART_AND, codes.PART_OR, codes.PAST_SINCE, codes.PAST_TRIGGER):
+            begin = min(begin, begins[node[codes.NODE_B]])
+        elif code in (codes.UNTIL, codes.RELEASE):
+            begin = offset
+        elif code in codes.AHEAD_OF:
+            distance = near if code == codes.SHIFT else far
+            if begin < since:
+                begin = first_behind(stamps, offset, begin, unit, distance)
+            if distance > 0:
+                begin = min(begin, first_behind(stamps, offset, since - 1, unit, distance - 1))
+        elif begin < since:
+            begin = ahead(stamps, offset, since - 1, begin, unit, near)
+        begins[d - first] = max(min(begin, since), memory.lows[d])
+        # what a past operator starts from may be a row, too
+        has_start = code in (codes.PAST_SINCE, codes.PAST_TRIGGER)
+        lowest = min(lowest, memory.lows[d] if has_start else begins[d - first])
+    return int(lowest)
+
+
+@uncounted
+def _find_ends(node: Integers, block: Block, recent: Recent, begin: int) -> None:
+    """Enter where windows from `begin` on start, and what comes after them; where shifts and delays look."""
+    starts, afters, stamps, offset, last = block.starts, block.afters, recent.stamps, block.offset, block.last
+    code, unit, near, far = node[0], node[codes.NODE_UNIT], node[codes.NODE_LOW], node[codes.NODE_HIGH]
+    if code in codes.AHEAD_OF and unit == codes.SAMPLES:
+        for k in range(last + 1 - begin):
+            starts[k] = min(begin + k + near, last + 1)
+        for k in range(last + 1 - begin):
+            afters[k] = min(begin + k + far, last) + 1
+        return
+    if code in codes.AHEAD_OF:
+        for position in range(begin, last + 1):
+            starts[position - begin] = window_start(node, recent, position, offset, last)
+            if code != codes.SHIFT:
+                afters[position - begin] = window_after(node, recent, position, offset, last)
+        return
+    start, after = begin, behind(stamps, offset, begin, unit, near) + 1
+    if code != codes.PAST_DELAY:
+        start = first_behind(stamps, offset, begin, unit, far)
+    for position in range(begin, last + 1):
+        if unit == codes.SAMPLES:
+            start, after = max(position - far, offset), position - near + 1
+        else:
+            time_ns = stamps[position - offset]
+            while code != codes.PAST_DELAY and time_ns - stamps[start - offset] > far:
+                start += 1
+            while after <= position and time_ns - stamps[after - offset] >= near:
+                after += 1
+        starts[position - begin] = after - 1 if code == codes.PAST_DELAY else start
+        afters[position - begin] = after
+
+
+@uncounted
+def _find_closing(
+    node: Integers, block: Block, stamps: Integers, begin: int, is_first: bool, closing: Integers
+) -> None:
+    """Enter with which sample of the block windows ahead close, from position `begin` on.
+
+    Args:
+        is_first: whether to replace what is there, or to raise it.
+    """
+    far, offset, at = node[codes.NODE_HIGH], block.offset, begin
+    for position in range(begin, block.last + 1):
+        if node[codes.NODE_UNIT] == codes.SAMPLES:
+            at = position + far
+        else:
+            while at <= block.last and stamps[at - offset] - stamps[position - offset] < far:
+                at += 1
+        sample, k = at - block.since, position - begin
+        closing[k] = sample if is_first else max(closing[k], sample)
+
+
+@inlined
+def _operand(
+    nodes: Integers,
+    part: Integers,
+    operand: int,
+    columns: Floats,
+    history: Floats,
+    scratch: Scratch,
+) -> Operand:
+    """Return the numbers of a node by its place in its part; where there is none, any."""
+    d = part[codes.PART_FIRST] + max(operand, 0)
+    signal, rows = signal_of(nodes, d), scratch.rows[max(nodes[d, codes.NODE_ROWS], 0)]
+    return Operand(columns[d] if signal < 0 else history[signal], rows, scratch.begins[max(operand, 0)])
+
+
+@inlined
+def _block_of(memory: Memory, scratch: Scratch) -> Block:
+    return Block(
+        scratch.running,
+        scratch.ends[0],
+        scratch.ends[1],
+        scratch.extrema[0],
+        scratch.block[SINCE],
+        scratch.block[LAST],
+        scratch.block[LOWEST],
+        memory.clock[OFFSET],
+    )
+
+
+@apart
+def _run_node(table_at: int, number: int, d: int, which: int, channels: int) -> int:
+    """Compute the rows of a node, and what the next samples need of its column (see `node_columns`)."""
+    tables, memory, scratch, _ = arrays_at(table_at)
+    nodes, part, recent = tables.nodes, tables.parts[number], recent_of(memory, scratch)
+    node, look, block = nodes[d], look_of(which, channels), _block_of(memory, scratch)
+    columns, history, offset = (
+        memory.columns[columns_number(which)],
+        memory.history[look.channel],
+        block.offset,
+    )
+    code, a, b, first = node[codes.NODE_CODE], node[codes.NODE_A], node[codes.NODE_B], part[codes.PART_FIRST]
+    target, begin = scratch.rows[node[codes.NODE_ROWS]], scratch.begins[d - first]
+    one = _operand(nodes, part, a, columns, history, scratch)
+    two = _operand(nodes, part, b, columns, history, scratch)
+    is_greatest = code in (codes.PART_OR, codes.PART_WINDOW_MAX, codes.PAST_WINDOW_MAX)
+    value = beyond(look.mode if code not in codes.PAST else codes.OPEN_END, node[codes.NODE_WEAK])
+    if code in (codes.PART_AND, codes.PART_OR):
+        if nodes[first + b, codes.NODE_ROWS] == node[codes.NODE_ROWS]:
+            join_operands_rows(block, is_greatest, two, one, True, target, begin)
+        else:
+            in_place = nodes[first + a, codes.NODE_ROWS] == node[codes.NODE_ROWS]
+            join_operands_rows(block, is_greatest, one, two, in_place, target, begin)
+    elif code in (codes.UNTIL, codes.RELEASE):
+        until_rows(block, code == codes.UNTIL, a >= 0, one, two, target, begin, value)
+    elif code in (codes.PAST_SINCE, codes.PAST_TRIGGER):
+        begin = _start_since(node, part, block, columns[d], memory, scratch, look.channel, begin, target)
+        scratch.begins[d - first] = begin
+        fresh = max(begin, memory.cells[cells_of(part)[2] + node[codes.NODE_TABLE]] + 1)
+        since_rows(block, code == codes.PAST_SINCE, a >= 0, one, two, target, fresh)
+    else:
+        _find_ends(node, block, recent, begin)
+        if code in (codes.SHIFT, codes.PAST_DELAY):
+            shift_rows(block, code == codes.SHIFT, one, target, begin, value)
+        else:
+            closed = block.last + 1
+            if code in codes.AHEAD_OF and is_decided(node, look.mode):
+                _find_closing(node, block, memory.stamps, begin, True, scratch.closing)
+                while closed > begin and scratch.closing[closed - 1 - begin] > block.last - block.since:
+                    closed -= 1
+            window_rows(block, is_greatest, one, target, begin, closed)
+            if code in codes.AHEAD_OF and is_decided(node, look.mode):
+                fill_open(block, scratch.closing, target, begin, value)
+    # after another block, the columns of positions that are still open are looked at no more
+    stop = scratch.next_begins[d - first] if scratch.block[IS_FOLLOWED] else block.last + 1
+    for position in range(begin, stop):
+        columns[d, position - offset] = target[position - block.lowest, block.last - block.since]
+    variable = node[codes.NODE_VARIABLE]
+    if variable >= 0:
+        boundary = memory.cells[cells_of(part)[1] + variable]
+        _take_row(block, Operand(columns[d], target, begin), boundary, value, scratch.points[variable])
+    return 0
+
+
+@uncounted
+def _start_since(
+    node: Integers, part: Integers, block: Block, column: Floats, memory: Memory, scratch: Scratch,
+    channel: int, begin: int, target: Floats,
+) -> int:  # fmt: skip
+    """Put what a since or trigger is before its first rows into the first running row.
+
+    Returns:
+        The position of its first row: `begin`, or that of what it starts from, if that differs.
+    """
+    running, offset, start = (
+        block.running[0],
+        block.offset,
+        memory.cells[cells_of(part)[2] + node[codes.NODE_TABLE]],
+    )
+    tables = memory.tables[channel, part[codes.PART_TABLE_START] : tables_end(part)]
+    differs = begin <= start
+    for k in range(block.last + 1 - block.since if start >= 0 else 0):
+        for variable in range(part[codes.PART_VARIABLES]):
+            scratch.point[variable] = scratch.points[variable, k]
+        running[k] = start_of_past(node, part, tables, start, scratch)
+        differs = differs or running[k] != column[start - offset]
+    if differs:
+        copy(running, target[start - block.lowest])
+        return int(start)
+    if begin == 0:
+        fill(running, np.inf if node[codes.NODE_WEAK] else -np.inf)
+    else:
+        fill(running, column[begin - 1 - offset])
+    return begin
+
+
+@inlined
+def _take_row(block: Block, operand: Operand, position: int, missing: float, target: Floats) -> None:
+    """Fill a row with the numbers at a position, or with `missing` for samples before it."""
+    if position > block.last:
+        fill(target, missing)
+        return
+    if position < operand.begin:
+        fill(target, operand.column[position - block.offset])
+    else:
+        copy(operand.rows[position - block.lowest], target)
+    fill(target[: max(position - block.since, 0)], missing)
+
+
+@uncounted
+def _join_body(
+    nodes: Integers, part: Integers, block: Block, body: Operand, start: float, is_cut: bool, memory: Memory,
+    scratch: Scratch,
+) -> int:  # fmt: skip
+    """Join what the root of a part joins, from its base on, with a number.
+
+    Args:
+        is_cut: whether only what comes before the first open window that cuts the bound short.
+
+    Returns:
+        In which of the running rows the numbers are, one for each sample.
+    """
+    root, offset, closing = nodes[part[codes.PART_END] - 1], block.offset, scratch.closing
+    base, is_until = memory.cells[part[codes.PART_CELL_START]], root[codes.NODE_CODE] == codes.UNTIL
+    settled, is_first, current = max(min(body.begin, block.since), base), True, 0
+    if is_cut:
+        settled = max(min(settled, block.lowest), base)
+        for d in range(part[codes.PART_FIRST], part[codes.PART_END]):
+            if nodes[d, codes.NODE_CUTS]:
+                _find_closing(nodes[d], block, memory.stamps, settled, is_first, closing)
+                is_first = False
+    fill(block.running[0], extremum(is_until, body.column[base - offset : settled - offset], start))
+    for position in range(settled, block.last + 1):
+        begin = position - block.since
+        if is_cut:
+            begin = max(begin, closing[position - settled])
+            if begin > block.last - block.since:
+                break  # no window closes before the ones before it do
+        current = enter(is_until, block, body, position, begin, current)
+    return current
+
+
+@uncounted
+def _read_points(part: Integers, table: Floats, count: int, scratch: Scratch, numbers: Floats) -> None:
+    """Read a part's table at the point of each sample."""
+    variables = part[codes.PART_VARIABLES]
+    for k in range(count):
+        for variable in range(variables):
+            scratch.point[variable] = scratch.points[variable, k]
+        numbers[k] = read_table(table, variables, scratch.point, scratch.order)
+
+
+@apart
+def _set_first(table_at: int, number: int, which: int, channels: int, at: int) -> int:
+    """Enter one of a part's numbers at the first sample, for each sample of the block (see `windows`)."""
+    tables, memory, scratch, _ = arrays_at(table_at)
+    nodes, part, block = tables.nodes, tables.parts[number], _block_of(memory, scratch)
+    look, end, root = look_of(which, channels), part[codes.PART_END] - 1, nodes[part[codes.PART_END] - 1]
+    base, is_cut = memory.cells[part[codes.PART_CELL_START]], is_cut_short(which, part, channels)
+    columns = memory.columns[look.channel if is_cut else columns_number(which)]
+    table = memory.tables[look.channel, part[codes.PART_TABLE_START] : tables_end(part)]
+    missing, count = beyond(look.mode, root[codes.NODE_WEAK]), block.last + 1 - block.since
+    numbers = scratch.parts[number, which, at : at + count]
+    place = root[codes.NODE_B] if is_plain(part) else end - part[codes.PART_FIRST]
+    operand = _operand(nodes, part, place, columns, memory.history[look.channel], scratch)
+    if not is_plain(part) and base > 0:
+        _read_points(part, table[: 1 << part[codes.PART_VARIABLES]], count, scratch, numbers)
+    elif not is_plain(part):
+        _take_row(block, operand, 0, missing, block.running[0])
+        copy(block.running[0], numbers)
+    elif is_known(which, part, root):
+        fill(numbers, missing)
+    elif root[codes.NODE_A] >= 0:
+        copy(scratch.points[root[codes.NODE_VARIABLE]], numbers)
+    else:
+        current = _join_body(nodes, part, block, operand, missing, is_cut, memory, scratch)
+        copy(block.running[current], numbers)
+    if is_plain(part) and base > 0:
+        for k in range(count):
+            numbers[k] = max(table[0], min(numbers[k], table[1]))
+    return 0
+
+
+@uncounted
+def _set_last(table_at: int, number: int, which: int, channels: int, at: int) -> None:
+    """Enter what a part is at each sample of the block (see `windows`)."""
+    tables, memory, scratch, _ = arrays_at(table_at)
+    nodes, part, block = tables.nodes, tables.parts[number], _block_of(memory, scratch)
+    end, root = part[codes.PART_END] - 1, nodes[part[codes.PART_END] - 1]
+    place = end - part[codes.PART_FIRST] if runs_root(part, root) else root[codes.NODE_B]
+    history = memory.history[look_of(which, channels).channel]
+    operand = _operand(nodes, part, place, memory.columns[which], history, scratch)
+    value, is_until = beyond(codes.OPEN_END, root[codes.NODE_WEAK]), root[codes.NODE_CODE] == codes.UNTIL
+    for k in range(block.last + 1 - block.since):
+        position = block.since + k
+        number_now = (
+            operand.column[position - block.offset]
+            if position < operand.begin
+            else operand.rows[position - block.lowest, k]
+        )
+        if not runs_root(part, root):
+            number_now = either(is_until, number_now, value)
+        scratch.parts[number, which + 2, at + k] = number_now
+
+
+@apart
+def run_block(
+    table_at: int, number: int, looks: int, channels: int, at: int, count: int, is_followed: int
+) -> int:
+    """Run a part over `count` samples from number `at` of a tile on, at most BLOCK.
+
+    Its columns are those of the sample before. `scratch.parts` receives its numbers, but none of an ending
+    run where these may differ from the value.
+
+    Args:
+        looks: the numbers that are computed by themselves, a bit for each.
+        is_followed: 1 if the samples after these are run as a block, too.
+
+    Returns:
+        1, or 0 if too many positions are open, and nothing is done.
+    """
+    tables, memory, scratch, _ = arrays_at(table_at)
+    nodes, part, numbers = tables.nodes, tables.parts[number], scratch.parts[number]
+    first, end, root = part[codes.PART_FIRST], part[codes.PART_END], nodes[part[codes.PART_END] - 1]
+    since = memory.clock[POSITION] + at
+    last = since + count - 1
+    lowest = _find_begins(nodes, part, memory, since, last, scratch.begins)
+    if last + 1 - lowest > scratch.rows.shape[1]:
+        return 0
+    block = scratch.block
+    block[SINCE], block[LAST], block[LOWEST], block[IS_FOLLOWED] = since, last, lowest, is_followed
+    for d in range(first, end):
+        # one that never ends stays open although what it is joined with has closed
+        if nodes[d, codes.NODE_CODE] in (codes.UNTIL, codes.RELEASE) and nodes[d, codes.NODE_VARIABLE] < 0:
+            block[IS_FOLLOWED] = 0
+    if block[IS_FOLLOWED]:
+        _find_begins(nodes, part, memory, last + 1, last + 1, scratch.next_begins)
+    if len(memory.window_next):
+        enter_samples(
+            nodes, part, memory.stamps, memory.window_ends, memory.window_next, memory.clock[OFFSET], last
+        )
+    for which in range(LOOKS):
+        if which in (2, 3) or not (looks >> which) & 1:
+            continue
+        for d in range(first, end if runs_root(part, root) else end - 1):
+            if nodes[d, codes.NODE_CODE] != codes.LITERAL:
+                _run_node(table_at, number, d, which, channels)
+        memory.known[number, columns_number(which)] = last
+        if is_plain(part):
+            unjoined = memory.unjoined[number]
+            begin = min(scratch.begins[root[codes.NODE_B]], since)
+            unjoined[columns_number(which)] = min(unjoined[columns_number(which)], begin)
+        _set_first(table_at, number, which, channels, at)
+        if which > 1:
+            continue
+        if part[codes.PART_IS_REMEMBERING]:
+            _set_last(table_at, number, which, channels, at)
+        for bound in (4, 5):
+            # of a bound that has no columns of its own
+            is_beside = bound - 4 == which if channels == 4 else look_of(bound, channels).channel == which
+            if is_beside and not (looks >> bound) & 1:
+                _set_first(table_at, number, bound, channels, at)
+    for k in range(at, at + count if channels < 4 else at):
+        if channels == 1:
+            numbers[1, k], numbers[3, k] = numbers[0, k], numbers[2, k]
+        numbers[6, k], numbers[7, k] = numbers[0, k], numbers[1, k]
+    absorb(table_at, number, channels, last)
+    return 1
+
+
+@uncounted
+def _is_brought_up(number: int, looks: int, memory: Memory, since: int) -> bool:
+    """Return whether the columns of a part are those of the sample before."""
+    for which in range(LOOKS):
+        if (looks >> which) & 1 and memory.known[number, columns_number(which)] != since - 1:
+            return False
+    return True
+
+
+@apart
+def run_in_blocks(table_at: int, channels: int, count: int) -> int:
+    """Run all parts with windows over the next `count` samples, in blocks as far as possible."""
+    tables, memory, _, _ = arrays_at(table_at)
+    # numbers of an ending run are computed at the last sample alone
+    position, stop = memory.clock[POSITION], count - 1 if channels == 4 else count
+    for number in range(len(tables.parts)):
+        part, k, was_block = tables.parts[number], 0, False
+        if part[codes.PART_KIND] != codes.WINDOWED:
+            continue
+        while k < count:
+            looks = looks_of(part, tables.nodes[part[codes.PART_END] - 1], memory, channels, False)
+            size, after = min(BLOCK, stop - k), min(BLOCK, stop - k - BLOCK)
+            if (
+                size < WORTHWHILE
+                or is_settled(part, memory)
+                or not _is_brought_up(number, looks, memory, position + k)
+            ):
+                run_part(table_at, number, channels, k, k + 1, count)
+                k += 1
+                continue
+            is_block = run_block(table_at, number, looks, channels, k, size, after >= WORTHWHILE) == 1
+            if not is_block:
+                if was_block:  # which has left out what it expected another one not to need
+                    memory.known[number] = -1
+                run_part(table_at, number, channels, k, k + size, count)
+            k, was_block = k + size, is_block
+    return 0

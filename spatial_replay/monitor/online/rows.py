@@ -1,0 +1,328 @@
+"""Nodes of a part at its open positions, for a block of samples side by side.
+
+What a node is at a position may differ with the sample that is the last one, so of a block of samples it is a
+row of numbers, one for each. What joins two rows is one loop over neighbouring numbers, which the compiler
+turns into vector instructions: a block costs little more than each of its samples would by itself.
+
+Before a node's first open position, nothing changes with the block, and its numbers are those of its column
+(see `node_columns`), the same for every sample. A row's samples before its own position have no number: what
+stands there is never looked at, or left out by what looks ahead.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from spatial_replay.compiled import inlined, inlined_as, uncounted
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.monitor.online.sliding import copy, either, fill
+
+
+class Block(NamedTuple):
+    """Some neighbouring samples, and room to work in.
+
+    Attributes:
+        running: (2, BLOCK), the rows that are joined one by one take turns.
+        starts, afters: (room,), where windows start, and what comes after them (see `sliding.find_ends`).
+        before: (2 * room,), what windows hold before some position.
+        since, last: the first and the last sample.
+        lowest: the position of the first row.
+        offset: that of the first number of a column.
+    """
+
+    running: Floats
+    starts: Integers
+    afters: Integers
+    before: Floats
+    since: int
+    last: int
+    lowest: int
+    offset: int
+
+
+class Operand(NamedTuple):
+    """The numbers of a node.
+
+    Attributes:
+        column: those of the positions before `begin`, from the block's offset on; of a signal, of all.
+        rows: (ROWS, BLOCK), those of the positions from `begin` on.
+        begin: the first position that has a row; for a signal, what comes after the last one.
+    """
+
+    column: Floats
+    rows: Floats
+    begin: int
+
+
+def _joined(is_greatest: bool, first: Floats, number: Any, target: Floats) -> None:
+    (np.maximum if is_greatest else np.minimum)(first, number, out=target)
+
+
+def _joined_into(is_greatest: bool, number: Any, target: Floats) -> None:
+    _joined(is_greatest, target, number, target)
+
+
+def _joined_from(is_greatest: bool, first: Floats, number: Any, target: Floats, begin: int) -> None:
+    copy(first[:begin], target[:begin])
+    others = number[begin:] if isinstance(number, np.ndarray) else number
+    _joined(is_greatest, first[begin:], others, target[begin:])
+
+
+# A row is joined in a place of its own, or in its own place alone: the compiler has to see which. And as a
+# row that is changed in its place is not stored as a whole, whoever reads it at once has to wait for it.
+
+
+@inlined_as(_joined)
+def join_rows(is_greatest: bool, first: Floats, number: Floats, target: Floats) -> None:
+    if is_greatest:
+        for k in range(len(target)):
+            target[k] = max(first[k], number[k])
+    else:
+        for k in range(len(target)):
+            target[k] = min(first[k], number[k])
+
+
+@inlined_as(_joined)
+def join_number(is_greatest: bool, first: Floats, number: float, target: Floats) -> None:
+    if is_greatest:
+        for k in range(len(target)):
+            target[k] = max(first[k], number)
+    else:
+        for k in range(len(target)):
+            target[k] = min(first[k], number)
+
+
+@inlined_as(_joined_into)
+def _join_rows_into(is_greatest: bool, number: Floats, target: Floats) -> None:
+    if is_greatest:
+        for k in range(len(target)):
+            target[k] = max(target[k], number[k])
+    else:
+        for k in range(len(target)):
+            target[k] = min(target[k], number[k])
+
+
+@inlined_as(_joined_into)
+def _join_number_into(is_greatest: bool, number: float, target: Floats) -> None:
+    if is_greatest:
+        for k in range(len(target)):
+            target[k] = max(target[k], number)
+    else:
+        for k in range(len(target)):
+            target[k] = min(target[k], number)
+
+
+@inlined_as(_joined_from)
+def _join_rows_from(is_greatest: bool, first: Floats, number: Floats, target: Floats, begin: int) -> None:
+    """Join the samples from `begin` on, and copy those before."""
+    if is_greatest:
+        for k in range(len(target)):
+            target[k] = max(first[k], number[k]) if k >= begin else first[k]
+    else:
+        for k in range(len(target)):
+            target[k] = min(first[k], number[k]) if k >= begin else first[k]
+
+
+@inlined_as(_joined_from)
+def _join_number_from(is_greatest: bool, first: Floats, number: float, target: Floats, begin: int) -> None:
+    if is_greatest:
+        for k in range(len(target)):
+            target[k] = max(first[k], number) if k >= begin else first[k]
+    else:
+        for k in range(len(target)):
+            target[k] = min(first[k], number) if k >= begin else first[k]
+
+
+@inlined
+def enter(is_greatest: bool, block: Block, operand: Operand, position: int, begin: int, current: int) -> int:
+    """Join the running row with the numbers at a position, for the samples from `begin` on.
+
+    Returns:
+        Which of the two running rows it is now; `current` before.
+    """
+    running, target = block.running[current], block.running[1 - current]
+    if position < operand.begin:
+        number = operand.column[position - block.offset]
+        if begin <= 0:
+            join_number(is_greatest, running, number, target)
+        else:
+            _join_number_from(is_greatest, running, number, target, begin)
+    else:
+        row = operand.rows[position - block.lowest]
+        if begin <= 0:
+            join_rows(is_greatest, running, row, target)
+        else:
+            _join_rows_from(is_greatest, running, row, target, begin)
+    return 1 - current
+
+
+@uncounted
+def join_operands_rows(
+    block: Block, is_greatest: bool, one: Operand, two: Operand, in_place: bool, target: Floats, begin: int
+) -> None:
+    """Compute an `and` or `or` from `begin` on.
+
+    Args:
+        in_place: whether `target` are the rows of `one`.
+    """
+    for position in range(begin, block.last + 1):
+        row = target[position - block.lowest]
+        if position < one.begin:
+            fill(row, one.column[position - block.offset])
+        elif not in_place:
+            copy(one.rows[position - block.lowest], row)
+        if position < two.begin:
+            _join_number_into(is_greatest, two.column[position - block.offset], row)
+        else:
+            _join_rows_into(is_greatest, two.rows[position - block.lowest], row)
+
+
+@uncounted
+def window_rows(
+    block: Block, is_greatest: bool, operand: Operand, target: Floats, begin: int, beyond: int
+) -> None:
+    """Compute extrema over the windows of begin … beyond - 1, whose ends are found.
+
+    Those that hold one position, or end there, share what they hold: of what comes before it, each holds what
+    the next one does and more; of the rest, what the one before does and more. For windows ahead, `target`
+    may be the rows of the operand.
+    """
+    starts, afters, end = block.starts, block.afters, block.last + 1
+    nothing, settled, position = (
+        -np.inf if is_greatest else np.inf,
+        min(operand.begin, block.since + 1),
+        begin,
+    )
+    while position < beyond:
+        start, after = starts[position - begin], afters[position - begin]
+        # what is the same for all samples is joined as numbers; windows that end with the block stay together
+        middle, until = settled if start < settled < after else max(start, after), position + 1
+        parts = middle > settled and after < end
+        while (
+            until < beyond and starts[until - begin] < middle and not (parts and afters[until - begin] == end)
+        ):
+            until += 1
+        first, count = position - begin, until - position
+        if middle <= settled:
+            value, at = nothing, middle
+            for k in range(until - 1 - begin, first - 1, -1):
+                while at > starts[k]:
+                    at -= 1
+                    value = either(is_greatest, value, operand.column[at - block.offset])
+                block.before[k] = value
+            fill(block.running[0], nothing)
+            ends, numbers = afters[first : first + count], block.before[first:]
+            _join_after(block, is_greatest, operand, middle, ends, numbers, True, target, position)
+        else:
+            fill(block.running[0], nothing)
+            _join_before(block, is_greatest, operand, middle, starts[first : first + count], target, position)
+            if middle < afters[until - 1 - begin]:
+                fill(block.running[0], nothing)
+                ends = afters[first : first + count]
+                _join_after(block, is_greatest, operand, middle, ends, block.before, False, target, position)
+        position = until
+
+
+@uncounted
+def _join_before(
+    block: Block, is_greatest: bool, operand: Operand, at: int, starts: Integers, target: Floats, begin: int
+) -> None:
+    """Enter the extrema from where windows start to before `at`, at positions from `begin` on."""
+    current = 0
+    for k in range(len(starts) - 1, -1, -1):
+        while at > starts[k]:
+            at -= 1
+            current = enter(is_greatest, block, operand, at, at - block.since, current)
+        copy(block.running[current], target[begin + k - block.lowest])
+
+
+@uncounted
+def _join_after(
+    block: Block, is_greatest: bool, operand: Operand, at: int, afters: Integers, before: Floats,
+    is_number: bool, target: Floats, begin: int,
+) -> None:  # fmt: skip
+    """Join the extrema from `at` to where windows end with what comes before, at positions from `begin` on.
+
+    Args:
+        before: what comes before, if `is_number`; else it stands in `target`.
+    """
+    current = 0
+    for k in range(len(afters)):
+        while at < afters[k]:
+            current = enter(is_greatest, block, operand, at, at - block.since, current)
+            at += 1
+        row = target[begin + k - block.lowest]
+        if is_number:
+            join_number(is_greatest, block.running[current], before[k], row)
+        else:
+            _join_rows_into(is_greatest, block.running[current], row)
+
+
+@uncounted
+def until_rows(
+    block: Block, is_until: bool, has_left: bool, one: Operand, two: Operand, target: Floats, begin: int,
+    value: float,
+) -> None:  # fmt: skip
+    """Compute an unbounded until or release from `begin` on, backwards; `value` is what it is beyond."""
+    current = 0
+    fill(block.running[0], value)
+    for position in range(block.last, begin - 1, -1):
+        if has_left:
+            current = enter(not is_until, block, one, position, position - block.since, current)
+        current = enter(is_until, block, two, position, position - block.since, current)
+        copy(block.running[current], target[position - block.lowest])
+
+
+@uncounted
+def since_rows(
+    block: Block, is_since: bool, has_left: bool, one: Operand, two: Operand, target: Floats, begin: int
+) -> None:
+    """Compute an unbounded since or trigger from `begin` on; the first running row is what it was before."""
+    current = 0
+    for position in range(begin, block.last + 1):
+        if has_left:
+            current = enter(not is_since, block, one, position, 0, current)
+        current = enter(is_since, block, two, position, 0, current)
+        copy(block.running[current], target[position - block.lowest])
+
+
+@inlined
+def _take(block: Block, operand: Operand, at: int, missing: float, target: Floats) -> None:
+    """Fill a row with the numbers at a position, or with `missing` for samples before it."""
+    if at < block.offset or at > block.last:
+        fill(target, missing)
+        return
+    if at < operand.begin:
+        fill(target, operand.column[at - block.offset])
+    else:
+        copy(operand.rows[at - block.lowest], target)
+    if at > block.since:
+        fill(target[: at - block.since], missing)
+
+
+@uncounted
+def shift_rows(
+    block: Block, is_ahead: bool, operand: Operand, target: Floats, begin: int, missing: float
+) -> None:
+    """Compute a shift or delay from `begin` on: `starts` says where each looks.
+
+    `target` may be the rows of the operand.
+    """
+    for k in range(block.last + 1 - begin):
+        # what is still to be looked at must not be replaced
+        position = begin + k if is_ahead else block.last - k
+        _take(block, operand, block.starts[position - begin], missing, target[position - block.lowest])
+
+
+@uncounted
+def fill_open(block: Block, is_open_until: Integers, target: Floats, begin: int, value: float) -> None:
+    """Enter what an operator is while it is open, at positions from `begin` on.
+
+    Args:
+        is_open_until: the first sample for which each is not, counted from the block's first.
+    """
+    for position in range(begin, block.last + 1):
+        row = target[position - block.lowest]
+        fill(row[: min(max(is_open_until[position - begin], 0), len(row))], value)
