@@ -32,6 +32,7 @@ from spatial_replay.monitor.online.rows import (
     enter,
     fill_open,
     join_operands_rows,
+    join_positions,
     shift_rows,
     since_rows,
     until_rows,
@@ -49,7 +50,6 @@ from spatial_replay.monitor.online.sliding import (
     is_decided,
     recent_of,
     window_after,
-    window_start,
 )
 from spatial_replay.monitor.online.state import (
     BLOCK,
@@ -74,13 +74,14 @@ WORTHWHILE = 8
 
 @uncounted
 def _find_begins(
-    nodes: Integers, part: Integers, memory: Memory, since: int, last: int, begins: Integers
-) -> int:
+    nodes: Integers, part: Integers, lows: Integers, stamps: Integers, offset: int, since: int, last: int,
+    begins: Integers,
+) -> int:  # fmt: skip
     """Enter the first position of each node that samples from `since` to `last` may change; return the least.
 
     Whether they do is known before they are: by the windows that are open.
     """
-    stamps, offset, first, lowest = memory.stamps, memory.clock[OFFSET], part[codes.PART_FIRST], since
+    first, lowest = part[codes.PART_FIRST], since
     for d in range(first, part[codes.PART_END]):
         node = nodes[d]
         code, unit, near, far = node[0], node[codes.NODE_UNIT], node[codes.NODE_LOW], node[codes.NODE_HIGH]
@@ -100,11 +101,21 @@ def _find_begins(
                 begin = min(begin, first_behind(stamps, offset, since - 1, unit, distance - 1))
         elif begin < since:
             begin = ahead(stamps, offset, since - 1, begin, unit, near)
-        begins[d - first] = max(min(begin, since), memory.lows[d])
+        begins[d - first] = max(min(begin, since), lows[d])
         # what a past operator starts from may be a row, too
         has_start = code in (codes.PAST_SINCE, codes.PAST_TRIGGER)
-        lowest = min(lowest, memory.lows[d] if has_start else begins[d - first])
+        lowest = min(lowest, lows[d] if has_start else begins[d - first])
     return int(lowest)
+
+
+@uncounted
+def _copy_known(ends: Integers, unknown: int, begin: int, last: int, offset: int, target: Integers) -> None:
+    """Copy ends of windows at positions from `begin` on; they are known up to `unknown`."""
+    known = max(min(unknown, last + 1), begin) - begin
+    for k in range(known):
+        target[k] = ends[begin - offset + k]
+    for k in range(known, last + 1 - begin):
+        target[k] = last + 1
 
 
 @uncounted
@@ -119,10 +130,9 @@ def _find_ends(node: Integers, block: Block, recent: Recent, begin: int) -> None
             afters[k] = min(begin + k + far, last) + 1
         return
     if code in codes.AHEAD_OF:
-        for position in range(begin, last + 1):
-            starts[position - begin] = window_start(node, recent, position, offset, last)
-            if code != codes.SHIFT:
-                afters[position - begin] = window_after(node, recent, position, offset, last)
+        timed, next_ends = node[codes.NODE_TIMED], recent.window_next[node[codes.NODE_TIMED]]
+        _copy_known(recent.window_ends[timed, 0], next_ends[1], begin, last, offset, starts)
+        _copy_known(recent.window_ends[timed, 1], next_ends[2], begin, last, offset, afters)
         return
     start, after = begin, behind(stamps, offset, begin, unit, near) + 1
     if code != codes.PAST_DELAY:
@@ -142,20 +152,19 @@ def _find_ends(node: Integers, block: Block, recent: Recent, begin: int) -> None
 
 @uncounted
 def _find_closing(
-    node: Integers, block: Block, stamps: Integers, begin: int, is_first: bool, closing: Integers
+    node: Integers, block: Block, recent: Recent, begin: int, is_first: bool, closing: Integers
 ) -> None:
     """Enter with which sample of the block windows ahead close, from position `begin` on.
 
     Args:
         is_first: whether to replace what is there, or to raise it.
     """
-    far, offset, at = node[codes.NODE_HIGH], block.offset, begin
+    far, stamps, offset = node[codes.NODE_HIGH], recent.stamps, block.offset
     for position in range(begin, block.last + 1):
-        if node[codes.NODE_UNIT] == codes.SAMPLES:
-            at = position + far
-        else:
-            while at <= block.last and stamps[at - offset] - stamps[position - offset] < far:
-                at += 1
+        at = position + far
+        if node[codes.NODE_UNIT] != codes.SAMPLES:
+            at = window_after(node, recent, position, offset, block.last)
+            at -= stamps[at - 1 - offset] - stamps[position - offset] == far
         sample, k = at - block.since, position - begin
         closing[k] = sample if is_first else max(closing[k], sample)
 
@@ -226,7 +235,7 @@ def _run_node(table_at: int, number: int, d: int, which: int, channels: int) -> 
         else:
             closed = block.last + 1
             if code in codes.AHEAD_OF and is_decided(node, look.mode):
-                _find_closing(node, block, memory.stamps, begin, True, scratch.closing)
+                _find_closing(node, block, recent, begin, True, scratch.closing)
                 while closed > begin and scratch.closing[closed - 1 - begin] > block.last - block.since:
                     closed -= 1
             window_rows(block, is_greatest, one, target, begin, closed)
@@ -243,7 +252,7 @@ def _run_node(table_at: int, number: int, d: int, which: int, channels: int) -> 
     return 0
 
 
-@uncounted
+@inlined
 def _start_since(
     node: Integers, part: Integers, block: Block, column: Floats, memory: Memory, scratch: Scratch,
     channel: int, begin: int, target: Floats,
@@ -290,28 +299,31 @@ def _take_row(block: Block, operand: Operand, position: int, missing: float, tar
 
 @uncounted
 def _join_body(
-    nodes: Integers, part: Integers, block: Block, body: Operand, start: float, is_cut: bool, memory: Memory,
-    scratch: Scratch,
+    nodes: Integers, part: Integers, block: Block, body: Operand, base: int, start: float, is_cut: bool,
+    recent: Recent, closing: Integers,
 ) -> int:  # fmt: skip
     """Join what the root of a part joins, from its base on, with a number.
 
     Args:
         is_cut: whether only what comes before the first open window that cuts the bound short.
+        closing: room to work in.
 
     Returns:
         In which of the running rows the numbers are, one for each sample.
     """
-    root, offset, closing = nodes[part[codes.PART_END] - 1], block.offset, scratch.closing
-    base, is_until = memory.cells[part[codes.PART_CELL_START]], root[codes.NODE_CODE] == codes.UNTIL
-    settled, is_first, current = max(min(body.begin, block.since), base), True, 0
+    is_until, offset = nodes[part[codes.PART_END] - 1, codes.NODE_CODE] == codes.UNTIL, block.offset
+    settled, is_first = max(body.begin, base), True
     if is_cut:
-        settled = max(min(settled, block.lowest), base)
         for d in range(part[codes.PART_FIRST], part[codes.PART_END]):
             if nodes[d, codes.NODE_CUTS]:
-                _find_closing(nodes[d], block, memory.stamps, settled, is_first, closing)
+                _find_closing(nodes[d], block, recent, settled, is_first, closing)
                 is_first = False
     fill(block.running[0], extremum(is_until, body.column[base - offset : settled - offset], start))
-    for position in range(settled, block.last + 1):
+    whole = settled
+    while whole <= block.since and not (is_cut and closing[whole - settled] > 0):
+        whole += 1
+    current = join_positions(block, is_until, body, settled, whole)
+    for position in range(whole, block.last + 1):
         begin = position - block.since
         if is_cut:
             begin = max(begin, closing[position - settled])
@@ -322,13 +334,14 @@ def _join_body(
 
 
 @uncounted
-def _read_points(part: Integers, table: Floats, count: int, scratch: Scratch, numbers: Floats) -> None:
+def _read_points(
+    variables: int, table: Floats, count: int, points: Floats, point: Floats, order: Integers, numbers: Floats
+) -> None:
     """Read a part's table at the point of each sample."""
-    variables = part[codes.PART_VARIABLES]
     for k in range(count):
         for variable in range(variables):
-            scratch.point[variable] = scratch.points[variable, k]
-        numbers[k] = read_table(table, variables, scratch.point, scratch.order)
+            point[variable] = points[variable, k]
+        numbers[k] = read_table(table, variables, point, order)
 
 
 @apart
@@ -345,7 +358,8 @@ def _set_first(table_at: int, number: int, which: int, channels: int, at: int) -
     place = root[codes.NODE_B] if is_plain(part) else end - part[codes.PART_FIRST]
     operand = _operand(nodes, part, place, columns, memory.history[look.channel], scratch)
     if not is_plain(part) and base > 0:
-        _read_points(part, table[: 1 << part[codes.PART_VARIABLES]], count, scratch, numbers)
+        variables, points = part[codes.PART_VARIABLES], scratch.points
+        _read_points(variables, table[: 1 << variables], count, points, scratch.point, scratch.order, numbers)
     elif not is_plain(part):
         _take_row(block, operand, 0, missing, block.running[0])
         copy(block.running[0], numbers)
@@ -354,7 +368,8 @@ def _set_first(table_at: int, number: int, which: int, channels: int, at: int) -
     elif root[codes.NODE_A] >= 0:
         copy(scratch.points[root[codes.NODE_VARIABLE]], numbers)
     else:
-        current = _join_body(nodes, part, block, operand, missing, is_cut, memory, scratch)
+        recent, closing = recent_of(memory, scratch), scratch.closing
+        current = _join_body(nodes, part, block, operand, base, missing, is_cut, recent, closing)
         copy(block.running[current], numbers)
     if is_plain(part) and base > 0:
         for k in range(count):
@@ -403,9 +418,10 @@ def run_block(
     tables, memory, scratch, _ = arrays_at(table_at)
     nodes, part, numbers = tables.nodes, tables.parts[number], scratch.parts[number]
     first, end, root = part[codes.PART_FIRST], part[codes.PART_END], nodes[part[codes.PART_END] - 1]
+    lows, stamps, offset = memory.lows, memory.stamps, memory.clock[OFFSET]
     since = memory.clock[POSITION] + at
     last = since + count - 1
-    lowest = _find_begins(nodes, part, memory, since, last, scratch.begins)
+    lowest = _find_begins(nodes, part, lows, stamps, offset, since, last, scratch.begins)
     if last + 1 - lowest > scratch.rows.shape[1]:
         return 0
     block = scratch.block
@@ -415,11 +431,9 @@ def run_block(
         if nodes[d, codes.NODE_CODE] in (codes.UNTIL, codes.RELEASE) and nodes[d, codes.NODE_VARIABLE] < 0:
             block[IS_FOLLOWED] = 0
     if block[IS_FOLLOWED]:
-        _find_begins(nodes, part, memory, last + 1, last + 1, scratch.next_begins)
+        _find_begins(nodes, part, lows, stamps, offset, last + 1, last + 1, scratch.next_begins)
     if len(memory.window_next):
-        enter_samples(
-            nodes, part, memory.stamps, memory.window_ends, memory.window_next, memory.clock[OFFSET], last
-        )
+        enter_samples(nodes, part, stamps, memory.window_ends, memory.window_next, offset, last)
     for which in range(LOOKS):
         if which in (2, 3) or not (looks >> which) & 1:
             continue
@@ -467,6 +481,9 @@ def run_in_blocks(table_at: int, channels: int, count: int) -> int:
     for number in range(len(tables.parts)):
         part, k, was_block = tables.parts[number], 0, False
         if part[codes.PART_KIND] != codes.WINDOWED:
+            continue
+        if is_settled(part, memory):
+            run_part(table_at, number, channels, 0, count, count)
             continue
         while k < count:
             looks = looks_of(part, tables.nodes[part[codes.PART_END] - 1], memory, channels, False)

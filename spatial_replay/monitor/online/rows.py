@@ -70,6 +70,11 @@ def _joined_from(is_greatest: bool, first: Floats, number: Any, target: Floats, 
     _joined(is_greatest, first[begin:], others, target[begin:])
 
 
+def _joined_both(is_greatest: bool, first: Floats, second: Floats, third: Floats, target: Floats) -> None:
+    _joined(is_greatest, first, second, target)
+    _joined(is_greatest, target, third, target)
+
+
 # A row is joined in a place of its own, or in its own place alone: the compiler has to see which. And as a
 # row that is changed in its place is not stored as a whole, whoever reads it at once has to wait for it.
 
@@ -156,6 +161,35 @@ def enter(is_greatest: bool, block: Block, operand: Operand, position: int, begi
         else:
             _join_rows_from(is_greatest, running, row, target, begin)
     return 1 - current
+
+
+@inlined_as(_joined_both)
+def _join_both(is_greatest: bool, first: Floats, second: Floats, third: Floats, target: Floats) -> None:
+    if is_greatest:
+        for k in range(len(target)):
+            target[k] = max(max(first[k], second[k]), third[k])
+    else:
+        for k in range(len(target)):
+            target[k] = min(min(first[k], second[k]), third[k])
+
+
+@uncounted
+def join_positions(block: Block, is_greatest: bool, operand: Operand, begin: int, end: int) -> int:
+    """Join the first running row with the rows of begin … end - 1, none of them after the first sample.
+
+    Returns:
+        Which of the running rows it is in the end.
+    """
+    current, rows = 0, operand.rows[begin - block.lowest : max(end, begin) - block.lowest]
+    # two at a time: the running row must be stored before it is joined again
+    for k in range(0, len(rows) - 1, 2):
+        running, target = block.running[current], block.running[1 - current]
+        _join_both(is_greatest, running, rows[k], rows[k + 1], target)
+        current = 1 - current
+    if len(rows) % 2:
+        join_rows(is_greatest, block.running[current], rows[-1], block.running[1 - current])
+        current = 1 - current
+    return current
 
 
 @uncounted
