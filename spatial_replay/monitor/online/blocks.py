@@ -211,18 +211,19 @@ def _run_node(table_at: int, number: int, d: int, which: int, channels: int) -> 
     )
     code, a, b, first = node[codes.NODE_CODE], node[codes.NODE_A], node[codes.NODE_B], part[codes.PART_FIRST]
     target, begin = scratch.rows[node[codes.NODE_ROWS]], scratch.begins[d - first]
+    rows_of = nodes[first:, codes.NODE_ROWS]
+    in_place = rows_of[max(a, 0)] == node[codes.NODE_ROWS], rows_of[b] == node[codes.NODE_ROWS]
     one = _operand(nodes, part, a, columns, history, scratch)
     two = _operand(nodes, part, b, columns, history, scratch)
     is_greatest = code in (codes.PART_OR, codes.PART_WINDOW_MAX, codes.PAST_WINDOW_MAX)
     value = beyond(look.mode if code not in codes.PAST else codes.OPEN_END, node[codes.NODE_WEAK])
     if code in (codes.PART_AND, codes.PART_OR):
-        if nodes[first + b, codes.NODE_ROWS] == node[codes.NODE_ROWS]:
+        if in_place[1]:
             join_operands_rows(block, is_greatest, two, one, True, target, begin)
         else:
-            in_place = nodes[first + a, codes.NODE_ROWS] == node[codes.NODE_ROWS]
-            join_operands_rows(block, is_greatest, one, two, in_place, target, begin)
+            join_operands_rows(block, is_greatest, one, two, in_place[0], target, begin)
     elif code in (codes.UNTIL, codes.RELEASE):
-        until_rows(block, code == codes.UNTIL, a >= 0, one, two, target, begin, value)
+        until_rows(block, code == codes.UNTIL, a >= 0, one, two, in_place[1], target, begin, value)
     elif code in (codes.PAST_SINCE, codes.PAST_TRIGGER):
         begin = _start_since(node, part, block, columns[d], memory, scratch, look.channel, begin, target)
         scratch.begins[d - first] = begin

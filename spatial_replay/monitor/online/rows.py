@@ -75,8 +75,7 @@ def _joined_both(is_greatest: bool, first: Floats, second: Floats, third: Floats
     _joined(is_greatest, target, third, target)
 
 
-# A row is joined in a place of its own, or in its own place alone: the compiler has to see which. And as a
-# row that is changed in its place is not stored as a whole, whoever reads it at once has to wait for it.
+# A row is joined in a place of its own, or in its own place alone: the compiler has to see which.
 
 
 @inlined_as(_joined)
@@ -117,6 +116,17 @@ def _join_number_into(is_greatest: bool, number: float, target: Floats) -> None:
     else:
         for k in range(len(target)):
             target[k] = min(target[k], number)
+
+
+@inlined_as(_joined_into)
+def _join_rows_whole(is_greatest: bool, number: Floats, target: Floats) -> None:
+    """Join a row that is read again at once: adding zero has all of it stored, not only what changes."""
+    if is_greatest:
+        for k in range(len(target)):
+            target[k] = max(target[k], number[k]) + 0.0
+    else:
+        for k in range(len(target)):
+            target[k] = min(target[k], number[k]) + 0.0
 
 
 @inlined_as(_joined_from)
@@ -220,8 +230,8 @@ def window_rows(
     """Compute extrema over the windows of begin … beyond - 1, whose ends are found.
 
     Those that hold one position, or end there, share what they hold: of what comes before it, each holds what
-    the next one does and more; of the rest, what the one before does and more. For windows ahead, `target`
-    may be the rows of the operand.
+    the next one does and more; of the rest, what the one before does and more. For windows ahead that begin
+    with their position, `target` may be the rows of the operand.
     """
     starts, afters, end = block.starts, block.afters, block.last + 1
     nothing, settled, position = (
@@ -251,7 +261,8 @@ def window_rows(
             _join_after(block, is_greatest, operand, middle, ends, numbers, True, target, position)
         else:
             fill(block.running[0], nothing)
-            _join_before(block, is_greatest, operand, middle, starts[first : first + count], target, position)
+            begins = starts[first : first + count]
+            _join_before(block, is_greatest, operand, middle, begins, target, position)
             if middle < afters[until - 1 - begin]:
                 fill(block.running[0], nothing)
                 ends = afters[first : first + count]
@@ -294,15 +305,37 @@ def _join_after(
             _join_rows_into(is_greatest, block.running[current], row)
 
 
+@inlined
+def _extend(
+    block: Block, is_greatest: bool, operand: Operand, in_place: bool, target: Floats, position: int
+) -> None:
+    """Join the row of a position, none after the first sample, with that of the next one."""
+    k = position - block.lowest
+    if position < operand.begin:
+        join_number(is_greatest, target[k + 1], operand.column[position - block.offset], target[k])
+    elif in_place:
+        _join_rows_whole(is_greatest, target[k + 1], target[k])
+    else:
+        join_rows(is_greatest, target[k + 1], operand.rows[k], target[k])
+
+
 @uncounted
 def until_rows(
-    block: Block, is_until: bool, has_left: bool, one: Operand, two: Operand, target: Floats, begin: int,
-    value: float,
+    block: Block, is_until: bool, has_left: bool, one: Operand, two: Operand, in_place: bool, target: Floats,
+    begin: int, value: float,
 ) -> None:  # fmt: skip
-    """Compute an unbounded until or release from `begin` on, backwards; `value` is what it is beyond."""
+    """Compute an unbounded until or release from `begin` on, backwards.
+
+    Args:
+        in_place: whether `target` are the rows of `two`.
+        value: what it is beyond the last sample.
+    """
     current = 0
     fill(block.running[0], value)
     for position in range(block.last, begin - 1, -1):
+        if not has_left and position < block.since:
+            _extend(block, is_until, two, in_place, target, position)
+            continue
         if has_left:
             current = enter(not is_until, block, one, position, position - block.since, current)
         current = enter(is_until, block, two, position, position - block.since, current)
