@@ -33,9 +33,8 @@ from spatial_replay.monitor.online.rows import (
     fill_open,
     join_operands_rows,
     join_positions,
+    recurrent_rows,
     shift_rows,
-    since_rows,
-    until_rows,
     window_rows,
 )
 from spatial_replay.monitor.online.run_arrays import arrays_at
@@ -222,13 +221,16 @@ def _run_node(table_at: int, number: int, d: int, which: int, channels: int) -> 
             join_operands_rows(block, is_greatest, two, one, True, target, begin)
         else:
             join_operands_rows(block, is_greatest, one, two, in_place[0], target, begin)
-    elif code in (codes.UNTIL, codes.RELEASE):
-        until_rows(block, code == codes.UNTIL, a >= 0, one, two, in_place[1], target, begin, value)
-    elif code in (codes.PAST_SINCE, codes.PAST_TRIGGER):
-        begin = _start_since(node, part, block, columns[d], memory, scratch, look.channel, begin, target)
-        scratch.begins[d - first] = begin
-        fresh = max(begin, memory.cells[cells_of(part)[2] + node[codes.NODE_TABLE]] + 1)
-        since_rows(block, code == codes.PAST_SINCE, a >= 0, one, two, target, fresh)
+    elif code in codes.BINARY_NODES:
+        is_strong, is_ahead, fresh = code in (codes.UNTIL, codes.PAST_SINCE), code not in codes.PAST, begin
+        if is_ahead:
+            fill(block.running[0], value)
+        else:
+            channel = look.channel
+            begin = _start_since(node, part, block, columns[d], memory, scratch, channel, begin, target)
+            scratch.begins[d - first] = begin
+            fresh = max(begin, memory.cells[cells_of(part)[2] + node[codes.NODE_TABLE]] + 1)
+        recurrent_rows(block, is_strong, a >= 0, one, two, in_place[1], target, fresh, is_ahead)
     else:
         _find_ends(node, block, recent, begin)
         if code in (codes.SHIFT, codes.PAST_DELAY):

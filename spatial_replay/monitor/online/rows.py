@@ -320,38 +320,28 @@ def _extend(
 
 
 @uncounted
-def until_rows(
-    block: Block, is_until: bool, has_left: bool, one: Operand, two: Operand, in_place: bool, target: Floats,
-    begin: int, value: float,
+def recurrent_rows(
+    block: Block, is_strong: bool, has_left: bool, one: Operand, two: Operand, in_place: bool, target: Floats,
+    begin: int, is_ahead: bool,
 ) -> None:  # fmt: skip
-    """Compute an unbounded until or release from `begin` on, backwards.
+    """Compute an unbounded until or release backwards from the last sample, a since or trigger forwards.
 
     Args:
+        is_strong: whether it is an until or a since.
         in_place: whether `target` are the rows of `two`.
-        value: what it is beyond the last sample.
+        begin: the first position.
+        is_ahead: whether it is an until or a release. The first running row is what it is beyond the samples,
+            or before `begin`.
     """
-    current = 0
-    fill(block.running[0], value)
-    for position in range(block.last, begin - 1, -1):
-        if not has_left and position < block.since:
-            _extend(block, is_until, two, in_place, target, position)
+    current, count = 0, block.last + 1 - begin
+    for k in range(count):
+        position = block.last - k if is_ahead else begin + k
+        if is_ahead and not has_left and position < block.since:
+            _extend(block, is_strong, two, in_place, target, position)
             continue
         if has_left:
-            current = enter(not is_until, block, one, position, position - block.since, current)
-        current = enter(is_until, block, two, position, position - block.since, current)
-        copy(block.running[current], target[position - block.lowest])
-
-
-@uncounted
-def since_rows(
-    block: Block, is_since: bool, has_left: bool, one: Operand, two: Operand, target: Floats, begin: int
-) -> None:
-    """Compute an unbounded since or trigger from `begin` on; the first running row is what it was before."""
-    current = 0
-    for position in range(begin, block.last + 1):
-        if has_left:
-            current = enter(not is_since, block, one, position, 0, current)
-        current = enter(is_since, block, two, position, 0, current)
+            current = enter(not is_strong, block, one, position, position - block.since, current)
+        current = enter(is_strong, block, two, position, position - block.since, current)
         copy(block.running[current], target[position - block.lowest])
 
 
