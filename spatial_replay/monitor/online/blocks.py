@@ -10,6 +10,13 @@ import numpy as np
 from spatial_replay.compiled import apart, inlined, uncounted
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
+from spatial_replay.monitor.online.block_ends import (
+    WIDE,
+    find_begins,
+    find_closing,
+    find_ends,
+    is_beside_one,
+)
 from spatial_replay.monitor.online.closing import absorb, is_settled
 from spatial_replay.monitor.online.node_columns import (
     cells_of,
@@ -48,7 +55,6 @@ from spatial_replay.monitor.online.sliding import (
     fill,
     is_decided,
     recent_of,
-    window_after,
 )
 from spatial_replay.monitor.online.state import (
     BLOCK,
@@ -57,8 +63,6 @@ from spatial_replay.monitor.online.state import (
     POSITION,
     Memory,
     Scratch,
-    ahead,
-    behind,
     first_behind,
 )
 from spatial_replay.monitor.online.tables import read_table
@@ -67,105 +71,15 @@ from spatial_replay.monitor.online.windows import run_part
 SINCE, LAST, LOWEST, IS_FOLLOWED = range(4)
 """What the numbers of a block stand for: see `Block`, and `run_block`."""
 
+WHOLE, PARTIAL = 1, 2
+"""Whether all of a part's columns are brought up, or what its next block looks at."""
+
 WORTHWHILE = 8
 """So many samples at least are run as a block."""
 
-
-@uncounted
-def _find_begins(
-    nodes: Integers, part: Integers, lows: Integers, stamps: Integers, offset: int, since: int, last: int,
-    begins: Integers,
-) -> int:  # fmt: skip
-    """Enter the first position of each node that samples from `since` to `last` may change; return the least.
-
-    Whether they do is known before they are: by the windows that are open.
-    """
-    first, lowest = part[codes.PART_FIRST], since
-    for d in range(first, part[codes.PART_END]):
-        node = nodes[d]
-        code, unit, near, far = node[0], node[codes.NODE_UNIT], node[codes.NODE_LOW], node[codes.NODE_HIGH]
-        if code == codes.LITERAL:
-            begins[d - first] = last + 1
-            continue
-        begin = begins[node[codes.NODE_A]] if node[codes.NODE_A] >= 0 else last + 1
-        if code in (codes.PART_AND, codes.PART_OR, codes.PAST_SINCE, codes.PAST_TRIGGER):
-            begin = min(begin, begins[node[codes.NODE_B]])
-        elif code in (codes.UNTIL, codes.RELEASE):
-            begin = offset
-        elif code in codes.AHEAD_OF:
-            distance = near if code == codes.SHIFT else far
-            if begin < since:
-                begin = first_behind(stamps, offset, begin, unit, distance)
-            if distance > 0:
-                begin = min(begin, first_behind(stamps, offset, since - 1, unit, distance - 1))
-        elif begin < since:
-            begin = ahead(stamps, offset, since - 1, begin, unit, near)
-        begins[d - first] = max(min(begin, since), lows[d])
-        # what a past operator starts from may be a row, too
-        has_start = code in (codes.PAST_SINCE, codes.PAST_TRIGGER)
-        lowest = min(lowest, lows[d] if has_start else begins[d - first])
-    return int(lowest)
-
-
-@uncounted
-def _copy_known(ends: Integers, unknown: int, begin: int, last: int, offset: int, target: Integers) -> None:
-    """Copy ends of windows at positions from `begin` on; they are known up to `unknown`."""
-    known = max(min(unknown, last + 1), begin) - begin
-    for k in range(known):
-        target[k] = ends[begin - offset + k]
-    for k in range(known, last + 1 - begin):
-        target[k] = last + 1
-
-
-@uncounted
-def _find_ends(node: Integers, block: Block, recent: Recent, begin: int) -> None:
-    """Enter where windows from `begin` on start, and what comes after them; where shifts and delays look."""
-    starts, afters, stamps, offset, last = block.starts, block.afters, recent.stamps, block.offset, block.last
-    code, unit, near, far = node[0], node[codes.NODE_UNIT], node[codes.NODE_LOW], node[codes.NODE_HIGH]
-    if code in codes.AHEAD_OF and unit == codes.SAMPLES:
-        for k in range(last + 1 - begin):
-            starts[k] = min(begin + k + near, last + 1)
-        for k in range(last + 1 - begin):
-            afters[k] = min(begin + k + far, last) + 1
-        return
-    if code in codes.AHEAD_OF:
-        timed, next_ends = node[codes.NODE_TIMED], recent.window_next[node[codes.NODE_TIMED]]
-        _copy_known(recent.window_ends[timed, 0], next_ends[1], begin, last, offset, starts)
-        _copy_known(recent.window_ends[timed, 1], next_ends[2], begin, last, offset, afters)
-        return
-    start, after = begin, behind(stamps, offset, begin, unit, near) + 1
-    if code != codes.PAST_DELAY:
-        start = first_behind(stamps, offset, begin, unit, far)
-    for position in range(begin, last + 1):
-        if unit == codes.SAMPLES:
-            start, after = max(position - far, offset), position - near + 1
-        else:
-            time_ns = stamps[position - offset]
-            while code != codes.PAST_DELAY and time_ns - stamps[start - offset] > far:
-                start += 1
-            while after <= position and time_ns - stamps[after - offset] >= near:
-                after += 1
-        starts[position - begin] = after - 1 if code == codes.PAST_DELAY else start
-        afters[position - begin] = after
-
-
-@uncounted
-def _find_closing(
-    node: Integers, block: Block, recent: Recent, begin: int, is_first: bool, closing: Integers
-) -> None:
-    """Enter with which sample of the block windows ahead close, from position `begin` on.
-
-    Args:
-        is_first: whether to replace what is there, or to raise it.
-    """
-    far, stamps, offset = node[codes.NODE_HIGH], recent.stamps, block.offset
-    for position in range(begin, block.last + 1):
-        at = position + far
-        if node[codes.NODE_UNIT] != codes.SAMPLES:
-            at = window_after(node, recent, position, offset, block.last)
-            at -= stamps[at - 1 - offset] - stamps[position - offset] == far
-        sample, k = at - block.since, position - begin
-        closing[k] = sample if is_first else max(closing[k], sample)
+BESIDE_ONE = 192
+"""So many rows at most are worth a block where one window alone is wide: sample by sample, its width costs
+next to nothing."""
 
 
 @inlined
@@ -232,13 +146,13 @@ def _run_node(table_at: int, number: int, d: int, which: int, channels: int) -> 
             fresh = max(begin, memory.cells[cells_of(part)[2] + node[codes.NODE_TABLE]] + 1)
         recurrent_rows(block, is_strong, a >= 0, one, two, in_place[1], target, fresh, is_ahead)
     else:
-        _find_ends(node, block, recent, begin)
+        find_ends(node, block, recent, begin)
         if code in (codes.SHIFT, codes.PAST_DELAY):
             shift_rows(block, code == codes.SHIFT, one, target, begin, value)
         else:
             closed = block.last + 1
             if code in codes.AHEAD_OF and is_decided(node, look.mode):
-                _find_closing(node, block, recent, begin, True, scratch.closing)
+                find_closing(node, block, recent, begin, True, scratch.closing)
                 while closed > begin and scratch.closing[closed - 1 - begin] > block.last - block.since:
                     closed -= 1
             window_rows(block, is_greatest, one, target, begin, closed)
@@ -319,11 +233,20 @@ def _join_body(
     if is_cut:
         for d in range(part[codes.PART_FIRST], part[codes.PART_END]):
             if nodes[d, codes.NODE_CUTS]:
-                _find_closing(nodes[d], block, recent, settled, is_first, closing)
+                unit, far = nodes[d, codes.NODE_UNIT], nodes[d, codes.NODE_HIGH]
+                closed = (
+                    first_behind(recent.stamps, offset, block.since - 1, unit, far - 1)
+                    if far > 0
+                    else settled
+                )
+                settled = max(min(settled, closed), base)
+        for d in range(part[codes.PART_FIRST], part[codes.PART_END]):
+            if nodes[d, codes.NODE_CUTS]:
+                find_closing(nodes[d], block, recent, settled, is_first, closing)
                 is_first = False
     fill(block.running[0], extremum(is_until, body.column[base - offset : settled - offset], start))
     whole = settled
-    while whole <= block.since and not (is_cut and closing[whole - settled] > 0):
+    while body.begin <= whole <= block.since and not (is_cut and closing[whole - settled] > 0):
         whole += 1
     current = join_positions(block, is_until, body, settled, whole)
     for position in range(whole, block.last + 1):
@@ -404,7 +327,14 @@ def _set_last(table_at: int, number: int, which: int, channels: int, at: int) ->
 
 @apart
 def run_block(
-    table_at: int, number: int, looks: int, channels: int, at: int, count: int, is_followed: int
+    table_at: int,
+    number: int,
+    looks: int,
+    channels: int,
+    at: int,
+    count: int,
+    is_followed: int,
+    is_whole: int,
 ) -> int:
     """Run a part over `count` samples from number `at` of a tile on, at most BLOCK.
 
@@ -414,32 +344,44 @@ def run_block(
     Args:
         looks: the numbers that are computed by themselves, a bit for each.
         is_followed: 1 if the samples after these are run as a block, too.
+        is_whole: 1 if all columns are brought up.
 
     Returns:
-        1, or 0 if too many positions are open, and nothing is done.
+        WHOLE or PARTIAL: whether all columns are brought up; or 0 if too many positions are open, and nothing
+        is done.
     """
     tables, memory, scratch, _ = arrays_at(table_at)
     nodes, part, numbers = tables.nodes, tables.parts[number], scratch.parts[number]
     first, end, root = part[codes.PART_FIRST], part[codes.PART_END], nodes[part[codes.PART_END] - 1]
-    lows, stamps, offset = memory.lows, memory.stamps, memory.clock[OFFSET]
     since = memory.clock[POSITION] + at
     last = since + count - 1
-    lowest = _find_begins(nodes, part, lows, stamps, offset, since, last, scratch.begins)
-    if last + 1 - lowest > scratch.rows.shape[1]:
+    block, most = scratch.block, scratch.rows.shape[1]
+    lowest = find_begins(table_at, number, 0, channels, 0, 0, since, last)
+    is_wide = last + 1 - lowest > WIDE
+    narrows = 1 if is_wide and is_whole else 0
+    if narrows and is_beside_one(nodes, part, memory.stamps, memory.clock[OFFSET], since):
+        most = BESIDE_ONE
+    for which in range(LOOKS if narrows else 0):
+        if (looks >> which) & 1 and last + 1 - lowest <= most:
+            lowest = find_begins(table_at, number, which, channels, narrows, 0, since, last)
+    if last + 1 - lowest > most:
         return 0
-    block = scratch.block
-    block[SINCE], block[LAST], block[LOWEST], block[IS_FOLLOWED] = since, last, lowest, is_followed
+    block[SINCE], block[LAST], block[LOWEST] = since, last, lowest
+    block[IS_FOLLOWED] = 1 if is_followed and not is_wide else 0
     for d in range(first, end):
         # one that never ends stays open although what it is joined with has closed
         if nodes[d, codes.NODE_CODE] in (codes.UNTIL, codes.RELEASE) and nodes[d, codes.NODE_VARIABLE] < 0:
             block[IS_FOLLOWED] = 0
     if block[IS_FOLLOWED]:
-        _find_begins(nodes, part, lows, stamps, offset, last + 1, last + 1, scratch.next_begins)
+        find_begins(table_at, number, 0, channels, 0, 1, last + 1, last + 1)
     if len(memory.window_next):
-        enter_samples(nodes, part, stamps, memory.window_ends, memory.window_next, offset, last)
+        ends, next_ends = memory.window_ends, memory.window_next
+        enter_samples(nodes, part, memory.stamps, ends, next_ends, memory.clock[OFFSET], last)
     for which in range(LOOKS):
-        if which in (2, 3) or not (looks >> which) & 1:
+        if not (looks >> which) & 1:
             continue
+        if narrows:
+            block[LOWEST] = find_begins(table_at, number, which, channels, narrows, 0, since, last)
         for d in range(first, end if runs_root(part, root) else end - 1):
             if nodes[d, codes.NODE_CODE] != codes.LITERAL:
                 _run_node(table_at, number, d, which, channels)
@@ -463,7 +405,7 @@ def run_block(
             numbers[1, k], numbers[3, k] = numbers[0, k], numbers[2, k]
         numbers[6, k], numbers[7, k] = numbers[0, k], numbers[1, k]
     absorb(table_at, number, channels, last)
-    return 1
+    return PARTIAL if block[IS_FOLLOWED] else WHOLE
 
 
 @uncounted
@@ -482,7 +424,7 @@ def run_in_blocks(table_at: int, channels: int, count: int) -> int:
     # numbers of an ending run are computed at the last sample alone
     position, stop = memory.clock[POSITION], count - 1 if channels == 4 else count
     for number in range(len(tables.parts)):
-        part, k, was_block = tables.parts[number], 0, False
+        part, k, state = tables.parts[number], 0, WHOLE
         if part[codes.PART_KIND] != codes.WINDOWED:
             continue
         if is_settled(part, memory):
@@ -499,10 +441,12 @@ def run_in_blocks(table_at: int, channels: int, count: int) -> int:
                 run_part(table_at, number, channels, k, k + 1, count)
                 k += 1
                 continue
-            is_block = run_block(table_at, number, looks, channels, k, size, after >= WORTHWHILE) == 1
-            if not is_block:
-                if was_block:  # which has left out what it expected another one not to need
+            is_whole, is_followed = state == WHOLE, after >= WORTHWHILE
+            state = run_block(table_at, number, looks, channels, k, size, is_followed, is_whole)
+            if state == 0:
+                if not is_whole:
                     memory.known[number] = -1
                 run_part(table_at, number, channels, k, k + size, count)
-            k, was_block = k + size, is_block
+                state = WHOLE
+            k += size
     return 0
