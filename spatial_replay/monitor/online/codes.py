@@ -48,7 +48,7 @@ NODE_CODE, NODE_A, NODE_B, NODE_WEAK, NODE_UNIT, NODE_LOW, NODE_HIGH = range(7)
 NODE_VARIABLE, NODE_TABLE, NODE_DEPENDS = 7, 8, 9  # the first two -1 for none
 NODE_TIMED = 10  # the number of a window or shift ahead in seconds, -1 for none
 NODE_CUTS = 11  # whether its windows cut a part's bound short (see `PART_IS_CUT`)
-NODE_ROWS = 12  # where its rows are in a block of samples, -1 for a literal (see `rows`)
+NODE_ROWS = 12  # where its rows are in a block of samples, -1 for a literal (see `blocks.node_rows`)
 NODE_WIDTH = 13
 # codes of parts' nodes
 LITERAL = 0  # signal a, negated if b

@@ -113,10 +113,11 @@ class Scratch(NamedTuple):
         extrema: (2, 2 * room), extrema over windows of growing width.
         ends: (2, room), where windows start and end.
         series: (3, tile), what one part says in one channel.
-        rows: (R, positions, BLOCK), nodes of a part at open positions, for a block of samples (see `rows`).
+        rows: (R, positions, BLOCK), nodes of a part at open positions, for a block of samples (see
+            `blocks.node_rows`).
         running: (2, BLOCK), a row that others are joined with, before and after.
         points: (16, BLOCK), a point at which a table is read, for each sample of a block.
-        block: (4,), where a block of samples is (see `blocks`).
+        block: (4,), where a block of samples is (see `blocks.block_run`).
         begins, next_begins: (D,), the first position of each node that has a row, in a block and in the next.
         closing: (positions,), the samples with which windows close.
         parts: (P, NUMBERS, tile), what each part says.

@@ -13,7 +13,7 @@ import numpy as np
 
 from spatial_replay.compiled import apart, floats_at, inlined, integers_at
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.monitor.online.blocks import run_in_blocks
+from spatial_replay.monitor.online.blocks.block_run import run_in_blocks
 from spatial_replay.monitor.online.codes import in_channels
 from spatial_replay.monitor.online.node_numbers import Results, report
 from spatial_replay.monitor.online.program import Program

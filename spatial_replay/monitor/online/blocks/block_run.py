@@ -1,4 +1,4 @@
-"""Parts with windows, run over a block of samples at once (see `rows`).
+"""Parts with windows, run over a block of samples at once (see `blocks.node_rows`).
 
 A block says the same as its samples one by one (see `windows`), and leaves the columns as these would.
 """
@@ -10,12 +10,23 @@ import numpy as np
 from spatial_replay.compiled import apart, inlined, uncounted
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
-from spatial_replay.monitor.online.block_ends import (
+from spatial_replay.monitor.online.blocks.block_ends import (
     WIDE,
     find_begins,
     find_closing,
     find_ends,
     is_beside_one,
+)
+from spatial_replay.monitor.online.blocks.node_rows import (
+    NodeRows,
+    SampleBlock,
+    enter,
+    fill_open,
+    join_operands_rows,
+    join_positions,
+    recurrent_rows,
+    shift_rows,
+    window_rows,
 )
 from spatial_replay.monitor.online.closing import absorb, is_settled
 from spatial_replay.monitor.online.node_columns import (
@@ -32,17 +43,6 @@ from spatial_replay.monitor.online.open_windows import (
     is_plain,
     looks_of,
     runs_root,
-)
-from spatial_replay.monitor.online.rows import (
-    Block,
-    Operand,
-    enter,
-    fill_open,
-    join_operands_rows,
-    join_positions,
-    recurrent_rows,
-    shift_rows,
-    window_rows,
 )
 from spatial_replay.monitor.online.run_arrays import arrays_at
 from spatial_replay.monitor.online.sliding import (
@@ -69,7 +69,7 @@ from spatial_replay.monitor.online.tables import read_table
 from spatial_replay.monitor.online.windows import run_part
 
 SINCE, LAST, LOWEST, IS_FOLLOWED = range(4)
-"""What the numbers of a block stand for: see `Block`, and `run_block`."""
+"""What the numbers of a block stand for: see `SampleBlock`, and `run_block`."""
 
 WHOLE, PARTIAL = 1, 2
 """Whether all of a part's columns are brought up, or what its next block looks at."""
@@ -90,16 +90,16 @@ def _operand(
     columns: Floats,
     history: Floats,
     scratch: Scratch,
-) -> Operand:
+) -> NodeRows:
     """Return the numbers of a node by its place in its part; where there is none, any."""
     d = part[codes.PART_FIRST] + max(operand, 0)
     signal, rows = signal_of(nodes, d), scratch.rows[max(nodes[d, codes.NODE_ROWS], 0)]
-    return Operand(columns[d] if signal < 0 else history[signal], rows, scratch.begins[max(operand, 0)])
+    return NodeRows(columns[d] if signal < 0 else history[signal], rows, scratch.begins[max(operand, 0)])
 
 
 @inlined
-def _block_of(memory: Memory, scratch: Scratch) -> Block:
-    return Block(
+def _block_of(memory: Memory, scratch: Scratch) -> SampleBlock:
+    return SampleBlock(
         scratch.running,
         scratch.ends[0],
         scratch.ends[1],
@@ -117,11 +117,7 @@ def _run_node(table_at: int, number: int, d: int, which: int, channels: int) -> 
     tables, memory, scratch, _ = arrays_at(table_at)
     nodes, part, recent = tables.nodes, tables.parts[number], recent_of(memory, scratch)
     node, look, block = nodes[d], look_of(which, channels), _block_of(memory, scratch)
-    columns, history, offset = (
-        memory.columns[columns_number(which)],
-        memory.history[look.channel],
-        block.offset,
-    )
+    columns, history = memory.columns[columns_number(which)], memory.history[look.channel]
     code, a, b, first = node[codes.NODE_CODE], node[codes.NODE_A], node[codes.NODE_B], part[codes.PART_FIRST]
     target, begin = scratch.rows[node[codes.NODE_ROWS]], scratch.begins[d - first]
     rows_of = nodes[first:, codes.NODE_ROWS]
@@ -161,17 +157,17 @@ def _run_node(table_at: int, number: int, d: int, which: int, channels: int) -> 
     # after another block, the columns of positions that are still open are looked at no more
     stop = scratch.next_begins[d - first] if scratch.block[IS_FOLLOWED] else block.last + 1
     for position in range(begin, stop):
-        columns[d, position - offset] = target[position - block.lowest, block.last - block.since]
+        columns[d, position - block.offset] = target[position - block.lowest, block.last - block.since]
     variable = node[codes.NODE_VARIABLE]
     if variable >= 0:
         boundary = memory.cells[cells_of(part)[1] + variable]
-        _take_row(block, Operand(columns[d], target, begin), boundary, value, scratch.points[variable])
+        _take_row(block, NodeRows(columns[d], target, begin), boundary, value, scratch.points[variable])
     return 0
 
 
 @inlined
 def _start_since(
-    node: Integers, part: Integers, block: Block, column: Floats, memory: Memory, scratch: Scratch,
+    node: Integers, part: Integers, block: SampleBlock, column: Floats, memory: Memory, scratch: Scratch,
     channel: int, begin: int, target: Floats,
 ) -> int:  # fmt: skip
     """Put what a since or trigger is before its first rows into the first running row.
@@ -179,11 +175,8 @@ def _start_since(
     Returns:
         The position of its first row: `begin`, or that of what it starts from, if that differs.
     """
-    running, offset, start = (
-        block.running[0],
-        block.offset,
-        memory.cells[cells_of(part)[2] + node[codes.NODE_TABLE]],
-    )
+    running, offset = block.running[0], block.offset
+    start = memory.cells[cells_of(part)[2] + node[codes.NODE_TABLE]]
     tables = memory.tables[channel, part[codes.PART_TABLE_START] : tables_end(part)]
     differs = begin <= start
     for k in range(block.last + 1 - block.since if start >= 0 else 0):
@@ -202,7 +195,7 @@ def _start_since(
 
 
 @inlined
-def _take_row(block: Block, operand: Operand, position: int, missing: float, target: Floats) -> None:
+def _take_row(block: SampleBlock, operand: NodeRows, position: int, missing: float, target: Floats) -> None:
     """Fill a row with the numbers at a position, or with `missing` for samples before it."""
     if position > block.last:
         fill(target, missing)
@@ -216,8 +209,8 @@ def _take_row(block: Block, operand: Operand, position: int, missing: float, tar
 
 @uncounted
 def _join_body(
-    nodes: Integers, part: Integers, block: Block, body: Operand, base: int, start: float, is_cut: bool,
-    recent: Recent, closing: Integers,
+    nodes: Integers, part: Integers, block: SampleBlock, body: NodeRows, base: int, start: float,
+    is_cut: bool, recent: Recent, closing: Integers,
 ) -> int:  # fmt: skip
     """Join what the root of a part joins, from its base on, with a number.
 
@@ -234,12 +227,9 @@ def _join_body(
         for d in range(part[codes.PART_FIRST], part[codes.PART_END]):
             if nodes[d, codes.NODE_CUTS]:
                 unit, far = nodes[d, codes.NODE_UNIT], nodes[d, codes.NODE_HIGH]
-                closed = (
-                    first_behind(recent.stamps, offset, block.since - 1, unit, far - 1)
-                    if far > 0
-                    else settled
-                )
-                settled = max(min(settled, closed), base)
+                if far > 0:
+                    closed = first_behind(recent.stamps, offset, block.since - 1, unit, far - 1)
+                    settled = max(min(settled, closed), base)
         for d in range(part[codes.PART_FIRST], part[codes.PART_END]):
             if nodes[d, codes.NODE_CUTS]:
                 find_closing(nodes[d], block, recent, settled, is_first, closing)

@@ -1,4 +1,4 @@
-"""Which positions a block of samples changes, and where the windows there end (see `rows`)."""
+"""Which positions a block of samples changes, and where the windows there end (see `blocks.node_rows`)."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import numpy as np
 from spatial_replay.compiled import apart, uncounted
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
+from spatial_replay.monitor.online.blocks.node_rows import SampleBlock
 from spatial_replay.monitor.online.node_columns import columns_number, look_of, signal_of
-from spatial_replay.monitor.online.rows import Block
 from spatial_replay.monitor.online.run_arrays import arrays_at
 from spatial_replay.monitor.online.sliding import Recent, either, extremum, is_decided, window_after
 from spatial_replay.monitor.online.state import OFFSET, ahead, behind, first_behind
@@ -108,7 +108,7 @@ def _copy_known(ends: Integers, unknown: int, begin: int, last: int, offset: int
 
 
 @uncounted
-def find_ends(node: Integers, block: Block, recent: Recent, begin: int) -> None:
+def find_ends(node: Integers, block: SampleBlock, recent: Recent, begin: int) -> None:
     """Enter where windows from `begin` on start, and what comes after them; where shifts and delays look."""
     starts, afters, stamps, offset, last = block.starts, block.afters, recent.stamps, block.offset, block.last
     code, unit, near, far = node[0], node[codes.NODE_UNIT], node[codes.NODE_LOW], node[codes.NODE_HIGH]
@@ -141,7 +141,7 @@ def find_ends(node: Integers, block: Block, recent: Recent, begin: int) -> None:
 
 @uncounted
 def find_closing(
-    node: Integers, block: Block, recent: Recent, begin: int, is_first: bool, closing: Integers
+    node: Integers, block: SampleBlock, recent: Recent, begin: int, is_first: bool, closing: Integers
 ) -> None:
     """Enter with which sample of the block windows ahead close, from position `begin` on.
 

@@ -20,12 +20,12 @@ from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online.sliding import copy, either, fill
 
 
-class Block(NamedTuple):
+class SampleBlock(NamedTuple):
     """Some neighbouring samples, and room to work in.
 
     Attributes:
         running: (2, BLOCK), the rows that are joined one by one take turns.
-        starts, afters: (room,), where windows start, and what comes after them (see `sliding.find_ends`).
+        starts, afters: (room,), where windows start, and what comes after them (see `find_ends`).
         before: (2 * room,), what windows hold before some position.
         since, last: the first and the last sample.
         lowest: the position of the first row.
@@ -42,7 +42,7 @@ class Block(NamedTuple):
     offset: int
 
 
-class Operand(NamedTuple):
+class NodeRows(NamedTuple):
     """The numbers of a node.
 
     Attributes:
@@ -151,7 +151,9 @@ def _join_number_from(is_greatest: bool, first: Floats, number: float, target: F
 
 
 @inlined
-def enter(is_greatest: bool, block: Block, operand: Operand, position: int, begin: int, current: int) -> int:
+def enter(
+    is_greatest: bool, block: SampleBlock, operand: NodeRows, position: int, begin: int, current: int
+) -> int:
     """Join the running row with the numbers at a position, for the samples from `begin` on.
 
     Returns:
@@ -184,7 +186,7 @@ def _join_both(is_greatest: bool, first: Floats, second: Floats, third: Floats, 
 
 
 @uncounted
-def join_positions(block: Block, is_greatest: bool, operand: Operand, begin: int, end: int) -> int:
+def join_positions(block: SampleBlock, is_greatest: bool, operand: NodeRows, begin: int, end: int) -> int:
     """Join the first running row with the rows of begin … end - 1, none of them after the first sample.
 
     Returns:
@@ -204,7 +206,13 @@ def join_positions(block: Block, is_greatest: bool, operand: Operand, begin: int
 
 @uncounted
 def join_operands_rows(
-    block: Block, is_greatest: bool, one: Operand, two: Operand, in_place: bool, target: Floats, begin: int
+    block: SampleBlock,
+    is_greatest: bool,
+    one: NodeRows,
+    two: NodeRows,
+    in_place: bool,
+    target: Floats,
+    begin: int,
 ) -> None:
     """Compute an `and` or `or` from `begin` on.
 
@@ -225,7 +233,7 @@ def join_operands_rows(
 
 @uncounted
 def window_rows(
-    block: Block, is_greatest: bool, operand: Operand, target: Floats, begin: int, beyond: int
+    block: SampleBlock, is_greatest: bool, operand: NodeRows, target: Floats, begin: int, beyond: int
 ) -> None:
     """Compute extrema over the windows of begin … beyond - 1, whose ends are found.
 
@@ -272,7 +280,13 @@ def window_rows(
 
 @uncounted
 def _join_before(
-    block: Block, is_greatest: bool, operand: Operand, at: int, starts: Integers, target: Floats, begin: int
+    block: SampleBlock,
+    is_greatest: bool,
+    operand: NodeRows,
+    at: int,
+    starts: Integers,
+    target: Floats,
+    begin: int,
 ) -> None:
     """Enter the extrema from where windows start to before `at`, at positions from `begin` on."""
     current = 0
@@ -285,7 +299,7 @@ def _join_before(
 
 @uncounted
 def _join_after(
-    block: Block, is_greatest: bool, operand: Operand, at: int, afters: Integers, before: Floats,
+    block: SampleBlock, is_greatest: bool, operand: NodeRows, at: int, afters: Integers, before: Floats,
     is_number: bool, target: Floats, begin: int,
 ) -> None:  # fmt: skip
     """Join the extrema from `at` to where windows end with what comes before, at positions from `begin` on.
@@ -307,7 +321,7 @@ def _join_after(
 
 @inlined
 def _extend(
-    block: Block, is_greatest: bool, operand: Operand, in_place: bool, target: Floats, position: int
+    block: SampleBlock, is_greatest: bool, operand: NodeRows, in_place: bool, target: Floats, position: int
 ) -> None:
     """Join the row of a position, none after the first sample, with that of the next one."""
     k = position - block.lowest
@@ -321,8 +335,8 @@ def _extend(
 
 @uncounted
 def recurrent_rows(
-    block: Block, is_strong: bool, has_left: bool, one: Operand, two: Operand, in_place: bool, target: Floats,
-    begin: int, is_ahead: bool,
+    block: SampleBlock, is_strong: bool, has_left: bool, one: NodeRows, two: NodeRows, in_place: bool,
+    target: Floats, begin: int, is_ahead: bool,
 ) -> None:  # fmt: skip
     """Compute an unbounded until or release backwards from the last sample, a since or trigger forwards.
 
@@ -346,7 +360,7 @@ def recurrent_rows(
 
 
 @inlined
-def _take(block: Block, operand: Operand, at: int, missing: float, target: Floats) -> None:
+def _take(block: SampleBlock, operand: NodeRows, at: int, missing: float, target: Floats) -> None:
     """Fill a row with the numbers at a position, or with `missing` for samples before it."""
     if at < block.offset or at > block.last:
         fill(target, missing)
@@ -361,7 +375,7 @@ def _take(block: Block, operand: Operand, at: int, missing: float, target: Float
 
 @uncounted
 def shift_rows(
-    block: Block, is_ahead: bool, operand: Operand, target: Floats, begin: int, missing: float
+    block: SampleBlock, is_ahead: bool, operand: NodeRows, target: Floats, begin: int, missing: float
 ) -> None:
     """Compute a shift or delay from `begin` on: `starts` says where each looks.
 
@@ -374,7 +388,7 @@ def shift_rows(
 
 
 @uncounted
-def fill_open(block: Block, is_open_until: Integers, target: Floats, begin: int, value: float) -> None:
+def fill_open(block: SampleBlock, is_open_until: Integers, target: Floats, begin: int, value: float) -> None:
     """Enter what an operator is while it is open, at positions from `begin` on.
 
     Args:
