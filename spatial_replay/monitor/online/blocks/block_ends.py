@@ -13,7 +13,7 @@ from spatial_replay.monitor.online.run_arrays import arrays_at
 from spatial_replay.monitor.online.sliding import Recent, either, extremum, is_decided, window_after
 from spatial_replay.monitor.online.state import OFFSET, ahead, behind, first_behind
 
-WIDE = 128
+WIDE = 192
 """So many open positions are many."""
 
 

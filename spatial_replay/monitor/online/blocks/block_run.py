@@ -77,10 +77,6 @@ WHOLE, PARTIAL = 1, 2
 WORTHWHILE = 8
 """So many samples at least are run as a block."""
 
-BESIDE_ONE = 192
-"""So many rows at most are worth a block where one window alone is wide: sample by sample, its width costs
-next to nothing."""
-
 
 @inlined
 def _operand(
@@ -350,7 +346,7 @@ def run_block(
     is_wide = last + 1 - lowest > WIDE
     narrows = 1 if is_wide and is_whole else 0
     if narrows and is_beside_one(nodes, part, memory.stamps, memory.clock[OFFSET], since):
-        most = BESIDE_ONE
+        most = WIDE  # sample by sample, the width of one window alone costs next to nothing
     for which in range(LOOKS if narrows else 0):
         if (looks >> which) & 1 and last + 1 - lowest <= most:
             lowest = find_begins(table_at, number, which, channels, narrows, 0, since, last)
