@@ -52,17 +52,17 @@ def find_begins(
     nodes, part, look = tables.nodes, tables.parts[number], look_of(which, channels)
     columns, history = memory.columns[columns_number(which)], memory.history[look.channel]
     stamps, lows, offset = memory.stamps, memory.lows, memory.clock[OFFSET]
-    begins = scratch.next_begins if is_next else scratch.begins
+    begins, changed = scratch.next_begins if is_next else scratch.begins, scratch.changed
     first, lowest = part[codes.PART_FIRST], since
     for d in range(first, part[codes.PART_END]):
         node = nodes[d]
         code, unit, near, far = node[0], node[codes.NODE_UNIT], node[codes.NODE_LOW], node[codes.NODE_HIGH]
         if code == codes.LITERAL:
-            begins[d - first] = last + 1
+            begins[d - first] = changed[d - first] = last + 1
             continue
-        begin = begins[node[codes.NODE_A]] if node[codes.NODE_A] >= 0 else last + 1
+        begin = changed[node[codes.NODE_A]] if node[codes.NODE_A] >= 0 else last + 1
         if code in (codes.PART_AND, codes.PART_OR, codes.PAST_SINCE, codes.PAST_TRIGGER):
-            begin = min(begin, begins[node[codes.NODE_B]])
+            begin = min(begin, changed[node[codes.NODE_B]])
         elif code in (codes.UNTIL, codes.RELEASE):
             begin = offset
         elif code in codes.AHEAD_OF:
@@ -77,7 +77,9 @@ def find_begins(
                 begin = _first_touched(is_greatest, source, columns[d], begin, since, last, offset)
         elif begin < since:
             begin = ahead(stamps, offset, since - 1, begin, unit, near)
-        begins[d - first] = max(min(begin, since), lows[d])
+        # which positions matter may change before the next block, and so must not tell which ones are open
+        changed[d - first] = min(begin, since)
+        begins[d - first] = max(changed[d - first], lows[d])
         # what a past operator starts from may be a row, too
         has_start = code in (codes.PAST_SINCE, codes.PAST_TRIGGER)
         lowest = min(lowest, lows[d] if has_start else begins[d - first])

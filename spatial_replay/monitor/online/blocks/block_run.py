@@ -218,26 +218,24 @@ def _join_body(
         In which of the running rows the numbers are, one for each sample.
     """
     is_until, offset = nodes[part[codes.PART_END] - 1, codes.NODE_CODE] == codes.UNTIL, block.offset
-    settled, is_first = max(body.begin, base), True
-    if is_cut:
-        for d in range(part[codes.PART_FIRST], part[codes.PART_END]):
-            if nodes[d, codes.NODE_CUTS]:
-                unit, far = nodes[d, codes.NODE_UNIT], nodes[d, codes.NODE_HIGH]
-                if far > 0:
-                    closed = first_behind(recent.stamps, offset, block.since - 1, unit, far - 1)
-                    settled = max(min(settled, closed), base)
-        for d in range(part[codes.PART_FIRST], part[codes.PART_END]):
-            if nodes[d, codes.NODE_CUTS]:
-                find_closing(nodes[d], block, recent, settled, is_first, closing)
-                is_first = False
+    settled, cuts = max(body.begin, base), 0
+    for d in range(part[codes.PART_FIRST], part[codes.PART_END] if is_cut else 0):
+        unit, far = nodes[d, codes.NODE_UNIT], nodes[d, codes.NODE_HIGH]
+        if nodes[d, codes.NODE_CUTS] and far > 0:
+            closed = first_behind(recent.stamps, offset, block.since - 1, unit, far - 1)
+            settled = max(min(settled, closed), base)
+    for d in range(part[codes.PART_FIRST], part[codes.PART_END] if is_cut else 0):
+        if nodes[d, codes.NODE_CUTS]:
+            find_closing(nodes[d], block, recent, settled, cuts == 0, closing)
+            cuts += 1
     fill(block.running[0], extremum(is_until, body.column[base - offset : settled - offset], start))
     whole = settled
-    while body.begin <= whole <= block.since and not (is_cut and closing[whole - settled] > 0):
+    while body.begin <= whole <= block.since and not (cuts and closing[whole - settled] > 0):
         whole += 1
     current = join_positions(block, is_until, body, settled, whole)
     for position in range(whole, block.last + 1):
         begin = position - block.since
-        if is_cut:
+        if cuts:
             begin = max(begin, closing[position - settled])
             if begin > block.last - block.since:
                 break  # no window closes before the ones before it do
