@@ -342,7 +342,9 @@ def run_to_last(
             if at <= changed and target[position - offset] == value:
                 break
             # where many change, most become equal to the newest
-            if is_even and position - stride >= lowest and position + STRIDE < since and at == start:
+            # windows that begin after the last sample all begin there, not one after the other
+            is_in_step = is_even and at == start <= last
+            if is_in_step and position - stride >= lowest and position + STRIDE < since:
                 begin = at - stride - offset
                 if extremum(is_greatest, source[begin : begin + stride], value) == value:
                     begin = position - stride - offset

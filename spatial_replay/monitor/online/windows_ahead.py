@@ -112,7 +112,8 @@ def _join_samples(
             after -= 1
             target[after - offset] = value
         changed = min(changed, after)
-    return changed
+    # of windows that begin late, a sample is in none of the recent ones
+    return max(changed, offset)
 
 
 @inlined
