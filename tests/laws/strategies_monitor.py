@@ -36,7 +36,7 @@ def time_bounds(draw):
 bounds = st.one_of(st.none(), st.none(), sample_bounds(), time_bounds())
 
 
-def combinations_of(operands):
+def combinations_of(operands, bounds=bounds):
     """One operator over the given formulas."""
     single = operands.map(lambda operand: (operand,))
     pairs = st.tuples(operands, operands)
