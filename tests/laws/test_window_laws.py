@@ -24,7 +24,7 @@ P, Q, R = LEAVES
 
 # --------------------------------------------------------------------------------------------- formulas
 
-_widths = st.sampled_from([0, 0, 1, 2, 5, 8, 15, 16, 17, 31, 32, 33, 40, 80])
+_widths = st.sampled_from([0, 0, 1, 2, 5, 8, 15, 16, 17, 31, 32, 33, 40, 80, 130, 260])
 _begins = st.sampled_from([0, 0, 0, 0, 1, 2, 10, 31, 33, 40])
 _even_bounds = st.builds(lambda low, more: Bound(low, low + more, "samples"), _begins, _widths)
 _timed_bounds = st.builds(

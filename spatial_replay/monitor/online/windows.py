@@ -217,6 +217,8 @@ def forget(table_at: int, channels: int) -> int:
     """
     tables, memory, _, _ = arrays_at(table_at)
     signals, position, offset = tables.signals, memory.clock[POSITION], memory.clock[OFFSET]
+    if position == 0:
+        return 0
     keep = _kept_from(table_at, position - 1)
     moved, kept = keep - offset, position - keep
     if 2 * moved < len(memory.stamps):

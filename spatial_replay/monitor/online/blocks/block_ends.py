@@ -69,7 +69,7 @@ def find_begins(
             distance = near if code == codes.SHIFT else far
             if begin < since:
                 begin = first_behind(stamps, offset, begin, unit, distance)
-            if distance > 0:
+            if distance > 0 and since > offset:
                 begin = min(begin, first_behind(stamps, offset, since - 1, unit, distance - 1))
             signal, is_greatest = signal_of(nodes, first + node[codes.NODE_A]), code == codes.PART_WINDOW_MAX
             if narrows and code != codes.SHIFT and signal >= 0 and not is_decided(node, look.mode):
@@ -77,7 +77,7 @@ def find_begins(
                 begin = _first_touched(is_greatest, source, columns[d], begin, since, last, offset)
         elif begin < since:
             begin = ahead(stamps, offset, since - 1, begin, unit, near)
-        # which positions matter may change before the next block, and so must not tell which ones are open
+        # which positions matter may change before the next block, and so must not say which ones are open
         changed[d - first] = min(begin, since)
         begins[d - first] = max(changed[d - first], lows[d])
         # what a past operator starts from may be a row, too

@@ -221,7 +221,7 @@ def _join_body(
     settled, cuts = max(body.begin, base), 0
     for d in range(part[codes.PART_FIRST], part[codes.PART_END] if is_cut else 0):
         unit, far = nodes[d, codes.NODE_UNIT], nodes[d, codes.NODE_HIGH]
-        if nodes[d, codes.NODE_CUTS] and far > 0:
+        if nodes[d, codes.NODE_CUTS] and far > 0 and block.since > offset:
             closed = first_behind(recent.stamps, offset, block.since - 1, unit, far - 1)
             settled = max(min(settled, closed), base)
     for d in range(part[codes.PART_FIRST], part[codes.PART_END] if is_cut else 0):
