@@ -80,12 +80,7 @@ WORTHWHILE = 8
 
 @inlined
 def _operand(
-    nodes: Integers,
-    part: Integers,
-    operand: int,
-    columns: Floats,
-    history: Floats,
-    scratch: Scratch,
+    nodes: Integers, part: Integers, operand: int, columns: Floats, history: Floats, scratch: Scratch
 ) -> NodeRows:
     """Return the numbers of a node by its place in its part; where there is none, any."""
     d = part[codes.PART_FIRST] + max(operand, 0)
@@ -341,15 +336,17 @@ def run_block(
     last = since + count - 1
     block, most = scratch.block, scratch.rows.shape[1]
     lowest = find_begins(table_at, number, 0, channels, 0, 0, since, last)
+    if last + 1 - lowest > most:
+        return 0
     is_wide = last + 1 - lowest > WIDE
     narrows = 1 if is_wide and is_whole else 0
     if narrows and is_beside_one(nodes, part, memory.stamps, memory.clock[OFFSET], since):
-        most = WIDE  # sample by sample, the width of one window alone costs next to nothing
-    for which in range(LOOKS if narrows else 0):
-        if (looks >> which) & 1 and last + 1 - lowest <= most:
-            lowest = find_begins(table_at, number, which, channels, narrows, 0, since, last)
-    if last + 1 - lowest > most:
-        return 0
+        # sample by sample, the width of one window alone costs next to nothing
+        for which in range(LOOKS):
+            if (looks >> which) & 1:
+                narrowed = find_begins(table_at, number, which, channels, narrows, 0, since, last)
+                if last + 1 - narrowed > WIDE:
+                    return 0
     block[SINCE], block[LAST], block[LOWEST] = since, last, lowest
     block[IS_FOLLOWED] = 1 if is_followed and not is_wide else 0
     for d in range(first, end):
@@ -411,21 +408,17 @@ def run_in_blocks(table_at: int, channels: int, count: int) -> int:
         part, k, state = tables.parts[number], 0, WHOLE
         if part[codes.PART_KIND] != codes.WINDOWED:
             continue
-        if is_settled(part, memory):
-            run_part(table_at, number, channels, 0, count, count)
-            continue
         while k < count:
+            if is_settled(part, memory):
+                run_part(table_at, number, channels, k, count, count)
+                break
             looks = looks_of(part, tables.nodes[part[codes.PART_END] - 1], memory, channels, False)
-            size, after = min(BLOCK, stop - k), min(BLOCK, stop - k - BLOCK)
-            if (
-                size < WORTHWHILE
-                or is_settled(part, memory)
-                or not _is_brought_up(number, looks, memory, position + k)
-            ):
+            size = min(BLOCK, stop - k)
+            if size < WORTHWHILE or not _is_brought_up(number, looks, memory, position + k):
                 run_part(table_at, number, channels, k, k + 1, count)
                 k += 1
                 continue
-            is_whole, is_followed = state == WHOLE, after >= WORTHWHILE
+            is_whole, is_followed = state == WHOLE, stop - k - size >= WORTHWHILE
             state = run_block(table_at, number, looks, channels, k, size, is_followed, is_whole)
             if state == 0:
                 if not is_whole:
