@@ -26,6 +26,7 @@ from spatial_replay.monitor.online.blocks.node_rows import (
     join_positions,
     recurrent_rows,
     shift_rows,
+    take_row,
     window_rows,
 )
 from spatial_replay.monitor.online.closing import absorb, is_settled
@@ -152,7 +153,7 @@ def _run_node(table_at: int, number: int, d: int, which: int, channels: int) -> 
     variable = node[codes.NODE_VARIABLE]
     if variable >= 0:
         boundary = memory.cells[cells_of(part)[1] + variable]
-        _take_row(block, NodeRows(columns[d], target, begin), boundary, value, scratch.points[variable])
+        take_row(block, NodeRows(columns[d], target, begin), boundary, value, scratch.points[variable])
     return 0
 
 
@@ -183,19 +184,6 @@ def _start_since(
     else:
         fill(running, column[begin - 1 - offset])
     return begin
-
-
-@inlined
-def _take_row(block: SampleBlock, operand: NodeRows, position: int, missing: float, target: Floats) -> None:
-    """Fill a row with the numbers at a position, or with `missing` for samples before it."""
-    if position > block.last:
-        fill(target, missing)
-        return
-    if position < operand.begin:
-        fill(target, operand.column[position - block.offset])
-    else:
-        copy(operand.rows[position - block.lowest], target)
-    fill(target[: max(position - block.since, 0)], missing)
 
 
 @uncounted
@@ -266,7 +254,7 @@ def _set_first(table_at: int, number: int, which: int, channels: int, at: int) -
         variables, points = part[codes.PART_VARIABLES], scratch.points
         _read_points(variables, table[: 1 << variables], count, points, scratch.point, scratch.order, numbers)
     elif not is_plain(part):
-        _take_row(block, operand, 0, missing, block.running[0])
+        take_row(block, operand, 0, missing, block.running[0])
         copy(block.running[0], numbers)
     elif is_known(which, part, root):
         fill(numbers, missing)

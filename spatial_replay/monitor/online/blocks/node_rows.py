@@ -360,8 +360,8 @@ def recurrent_rows(
 
 
 @inlined
-def _take(block: SampleBlock, operand: NodeRows, at: int, missing: float, target: Floats) -> None:
-    """Fill a row with the numbers at a position, or with `missing` for samples before it."""
+def take_row(block: SampleBlock, operand: NodeRows, at: int, missing: float, target: Floats) -> None:
+    """Fill a row with the numbers at a position, or with `missing` for samples before it, or all outside."""
     if at < block.offset or at > block.last:
         fill(target, missing)
         return
@@ -384,7 +384,7 @@ def shift_rows(
     for k in range(block.last + 1 - begin):
         # what is still to be looked at must not be replaced
         position = begin + k if is_ahead else block.last - k
-        _take(block, operand, block.starts[position - begin], missing, target[position - block.lowest])
+        take_row(block, operand, block.starts[position - begin], missing, target[position - block.lowest])
 
 
 @uncounted
