@@ -15,7 +15,7 @@ from laws.strategies_monitor import LEAVES, LeafRun, combinations_of, responses,
 from laws.test_monitor_laws import fewest
 from spatial_replay import UsageError
 from spatial_replay.compiled import only
-from spatial_replay.monitor.online import state
+from spatial_replay.monitor.online import operators, state
 from spatial_replay.monitor.online.program import compile_formula
 from spatial_replay.monitor.online.step import OnlineRun
 from spatial_replay.spec.formula import Boolean, Bound, Temporal
@@ -64,6 +64,27 @@ _beside = st.builds(Boolean, st.sampled_from(["and", "or", "xor", "<->"]), st.tu
 formulas = st.one_of(
     responses(_deep), responses(_over), responses(_beside), _deep, _behind(_below(2)), _below(3)
 )
+_ends = st.one_of(
+    st.builds(
+        lambda low, more: Bound(low, low + more, "samples"),
+        st.sampled_from([0, 0, 0, 1, 5, 31, 40]),
+        st.sampled_from([1, 2, 8, 31, 32, 33, 64, 100, 150, 260, 5000]),
+    ),
+    st.builds(
+        lambda low, more: Bound(low, low + more, "ns"),
+        st.sampled_from([0, 0, 0, 1, 100, 250, 3300]),
+        st.sampled_from([1, 50, 100, 800, 3200, 3250, 8000, 10**6, 8 * 10**18]),
+    ),
+)
+_conditioned = st.builds(Boolean, st.sampled_from(["and", "or", "->"]), st.tuples(_literals, _ahead))
+_several = st.builds(Boolean, st.sampled_from(["and", "or"]), st.tuples(_conditioned, _ahead))
+ending = st.builds(
+    Temporal,
+    st.sampled_from(["F", "G"]),
+    st.tuples(st.one_of(_conditioned, _several, _over, _deep, _beside, _behind(_ahead), _below(2))),
+    _ends,
+)
+"""A window from the first sample on over what looks ahead itself."""
 
 # ------------------------------------------------------------------------------------------------- runs
 
@@ -196,6 +217,42 @@ def assert_as_defined(formula, program, run, ends, **options):
     for series, finals in ways:
         np.testing.assert_array_equal(series, expected.series)
         np.testing.assert_array_equal(finals[-1], expected.final)
+
+
+# how wide such a window may be that is not made of signals
+briefs = st.sampled_from([(0, 0), operators.BRIEF])
+
+
+@settings(max_examples=300)
+@given(data=st.data(), formula=ending, run=long_runs(), room=rooms, tile=tiles, brief=briefs)
+def test_windows_from_the_first_sample_say_the_same_in_blocks(data, formula, run, room, tile, brief):
+    ends = data.draw(stretches(len(run)))
+    with mock.patch.object(operators, "BRIEF", brief):
+        program = program_of(formula)
+    assert_same_bits(*both_ways(program, run, ends, room=room, tile=tile))
+
+
+@settings(max_examples=100)
+@given(data=st.data(), formula=ending, run=long_runs(min_size=36, max_size=60), room=rooms, brief=briefs)
+def test_windows_from_the_first_sample_equal_the_definitions(data, formula, run, room, brief):
+    ends = data.draw(stretches(len(run)))
+    with mock.patch.object(operators, "BRIEF", brief):
+        program = compile_formula(formula)
+    assert_as_defined(formula, program, run, ends, room=room)
+
+
+def test_memory_does_not_grow_with_a_window_from_the_first_sample():
+    size, rng = 6000, np.random.default_rng(3)
+    times = np.arange(size) * 100
+    for body in (
+        ahead("F", 0, 20, Boolean("and", (P, ahead("F", 0, 20, Q)))),  # kept at open positions
+        Boolean("->", (P, ahead("F", 0, 20, Q))),  # made of signals
+    ):
+        program = compile_formula(ahead("G", 0, 10**6, body))
+        run = OnlineRun(program, room=64, tile=32)
+        run.extend(rng.normal(size=(1, len(program.leaves), size)), times)
+        # room for more is less than all there is
+        assert run.make_room(size) <= 512
 
 
 @settings(max_examples=40)

@@ -10,8 +10,10 @@ may be taken in any order: G (x and y) is G x and G y. So consider one clause, `
   windows that have begun and are open, so those over which it is the greatest so far form a single segment.
 
 With a left operand, `a R (…)`, p counts as the greater of p and every a before, and before the next sample,
-where what is open begins, that is all. `F` and `U` are the same upside down. Two windows of different kinds
-in a clause, or one of the other kind over a window, are none of this: they stay with `windows`.
+where what is open begins, that is all. Where `G` joins a window from the first sample on, p counts as
+infinite at positions outside, and what is open is the least that it can be until the window has closed. `F`
+and `U` are the same upside down. Two windows of different kinds in a clause, or one of the other kind over a
+window, are none of this: they stay with `windows`.
 """
 
 from __future__ import annotations
@@ -52,14 +54,16 @@ class Clauses:
 def clauses_of(signals: SignalTable, part: PartRows) -> Clauses | None:
     """Return a part as clauses, for which signals are added; None if it has to be run as it is."""
     code, left, body, is_weak, *_, is_variable = part.fields[-1]
-    if not is_variable or code not in (codes.UNTIL, codes.RELEASE) or part.is_flat:
+    if not is_variable or code not in (codes.UNTIL, codes.RELEASE) or part.is_flat or part.is_brief:
         return None
     if left != NOTHING and part.fields[left][0] != codes.LITERAL:
         return None
     clauses = _normal_form(part.fields, body, is_weak=bool(is_weak))
     if clauses is None:
         return None
-    builder, before = _Builder(signals, part.fields, left, is_weak=bool(is_weak)), len(signals)
+    before = len(signals)
+    window = part.root_window if part.ends else None
+    builder = _Builder(signals, part.fields, left, window, is_weak=bool(is_weak))
     found = builder.result() if all(map(builder.add, clauses)) else None
     if found is None:
         signals.drop(before)
@@ -90,10 +94,24 @@ def _normal_form(rows: tuple[Row, ...], body: int, *, is_weak: bool) -> list[Cla
 class _Builder:
     """Collects the signals of one part, clause by clause."""
 
-    def __init__(self, signals: SignalTable, rows: tuple[Row, ...], left: int, *, is_weak: bool) -> None:
+    def __init__(
+        self,
+        signals: SignalTable,
+        rows: tuple[Row, ...],
+        left: int,
+        window: tuple[int, int, int] | None,
+        *,
+        is_weak: bool,
+    ) -> None:
+        """Begin without clauses.
+
+        Args:
+            window: the unit and the ends of what the root joins, if it ends.
+        """
         self._signals = signals
         self._rows = rows
         self._left = left
+        self._ends = window
         self._is_weak = is_weak
         self._both, self._either = (codes.AND, codes.OR) if is_weak else (codes.OR, codes.AND)
         self._running, self._before = (
@@ -134,12 +152,16 @@ class _Builder:
 
     def result(self) -> Clauses | None:
         """Return what was added; None if there was no window or if the table beside would be too large."""
+        if self._tabled and self._ends is not None:
+            return None
         beside = self._table() if self._tabled else None
         if not self._ending or (beside is not None and beside.variables > MAX_TABLE):
             return None
         best = self._signals.row(codes.CONSTANT, low=1 if self._is_weak else -1)
         ending, settled = self._joined(self._ending), self._joined(self._settled or [best])
-        if self._left == NOTHING:
+        if self._ends is not None:
+            last = self._joined([*self._open, self._elapsed(self._ends[2])])
+        elif self._left == NOTHING:
             last = self._nothing()
         else:  # what is open may begin with the next sample
             last = self._joined([*self._open, self._signals.row(self._before, self._literal(self._left))])
@@ -173,7 +195,7 @@ class _Builder:
         """
         _, operand, _, _, unit, low, high, *_ = window
         clauses = _normal_form(self._rows, operand, is_weak=self._is_weak)
-        if clauses is None or self._left != NOTHING:
+        if clauses is None or self._left != NOTHING or self._ends is not None:
             return False
         behind = self._signals.row(self._window, condition, 0, unit, low, high)
         return all(self.add(clause, behind) for clause in clauses)
@@ -191,22 +213,25 @@ class _Builder:
             return False
         ((unit, low),) = starts
         row, kind = self._signals.row, codes.CLOSED_MIN_OF_MAX if self._is_weak else codes.CLOSED_MAX_OF_MIN
+        ending = list[int]()
         begun = codes.BEGUN_MIN if self._is_weak else codes.BEGUN_MAX
         each = codes.CLOSED_EACH_MAX if self._is_weak else codes.CLOSED_EACH_MIN
         if low > 0:
-            self._ending.append(row(self._window, condition, 0, unit, 0, low - 1))
+            ending.append(row(self._window, condition, 0, unit, 0, low - 1))
         near, ends = low, sorted({window[6] for window in windows})
         for high in ends:
             numbers = [self._literal(window[1]) for window in windows if window[6] >= high]
             number = reduce(lambda one, other: row(self._either, one, other), numbers)
-            self._ending.append(row(begun, condition, number, unit, near, high))
+            ending.append(row(begun, condition, number, unit, near, high))
             if high < ends[-1]:
                 condition = row(each, condition, number, unit, near, high)
             else:
                 closed = row(kind, condition, number, unit, near, high)
                 self._settled.append(closed)
-                self._ending.append(closed)
+                ending.append(closed)
             near = high
+        self._ending += ending
+        self._open += ending
         return True
 
     def _add_later(self, condition: int, row: int) -> bool:
@@ -227,7 +252,7 @@ class _Builder:
     def _add_joined(self, behind: int, number: int, condition: int, window: tuple[int, int, int]) -> None:
         """Add a clause by what its conditions are, together, where its window holds each number."""
         value = self._signals.row(self._running, self._signals.row(self._either, behind, number))
-        if self._left == NOTHING:
+        if self._left == NOTHING and self._ends is None:
             self._add_same(value)
             return
         unit, low, high = window
@@ -251,7 +276,7 @@ class _Builder:
         """
         windows = [row for row in others if row[0] == self._same]
         shifts = [row for row in others if row[0] == codes.SHIFT]
-        if len(windows) != 1 or len(shifts) != 1 or self._left != NOTHING:
+        if len(windows) != 1 or len(shifts) != 1 or self._left != NOTHING or self._ends is not None:
             return False
         _, operand, _, _, unit, low, high, *_ = windows[0]
         release = self._rows[shifts[0][1]]
@@ -278,6 +303,8 @@ class _Builder:
         found = [self._literal(each) for each in literals]
         if beside != NOTHING:
             found.append(beside)
+        elif self._ends is not None:
+            found += self._outside()
         if self._left != NOTHING:
             before = self._signals.row(self._before, self._literal(self._left))
             # what stands before the first sample is the least that it can be
@@ -285,6 +312,19 @@ class _Builder:
         return reduce(
             lambda one, other: self._signals.row(self._either, one, other), found or [self._nothing()]
         )
+
+    def _outside(self) -> list[int]:
+        """Return signals of which one is infinite where a position is not in the root's window."""
+        assert self._ends is not None
+        _, low, high = self._ends
+        early = [self._signals.row(codes.NOT, self._elapsed(low))] if low > 0 else []
+        return [*early, self._elapsed(high + 1)]
+
+    def _elapsed(self, distance: int) -> int:
+        """Return a signal that, once a distance from the first sample on, is as good as a clause can be."""
+        assert self._ends is not None
+        sign = 1 if self._is_weak else -1
+        return self._signals.row(codes.ELAPSED, unit=self._ends[0], low=distance, high=sign)
 
     def _literal(self, row: int) -> int:
         _, signal, is_negated = self._rows[row][:3]

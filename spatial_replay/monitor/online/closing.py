@@ -12,9 +12,23 @@ from spatial_replay.compiled import apart, inlined, uncounted
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.node_columns import cells_of, signal_of, start_of_past, tables_end
-from spatial_replay.monitor.online.open_windows import bring_columns_up, find_lows, reach
+from spatial_replay.monitor.online.open_windows import (
+    bring_columns_up,
+    find_lows,
+    has_ended,
+    reach,
+    root_window,
+)
 from spatial_replay.monitor.online.run_arrays import arrays_at
-from spatial_replay.monitor.online.sliding import either, extremum, join, recent_of, run_shift, run_window
+from spatial_replay.monitor.online.sliding import (
+    beyond,
+    either,
+    extremum,
+    join,
+    recent_of,
+    run_shift,
+    run_window,
+)
 from spatial_replay.monitor.online.state import OFFSET, Memory, Scratch
 from spatial_replay.monitor.online.tables import corner_value, read_table
 
@@ -38,9 +52,15 @@ def root_value(
 
 @inlined
 def is_settled(part: Integers, memory: Memory) -> bool:
-    """Return whether no later sample matters: every window from the first sample on has closed."""
-    without_state = part[codes.PART_VARIABLES] == 0 and not part[codes.PART_IS_REMEMBERING]
-    return bool(without_state and memory.cells[part[codes.PART_CELL_START]] > 0)
+    """Return whether no later sample matters: a part's table says the same whatever is still to come."""
+    if part[codes.PART_IS_REMEMBERING] or memory.cells[part[codes.PART_CELL_START]] == 0:
+        return False
+    least = part[codes.PART_TABLE_START]
+    most = least + (1 << part[codes.PART_VARIABLES]) - 1
+    for channel in range(codes.CHANNELS):
+        if memory.tables[channel, least] != memory.tables[channel, most]:
+            return False
+    return True
 
 
 @inlined
@@ -139,6 +159,7 @@ def _absorb_plain(
     """Absorb what has closed, many positions at a time, where no more than the root has a variable."""
     base, boundary, _ = cells_of(part)
     cells, root, size = memory.cells, nodes[part[codes.PART_END] - 1], CLOSING
+    earliest, after = root_window(root, memory, last)
     while size > 0:
         first, newest = cells[base], cells[base] + size - 1
         if newest > last or not reach(table_at, number, newest, newest, last):
@@ -158,8 +179,13 @@ def _absorb_plain(
             signal, other = signal_of(nodes, a), signal_of(nodes, b)
             left = columns[a] if signal < 0 else history[signal]
             right = columns[b] if other < 0 else history[other]
-            worst = root_value(root, left, right, -np.inf, first, newest, offset)
-            best = root_value(root, left, right, np.inf, first, newest, offset)
+            worst, best = -np.inf, np.inf
+            if newest + 1 >= after and has_ended(part, root, memory, last):
+                worst = best = beyond(codes.OPEN_END, root[codes.NODE_WEAK])
+            begin = max(first, earliest)
+            end = max(min(newest + 1, after), begin)
+            worst = root_value(root, left, right, worst, begin, end - 1, offset)
+            best = root_value(root, left, right, best, begin, end - 1, offset)
             if first > 0:
                 low, high = tables[0], tables[1]
                 worst, best = max(low, min(worst, high)), max(low, min(best, high))

@@ -35,6 +35,8 @@ CLOSED_MIN_OF_MAX, CLOSED_MIN_OF_MIN, CLOSED_MAX_OF_MAX, CLOSED_MAX_OF_MIN = 17,
 CLOSED_EACH_MAX, CLOSED_EACH_MIN = 29, 30
 # of a, over the positions that have come to be low back with the sample; infinite if there are none
 ARRIVED_MIN, ARRIVED_MAX = 21, 22
+# high times infinity once the first sample is at least low behind, the negative of that before
+ELAPSED = 31
 DELAYED = (DELAY, ARRIVED_MIN, ARRIVED_MAX)
 BEGUN = (BEGUN_MIN, BEGUN_MAX)
 CLOSED_EACH = (CLOSED_EACH_MAX, CLOSED_EACH_MIN)
@@ -53,7 +55,9 @@ NODE_WIDTH = 13
 # codes of parts' nodes
 LITERAL = 0  # signal a, negated if b
 PART_AND, PART_OR = 2, 3
-UNTIL, RELEASE = 4, 5  # max(b, min(a, next)); min(b, max(a, next))
+# max(b, min(a, next)); min(b, max(a, next)). With a high end, as the root of a part, over the window
+# [low, high] from the first sample on
+UNTIL, RELEASE = 4, 5
 PART_WINDOW_MAX, PART_WINDOW_MIN = 6, 7  # of a, over [low, high] ahead
 SHIFT = 8  # a, low ahead; a is wanted up to high ahead
 AHEAD_OF = (PART_WINDOW_MAX, PART_WINDOW_MIN, SHIFT)

@@ -25,10 +25,12 @@ from spatial_replay.monitor.online.sliding import looks_ahead
 from spatial_replay.monitor.online.state import (
     NUMBERS,
     OFFSET,
+    START_NS,
     Memory,
     ahead,
     behind,
     first_behind,
+    first_since,
     is_closed,
     last_ahead,
 )
@@ -133,22 +135,52 @@ def runs_root(part: Integers, root: Integers) -> bool:
 
 
 @inlined
-def is_known(which: int, part: Integers, root: Integers) -> bool:
+def has_ended(part: Integers, root: Integers, memory: Memory, last: int) -> bool:
+    """Return whether no later sample can fall into the window of a root that counts from the first one."""
+    far = root[codes.NODE_HIGH]
+    if not is_plain(part) or far <= 0:
+        return False
+    if root[codes.NODE_UNIT] == codes.SAMPLES:
+        return bool(last >= far)
+    return bool(memory.stamps[last - memory.clock[OFFSET]] - memory.clock[START_NS] >= far)
+
+
+@inlined
+def root_window(root: Integers, memory: Memory, last: int) -> tuple[int, int]:
+    """Return the first of the recent positions that a plain root joins, and what comes after the last one."""
+    unit, near, far = root[codes.NODE_UNIT], root[codes.NODE_LOW], root[codes.NODE_HIGH]
+    offset, start_ns = memory.clock[OFFSET], memory.clock[START_NS]
+    begin, after = offset, last + 1
+    if far > 0 and unit == codes.SAMPLES:
+        begin, after = min(max(near, offset), last + 1), min(far, last) + 1
+    elif far > 0:
+        if near > 0:
+            begin = first_since(memory.stamps, offset, last, start_ns, near)
+        if memory.stamps[last - offset] - start_ns > far:
+            after = first_since(memory.stamps, offset, last, start_ns, far + 1)
+    return begin, after
+
+
+@inlined
+def is_known(which: int, part: Integers, root: Integers, memory: Memory, last: int) -> bool:
     """Return whether what may still come outdoes all that is open, whatever that is."""
-    is_high = which in (5, 7)
     is_bound = is_plain(part) and root[codes.NODE_A] < 0 and which in (4, 5)
-    return is_bound and is_high == (root[codes.NODE_CODE] == codes.UNTIL)
+    is_best = (which == 5) == (root[codes.NODE_CODE] == codes.UNTIL)
+    return is_bound and is_best and not has_ended(part, root, memory, last)
 
 
 @inlined
-def is_cut_short(which: int, part: Integers, channels: int) -> bool:
+def is_cut_short(which: int, part: Integers, root: Integers, channels: int) -> bool:
     """Return whether a number is that of the value, cut short, which needs no columns of its own."""
-    return part[codes.PART_IS_CUT] == 1 and which in (4, 5) and channels < 4
+    cuts = 4 if root[codes.NODE_CODE] == codes.UNTIL else 5
+    return part[codes.PART_IS_CUT] == 1 and which == cuts and channels < 4
 
 
 @inlined
-def looks_of(part: Integers, root: Integers, memory: Memory, channels: int, is_last: bool) -> int:
-    """Return which numbers of a part are computed by themselves, a bit for each.
+def looks_of(
+    part: Integers, root: Integers, memory: Memory, channels: int, is_last: bool, position: int
+) -> int:
+    """Return which numbers of a part at a sample are computed by themselves, a bit for each.
 
     Numbers 2 and 3 (now) come with 0 and 1; those of an ending run count for the last sample only.
     """
@@ -156,7 +188,8 @@ def looks_of(part: Integers, root: Integers, memory: Memory, channels: int, is_l
     if part[codes.PART_VARIABLES] == 0 and memory.cells[part[codes.PART_CELL_START]] > 0:
         return looks  # its numbers at the first sample stand in its table
     for which in (4, 5):
-        if not is_known(which, part, root) and not is_cut_short(which, part, channels):
+        is_other = is_known(which, part, root, memory, position) or is_cut_short(which, part, root, channels)
+        if not is_other:
             looks |= 1 << which
     return looks | 1 << 6 | 1 << 7 if is_last and channels == 4 else looks
 

@@ -181,6 +181,9 @@ class SignalTable:
 MAX_VARIABLES = 12
 """How many unbounded future operators one part may nest: its table has 2**variables entries."""
 
+BRIEF = (1000, 10 * 10**9)
+"""So wide a window of the root, in samples or in ns, is over soon; then it costs nothing any more."""
+
 _ANCHORED = (codes.ANCHORED_UNTIL, codes.ANCHORED_RELEASE)
 _RUNNING = (codes.UNTIL, codes.RELEASE)
 _RECURRENT_PAST = (codes.PAST_SINCE, codes.PAST_TRIGGER)
@@ -197,7 +200,9 @@ def part_of(signals: SignalTable, node: Temporal) -> WindowedPart:
     if bounded and not part.is_flat:
         # what a past operator over a future one is now is read at the last sample, too
         asked = node if part.is_remembering else from_first(node)
-        part = WindowedPart(signals, asked, anchored=False)
+        part = WindowedPart(signals, asked, anchored=False, ends=True)
+        if part.ends and part.is_nested:
+            part = WindowedPart(signals, asked, anchored=False)
     if part.variables > MAX_VARIABLES:
         raise UsageError(
             f"a formula nests {part.variables} unbounded temporal operators under one {node.operator}; "
@@ -260,7 +265,26 @@ class PartRows:
     @property
     def is_remembering(self) -> bool:
         """Whether it is asked for at the last sample, too: a past operator stands over a future one."""
-        return self._is_past or any(row[0] in codes.PAST for row in self._rows)
+        # a root with a window of its own stands at the first sample alone
+        return self._is_past or (not self.ends and any(row[0] in codes.PAST for row in self._rows))
+
+    @property
+    def ends(self) -> bool:
+        """Whether the root joins a window that is counted from the first sample."""
+        code, *_, high, is_variable = self.fields[-1]
+        return code in _RUNNING and bool(is_variable) and high > 0
+
+    @property
+    def root_window(self) -> tuple[int, int, int]:
+        """The unit and the ends of the window that a root which `ends` joins."""
+        _, _, _, _, unit, low, high, _ = self.fields[-1]
+        return unit, low, high
+
+    @property
+    def is_brief(self) -> bool:
+        """Whether the root joins a window so short that what it costs until then matters little."""
+        unit, _, high = self.root_window
+        return self.ends and high <= BRIEF[unit]
 
     @property
     def end_corner(self) -> int:
@@ -291,13 +315,15 @@ class PartRows:
 class WindowedPart(PartRows):
     """The rows of a node that looks ahead, in negation normal form."""
 
-    def __init__(self, signals: SignalTable, root: Temporal, *, anchored: bool) -> None:
+    def __init__(self, signals: SignalTable, root: Temporal, *, anchored: bool, ends: bool = False) -> None:
         """Build the part of a node that looks ahead.
 
         Args:
             signals: receives the subformulas that do not look ahead.
             anchored: whether the root is a bounded operator that is only ever asked for at the first
                 sample, so that its window is a fixed stretch of the run and needs no history.
+            ends: whether such a root, over what looks ahead itself, is an unbounded operator that joins no
+                more than its window, so that what has closed in there is kept as one number.
         """
         super().__init__()
         self._signals = signals
@@ -305,6 +331,8 @@ class WindowedPart(PartRows):
         self._added: dict[tuple[int, bool], tuple[Formula, int]] = {}
         if anchored:
             self._anchored(root, True)
+        elif ends:
+            self._ending(root)
         else:
             self._add(root, True)
 
@@ -378,6 +406,15 @@ class WindowedPart(PartRows):
                 before = self.row(other, left, 0, 1 - weak, unit, 0, low - 1)
                 result = self._join(before, result, is_both=is_since)
         return result if within is None else self._join(within, result, is_both=is_since)
+
+    def _ending(self, root: Temporal) -> int:
+        bound = root.bound
+        if root.operator not in "FG" or bound is None or not bound.upper:
+            return self._add(root, True)
+        unit, low, high = window_of(bound)
+        body, is_until = self._add(root.operands[0], True), root.operator == "F"
+        code = codes.UNTIL if is_until else codes.RELEASE
+        return self.row(code, NOTHING, body, int(not is_until), unit, low, high or 0, variable=True)
 
     def _anchored(self, formula: Formula, positive: bool) -> int:
         formula = expand(formula)

@@ -12,7 +12,7 @@ import numpy as np
 from spatial_replay.compiled import inlined, uncounted
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
-from spatial_replay.monitor.online.state import Memory, behind, is_closed, past_value
+from spatial_replay.monitor.online.state import START_NS, Memory, behind, is_closed, past_value
 
 
 @uncounted
@@ -58,6 +58,12 @@ def step_signals(
                         target[k] = history[channel, a, source - offset]
                     else:
                         target[k] = signals[s, 5] * np.inf
+            elif code == codes.ELAPSED:
+                for k in range(count):
+                    distance = position + k
+                    if signals[s, 3] != codes.SAMPLES:
+                        distance = stamps[distance - offset] - memory.clock[START_NS]
+                    target[k] = signals[s, 5] * (np.inf if distance >= signals[s, 4] else -np.inf)
             elif code in (codes.ARRIVED_MIN, codes.ARRIVED_MAX):
                 _gather_arrived(signals[s], history[channel, a], target, position, offset, count, stamps)
             elif code in codes.BEGUN:

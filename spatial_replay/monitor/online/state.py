@@ -287,12 +287,17 @@ def past_value(code: int, first: float, second: float, before: float) -> float:
 
 @uncounted
 def first_after(stamps: Integers, offset: int, last: int, position: int, distance: int) -> int:
-    """Return the first position, offset … last, at least `distance` ns after another; else last + 1.
+    """Return the first position, offset … last, at least `distance` ns after another; else last + 1."""
+    return first_since(stamps, offset, last, stamps[position - offset], distance)
+
+
+@uncounted
+def first_since(stamps: Integers, offset: int, last: int, origin: int, distance: int) -> int:
+    """Return the first position, offset … last, at least `distance` ns after a time; else last + 1.
 
     Times are compared by their differences, which fit where a time plus the distance might not.
     """
     low, high = 0, last - offset + 1
-    origin = stamps[position - offset]
     while low < high:
         middle = (low + high) >> 1
         if stamps[middle] - origin < distance:

@@ -27,11 +27,13 @@ from spatial_replay.monitor.online.node_columns import (
 )
 from spatial_replay.monitor.online.open_windows import (
     bring_columns_up,
+    has_ended,
     is_cut_short,
     is_known,
     is_plain,
     looks_of,
     reach,
+    root_window,
     runs_root,
 )
 from spatial_replay.monitor.online.run_arrays import arrays_at
@@ -99,18 +101,19 @@ def _value_at_first(
     base, variables = memory.cells[part[codes.PART_CELL_START]], part[codes.PART_VARIABLES]
     tables = memory.tables[look.channel, part[codes.PART_TABLE_START] : tables_end(part)]
     if is_plain(part):
-        value = beyond(look.mode, root[codes.NODE_WEAK])
+        has_more = not has_ended(part, root, memory, last)
+        value = beyond(look.mode if has_more else codes.OPEN_END, root[codes.NODE_WEAK])
         if root[codes.NODE_A] >= 0:
             value = memory.columns[at, part[codes.PART_END] - 1, base - offset] if base <= last else value
-        elif not is_known(which, part, root):
-            end = last + 1
-            if is_cut_short(which, part, channels):
+        elif not is_known(which, part, root, memory, last):
+            begin, end = root_window(root, memory, last)
+            if is_cut_short(which, part, root, channels):
                 at = look.channel
-                end = _cut_at(nodes, part, memory, scratch, offset, last)
+                end = min(end, _cut_at(nodes, part, memory, scratch, offset, last))
             d = part[codes.PART_FIRST] + root[codes.NODE_B]
             signal, is_until = signal_of(nodes, d), root[codes.NODE_CODE] == codes.UNTIL
             body = memory.columns[at, d] if signal < 0 else memory.history[look.channel, signal]
-            begin, count = base - offset, last + 1 - offset
+            begin, count = max(begin, base) - offset, last + 1 - offset
             value = _joined(number, at, is_until, body, value, begin, end - offset, memory, count)
         return value if base == 0 else max(tables[0], min(value, tables[1]))
     if base == 0:
@@ -165,7 +168,8 @@ def run_part(table_at: int, number: int, channels: int, begin: int, end: int, co
             enter_samples(
                 tables.nodes, part, memory.stamps, memory.window_ends, memory.window_next, offset, last
             )
-        looks = looks_of(part, tables.nodes[part[codes.PART_END] - 1], memory, channels, k == count - 1)
+        root = tables.nodes[part[codes.PART_END] - 1]
+        looks = looks_of(part, root, memory, channels, k == count - 1, last)
         bring_columns_up(table_at, number, looks, channels, last)
         for which in range(NUMBERS):
             if which in (2, 3) or (which >= 6 and k < count - 1):

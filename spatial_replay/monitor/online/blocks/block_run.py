@@ -39,10 +39,12 @@ from spatial_replay.monitor.online.node_columns import (
     tables_end,
 )
 from spatial_replay.monitor.online.open_windows import (
+    has_ended,
     is_cut_short,
     is_known,
     is_plain,
     looks_of,
+    root_window,
     runs_root,
 )
 from spatial_replay.monitor.online.run_arrays import arrays_at
@@ -188,12 +190,13 @@ def _start_since(
 
 @uncounted
 def _join_body(
-    nodes: Integers, part: Integers, block: SampleBlock, body: NodeRows, base: int, start: float,
-    is_cut: bool, recent: Recent, closing: Integers,
+    nodes: Integers, part: Integers, block: SampleBlock, body: NodeRows, base: int, after: int,
+    start: float, is_cut: bool, recent: Recent, closing: Integers,
 ) -> int:  # fmt: skip
     """Join what the root of a part joins, from its base on, with a number.
 
     Args:
+        after: what comes after the last position.
         is_cut: whether only what comes before the first open window that cuts the bound short.
         closing: room to work in.
 
@@ -211,12 +214,13 @@ def _join_body(
         if nodes[d, codes.NODE_CUTS]:
             find_closing(nodes[d], block, recent, settled, cuts == 0, closing)
             cuts += 1
-    fill(block.running[0], extremum(is_until, body.column[base - offset : settled - offset], start))
+    known = max(min(settled, after), base)
+    fill(block.running[0], extremum(is_until, body.column[base - offset : known - offset], start))
     whole = settled
-    while body.begin <= whole <= block.since and not (cuts and closing[whole - settled] > 0):
+    while body.begin <= whole < min(block.since + 1, after) and not (cuts and closing[whole - settled] > 0):
         whole += 1
     current = join_positions(block, is_until, body, settled, whole)
-    for position in range(whole, block.last + 1):
+    for position in range(whole, after):
         begin = position - block.since
         if cuts:
             begin = max(begin, closing[position - settled])
@@ -243,10 +247,11 @@ def _set_first(table_at: int, number: int, which: int, channels: int, at: int) -
     tables, memory, scratch, _ = arrays_at(table_at)
     nodes, part, block = tables.nodes, tables.parts[number], _block_of(memory, scratch)
     look, end, root = look_of(which, channels), part[codes.PART_END] - 1, nodes[part[codes.PART_END] - 1]
-    base, is_cut = memory.cells[part[codes.PART_CELL_START]], is_cut_short(which, part, channels)
+    base, is_cut = memory.cells[part[codes.PART_CELL_START]], is_cut_short(which, part, root, channels)
     columns = memory.columns[look.channel if is_cut else columns_number(which)]
     table = memory.tables[look.channel, part[codes.PART_TABLE_START] : tables_end(part)]
-    missing, count = beyond(look.mode, root[codes.NODE_WEAK]), block.last + 1 - block.since
+    mode = codes.OPEN_END if has_ended(part, root, memory, block.since) else look.mode
+    missing, count = beyond(mode, root[codes.NODE_WEAK]), block.last + 1 - block.since
     numbers = scratch.parts[number, which, at : at + count]
     place = root[codes.NODE_B] if is_plain(part) else end - part[codes.PART_FIRST]
     operand = _operand(nodes, part, place, columns, memory.history[look.channel], scratch)
@@ -256,13 +261,15 @@ def _set_first(table_at: int, number: int, which: int, channels: int, at: int) -
     elif not is_plain(part):
         take_row(block, operand, 0, missing, block.running[0])
         copy(block.running[0], numbers)
-    elif is_known(which, part, root):
+    elif is_known(which, part, root, memory, block.since):
         fill(numbers, missing)
     elif root[codes.NODE_A] >= 0:
         copy(scratch.points[root[codes.NODE_VARIABLE]], numbers)
     else:
         recent, closing = recent_of(memory, scratch), scratch.closing
-        current = _join_body(nodes, part, block, operand, base, missing, is_cut, recent, closing)
+        begin, after = root_window(root, memory, block.last)
+        begin = max(begin, base)
+        current = _join_body(nodes, part, block, operand, begin, after, missing, is_cut, recent, closing)
         copy(block.running[current], numbers)
     if is_plain(part) and base > 0:
         for k in range(count):
@@ -326,6 +333,8 @@ def run_block(
     lowest = find_begins(table_at, number, 0, channels, 0, 0, since, last)
     if last + 1 - lowest > most:
         return 0
+    if has_ended(part, root, memory, last) and not has_ended(part, root, memory, since):
+        return 0  # the samples of a block are all of one kind
     is_wide = last + 1 - lowest > WIDE
     narrows = 1 if is_wide and is_whole else 0
     if narrows and is_beside_one(nodes, part, memory.stamps, memory.clock[OFFSET], since):
@@ -400,18 +409,18 @@ def run_in_blocks(table_at: int, channels: int, count: int) -> int:
             if is_settled(part, memory):
                 run_part(table_at, number, channels, k, count, count)
                 break
-            looks = looks_of(part, tables.nodes[part[codes.PART_END] - 1], memory, channels, False)
-            size = min(BLOCK, stop - k)
+            root = tables.nodes[part[codes.PART_END] - 1]
+            looks = looks_of(part, root, memory, channels, False, position + k)
+            size, is_whole, after = min(BLOCK, stop - k), state == WHOLE, 0
             if size < WORTHWHILE or not _is_brought_up(number, looks, memory, position + k):
-                run_part(table_at, number, channels, k, k + 1, count)
-                k += 1
-                continue
-            is_whole, is_followed = state == WHOLE, stop - k - size >= WORTHWHILE
-            state = run_block(table_at, number, looks, channels, k, size, is_followed, is_whole)
-            if state == 0:
+                size = 1
+            else:
+                is_followed = stop - k - size >= WORTHWHILE
+                after = run_block(table_at, number, looks, channels, k, size, is_followed, is_whole)
+            if after == 0:
                 if not is_whole:
                     memory.known[number] = -1
                 run_part(table_at, number, channels, k, k + size, count)
-                state = WHOLE
+            state = WHOLE if after == 0 else after
             k += size
     return 0
