@@ -139,6 +139,17 @@ def by_address(function: Callable[..., int]) -> Callable[[int, bytes, int], int]
     return cast(Callable[[int, bytes, int], int], cast("_Apart", function).entry())
 
 
+def releasing(function: Callable[..., int]) -> Callable[..., int]:
+    """Return a kernel compiled apart for long calls, while which other threads run (see `long_kernel`)."""
+    if _process.only == "interpreted":
+        return function
+    kernel = cast("_Apart", function)
+    count = cast(FunctionType, kernel.__wrapped__).__code__.co_argcount
+    address = kernel.entry().machine_code.address
+    entry = ctypes.CFUNCTYPE(ctypes.c_int64, *[ctypes.c_void_p] * count)(address)
+    return lambda *arguments: cast(int, entry(*kernel._taken(arguments)))
+
+
 def compile_ahead() -> None:
     """Interpret no kernel in this process from now on.
 
@@ -344,7 +355,7 @@ class _ArrayAt(_Kernel[[int, Any], Any]):
         self._kind = kind
 
     def interpreted(self) -> Callable[[int, Any], Any]:
-        kind: Any = _C_TYPES[self._kind]
+        kind: Any = np.ctypeslib.as_ctypes_type(self._kind)
 
         def array_at(address: int, shape: Any) -> Any:
             count = math.prod(shape) if isinstance(shape, tuple) else shape
@@ -359,13 +370,6 @@ class _ArrayAt(_Kernel[[int, Any], Any]):
         return self._compiled
 
 
-_C_TYPES: Final[dict[type, Any]] = {
-    np.float64: ctypes.c_double,
-    np.int64: ctypes.c_int64,
-    np.uint8: ctypes.c_uint8,
-    np.int8: ctypes.c_int8,
-}
-
 floats_at: Final = _ArrayAt("floats_at", np.float64)
 integers_at: Final = _ArrayAt("integers_at", np.int64)
 bytes_at: Final = _ArrayAt("bytes_at", np.uint8)
@@ -377,7 +381,8 @@ class _Process:
     """What this process knows about its kernels: the compiler, the cache, who listens."""
 
     def __init__(self) -> None:
-        self.only = _required_form()
+        form = os.environ.get("SPATIAL_REPLAY_KERNELS")
+        self.only = form if form in ("compiled", "interpreted") else None
         self.interprets = True
         self.spent_s = 0.0
         self.listeners: list[Callable[[], None]] = []
@@ -510,11 +515,6 @@ class _Process:
                 cast(Any, event).register("numba:compile", Listener())
                 self._compiler = numba
             return self._compiler
-
-
-def _required_form() -> str | None:
-    value = os.environ.get("SPATIAL_REPLAY_KERNELS")
-    return value if value in ("compiled", "interpreted") else None
 
 
 _process: Final = _Process()

@@ -76,6 +76,37 @@ _ends = st.one_of(
         st.sampled_from([1, 50, 100, 800, 3200, 3250, 8000, 10**6, 8 * 10**18]),
     ),
 )
+_far = st.one_of(
+    st.builds(
+        lambda low, more: Bound(low, low + more, "samples"),
+        st.sampled_from([0, 0, 0, 0, 1, 33, 200]),
+        st.sampled_from([0, 5, 100, 150, 200, 260, 330]),
+    ),
+    st.builds(
+        lambda low, more: Bound(low, low + more, "ns"),
+        st.sampled_from([0, 0, 0, 0, 1, 3300, 20000]),
+        st.sampled_from([0, 500, 10000, 15000, 20000, 33000]),
+    ),
+)
+
+
+def _wide_windows(depth):
+    if depth == 0:
+        return _literals
+    below = _wide_windows(depth - 1)
+    return st.one_of(
+        *[st.builds(Temporal, st.sampled_from(["F", "G"]), st.tuples(below), _far)] * 4,
+        st.builds(Temporal, st.sampled_from(["O", "H"]), st.tuples(below), _far),
+        *[st.builds(Boolean, st.sampled_from(["and", "or", "->"]), st.tuples(_literals, below))] * 2,
+        st.builds(
+            Boolean, st.sampled_from(["and", "or", "<->"]), st.tuples(below, _wide_windows(min(depth - 1, 1)))
+        ),
+    )
+
+
+wide_windows = st.builds(Temporal, st.sampled_from(["F", "G"]), st.tuples(_wide_windows(4)))
+"""Windows of some hundred samples over each other."""
+
 _conditioned = st.builds(Boolean, st.sampled_from(["and", "or", "->"]), st.tuples(_literals, _ahead))
 _several = st.builds(Boolean, st.sampled_from(["and", "or"]), st.tuples(_conditioned, _ahead))
 ending = st.builds(
@@ -185,6 +216,7 @@ def assert_same_bits(first, second):
 
 rooms = st.sampled_from([2, 3, 16, 64, 256, 512])
 tiles = st.sampled_from([33, 40, 256, 256])
+widths = st.sampled_from([100, 256, 1024])
 
 
 @settings(max_examples=1000)
@@ -192,6 +224,39 @@ tiles = st.sampled_from([33, 40, 256, 256])
 def test_blocks_say_what_samples_say_one_by_one(data, formula, run, room, tile):
     ends = data.draw(stretches(len(run)))
     assert_same_bits(*both_ways(program_of(formula), run, ends, room=room, tile=tile))
+
+
+@settings(max_examples=200)
+@given(data=st.data(), formula=wide_windows, run=long_runs(min_size=500, max_size=900), tile=widths)
+def test_spans_of_open_positions_say_what_samples_say_one_by_one(data, formula, run, tile):
+    ends = data.draw(stretches(len(run)))
+    assert_same_bits(*both_ways(program_of(formula), run, ends, room=2048, tile=tile))
+
+
+@settings(max_examples=20)
+@given(formula=wide_windows, run=long_runs(min_size=500, max_size=900))
+def test_interpreted_spans_have_the_same_bits(formula, run):
+    program, leaves = program_of(formula), run.values
+    with only("interpreted"):
+        interpreted = OnlineRun(program, room=1024).extend(leaves(program.leaves), np.array(run.times_ns))
+    with only("compiled"):
+        compiled = OnlineRun(program, room=1024).extend(leaves(program.leaves), np.array(run.times_ns))
+    assert_same_bits([interpreted], [compiled])
+
+
+@settings(max_examples=500)
+@given(
+    data=st.data(),
+    formula=formulas,
+    run=long_runs(),
+    room=rooms,
+    tile=st.sampled_from([8, 20, 33, 40, 77]),
+    least=st.sampled_from([10, 50, 100]),
+)
+def test_two_runs_that_share_a_stretch_say_what_one_does(data, formula, run, room, tile, least):
+    ends = data.draw(stretches(len(run)))
+    with only("compiled"):  # the work is shared once there is machine code
+        assert_same_bits(*both_ways(program_of(formula), run, ends, room=room, tile=tile, least_shared=least))
 
 
 @settings(max_examples=200)

@@ -11,7 +11,14 @@ import numpy as np
 from spatial_replay.compiled import apart, inlined, uncounted
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
-from spatial_replay.monitor.online.node_columns import cells_of, signal_of, start_of_past, tables_end
+from spatial_replay.monitor.online.node_columns import (
+    cells_of,
+    columns_number,
+    settled_look,
+    signal_of,
+    start_of_past,
+    tables_end,
+)
 from spatial_replay.monitor.online.open_windows import (
     bring_columns_up,
     find_lows,
@@ -53,7 +60,9 @@ def root_value(
 @inlined
 def is_settled(part: Integers, memory: Memory) -> bool:
     """Return whether no later sample matters: a part's table says the same whatever is still to come."""
-    if part[codes.PART_IS_REMEMBERING] or memory.cells[part[codes.PART_CELL_START]] == 0:
+    # what it is now goes on, but is a matter of the run that computes its value
+    goes_on = part[codes.PART_IS_REMEMBERING] and part[codes.PART_NUMBERS] & 1
+    if goes_on or memory.cells[part[codes.PART_CELL_START]] == 0:
         return False
     least = part[codes.PART_TABLE_START]
     most = least + (1 << part[codes.PART_VARIABLES]) - 1
@@ -80,7 +89,7 @@ def _run_recurrence(
 
 
 @apart
-def run_dependent(table_at: int, number: int, channel: int, corner: int, last: int) -> int:
+def run_dependent(table_at: int, number: int, channel: int, at: int, corner: int, last: int) -> int:
     """Run the nodes of a part that depend on a variable or a table, at the positions low … high of `Scratch`.
 
     `scratch.point` receives the variables' values where the table's base ends, `scratch.starts` the
@@ -88,13 +97,14 @@ def run_dependent(table_at: int, number: int, channel: int, corner: int, last: i
 
     Args:
         number: of the part.
-        channel: of the columns of what does not depend on any, and of the tables.
+        channel: of the tables.
+        at: which columns hold what does not depend on any.
         corner: of the table, the values of the variables.
     """
     arrays, memory, scratch, _ = arrays_at(table_at)
     nodes, part, offset = arrays.nodes, arrays.parts[number], memory.clock[OFFSET]
     first, recent, cells = part[codes.PART_FIRST], recent_of(memory, scratch), memory.cells
-    settled, history = memory.columns[channel], memory.history[channel]
+    settled, history = memory.columns[at], memory.history[channel]
     tables = memory.tables[channel, part[codes.PART_TABLE_START] : tables_end(part)]
     _, boundaries, states = cells_of(part)
     for d in range(first, part[codes.PART_END]):
@@ -139,8 +149,10 @@ def absorb(table_at: int, number: int, channels: int, last: int) -> int:
     nodes, part, offset = tables.nodes, tables.parts[number], memory.clock[OFFSET]
     base = cells_of(part)[0]
     before = memory.cells[base]
-    # of closed positions a column holds the same whatever is open, so that any look of a channel will do
-    looks = (1, 3, 3, 3 | 48)[channels - 1]
+    looks = 0
+    for channel in range(channels):
+        which = settled_look(part, channel, channels)
+        looks |= 1 << which if which >= 0 else 0
     bring_columns_up(table_at, number, looks, channels, last)
     if part[codes.PART_IS_NESTED]:
         _absorb_nested(table_at, number, nodes, part, memory, scratch, channels, offset, last)
@@ -166,7 +178,10 @@ def _absorb_plain(
             size //= 2
             continue
         for channel in range(channels):
-            columns, history = memory.columns[channel], memory.history[channel]
+            which = settled_look(part, channel, channels)
+            if which < 0:
+                continue
+            columns, history = memory.columns[columns_number(which)], memory.history[channel]
             tables = memory.tables[channel, part[codes.PART_TABLE_START] : tables_end(part)]
             if part[codes.PART_VARIABLES] == 0:
                 if first == 0:
@@ -209,23 +224,23 @@ def _absorb_nested(
             size //= 2
             continue
         for channel in range(channels):
-            _renew_tables(table_at, number, nodes, part, channel, memory, scratch, offset, last)
+            which = settled_look(part, channel, channels)
+            if which >= 0:
+                at = columns_number(which)
+                _renew_tables(table_at, number, nodes, part, channel, at, memory, scratch, offset, last)
         for d in range(part[codes.PART_FIRST], part[codes.PART_END]):
-            variable, table, at = (
-                nodes[d, codes.NODE_VARIABLE],
-                nodes[d, codes.NODE_TABLE],
-                d - part[codes.PART_FIRST],
-            )
+            variable, table = nodes[d, codes.NODE_VARIABLE], nodes[d, codes.NODE_TABLE]
             if variable >= 0:
-                cells[boundaries + variable] = scratch.high[at] + 1
+                cells[boundaries + variable] = scratch.high[d - part[codes.PART_FIRST]] + 1
             if table >= 0:
-                cells[states + table] = max(cells[states + table], scratch.plain[at] - 1)
+                state = scratch.plain[d - part[codes.PART_FIRST]] - 1
+                cells[states + table] = max(cells[states + table], state)
         cells[base] = newest + 1
 
 
 @uncounted
 def _renew_tables(
-    table_at: int, number: int, nodes: Integers, part: Integers, channel: int, memory: Memory,
+    table_at: int, number: int, nodes: Integers, part: Integers, channel: int, at: int, memory: Memory,
     scratch: Scratch, offset: int, last: int,
 ) -> None:  # fmt: skip
     """Renew the tables of a part, in one channel, after adding positions from its base on."""
@@ -234,10 +249,10 @@ def _renew_tables(
     base, _, states = cells_of(part)
     tables = memory.tables[channel, part[codes.PART_TABLE_START] : tables_end(part)]
     for corner in range(size):
-        run_dependent(table_at, number, channel, corner, last)
+        run_dependent(table_at, number, channel, at, corner, last)
         if memory.cells[base] == 0:
             is_known = not nodes[end - 1, codes.NODE_DEPENDS]
-            root = memory.columns[channel, end - 1] if is_known else scratch.corners[end - 1 - first]
+            root = memory.columns[at, end - 1] if is_known else scratch.corners[end - 1 - first]
             fresh[corner] = root[0 - offset]
         else:
             fresh[corner] = read_table(tables[:size], variables, scratch.point, scratch.order)

@@ -80,7 +80,10 @@ PART_ENDING, PART_LOWER, PART_UPPER, PART_IS_MINIMUM, PART_BESIDE = 10, 11, 12, 
 # whether the bound that is not known at once is the value but for positions where a window of those nodes
 # is open that cut it
 PART_IS_CUT = 15
-PART_WIDTH = 16
+# which of its numbers a run computes, a bit for each: all, but where two runs share them (see `shares`)
+PART_NUMBERS = 16
+PART_WIDTH = 17
+ALL_NUMBERS = (1 << 8) - 1
 # kinds of parts
 TABLE, WINDOWED, CLAUSES = 0, 1, 2  # see `tables`, `windows`, `clauses`
 

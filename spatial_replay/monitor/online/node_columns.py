@@ -62,6 +62,19 @@ def columns_number(which: int) -> int:
 
 
 @inlined
+def settled_look(part: Integers, channel: int, channels: int) -> int:
+    """Return for which number closed positions of a part are looked up in a channel, -1 for none.
+
+    Their columns are the same for all numbers of a channel, whatever is open, so that any will do that the
+    run computes.
+    """
+    for which in (0, 1, 4, 5):
+        if (part[codes.PART_NUMBERS] >> which) & 1 and look_of(which, channels).channel == channel:
+            return which
+    return -1
+
+
+@inlined
 def cells_of(part: Integers) -> tuple[int, int, int]:
     """Return where a part's cells hold its base, its variables' positions and its tables' positions."""
     base = part[codes.PART_CELL_START]

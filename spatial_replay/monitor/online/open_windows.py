@@ -180,18 +180,20 @@ def is_cut_short(which: int, part: Integers, root: Integers, channels: int) -> b
 def looks_of(
     part: Integers, root: Integers, memory: Memory, channels: int, is_last: bool, position: int
 ) -> int:
-    """Return which numbers of a part at a sample are computed by themselves, a bit for each.
+    """Return which numbers of a part a run computes by themselves at a sample, a bit for each.
 
     Numbers 2 and 3 (now) come with 0 and 1; those of an ending run count for the last sample only.
     """
-    looks = 1 | 2 if channels > 1 else 1
+    looks, own = 1 | 2 if channels > 1 else 1, part[codes.PART_NUMBERS]
     if part[codes.PART_VARIABLES] == 0 and memory.cells[part[codes.PART_CELL_START]] > 0:
-        return looks  # its numbers at the first sample stand in its table
+        return int(looks & own)  # its numbers at the first sample stand in its table
     for which in (4, 5):
         is_other = is_known(which, part, root, memory, position) or is_cut_short(which, part, root, channels)
         if not is_other:
             looks |= 1 << which
-    return looks | 1 << 6 | 1 << 7 if is_last and channels == 4 else looks
+    if is_last and channels == 4:
+        looks |= 1 << 6 | 1 << 7
+    return int(looks & own)
 
 
 @apart

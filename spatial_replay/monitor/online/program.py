@@ -148,7 +148,7 @@ class _Parts:
             self._built[own] = len(self.part_rows)
             end = len(self.node_rows)
             row = (end, end, 0, 0, self.table_size, self.cells, codes.CLAUSES, 0, 0, 0, *own, 0)
-            self.part_rows.append(row)
+            self.part_rows.append((*row, codes.ALL_NUMBERS))
         return self._built[own]
 
     def add(self, part: PartRows, signals: SignalTable) -> int:
@@ -177,6 +177,7 @@ class _Parts:
                 int(part.is_nested),
                 *[NOTHING] * 5,
                 int(cutting is not None),
+                codes.ALL_NUMBERS,
             )
         )
         places = _places_of_rows(rows)

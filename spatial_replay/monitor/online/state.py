@@ -37,6 +37,15 @@ BLOCK = 32
 MOST_ROWS = 4096
 """So many open positions at most are looked at for a block of samples."""
 
+MOST_POSITIONS = 1 << 15
+"""As many where most are looked at for many samples together (see `blocks.spans`)."""
+
+CORNER_BITS = 4
+"""So many rows at most are followed by the positions of a span."""
+
+MOST_SPANS = 48
+"""So many spans at most has a node."""
+
 NUMBERS = 8
 """Numbers of a node at a sample: low and high end of its value, of what it is now, of its value over every
 continuation, and of its value if the run ends there."""
@@ -51,6 +60,10 @@ JOINED = 64
 POSITION, OFFSET, START_NS, KEEPS = range(4)
 CLOCK = 4
 """What the clock of a run holds."""
+
+BLOCK_SINCE, BLOCK_LAST, BLOCK_LOWEST, IS_FOLLOWED, BLOCK_NEWEST = range(5)
+"""What the numbers of a block stand for: see `SampleBlock` and `run_block` in `blocks`; and the last of the
+samples that are run together (see `blocks.spans`)."""
 
 
 class Memory(NamedTuple):
@@ -69,6 +82,7 @@ class Memory(NamedTuple):
         cells: the parts' bookkeeping (see `windows`).
         columns: (LOOKS, D, room), the nodes of the parts with windows at the recent samples, for each number.
         known: (P, LOOKS), the last sample that each part's columns know, -1 for none.
+        closed: (P, LOOKS), the same where only those numbers are known that the next samples do not change.
         unjoined: (P, LOOKS), the first sample that is not yet in `joined`.
         joined: (LOOKS, P, room / JOINED), what the root of each part joins, so many positions at a time.
         lows: (D,), the first position of each of these nodes that matters.
@@ -91,6 +105,7 @@ class Memory(NamedTuple):
     cells: Integers
     columns: Floats
     known: Integers
+    closed: Integers
     unjoined: Integers
     joined: Floats
     lows: Integers
@@ -117,9 +132,18 @@ class Scratch(NamedTuple):
             `blocks.node_rows`).
         running: (2, BLOCK), a row that others are joined with, before and after.
         points: (16, BLOCK), a point at which a table is read, for each sample of a block.
-        block: (4,), where a block of samples is (see `blocks.block_run`).
+        block: (5,), where a block of samples is (see `BLOCK_SINCE`).
         begins, next_begins: (D,), the first position of each node that has a row, in a block and in the next.
         closing: (positions,), the samples with which windows close.
+        spans: (D, MOST_SPANS, 10), spans of neighbouring positions of each node (see `blocks.spans`).
+        span_counts, corner_bits, bit_of: (D,), how many these are; which bits they use; that of a window.
+        cuts: (2 * MOST_SPANS,), where spans begin.
+        corner_columns: (D, corners, positions), nodes at each corner, in spans with tables.
+        corner: (corners,), one position of these.
+        sums: (D, MOST_SPANS, corners), what each of the operand's spans holds.
+        wholes: (D, MOST_SPANS, BLOCK), the same as rows.
+        joints: (D * MOST_SPANS, BLOCK), the rows that spans follow.
+        spare: (BLOCK,), a row.
         parts: (P, NUMBERS, tile), what each part says.
         nodes: (N, NUMBERS, tile), what each node of the tree says.
     """
@@ -145,6 +169,17 @@ class Scratch(NamedTuple):
     begins: Integers
     next_begins: Integers
     closing: Integers
+    spans: Integers
+    span_counts: Integers
+    corner_bits: Integers
+    bit_of: Integers
+    cuts: Integers
+    corner_columns: Floats
+    corner: Floats
+    sums: Floats
+    wholes: Floats
+    joints: Floats
+    spare: Floats
     parts: Floats
     nodes: Floats
 
@@ -169,6 +204,7 @@ def first_memory(program: Program, room: int) -> Memory:
         cells=cells,
         columns=np.zeros((LOOKS, nodes, room)),
         known=np.full((len(program.parts), LOOKS), -1),
+        closed=np.full((len(program.parts), LOOKS), -1),
         unjoined=np.zeros((len(program.parts), LOOKS), np.int64),
         joined=np.zeros((LOOKS, len(program.parts), room // JOINED + 1)),
         lows=np.zeros(nodes, np.int64),
@@ -190,7 +226,9 @@ def scratch_for(program: Program, room: int, tile: int) -> Scratch:
     most_tables = max((int(part[3]) for part in program.parts), default=1)
     low, high, plain, changed, begins, next_begins = np.zeros((6, widest), np.int64)
     open_room = room if has_windows(program) else 0
-    positions = min(open_room, MOST_ROWS) if tile > BLOCK else 0
+    positions = min(open_room, MOST_POSITIONS) if tile > BLOCK else 0
+    wide, corners = widest if positions else 0, 1 << CORNER_BITS
+    span_counts, corner_bits, bit_of = np.zeros((3, wide), np.int64)
     return Scratch(
         columns=np.zeros((widest, tile)),
         corners=np.zeros((widest if program.parts[:, PART_IS_NESTED].any() else 0, room)),
@@ -209,10 +247,21 @@ def scratch_for(program: Program, room: int, tile: int) -> Scratch:
         rows=_aligned((program.rows, positions, BLOCK)),
         running=_aligned((2, BLOCK)),
         points=np.zeros((16, BLOCK)),
-        block=np.zeros(4, np.int64),
+        block=np.zeros(5, np.int64),
         begins=begins,
         next_begins=next_begins,
         closing=np.zeros(positions, np.int64),
+        spans=np.zeros((wide, MOST_SPANS, 6 + CORNER_BITS), np.int64),
+        span_counts=span_counts,
+        corner_bits=corner_bits,
+        bit_of=bit_of,
+        cuts=np.zeros(2 * MOST_SPANS, np.int64),
+        corner_columns=np.zeros((wide, corners, positions)),
+        corner=np.zeros(corners),
+        sums=np.zeros((wide, MOST_SPANS, corners)),
+        wholes=_aligned((wide, MOST_SPANS, BLOCK)),
+        joints=_aligned((wide * MOST_SPANS, BLOCK)),
+        spare=_aligned((BLOCK,)),
         parts=np.zeros((len(program.parts), NUMBERS, tile)),
         nodes=np.zeros((len(program.reports), NUMBERS, tile)),
     )
@@ -235,12 +284,13 @@ def widen(memory: Memory, before: int) -> None:
         if before == 1:
             state[1] = state[0]
         state[2:] = state[:2]
-    _know_no_columns(memory)
+    know_no_columns(memory)
 
 
-def _know_no_columns(memory: Memory) -> None:
+def know_no_columns(memory: Memory) -> None:
     """Have the columns of parts with windows computed again: positions have moved, or there are more."""
     memory.known[:] = -1
+    memory.closed[:] = -1
     memory.window_next[:] = -1
 
 
@@ -263,7 +313,7 @@ def doubled(memory: Memory, channels: int, signals: Integers) -> Memory:
             heights[window, channel][:, entries % (2 * old)] = memory.heights[window, channel][
                 :, entries % old
             ]
-    _know_no_columns(memory)
+    know_no_columns(memory)
     return memory._replace(
         columns=np.zeros((*memory.columns.shape[:2], 2 * old)),
         joined=np.zeros((*memory.joined.shape[:2], 2 * old // JOINED + 1)),

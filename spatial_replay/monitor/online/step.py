@@ -7,17 +7,28 @@ same bits, because the only arithmetic is minima, maxima and negation.
 
 from __future__ import annotations
 
-from typing import Any, cast
+from contextlib import closing
+from copy import copy
+from functools import partial
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
-from spatial_replay.compiled import apart, floats_at, inlined, integers_at
+from spatial_replay.compiled import apart, floats_at, inlined, integers_at, releasing
+from spatial_replay.cores import cores
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.monitor.online.blocks.block_run import run_in_blocks
+from spatial_replay.monitor.online.blocks.tile_run import run_in_blocks
 from spatial_replay.monitor.online.codes import in_channels
 from spatial_replay.monitor.online.node_numbers import Results, report
 from spatial_replay.monitor.online.program import Program
 from spatial_replay.monitor.online.run_arrays import RunArrays, Tables, arrays_at, table_of
+from spatial_replay.monitor.online.shares import (
+    copied,
+    iter_ahead,
+    joined_memory,
+    numbers_of,
+    shared_programs,
+)
 from spatial_replay.monitor.online.signals import step_signals
 from spatial_replay.monitor.online.state import (
     KEEPS,
@@ -38,6 +49,10 @@ from spatial_replay.monitor.online.windows import forget
 
 _MANY_TILES = 8
 """So many long tiles of samples that come together are worth more room to work in."""
+
+_WORTH_TWO_CORES = 16 * LONG_TILE
+"""So many samples that come together are worth two cores: more than a replay takes in at once, which has
+both of them busy."""
 
 
 @inlined
@@ -106,6 +121,14 @@ def step_with_windows(
     return 0
 
 
+class _Stretch(NamedTuple):
+    """Samples that come together, and what is said of them: see `OnlineRun.extend`."""
+
+    leaves: Floats
+    times_ns: Integers
+    series: Floats
+
+
 class OnlineRun:
     """The state that a compiled formula carries from sample to sample.
 
@@ -115,17 +138,23 @@ class OnlineRun:
         step: the kernel that runs its samples.
     """
 
-    def __init__(self, program: Program, *, room: int = 2 * TILE, tile: int = TILE) -> None:
+    def __init__(
+        self, program: Program, *, room: int = 2 * TILE, tile: int = TILE, least_shared: int | None = None
+    ) -> None:
         """Start before the first sample.
 
         Args:
             room: the number of recent samples there is room for at first (it doubles when needed).
             tile: how many samples are run together, at most. Samples that come one by one are faster with 1,
                 since the numbers worked with then lie closer together.
+            least_shared: from so many samples that come together on, two threads share the work; with None,
+                from very many on, if there are two cores.
         """
         self._program = program
         self.step = step_with_windows if has_windows(program) else step
+        self._called = self.step
         self._tile = tile
+        self._least_shared = least_shared
         if not program.keeps_history:
             room = tile
         self._memory = first_memory(program, room)
@@ -166,12 +195,90 @@ class OnlineRun:
         leaves = np.ascontiguousarray(in_channels(leaves, self._channels))
         times_ns = np.array(times_ns, np.int64)  # writable, since kernels are compiled for that
         series = np.empty((len(self._program.reports), 4, len(times_ns)))
-        done = 0
+        stretch, done = _Stretch(leaves, times_ns, series), 0
+        may_share = has_windows(self._program) and self._is_worth_sharing(len(times_ns))
         while done < len(times_ns):
-            count = self.make_room(min(self._tile, len(times_ns) - done))
-            self.step(self._table_at, leaves, *leaves.shape[:2], times_ns, series, len(times_ns), done, count)
-            done += count
+            done += self._run_tile(stretch, done, len(times_ns))
+            # after a tile, the kernel is there, and what settles soon has
+            if may_share and done < len(times_ns) and self._is_compiled:
+                may_share = False
+                done = self._run_shared(stretch, done)
         return series
+
+    @property
+    def _is_compiled(self) -> bool:
+        return bool(getattr(self.step, "is_compiled", False))
+
+    def _is_worth_sharing(self, count: int) -> bool:
+        if self._least_shared is None:
+            return count >= _WORTH_TWO_CORES and cores() > 1
+        return count >= self._least_shared
+
+    def _run_tile(self, stretch: _Stretch, begin: int, end: int) -> int:
+        """Run the first samples of a stretch's number begin … end - 1; return how many."""
+        count = self.make_room(min(self._tile, end - begin))
+        self._run(stretch, begin, count)
+        return count
+
+    def _run(self, stretch: _Stretch, begin: int, count: int) -> None:
+        leaves, times_ns, series = stretch
+        arrays = leaves, *leaves.shape[:2], times_ns, series, len(times_ns)
+        self._called(self._table_at, *arrays, begin, count)
+
+    def _run_shared(self, stretch: _Stretch, begin: int) -> int:
+        """Run the samples of a stretch from `begin` on by two runs at once (see `shares`).
+
+        They begin with copies of the state, which stays as it is until both are done.
+
+        Returns:
+            How many samples of the stretch are done: as before, if the work cannot be shared.
+        """
+        programs = shared_programs(self._program, self._memory, self._channels)
+        if programs is None:
+            return begin
+        first, second = map(self._share, programs)
+        which, end = numbers_of(second._program), len(stretch.times_ns)
+        tiles = [(at, min(at + self._tile, end)) for at in range(begin, end, self._tile)]
+        of_none = stretch._replace(series=np.empty((0, 4, end)))
+        with closing(iter_ahead(partial(second._run_ahead, of_none, which), tiles)) as ahead:
+            for (at, _), numbers in zip(tiles, ahead, strict=True):
+                first._run_behind(stretch, which, numbers, at)
+        memory = joined_memory(programs, (first._memory, second._memory))
+        scratch = scratch_for(self._program, len(memory.stamps), self._tile)
+        self._memory, self._scratch, self._final = memory, scratch, first._final
+        self._find_arrays()
+        return end
+
+    def _share(self, program: Program) -> OnlineRun:
+        """Return a run that goes on from here, of the same program but for what it computes."""
+        share = copy(self)
+        share._program, share._tables = program, Tables.of(program)
+        share._called = releasing(self.step)
+        share._memory = copied(self._memory)
+        share._scratch = scratch_for(program, len(self._memory.stamps), self._tile)
+        share._final = np.zeros((len(program.reports), 2))
+        share._find_arrays()
+        return share
+
+    def _run_ahead(self, stretch: _Stretch, which: tuple[Integers, Integers], begin: int, end: int) -> Floats:
+        """Run samples number begin … end - 1 of a stretch; return these numbers of its parts, (K, count)."""
+        numbers, done = np.empty((len(which[0]), end - begin)), 0
+        while done < end - begin:
+            count = self._run_tile(stretch, begin + done, end)
+            numbers[:, done : done + count] = self._scratch.parts[*which, :count]
+            done += count
+        return numbers
+
+    def _run_behind(
+        self, stretch: _Stretch, which: tuple[Integers, Integers], numbers: Floats, begin: int
+    ) -> None:
+        """Run samples of a stretch from `begin` on, given these numbers of its parts, (K, count)."""
+        done = 0
+        while done < numbers.shape[1]:
+            count = self.make_room(min(self._tile, numbers.shape[1] - done))
+            self._scratch.parts[*which, :count] = numbers[:, done : done + count]
+            self._run(stretch, begin + done, count)
+            done += count
 
     def widen(self, channels: int) -> None:
         """Have at least so many channels."""
@@ -201,8 +308,7 @@ class OnlineRun:
         used = position - offset
         if used + wanted > room:
             # given addresses, a kernel does not see how much there is to move, and is interpreted long
-            is_ready = getattr(self.step, "is_compiled", False)
-            drop = cast(Any, forget).compiled() if is_ready else forget
+            drop = cast(Any, forget).compiled() if self._is_compiled else forget
             if drop(self._table_at, self._channels):
                 offset = int(clock[OFFSET])
             elif used == room:

@@ -248,6 +248,8 @@ def step_tables(
     ends, lows, highs = scratch.series[0], scratch.series[1], scratch.series[2]
     for p in range(parts.shape[0]):
         part, numbers = parts[p], scratch.parts[p]
+        if not part[codes.PART_NUMBERS]:
+            continue
         if part[codes.PART_KIND] == codes.CLAUSES:
             _read_clauses(part, memory, scratch, channels, begin, count, numbers)
         if part[codes.PART_KIND] != codes.TABLE:

@@ -157,12 +157,14 @@ def run_part(table_at: int, number: int, channels: int, begin: int, end: int, co
     tables, memory, scratch, _ = arrays_at(table_at)
     position, offset = memory.clock[POSITION], memory.clock[OFFSET]
     part, numbers = tables.parts[number], scratch.parts[number]
+    own = part[codes.PART_NUMBERS]
     for k in range(begin, end):
         last = position + k
         if is_settled(part, memory):
             for which in range(NUMBERS):
-                channel = look_of(which, channels).channel
-                numbers[which, k] = memory.tables[channel, part[codes.PART_TABLE_START]]
+                if (own >> which) & 1:
+                    channel = look_of(which, channels).channel
+                    numbers[which, k] = memory.tables[channel, part[codes.PART_TABLE_START]]
             continue
         if len(memory.window_next):
             enter_samples(
@@ -172,7 +174,7 @@ def run_part(table_at: int, number: int, channels: int, begin: int, end: int, co
         looks = looks_of(part, root, memory, channels, k == count - 1, last)
         bring_columns_up(table_at, number, looks, channels, last)
         for which in range(NUMBERS):
-            if which in (2, 3) or (which >= 6 and k < count - 1):
+            if which in (2, 3) or (which >= 6 and k < count - 1) or not (own >> which) & 1:
                 continue
             if which == 1 and channels == 1:
                 numbers[1, k], numbers[3, k] = numbers[0, k], numbers[2, k]
@@ -204,7 +206,8 @@ def _kept_from(table_at: int, last: int) -> int:
             keep = min(keep, first_behind(memory.stamps, offset, last, unit, signals[s, codes.SIGNAL_HIGH]))
     for p in range(parts.shape[0]):
         part = parts[p]
-        if part[codes.PART_KIND] == codes.WINDOWED and not is_settled(part, memory):
+        is_open = part[codes.PART_KIND] == codes.WINDOWED and not is_settled(part, memory)
+        if is_open and part[codes.PART_NUMBERS]:
             base = min(memory.cells[part[codes.PART_CELL_START]], last)
             reach(table_at, p, base, last, last)
             for d in range(part[codes.PART_END] - part[codes.PART_FIRST]):
@@ -235,6 +238,7 @@ def forget(table_at: int, channels: int) -> int:
                 copy(memory.history[channel, s, moved : moved + kept], memory.history[channel, s, :kept])
     # positions have moved
     memory.known[:] = -1
+    memory.closed[:] = -1
     memory.window_next[:] = -1
     memory.clock[OFFSET] = keep
     return 1

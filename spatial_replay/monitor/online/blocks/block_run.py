@@ -29,7 +29,8 @@ from spatial_replay.monitor.online.blocks.node_rows import (
     take_row,
     window_rows,
 )
-from spatial_replay.monitor.online.closing import absorb, is_settled
+from spatial_replay.monitor.online.blocks.span_rows import block_of
+from spatial_replay.monitor.online.closing import absorb
 from spatial_replay.monitor.online.node_columns import (
     cells_of,
     columns_number,
@@ -43,7 +44,6 @@ from spatial_replay.monitor.online.open_windows import (
     is_cut_short,
     is_known,
     is_plain,
-    looks_of,
     root_window,
     runs_root,
 )
@@ -60,8 +60,12 @@ from spatial_replay.monitor.online.sliding import (
     recent_of,
 )
 from spatial_replay.monitor.online.state import (
-    BLOCK,
+    BLOCK_LAST,
+    BLOCK_LOWEST,
+    BLOCK_SINCE,
+    IS_FOLLOWED,
     LOOKS,
+    MOST_ROWS,
     OFFSET,
     POSITION,
     Memory,
@@ -69,20 +73,13 @@ from spatial_replay.monitor.online.state import (
     first_behind,
 )
 from spatial_replay.monitor.online.tables import read_table
-from spatial_replay.monitor.online.windows import run_part
-
-SINCE, LAST, LOWEST, IS_FOLLOWED = range(4)
-"""What the numbers of a block stand for: see `SampleBlock`, and `run_block`."""
 
 WHOLE, PARTIAL = 1, 2
 """Whether all of a part's columns are brought up, or what its next block looks at."""
 
-WORTHWHILE = 8
-"""So many samples at least are run as a block."""
-
 
 @inlined
-def _operand(
+def operand_of(
     nodes: Integers, part: Integers, operand: int, columns: Floats, history: Floats, scratch: Scratch
 ) -> NodeRows:
     """Return the numbers of a node by its place in its part; where there is none, any."""
@@ -91,40 +88,26 @@ def _operand(
     return NodeRows(columns[d] if signal < 0 else history[signal], rows, scratch.begins[max(operand, 0)])
 
 
-@inlined
-def _block_of(memory: Memory, scratch: Scratch) -> SampleBlock:
-    return SampleBlock(
-        scratch.running,
-        scratch.ends[0],
-        scratch.ends[1],
-        scratch.extrema[0],
-        scratch.block[SINCE],
-        scratch.block[LAST],
-        scratch.block[LOWEST],
-        memory.clock[OFFSET],
-    )
-
-
 @apart
 def _run_node(table_at: int, number: int, d: int, which: int, channels: int) -> int:
     """Compute the rows of a node, and what the next samples need of its column (see `node_columns`)."""
     tables, memory, scratch, _ = arrays_at(table_at)
     nodes, part, recent = tables.nodes, tables.parts[number], recent_of(memory, scratch)
-    node, look, block = nodes[d], look_of(which, channels), _block_of(memory, scratch)
+    node, look, block = nodes[d], look_of(which, channels), block_of(memory, scratch)
     columns, history = memory.columns[columns_number(which)], memory.history[look.channel]
     code, a, b, first = node[codes.NODE_CODE], node[codes.NODE_A], node[codes.NODE_B], part[codes.PART_FIRST]
     target, begin = scratch.rows[node[codes.NODE_ROWS]], scratch.begins[d - first]
     rows_of = nodes[first:, codes.NODE_ROWS]
     in_place = rows_of[max(a, 0)] == node[codes.NODE_ROWS], rows_of[b] == node[codes.NODE_ROWS]
-    one = _operand(nodes, part, a, columns, history, scratch)
-    two = _operand(nodes, part, b, columns, history, scratch)
+    one = operand_of(nodes, part, a, columns, history, scratch)
+    two = operand_of(nodes, part, b, columns, history, scratch)
     is_greatest = code in (codes.PART_OR, codes.PART_WINDOW_MAX, codes.PAST_WINDOW_MAX)
     value = beyond(look.mode if code not in codes.PAST else codes.OPEN_END, node[codes.NODE_WEAK])
     if code in (codes.PART_AND, codes.PART_OR):
         if in_place[1]:
-            join_operands_rows(block, is_greatest, two, one, True, target, begin)
+            join_operands_rows(block, is_greatest, two, one, True, target, begin, block.last + 1)
         else:
-            join_operands_rows(block, is_greatest, one, two, in_place[0], target, begin)
+            join_operands_rows(block, is_greatest, one, two, in_place[0], target, begin, block.last + 1)
     elif code in codes.BINARY_NODES:
         is_strong, is_ahead, fresh = code in (codes.UNTIL, codes.PAST_SINCE), code not in codes.PAST, begin
         if is_ahead:
@@ -147,7 +130,7 @@ def _run_node(table_at: int, number: int, d: int, which: int, channels: int) -> 
                     closed -= 1
             window_rows(block, is_greatest, one, target, begin, closed)
             if code in codes.AHEAD_OF and is_decided(node, look.mode):
-                fill_open(block, scratch.closing, target, begin, value)
+                fill_open(block, scratch.closing, target, begin, block.last + 1, value)
     # after another block, the columns of positions that are still open are looked at no more
     stop = scratch.next_begins[d - first] if scratch.block[IS_FOLLOWED] else block.last + 1
     for position in range(begin, stop):
@@ -245,7 +228,7 @@ def _read_points(
 def _set_first(table_at: int, number: int, which: int, channels: int, at: int) -> int:
     """Enter one of a part's numbers at the first sample, for each sample of the block (see `windows`)."""
     tables, memory, scratch, _ = arrays_at(table_at)
-    nodes, part, block = tables.nodes, tables.parts[number], _block_of(memory, scratch)
+    nodes, part, block = tables.nodes, tables.parts[number], block_of(memory, scratch)
     look, end, root = look_of(which, channels), part[codes.PART_END] - 1, nodes[part[codes.PART_END] - 1]
     base, is_cut = memory.cells[part[codes.PART_CELL_START]], is_cut_short(which, part, root, channels)
     columns = memory.columns[look.channel if is_cut else columns_number(which)]
@@ -254,7 +237,7 @@ def _set_first(table_at: int, number: int, which: int, channels: int, at: int) -
     missing, count = beyond(mode, root[codes.NODE_WEAK]), block.last + 1 - block.since
     numbers = scratch.parts[number, which, at : at + count]
     place = root[codes.NODE_B] if is_plain(part) else end - part[codes.PART_FIRST]
-    operand = _operand(nodes, part, place, columns, memory.history[look.channel], scratch)
+    operand = operand_of(nodes, part, place, columns, memory.history[look.channel], scratch)
     if not is_plain(part) and base > 0:
         variables, points = part[codes.PART_VARIABLES], scratch.points
         _read_points(variables, table[: 1 << variables], count, points, scratch.point, scratch.order, numbers)
@@ -278,14 +261,14 @@ def _set_first(table_at: int, number: int, which: int, channels: int, at: int) -
 
 
 @uncounted
-def _set_last(table_at: int, number: int, which: int, channels: int, at: int) -> None:
+def set_last(table_at: int, number: int, which: int, channels: int, at: int) -> None:
     """Enter what a part is at each sample of the block (see `windows`)."""
     tables, memory, scratch, _ = arrays_at(table_at)
-    nodes, part, block = tables.nodes, tables.parts[number], _block_of(memory, scratch)
+    nodes, part, block = tables.nodes, tables.parts[number], block_of(memory, scratch)
     end, root = part[codes.PART_END] - 1, nodes[part[codes.PART_END] - 1]
     place = end - part[codes.PART_FIRST] if runs_root(part, root) else root[codes.NODE_B]
     history = memory.history[look_of(which, channels).channel]
-    operand = _operand(nodes, part, place, memory.columns[which], history, scratch)
+    operand = operand_of(nodes, part, place, memory.columns[which], history, scratch)
     value, is_until = beyond(codes.OPEN_END, root[codes.NODE_WEAK]), root[codes.NODE_CODE] == codes.UNTIL
     for k in range(block.last + 1 - block.since):
         position = block.since + k
@@ -329,7 +312,7 @@ def run_block(
     first, end, root = part[codes.PART_FIRST], part[codes.PART_END], nodes[part[codes.PART_END] - 1]
     since = memory.clock[POSITION] + at
     last = since + count - 1
-    block, most = scratch.block, scratch.rows.shape[1]
+    block, most = scratch.block, min(scratch.rows.shape[1], MOST_ROWS)
     lowest = find_begins(table_at, number, 0, channels, 0, 0, since, last)
     if last + 1 - lowest > most:
         return 0
@@ -344,7 +327,7 @@ def run_block(
                 narrowed = find_begins(table_at, number, which, channels, narrows, 0, since, last)
                 if last + 1 - narrowed > WIDE:
                     return 0
-    block[SINCE], block[LAST], block[LOWEST] = since, last, lowest
+    block[BLOCK_SINCE], block[BLOCK_LAST], block[BLOCK_LOWEST] = since, last, lowest
     block[IS_FOLLOWED] = 1 if is_followed and not is_wide else 0
     for d in range(first, end):
         # one that never ends stays open although what it is joined with has closed
@@ -359,7 +342,7 @@ def run_block(
         if not (looks >> which) & 1:
             continue
         if narrows:
-            block[LOWEST] = find_begins(table_at, number, which, channels, narrows, 0, since, last)
+            block[BLOCK_LOWEST] = find_begins(table_at, number, which, channels, narrows, 0, since, last)
         for d in range(first, end if runs_root(part, root) else end - 1):
             if nodes[d, codes.NODE_CODE] != codes.LITERAL:
                 _run_node(table_at, number, d, which, channels)
@@ -372,11 +355,11 @@ def run_block(
         if which > 1:
             continue
         if part[codes.PART_IS_REMEMBERING]:
-            _set_last(table_at, number, which, channels, at)
+            set_last(table_at, number, which, channels, at)
         for bound in (4, 5):
             # of a bound that has no columns of its own
             is_beside = bound - 4 == which if channels == 4 else look_of(bound, channels).channel == which
-            if is_beside and not (looks >> bound) & 1:
+            if is_beside and ((part[codes.PART_NUMBERS] & ~looks) >> bound) & 1:
                 _set_first(table_at, number, bound, channels, at)
     for k in range(at, at + count if channels < 4 else at):
         if channels == 1:
@@ -384,43 +367,3 @@ def run_block(
         numbers[6, k], numbers[7, k] = numbers[0, k], numbers[1, k]
     absorb(table_at, number, channels, last)
     return PARTIAL if block[IS_FOLLOWED] else WHOLE
-
-
-@uncounted
-def _is_brought_up(number: int, looks: int, memory: Memory, since: int) -> bool:
-    """Return whether the columns of a part are those of the sample before."""
-    for which in range(LOOKS):
-        if (looks >> which) & 1 and memory.known[number, columns_number(which)] != since - 1:
-            return False
-    return True
-
-
-@apart
-def run_in_blocks(table_at: int, channels: int, count: int) -> int:
-    """Run all parts with windows over the next `count` samples, in blocks as far as possible."""
-    tables, memory, _, _ = arrays_at(table_at)
-    # numbers of an ending run are computed at the last sample alone
-    position, stop = memory.clock[POSITION], count - 1 if channels == 4 else count
-    for number in range(len(tables.parts)):
-        part, k, state = tables.parts[number], 0, WHOLE
-        if part[codes.PART_KIND] != codes.WINDOWED:
-            continue
-        while k < count:
-            if is_settled(part, memory):
-                run_part(table_at, number, channels, k, count, count)
-                break
-            root = tables.nodes[part[codes.PART_END] - 1]
-            looks = looks_of(part, root, memory, channels, False, position + k)
-            size, is_whole, after = min(BLOCK, stop - k), state == WHOLE, 0
-            if size < WORTHWHILE or not _is_brought_up(number, looks, memory, position + k):
-                size = 1
-            else:
-                is_followed = stop - k - size >= WORTHWHILE
-                after = run_block(table_at, number, looks, channels, k, size, is_followed, is_whole)
-            if after == 0:
-                if not is_whole:
-                    memory.known[number] = -1
-                run_part(table_at, number, channels, k, k + size, count)
-            state = WHOLE if after == 0 else after
-            k += size
-    return 0

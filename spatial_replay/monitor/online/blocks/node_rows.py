@@ -99,7 +99,7 @@ def join_number(is_greatest: bool, first: Floats, number: float, target: Floats)
 
 
 @inlined_as(_joined_into)
-def _join_rows_into(is_greatest: bool, number: Floats, target: Floats) -> None:
+def join_rows_into(is_greatest: bool, number: Floats, target: Floats) -> None:
     if is_greatest:
         for k in range(len(target)):
             target[k] = max(target[k], number[k])
@@ -213,13 +213,14 @@ def join_operands_rows(
     in_place: bool,
     target: Floats,
     begin: int,
+    end: int,
 ) -> None:
-    """Compute an `and` or `or` from `begin` on.
+    """Compute an `and` or `or` at begin … end - 1.
 
     Args:
         in_place: whether `target` are the rows of `one`.
     """
-    for position in range(begin, block.last + 1):
+    for position in range(begin, end):
         row = target[position - block.lowest]
         if position < one.begin:
             fill(row, one.column[position - block.offset])
@@ -228,7 +229,7 @@ def join_operands_rows(
         if position < two.begin:
             _join_number_into(is_greatest, two.column[position - block.offset], row)
         else:
-            _join_rows_into(is_greatest, two.rows[position - block.lowest], row)
+            join_rows_into(is_greatest, two.rows[position - block.lowest], row)
 
 
 @uncounted
@@ -266,20 +267,20 @@ def window_rows(
                 block.before[k] = value
             fill(block.running[0], nothing)
             ends, numbers = afters[first : first + count], block.before[first:]
-            _join_after(block, is_greatest, operand, middle, ends, numbers, True, target, position)
+            join_after(block, is_greatest, operand, middle, ends, numbers, True, target, position)
         else:
             fill(block.running[0], nothing)
             begins = starts[first : first + count]
-            _join_before(block, is_greatest, operand, middle, begins, target, position)
+            join_before(block, is_greatest, operand, middle, begins, target, position)
             if middle < afters[until - 1 - begin]:
                 fill(block.running[0], nothing)
                 ends = afters[first : first + count]
-                _join_after(block, is_greatest, operand, middle, ends, block.before, False, target, position)
+                join_after(block, is_greatest, operand, middle, ends, block.before, False, target, position)
         position = until
 
 
 @uncounted
-def _join_before(
+def join_before(
     block: SampleBlock,
     is_greatest: bool,
     operand: NodeRows,
@@ -298,7 +299,7 @@ def _join_before(
 
 
 @uncounted
-def _join_after(
+def join_after(
     block: SampleBlock, is_greatest: bool, operand: NodeRows, at: int, afters: Integers, before: Floats,
     is_number: bool, target: Floats, begin: int,
 ) -> None:  # fmt: skip
@@ -316,7 +317,7 @@ def _join_after(
         if is_number:
             join_number(is_greatest, block.running[current], before[k], row)
         else:
-            _join_rows_into(is_greatest, block.running[current], row)
+            join_rows_into(is_greatest, block.running[current], row)
 
 
 @inlined
@@ -388,12 +389,14 @@ def shift_rows(
 
 
 @uncounted
-def fill_open(block: SampleBlock, is_open_until: Integers, target: Floats, begin: int, value: float) -> None:
-    """Enter what an operator is while it is open, at positions from `begin` on.
+def fill_open(
+    block: SampleBlock, is_open_until: Integers, target: Floats, begin: int, end: int, value: float
+) -> None:
+    """Enter what an operator is while it is open, at begin … end - 1.
 
     Args:
         is_open_until: the first sample for which each is not, counted from the block's first.
     """
-    for position in range(begin, block.last + 1):
+    for position in range(begin, end):
         row = target[position - block.lowest]
         fill(row[: min(max(is_open_until[position - begin], 0), len(row))], value)

@@ -1,0 +1,396 @@
+"""The rows of nodes for a block of samples, at positions whose spans have no tables (see `blocks.spans`)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from spatial_replay.compiled import apart, inlined, uncounted
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.monitor.online import codes
+from spatial_replay.monitor.online.blocks.node_rows import (
+    NodeRows,
+    SampleBlock,
+    enter,
+    fill_open,
+    join_after,
+    join_before,
+    join_number,
+    join_operands_rows,
+    join_positions,
+    join_rows,
+    join_rows_into,
+    window_rows,
+)
+from spatial_replay.monitor.online.blocks.spans import (
+    BEGIN,
+    END,
+    IN_COLUMN,
+    IN_ROWS,
+    IN_TABLE,
+    KIND,
+    LEFT,
+    RIGHT,
+    ROW,
+    ROWS_FROM,
+    THROUGH,
+    ends_between,
+)
+from spatial_replay.monitor.online.node_columns import columns_number, look_of, signal_of
+from spatial_replay.monitor.online.run_arrays import arrays_at
+from spatial_replay.monitor.online.sliding import (
+    Recent,
+    beyond,
+    copy,
+    extremum,
+    fill,
+    is_decided,
+    recent_of,
+    window_after,
+)
+from spatial_replay.monitor.online.state import (
+    BLOCK_LAST,
+    BLOCK_LOWEST,
+    BLOCK_NEWEST,
+    BLOCK_SINCE,
+    CORNER_BITS,
+    OFFSET,
+    Memory,
+    Scratch,
+    is_closed,
+)
+
+
+@inlined
+def block_of(memory: Memory, scratch: Scratch) -> SampleBlock:
+    """Return the block of samples that is run."""
+    return SampleBlock(
+        scratch.running,
+        scratch.ends[0],
+        scratch.ends[1],
+        scratch.extrema[0],
+        scratch.block[BLOCK_SINCE],
+        scratch.block[BLOCK_LAST],
+        scratch.block[BLOCK_LOWEST],
+        memory.clock[OFFSET],
+    )
+
+
+@uncounted
+def _one_bit(low: float, high: float, row: Floats, target: Floats) -> None:
+    for k in range(len(target)):
+        target[k] = max(low, min(high, row[k]))
+
+
+@uncounted
+def _two_bits(
+    none: float, first: float, second: float, both: float, row: Floats, other: Floats, target: Floats
+) -> None:
+    for k in range(len(target)):
+        target[k] = max(max(none, min(first, row[k])), min(other[k], max(second, min(both, row[k]))))
+
+
+@uncounted
+def _at_corner(span: Integers, corner: int, rows: Floats, number: float, row: Floats, target: Floats) -> None:
+    """Join a row with what a corner adds: the least of its number and of the rows of its bits."""
+    fill(row, number)
+    for bit in range(CORNER_BITS):
+        if (corner >> bit) & 1:
+            other = rows[span[ROWS_FROM + bit]]
+            for k in range(len(row)):
+                row[k] = min(row[k], other[k])
+    for k in range(len(target)):
+        target[k] = max(target[k], row[k])
+
+
+@uncounted
+def read_rows(span: Integers, numbers: Floats, rows: Floats, spare: Floats, target: Floats) -> None:
+    """Read the numbers at the corners for the rows that a span follows.
+
+    They grow with each row, so that each corner's number counts as far as all rows of its bits reach.
+    """
+    bits, one, two = 0, -1, -1
+    for bit in range(CORNER_BITS):
+        if span[ROWS_FROM + bit] >= 0:
+            bits |= 1 << bit
+            one, two = two, bit
+    if bits == 0:
+        fill(target, numbers[0])
+    elif one < 0:
+        _one_bit(numbers[0], numbers[1 << two], rows[span[ROWS_FROM + two]], target)
+    elif bits == (1 << one | 1 << two):
+        _two_bits(
+            numbers[0], numbers[1 << one], numbers[1 << two], numbers[bits],
+            rows[span[ROWS_FROM + one]], rows[span[ROWS_FROM + two]], target,
+        )  # fmt: skip
+    else:
+        fill(target, numbers[0])
+        for corner in range(1, 1 << CORNER_BITS):
+            if not corner & ~bits:
+                _at_corner(span, corner, rows, numbers[corner], spare, target)
+
+
+@uncounted
+def _read_position(
+    span: Integers, columns: Floats, at: int, rows: Floats, spare: Floats, numbers: Floats, target: Floats
+) -> None:
+    """Read the table of one position."""
+    for corner in range(len(columns)):
+        numbers[corner] = columns[corner, at]
+    read_rows(span, numbers, rows, spare, target)
+
+
+@uncounted
+def _fill_wholes(
+    block: SampleBlock, is_greatest: bool, operand: NodeRows, spans: Integers, count: int, sums: Floats,
+    joints: Floats, spare: Floats, wholes: Floats,
+) -> None:  # fmt: skip
+    """Join each of an operand's spans into one row."""
+    for k in range(1, count):
+        span, begin = spans[k], spans[k, BEGIN]
+        end = min(span[END], block.last + 1)
+        if span[KIND] != IN_ROWS:
+            read_rows(span, sums[k], joints, spare, wholes[k])
+            continue
+        fill(block.running[0], -np.inf if is_greatest else np.inf)
+        current, whole = 0, begin
+        if begin >= operand.begin:
+            whole = max(min(end, block.since + 1), begin)
+            current = join_positions(block, is_greatest, operand, begin, whole)
+        for position in range(whole, end):
+            current = enter(is_greatest, block, operand, position, position - block.since, current)
+        copy(block.running[current], wholes[k])
+
+
+@uncounted
+def _fill_joint(is_greatest: bool, wholes: Floats, begin: int, end: int, target: Floats) -> None:
+    """Join the rows of neighbouring spans."""
+    copy(wholes[begin], target)
+    for k in range(begin + 1, end):
+        join_rows_into(is_greatest, wholes[k], target)
+
+
+@uncounted
+def _find_closing(
+    node: Integers, block: SampleBlock, recent: Recent, begin: int, end: int, newest: int, is_first: bool,
+    closing: Integers,
+) -> None:  # fmt: skip
+    """Enter with which sample windows of begin … end - 1 close, counted from the block's first.
+
+    Args:
+        is_first: whether to replace what is there, or to raise it.
+    """
+    far, stamps, offset = node[codes.NODE_HIGH], recent.stamps, block.offset
+    for position in range(begin, end):
+        at = position + far
+        if node[codes.NODE_UNIT] != codes.SAMPLES:
+            at = window_after(node, recent, position, offset, newest)
+            at -= stamps[at - 1 - offset] - stamps[position - offset] == far
+        sample, k = at - block.since, position - begin
+        closing[k] = sample if is_first else max(closing[k], sample)
+
+
+@uncounted
+def _window_span_rows(
+    node: Integers, block: SampleBlock, recent: Recent, span: Integers, operand: NodeRows,
+    operands: Integers, columns: Floats, joints: Floats, spare: Floats, numbers: Floats, target: Floats,
+) -> None:  # fmt: skip
+    """Compute a window's rows in one span."""
+    is_greatest = node[codes.NODE_CODE] in (codes.PART_WINDOW_MAX, codes.PAST_WINDOW_MAX)
+    begin, end, left, right = span[BEGIN], min(span[END], block.last + 1), span[LEFT], span[RIGHT]
+    begins_in_rows = operands[left, KIND] == IN_ROWS
+    ends_in_rows = right != THROUGH and right != left and operands[right, KIND] == IN_ROWS
+    if begins_in_rows or ends_in_rows:
+        ends_between(node, recent, begin, end, block.offset, block.last, block.starts, block.afters)
+    if left == right and begins_in_rows:
+        window_rows(block, is_greatest, operand, target, begin, end)
+        return
+    # what stands in the table is the same for all samples, if no row is followed
+    is_number = True
+    for bit in range(CORNER_BITS):
+        is_number = is_number and span[ROWS_FROM + bit] < 0
+    first, count = begin - block.lowest, end - begin
+    if span[ROW] >= 0:
+        copy(joints[span[ROW]], block.running[0])
+    else:
+        fill(block.running[0], -np.inf if is_greatest else np.inf)
+    if begins_in_rows:
+        at = min(operands[left, END], block.last + 1)
+        join_before(block, is_greatest, operand, at, block.starts[:count], target, begin)
+        fill(block.running[0], -np.inf if is_greatest else np.inf)
+    if begins_in_rows and not ends_in_rows and right != THROUGH:
+        for k in range(count):
+            _read_position(span, columns, first + k, joints, spare, numbers, block.running[0])
+            join_rows_into(is_greatest, block.running[0], target[first + k])
+    elif not begins_in_rows and is_number and ends_in_rows:
+        at = operands[right, BEGIN]
+        numbers_before, afters = columns[0, first:], block.afters[:count]
+        join_after(block, is_greatest, operand, at, afters, numbers_before, True, target, begin)
+        return
+    elif not begins_in_rows:
+        for k in range(count):
+            if is_number:
+                join_number(is_greatest, block.running[0], columns[0, first + k], target[first + k])
+                continue
+            _read_position(span, columns, first + k, joints, spare, numbers, target[first + k])
+            join_rows_into(is_greatest, block.running[0], target[first + k])
+        fill(block.running[0], -np.inf if is_greatest else np.inf)
+    if ends_in_rows:
+        at = operands[right, BEGIN]
+        join_after(block, is_greatest, operand, at, block.afters[:count], block.before, False, target, begin)
+
+
+@uncounted
+def _operand_rows(
+    spans: Integers, span: int, column: Floats, columns: Floats, rows: Floats, begin: int, end: int,
+    joints: Floats, spare: Floats, numbers: Floats, lowest: int, has_rows: bool, last: int,
+) -> NodeRows:  # fmt: skip
+    """Return what an operand is at begin … end - 1: rows, or numbers that are the same for all samples."""
+    if spans[span, KIND] == IN_COLUMN or not has_rows:
+        return NodeRows(column, rows, last + 1)
+    if spans[span, KIND] == IN_TABLE:
+        for position in range(begin, end):
+            at = position - lowest
+            _read_position(spans[span], columns, at, joints, spare, numbers, rows[at])
+    return NodeRows(column, rows, begin)
+
+
+@apart
+def run_spans(table_at: int, number: int, which: int, channels: int, is_end: int) -> int:
+    """Compute the rows of all nodes for a block of samples (see `find_spans`).
+
+    Args:
+        is_end: 1 if it is the last one of those that spans were found for: then what is closed after it is
+            entered into the columns.
+    """
+    tables, memory, scratch, _ = arrays_at(table_at)
+    nodes, part, look = tables.nodes, tables.parts[number], look_of(which, channels)
+    columns, history = memory.columns[columns_number(which)], memory.history[look.channel]
+    recent, block, first = recent_of(memory, scratch), block_of(memory, scratch), part[codes.PART_FIRST]
+    newest, joints, spare = scratch.block[BLOCK_NEWEST], scratch.joints, scratch.spare
+    root = part[codes.PART_END] - 1
+    for d in range(first, part[codes.PART_END]):
+        node, place = nodes[d], d - first
+        code = node[codes.NODE_CODE]
+        if code == codes.LITERAL:
+            continue
+        a, b = node[codes.NODE_B] if d == root else node[codes.NODE_A], node[codes.NODE_B]
+        signal, spans = signal_of(nodes, first + a), scratch.spans[place]
+        is_greatest = code in (codes.PART_OR, codes.PART_WINDOW_MAX, codes.PAST_WINDOW_MAX, codes.UNTIL)
+        column = columns[first + a] if signal < 0 else history[signal]
+        rows = scratch.rows[max(nodes[first + a, codes.NODE_ROWS], 0)]
+        target = scratch.rows[max(node[codes.NODE_ROWS], 0)]
+        if code in (codes.PART_AND, codes.PART_OR):
+            other_signal = signal_of(nodes, first + b)
+            other = columns[first + b] if other_signal < 0 else history[other_signal]
+            other_rows = scratch.rows[max(nodes[first + b, codes.NODE_ROWS], 0)]
+            is_first = signal < 0 and nodes[first + a, codes.NODE_ROWS] == node[codes.NODE_ROWS]
+            is_second = other_signal < 0 and nodes[first + b, codes.NODE_ROWS] == node[codes.NODE_ROWS]
+            for k in range(1, scratch.span_counts[place]):
+                span, begin, end = spans[k], spans[k, BEGIN], min(spans[k, END], block.last + 1)
+                if span[KIND] != IN_ROWS or begin >= end:
+                    continue
+                one = _operand_rows(
+                    scratch.spans[a], span[LEFT], column, scratch.corner_columns[a], rows, begin, end,
+                    joints, spare, scratch.corner, block.lowest, signal < 0, block.last,
+                )  # fmt: skip
+                two = _operand_rows(
+                    scratch.spans[b], span[RIGHT], other, scratch.corner_columns[b], other_rows, begin, end,
+                    joints, spare, scratch.corner, block.lowest, other_signal < 0, block.last,
+                )  # fmt: skip
+                if is_second:
+                    join_operands_rows(block, is_greatest, two, one, True, target, begin, end)
+                else:
+                    join_operands_rows(block, is_greatest, one, two, is_first, target, begin, end)
+        else:
+            operand = NodeRows(column, rows, scratch.begins[a] if signal < 0 else block.last + 1)
+            operands, count, wholes = scratch.spans[a], scratch.span_counts[a], scratch.wholes[place]
+            _fill_wholes(
+                block, is_greatest, operand, operands, count, scratch.sums[place], joints, spare, wholes
+            )
+            if d == root:
+                continue
+            for k in range(1, scratch.span_counts[place]):
+                left, right = spans[k, LEFT], min(spans[k, RIGHT], count)
+                if spans[k, ROW] >= 0:
+                    _fill_joint(is_greatest, wholes, left + 1, right, joints[spans[k, ROW]])
+            decided = is_decided(node, look.mode) and code in codes.AHEAD_OF
+            for k in range(1, scratch.span_counts[place]):
+                span, begin, end = spans[k], spans[k, BEGIN], min(spans[k, END], block.last + 1)
+                if span[KIND] != IN_ROWS or begin >= end:
+                    continue
+                _window_span_rows(
+                    node, block, recent, span, operand, operands, scratch.corner_columns[place],
+                    joints, spare, scratch.corner, target,
+                )  # fmt: skip
+                if decided:
+                    _find_closing(node, block, recent, begin, end, newest, True, scratch.closing)
+                    value = beyond(look.mode, node[codes.NODE_WEAK])
+                    fill_open(block, scratch.closing, target, begin, end, value)
+        if is_end:
+            _fill_column(spans, scratch.span_counts[place], scratch, place, target, columns[d], block)
+    return 0
+
+
+@uncounted
+def _fill_column(
+    spans: Integers, count: int, scratch: Scratch, place: int, target: Floats, column: Floats,
+    block: SampleBlock,
+) -> None:  # fmt: skip
+    """Enter what a node is after the last sample at positions that the next ones do not change."""
+    stop, sample = scratch.next_begins[place], block.last - block.since
+    for k in range(1, count):
+        for position in range(spans[k, BEGIN], min(spans[k, END], stop)):
+            at = position - block.lowest
+            if spans[k, KIND] == IN_ROWS:
+                column[position - block.offset] = target[at, sample]
+            else:
+                columns, row = scratch.corner_columns[place], block.running[0]
+                _read_position(spans[k], columns, at, scratch.joints, scratch.spare, scratch.corner, row)
+                column[position - block.offset] = row[sample]
+
+
+@uncounted
+def _is_closed_before(nodes: Integers, part: Integers, recent: Recent, block: SampleBlock, at: int) -> bool:
+    """Return whether no window that cuts a bound short is open at a position when the block begins."""
+    closed = True
+    for d in range(part[codes.PART_FIRST], part[codes.PART_END]):
+        if nodes[d, codes.NODE_CUTS]:
+            unit, far = nodes[d, codes.NODE_UNIT], nodes[d, codes.NODE_HIGH]
+            closed = closed and is_closed(recent.stamps, block.offset, block.since - 1, at, unit, far)
+    return closed
+
+
+@uncounted
+def join_body_spans(
+    nodes: Integers, part: Integers, block: SampleBlock, body: NodeRows, base: int, start: float,
+    is_cut: bool, recent: Recent, newest: int, spans: Integers, count: int, wholes: Floats,
+    closing: Integers,
+) -> int:  # fmt: skip
+    """Join what the root of a part joins, from its base on, with a number (see `_join_body`)."""
+    root = part[codes.PART_END] - 1
+    is_until, current = nodes[root, codes.NODE_CODE] == codes.UNTIL, 0
+    settled = max(spans[0, END], base)
+    fill(
+        block.running[0], extremum(is_until, body.column[base - block.offset : settled - block.offset], start)
+    )
+    for k in range(1, count):
+        begin, end = spans[k, BEGIN], min(spans[k, END], block.last + 1)
+        if begin >= end:
+            break
+        if not is_cut or _is_closed_before(nodes, part, recent, block, spans[k, END] - 1):
+            join_rows(is_until, block.running[current], wholes[k], block.running[1 - current])
+            current = 1 - current
+            continue
+        if spans[k, KIND] == IN_TABLE:
+            break
+        is_first = True
+        for d in range(part[codes.PART_FIRST], part[codes.PART_END]):
+            if nodes[d, codes.NODE_CUTS]:
+                _find_closing(nodes[d], block, recent, begin, end, newest, is_first, closing)
+                is_first = False
+        for position in range(begin, end):
+            sample = max(position - block.since, closing[position - begin])
+            if sample > block.last - block.since:
+                return current
+            current = enter(is_until, block, body, position, sample, current)
+    return current

@@ -1,0 +1,145 @@
+"""Parts with many open positions, run over several blocks of samples at once (see `blocks.spans`)."""
+
+from __future__ import annotations
+
+from spatial_replay.compiled import apart, uncounted
+from spatial_replay.geometry.arrays import Integers
+from spatial_replay.monitor.online import codes
+from spatial_replay.monitor.online.blocks.block_ends import find_begins, is_beside_one
+from spatial_replay.monitor.online.blocks.block_run import PARTIAL, WHOLE, operand_of, set_last
+from spatial_replay.monitor.online.blocks.span_rows import block_of, join_body_spans, run_spans
+from spatial_replay.monitor.online.blocks.spans import fill_tables, find_spans
+from spatial_replay.monitor.online.closing import absorb
+from spatial_replay.monitor.online.node_columns import columns_number, look_of, tables_end
+from spatial_replay.monitor.online.open_windows import (
+    has_ended,
+    is_cut_short,
+    is_known,
+    is_plain,
+    root_window,
+)
+from spatial_replay.monitor.online.run_arrays import arrays_at
+from spatial_replay.monitor.online.sliding import beyond, copy, enter_samples, fill, recent_of
+from spatial_replay.monitor.online.state import (
+    BLOCK,
+    BLOCK_LAST,
+    BLOCK_LOWEST,
+    BLOCK_NEWEST,
+    BLOCK_SINCE,
+    IS_FOLLOWED,
+    LOOKS,
+    OFFSET,
+    POSITION,
+)
+from spatial_replay.monitor.online.windows import run_part
+
+
+@uncounted
+def _takes_spans(nodes: Integers, part: Integers) -> bool:
+    """Return whether a part has nothing but windows below a root that joins all that follows."""
+    root = nodes[part[codes.PART_END] - 1]
+    if not is_plain(part) or root[codes.NODE_A] >= 0:
+        return False
+    for d in range(part[codes.PART_FIRST], part[codes.PART_END] - 1):
+        code = nodes[d, codes.NODE_CODE]
+        is_window = code in (codes.PART_WINDOW_MAX, codes.PART_WINDOW_MIN) or code in codes.PAST_WINDOWS
+        if not is_window and code not in (codes.LITERAL, codes.PART_AND, codes.PART_OR):
+            return False
+    return True
+
+
+@apart
+def _set_first_of_spans(
+    table_at: int, number: int, which: int, channels: int, at: int, columns_of: int
+) -> int:
+    """Enter one of a part's numbers at the first sample, as `_set_first` does, from the spans of its body."""
+    tables, memory, scratch, _ = arrays_at(table_at)
+    nodes, part, block = tables.nodes, tables.parts[number], block_of(memory, scratch)
+    look, root = look_of(which, channels), nodes[part[codes.PART_END] - 1]
+    table = memory.tables[look.channel, part[codes.PART_TABLE_START] : tables_end(part)]
+    missing, count = beyond(look.mode, root[codes.NODE_WEAK]), block.last + 1 - block.since
+    numbers, body = scratch.parts[number, which, at : at + count], root[codes.NODE_B]
+    base = memory.cells[part[codes.PART_CELL_START]]
+    if is_known(which, part, root, memory, block.since):
+        fill(numbers, missing)
+    else:
+        operand = operand_of(
+            nodes, part, body, memory.columns[columns_of], memory.history[look.channel], scratch
+        )
+        current = join_body_spans(
+            nodes, part, block, operand, base, missing, is_cut_short(which, part, root, channels),
+            recent_of(memory, scratch), scratch.block[BLOCK_NEWEST], scratch.spans[body],
+            scratch.span_counts[body], scratch.wholes[part[codes.PART_END] - 1 - part[codes.PART_FIRST]],
+            scratch.closing,
+        )  # fmt: skip
+        copy(block.running[current], numbers)
+    if base > 0:
+        for k in range(count):
+            numbers[k] = max(table[0], min(numbers[k], table[1]))
+    return 0
+
+
+@apart
+def run_wide(table_at: int, number: int, looks: int, channels: int, at: int, count: int, tile: int) -> int:
+    """Run a part with many open positions over `count` samples from number `at` of a tile on (see `spans`).
+
+    Args:
+        looks: as for `run_block`.
+        tile: how many samples the tile has.
+
+    Returns:
+        WHOLE or PARTIAL, as `run_block`; or 0 if it cannot be run so, and nothing is done.
+    """
+    tables, memory, scratch, _ = arrays_at(table_at)
+    nodes, part, numbers = tables.nodes, tables.parts[number], scratch.parts[number]
+    root, block, offset = nodes[part[codes.PART_END] - 1], scratch.block, memory.clock[OFFSET]
+    since = memory.clock[POSITION] + at
+    last = since + count - 1
+    begin, _ = root_window(root, memory, last)
+    if not _takes_spans(nodes, part) or since <= offset:
+        return 0
+    if is_beside_one(nodes, part, memory.stamps, offset, since):
+        return 0  # sample by sample, the width of one window alone costs next to nothing
+    if begin > memory.cells[part[codes.PART_CELL_START]] or has_ended(part, root, memory, last):
+        return 0  # the root leaves out some of the spans' positions
+    # as long as not looked at what the samples are, this is the same for all numbers
+    find_begins(table_at, number, 0, channels, 0, 1, last + 1, last + 1)
+    lowest, is_first = find_begins(table_at, number, 0, channels, 0, 0, since, last), True
+    if last + 1 - lowest > scratch.rows.shape[1]:
+        return 0
+    block[BLOCK_LOWEST], block[BLOCK_NEWEST], block[IS_FOLLOWED] = lowest, last, 1
+    for which in range(LOOKS):
+        if not (looks >> which) & 1:
+            continue
+        if not find_spans(table_at, number, which, channels, since, last):
+            if is_first:
+                return 0
+            memory.known[number], memory.window_next[:] = -1, -1
+            run_part(table_at, number, channels, at, at + count, tile)
+            return WHOLE
+        if is_first and len(memory.window_next):
+            enter_samples(nodes, part, memory.stamps, memory.window_ends, memory.window_next, offset, last)
+        is_first = False
+        fill_tables(table_at, number, which, channels, since, last)
+        for begin in range(since, last + 1, BLOCK):
+            end = min(begin + BLOCK - 1, last)
+            block[BLOCK_SINCE], block[BLOCK_LAST] = begin, end
+            run_spans(table_at, number, which, channels, 1 if end == last else 0)
+            k = at + begin - since
+            _set_first_of_spans(table_at, number, which, channels, k, columns_number(which))
+            if which > 1:
+                continue
+            if part[codes.PART_IS_REMEMBERING]:
+                set_last(table_at, number, which, channels, k)
+            for bound in (4, 5):
+                is_beside = bound - 4 == which if channels == 4 else look_of(bound, channels).channel == which
+                if is_beside and ((part[codes.PART_NUMBERS] & ~looks) >> bound) & 1:
+                    _set_first_of_spans(table_at, number, bound, channels, k, columns_number(which))
+        memory.known[number, columns_number(which)] = memory.closed[number, columns_number(which)] = last
+        memory.unjoined[number, columns_number(which)] = 0
+    for k in range(at, at + count if channels < 4 else at):
+        if channels == 1:
+            numbers[1, k], numbers[3, k] = numbers[0, k], numbers[2, k]
+        numbers[6, k], numbers[7, k] = numbers[0, k], numbers[1, k]
+    absorb(table_at, number, channels, last)
+    return PARTIAL
