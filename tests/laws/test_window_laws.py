@@ -384,6 +384,13 @@ _both_open = Boolean("or", (ahead("G", 0, 0, Q), ahead("G", 0, 1, ahead("G", 0, 
             0.5,
             id="samples come together into windows that none of them is in",
         ),
+        pytest.param(
+            ahead("H", 0, 5, Temporal("G", (Temporal("G", (P,)),))),
+            {"p": {0: 3.0, 1: 2.0, 20: -1.0}},
+            (0, 10, 41),
+            0.5,
+            id="nothing past is left of a past operator",
+        ),
     ],
 )
 def test_windows_equal_the_definitions_where(formula, numbers, ends, spread, tile):

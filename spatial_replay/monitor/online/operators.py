@@ -255,7 +255,9 @@ class PartRows:
     def is_flat(self) -> bool:
         """Whether one sample settles everything but the variables: no window, shift or past operator."""
         flat = (codes.LITERAL, codes.PART_AND, codes.PART_OR, *_ANCHORED)
-        return all(row[0] in flat or (row[0] in _RUNNING and row[-1]) for row in self._rows)
+        # what a past operator is now is asked for, too, although nothing past is left of `H[0,5] G G x`
+        is_flat = all(row[0] in flat or (row[0] in _RUNNING and row[-1]) for row in self._rows)
+        return is_flat and not self._is_past
 
     @property
     def is_nested(self) -> bool:
