@@ -140,7 +140,7 @@ def by_address(function: Callable[..., int]) -> Callable[[int, bytes, int], int]
 
 
 def releasing(function: Callable[..., int]) -> Callable[..., int]:
-    """Return a kernel compiled apart for long calls, while which other threads run (see `long_kernel`)."""
+    """Return a kernel compiled apart whose calls let other threads run (see `long_kernel`)."""
     if _process.only == "interpreted":
         return function
     kernel = cast("_Apart", function)

@@ -64,6 +64,10 @@ _beside = st.builds(Boolean, st.sampled_from(["and", "or", "xor", "<->"]), st.tu
 formulas = st.one_of(
     responses(_deep), responses(_over), responses(_beside), _deep, _behind(_below(2)), _below(3)
 )
+_cheap = responses(windows_of(_literals, _even_bounds))
+_roots = st.lists(st.one_of(_cheap, responses(_over), responses(_deep)), min_size=2, max_size=4)
+several = st.builds(Boolean, st.sampled_from(["and", "or"]), _roots.map(tuple))
+"""Some responses beside each other, of which some are made of signals."""
 _ends = st.one_of(
     st.builds(
         lambda low, more: Bound(low, low + more, "samples"),
@@ -260,10 +264,20 @@ def test_two_runs_that_share_a_stretch_say_what_one_does(data, formula, run, roo
 
 
 @settings(max_examples=200)
+@given(data=st.data(), formula=several, run=long_runs(200, 600), tile=st.sampled_from([20, 64]))
+def test_two_runs_that_share_several_roots_say_what_one_does(data, formula, run, tile):
+    ends, size = data.draw(stretches(len(run))), len(run)
+    # a long stretch, and then others
+    ends = sorted({0, size // 2, *(end for end in ends if end > size // 2)})
+    with only("compiled"):
+        assert_same_bits(*both_ways(program_of(formula), run, ends, room=tile, tile=tile, least_shared=60))
+
+
+@settings(max_examples=200)
 @given(data=st.data(), formula=formulas, run=long_runs(), most=st.sampled_from([9, 16, 33, 50, 80]))
 def test_where_more_is_open_than_there_are_rows_samples_run_one_by_one(data, formula, run, most):
     ends = data.draw(stretches(len(run)))
-    with mock.patch.object(state, "MOST_ROWS", most):
+    with mock.patch.object(state, "MOST_POSITIONS", most):
         assert_same_bits(*both_ways(program_of(formula), run, ends))
 
 

@@ -32,6 +32,9 @@ MAX_TABLE = 5
 Clause = frozenset[int]
 """Rows of a part that are joined by `or` below a weak root, by `and` below a strong one."""
 
+_LAST = (1 << 63) - 1
+"""No sample comes later."""
+
 
 @dataclass(frozen=True)
 class Clauses:
@@ -318,7 +321,8 @@ class _Builder:
         assert self._ends is not None
         _, low, high = self._ends
         early = [self._signals.row(codes.NOT, self._elapsed(low))] if low > 0 else []
-        return [*early, self._elapsed(high + 1)]
+        late = [self._elapsed(high + 1)] if high < _LAST else []
+        return [*early, *late]
 
     def _elapsed(self, distance: int) -> int:
         """Return a signal that, once a distance from the first sample on, is as good as a clause can be."""

@@ -83,7 +83,7 @@ def _assigned(program: Program, units: list[_Unit]) -> tuple[float, Integers]:
 
 def copied(memory: Memory) -> Memory:
     """Return a copy of a run's memory, of which columns are to be computed again."""
-    # of zeros that are not looked at, there is no memory
+    # zeros take up memory once they are touched
     again = {name: np.zeros(getattr(memory, name).shape, getattr(memory, name).dtype) for name in _AGAIN}
     others = {name: values.copy() for name, values in memory._asdict().items() if name not in again}
     copy = Memory(**others, **again)
@@ -97,7 +97,8 @@ def joined_memory(programs: tuple[Program, Program], memories: tuple[Memory, Mem
     kept = int(memories[0].clock[OFFSET] > memories[1].clock[OFFSET])
     memory, other = memories[kept], memories[1 - kept]
     for part in programs[1 - kept].parts.tolist():
-        if part[codes.PART_NUMBERS] & 1:
+        # what is made of signals has no cells
+        if part[codes.PART_NUMBERS] & 1 and part[codes.PART_KIND] != codes.CLAUSES:
             cell, table = part[codes.PART_CELL_START], part[codes.PART_TABLE_START]
             variables, tables = part[codes.PART_VARIABLES], part[codes.PART_TABLES]
             cells = slice(cell, cell + 1 + variables + tables)

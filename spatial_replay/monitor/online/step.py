@@ -153,16 +153,12 @@ class OnlineRun:
         self._program = program
         self.step = step_with_windows if has_windows(program) else step
         self._called = self.step
-        self._tile = tile
         self._least_shared = least_shared
         if not program.keeps_history:
             room = tile
-        self._memory = first_memory(program, room)
-        self._scratch = scratch_for(program, room, tile)
-        self._final = np.zeros((len(program.reports), 2))
         self._tables = Tables.of(program)
         self._channels = 1
-        self._find_arrays()
+        self._take(first_memory(program, room), np.zeros((len(program.reports), 2)), tile)
 
     def __len__(self) -> int:
         """Return how many samples were added."""
@@ -243,10 +239,7 @@ class OnlineRun:
         with closing(iter_ahead(partial(second._run_ahead, of_none, which), tiles)) as ahead:
             for (at, _), numbers in zip(tiles, ahead, strict=True):
                 first._run_behind(stretch, which, numbers, at)
-        memory = joined_memory(programs, (first._memory, second._memory))
-        scratch = scratch_for(self._program, len(memory.stamps), self._tile)
-        self._memory, self._scratch, self._final = memory, scratch, first._final
-        self._find_arrays()
+        self._take(joined_memory(programs, (first._memory, second._memory)), first._final, self._tile)
         return end
 
     def _share(self, program: Program) -> OnlineRun:
@@ -254,10 +247,7 @@ class OnlineRun:
         share = copy(self)
         share._program, share._tables = program, Tables.of(program)
         share._called = releasing(self.step)
-        share._memory = copied(self._memory)
-        share._scratch = scratch_for(program, len(self._memory.stamps), self._tile)
-        share._final = np.zeros((len(program.reports), 2))
-        share._find_arrays()
+        share._take(copied(self._memory), np.zeros((len(program.reports), 2)), self._tile)
         return share
 
     def _run_ahead(self, stretch: _Stretch, which: tuple[Integers, Integers], begin: int, end: int) -> Floats:
@@ -288,16 +278,20 @@ class OnlineRun:
 
     def _lengthen_tiles(self) -> None:
         """Run more samples together from now on: with many, the calls cost more than what the cache saves."""
-        self._tile = LONG_TILE
-        while len(self._memory.stamps) < (2 if self._program.keeps_history else 1) * LONG_TILE:
-            self._memory = doubled(self._memory, self._channels, self._program.signals)
-        self._scratch = scratch_for(self._program, len(self._memory.stamps), self._tile)
-        self._find_arrays()
+        memory = self._memory
+        while len(memory.stamps) < (2 if self._program.keeps_history else 1) * LONG_TILE:
+            memory = doubled(memory, self._channels, self._program.signals)
+        self._take(memory, self._final, LONG_TILE)
 
-    def _find_arrays(self) -> None:
-        self._arrays = RunArrays(self._tables, self._memory, self._scratch, self._final)
-        self._table = table_of(self._arrays)
-        self._table_at = self._table.ctypes.data
+    def _take(self, memory: Memory, final: Floats, tile: int) -> None:
+        """Go on with another memory, and other tiles, and the room to work in that these need."""
+        scratch = scratch_for(self._program, len(memory.stamps), tile)
+        arrays = RunArrays(self._tables, memory, scratch, final)
+        table = table_of(arrays)
+        at = table.ctypes.data
+        # together, so that an interruption comes before all of these or after
+        self._memory, self._scratch, self._final, self._tile = memory, scratch, final, tile
+        self._arrays, self._table, self._table_at = arrays, table, at
 
     def make_room(self, wanted: int) -> int:
         """Make room for at least one of the wanted samples; return for how many."""
@@ -312,7 +306,6 @@ class OnlineRun:
             if drop(self._table_at, self._channels):
                 offset = int(clock[OFFSET])
             elif used == room:
-                self._memory = doubled(self._memory, self._channels, self._program.signals)
-                self._scratch = scratch_for(self._program, 2 * room, self._tile)
-                self._find_arrays()
+                memory = doubled(self._memory, self._channels, self._program.signals)
+                self._take(memory, self._final, self._tile)
         return min(wanted, len(self._memory.stamps) - (position - offset))

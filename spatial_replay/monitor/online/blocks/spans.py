@@ -45,14 +45,15 @@ from spatial_replay.monitor.online.state import (
 
 BEGIN, END, KIND, LEFT, RIGHT, ROW = range(6)
 """What the numbers of a span stand for: its first position, and what comes after it; which kind it is; of a
-window, the operand's spans that its first and its last position lie in (`THROUGH`: it ends with the newest
-sample), and the row of what lies between, -1 for none. The rows it follows come next, one for each bit."""
+window, the operand's spans that its first and its last position lie in, and the row of what lies between, -1
+for none. The rows it follows come next, one for each bit."""
 
 ROWS_FROM: Final = 6
 IN_COLUMN, IN_ROWS, IN_TABLE = range(3)
 """Kinds of spans: what they are stands in the node's column, in rows of its own, in its table."""
 
 THROUGH: Final = 1 << 20
+"""Stands for the span of a window's last position where that is the newest sample."""
 
 
 @inlined
@@ -91,13 +92,11 @@ def _sorted_into(cuts: Integers, count: int, at: int, begin: int, end: int) -> i
         return count
     k = count
     while k > 0 and cuts[k - 1] > at:
-        cuts[k] = cuts[k - 1]
         k -= 1
     if k > 0 and cuts[k - 1] == at:
-        while k < count:
-            cuts[k] = cuts[k + 1]
-            k += 1
         return count
+    for later in range(count, k, -1):
+        cuts[later] = cuts[later - 1]
     cuts[k] = at
     return count + 1
 
