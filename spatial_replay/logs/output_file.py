@@ -5,17 +5,18 @@ from __future__ import annotations
 import errno
 import io
 import os
+import secrets
 import stat
 import sys
-import tempfile
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, Literal, TypeAlias, get_args
 
 from spatial_replay.errors import OutputError, UsageError, system_reason
 
 _SCHEMES = ("s3:", "gs:", "az:", "http:", "https:")
+_CREATE = os.O_WRONLY | os.O_CREAT | getattr(os, "O_BINARY", 0)
 
 
 @contextmanager
@@ -37,23 +38,19 @@ def replacing(output: Path, inputs: Iterable[Path] = ()) -> Iterator[BinaryIO]:
         return
     # a link stays a link, to the new content
     output = output.resolve()
-    with _writing(output):
-        descriptor, partial = tempfile.mkstemp(".partial", f".{output.name}.", output.parent)
+    # named before it is made: an interruption at whatever step finds it
+    partial = output.with_name(f".{output.name}.{secrets.token_hex(8)}.partial")
     try:
+        with _writing(output):
+            descriptor = os.open(partial, _CREATE | os.O_EXCL, 0o666)
         with _stream(descriptor, output) as stream:
             yield stream
         with _writing(output):
-            _move(Path(partial), output)
+            partial.replace(output)
     finally:
-        Path(partial).unlink(missing_ok=True)
-
-
-def _move(partial: Path, output: Path) -> None:
-    """Give a whole file its name, and the permissions that a new file has."""
-    umask = os.umask(0)
-    os.umask(umask)
-    partial.chmod(0o666 & ~umask)
-    partial.replace(output)
+        # a file that could not be made, or has its own name now, needs no removal
+        with suppress(OSError):
+            partial.unlink()
 
 
 Durability: TypeAlias = Literal["process", "disk"]
@@ -73,7 +70,7 @@ def open_output(output: Path, durability: Durability = "process") -> BinaryIO:
     if durability not in get_args(Durability):
         raise UsageError(f"durability is {durability!r}; give 'process' or 'disk'")
     with _writing(output):
-        descriptor = os.open(output, os.O_WRONLY | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o666)
+        descriptor = os.open(output, _CREATE, 0o666)
     try:
         with _writing(output):
             if stat.S_ISREG(os.fstat(descriptor).st_mode):

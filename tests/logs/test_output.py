@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from itertools import count
 from pathlib import Path
+from types import FrameType
 
 import pytest
 
@@ -30,6 +32,39 @@ def test_an_error_of_the_block_is_not_an_output_error(tmp_path: Path) -> None:
         (tmp_path / "absent").read_bytes()
     assert output.read_bytes() == b"before"
     assert list(tmp_path.iterdir()) == [output]
+
+
+# a file that an interruption leaves open is closed when it is collected
+@pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
+def test_interrupted_at_any_step_an_output_is_whole_or_not_there(tmp_path: Path) -> None:
+    output, before = tmp_path / "out", sys.gettrace()
+    left = 0
+
+    def step(frame: FrameType, event: str, _: object) -> object:
+        nonlocal left
+        left -= event == "line"
+        if left == 0:
+            sys.settrace(before)
+            raise KeyboardInterrupt
+        return step
+
+    for at in count(1):
+        left = at
+        try:
+            sys.settrace(step)
+            with replacing(output) as stream:
+                stream.write(b"whole")
+        except KeyboardInterrupt:
+            pass
+        finally:
+            sys.settrace(before)
+        if left > 0:
+            break
+        assert [each.name for each in tmp_path.iterdir()] in ([], ["out"]), at
+        if output.exists():
+            assert output.read_bytes() == b"whole"
+            output.unlink()
+    assert at > 50
 
 
 @pytest.mark.parametrize("size", [1, 1 << 22], ids=["when it is closed", "while it is written"])
