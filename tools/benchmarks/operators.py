@@ -73,7 +73,7 @@ GENERAL = "G (a -> F[0,5] G[0,w] b)"
 def bench_online_windows(bench: Any) -> None:
     """Bounded operators below an unbounded one, every prefix, beside `G (a -> b)`; processor time."""
     compile_ahead()
-    source = np.random.default_rng(0).normal(size=(1, 2, ONLINE))
+    source = np.random.default_rng(0).normal(size=(1, 3, ONLINE))
     for name, text in RESPONSES.items():
         is_general = name == GENERAL
         widths = (10, 100) if is_general else (10, 100, 1000, 10_000, 100_000)
@@ -106,7 +106,7 @@ def _online_times(texts: dict[str, str], leaves: Any) -> dict[str, list[float]]:
         for name, program in programs.items():
             run = OnlineRun(program)
             start = time.process_time()
-            run.extend(leaves, times_ns)
+            run.extend(leaves[:, : len(program.leaves)], times_ns)
             if turn > 0:
                 times[name].append((time.process_time() - start) / len(times_ns))
     return times
