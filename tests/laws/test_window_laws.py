@@ -111,6 +111,36 @@ def _wide_windows(depth):
 wide_windows = st.builds(Temporal, st.sampled_from(["F", "G"]), st.tuples(_wide_windows(4)))
 """Windows of some hundred samples over each other."""
 
+_near = st.one_of(
+    st.builds(
+        lambda low, more: Bound(low, low + more, "samples"),
+        st.sampled_from([0, 0, 0, 1, 9]),
+        st.sampled_from([0, 1, 8, 15, 31, 40]),
+    ),
+    st.builds(
+        lambda low, more: Bound(low, low + more, "ns"),
+        st.sampled_from([0, 0, 0, 1, 100, 250]),
+        st.sampled_from([0, 50, 101, 800, 1600, 3200]),
+    ),
+)
+_nearby = st.one_of(windows_of(_below(0), _near), windows_of(combinations_of(_literals, _near), _near))
+_near_root = st.builds(
+    Temporal,
+    st.sampled_from(["F", "G"]),
+    st.tuples(
+        st.one_of(
+            _nearby,
+            st.builds(Temporal, st.sampled_from(["F", "G", "O", "H"]), st.tuples(_nearby), _near),
+            st.builds(Boolean, st.sampled_from(["and", "or", "->", "<->"]), st.tuples(_nearby, _nearby)),
+        )
+    ),
+)
+near_windows = st.one_of(
+    _near_root,
+    st.builds(Boolean, st.sampled_from(["and", "or", "<->"]), st.tuples(_near_root, _near_root)),
+)
+"""Unbounded roots over windows that look no further than some ten samples."""
+
 _conditioned = st.builds(Boolean, st.sampled_from(["and", "or", "->"]), st.tuples(_literals, _ahead))
 _several = st.builds(Boolean, st.sampled_from(["and", "or"]), st.tuples(_conditioned, _ahead))
 ending = st.builds(
@@ -261,6 +291,22 @@ def test_two_runs_that_share_a_stretch_say_what_one_does(data, formula, run, roo
     ends = data.draw(stretches(len(run)))
     with only("compiled"):  # the work is shared once there is machine code
         assert_same_bits(*both_ways(program_of(formula), run, ends, room=room, tile=tile, least_shared=least))
+
+
+@settings(max_examples=800)
+@given(
+    data=st.data(),
+    formula=near_windows,
+    run=long_runs(500, 900),
+    tile=st.sampled_from([20, 33, 64]),
+    least=st.sampled_from([200, 300]),
+)
+def test_two_runs_that_take_half_a_stretch_each_say_what_one_does(data, formula, run, tile, least):
+    ends, size = data.draw(stretches(len(run))), len(run)
+    # a stretch that has a middle, and then others
+    ends = sorted({0, 4 * size // 5, *(end for end in ends if end > 4 * size // 5)})
+    with only("compiled"):
+        assert_same_bits(*both_ways(program_of(formula), run, ends, room=tile, tile=tile, least_shared=least))
 
 
 @settings(max_examples=200)

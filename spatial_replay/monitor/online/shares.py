@@ -1,8 +1,12 @@
-"""A long stretch of samples on two cores, each of which computes some numbers of the parts with windows.
+"""A long stretch of samples on two cores: each takes one half of them, or some numbers of the parts.
 
-Nothing that is open in a part matters to another one, nor do the columns of one number to those of another
-(see `windows`). So two runs of the same samples share these: the one that says what all nodes are takes what
-it has not computed from the other, which goes ahead of it tile by tile.
+*Halves*: with nothing but bounded windows below an unbounded root, what is open at a sample depends on the
+samples around it alone, and what has closed is no more than a bound. So another run begins in the middle, as
+if nothing had closed before, and its numbers are bounded afterwards by what has closed in the first half.
+
+*Shares*: nothing that is open in a part matters to another one, nor do the columns of one number to those of
+another (see `windows`). So two runs of the same samples share these: the one that says what all nodes are
+takes what it has not computed from the other, which goes ahead of it tile by tile.
 """
 
 from __future__ import annotations
@@ -10,17 +14,18 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, TypeAlias, cast
+from typing import Any, NamedTuple, TypeAlias, cast
 
 import numpy as np
 
 from spatial_replay.cores import Work, drop
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
-from spatial_replay.monitor.online.closing import is_settled
-from spatial_replay.monitor.online.open_windows import looks_of
+from spatial_replay.monitor.online.closing import CLOSING, is_settled
+from spatial_replay.monitor.online.node_columns import cells_of, look_of
+from spatial_replay.monitor.online.open_windows import is_plain, looks_of
 from spatial_replay.monitor.online.program import Program
-from spatial_replay.monitor.online.state import NUMBERS, OFFSET, POSITION, Memory, know_no_columns
+from spatial_replay.monitor.online.state import BLOCK, NUMBERS, OFFSET, POSITION, Memory, know_no_columns
 
 _LOWER, _UPPER = 1 << 4, 1 << 5
 
@@ -30,8 +35,153 @@ _AGAIN = ("columns", "joined", "window_ends")
 _TWICE = 1.2
 """So many times the work it takes to have a part in both shares."""
 
+_MOST_OF_WORK = 0.8
+"""So much of the work at least is done in halves, or none."""
+
+_BOUNDED = (
+    codes.LITERAL, codes.PART_AND, codes.PART_OR, codes.PAST_DELAY, *codes.AHEAD_OF, *codes.PAST_WINDOWS,
+)  # fmt: skip
+"""Nodes that look at no more than the samples around a position."""
+
 _Unit: TypeAlias = tuple[float, int, int]
 """What one run computes: its cost, the part, and the numbers, a bit for each."""
+
+
+class Halves(NamedTuple):
+    """A program in two, for two halves of a stretch.
+
+    Attributes:
+        early: all but the parts that `late` runs: of the second half, this is left to do.
+        late: the parts that are run in halves, without a tree.
+        samples, time_ns: so far ahead at most these look from a position.
+    """
+
+    early: Program
+    late: Program
+    samples: int
+    time_ns: int
+
+
+def halves_of(program: Program, memory: Memory, channels: int) -> Halves | None:
+    """Return a program in two whose parts mostly look no further than bounded windows; None for another.
+
+    Args:
+        memory: of a run of the program; what has settled costs nothing.
+    """
+    own = np.zeros((2, len(program.parts)), np.int64)
+    own[0] = codes.ALL_NUMBERS
+    late = whole = 0
+    samples = time_ns = 0
+    for number, part in enumerate(program.parts):
+        nodes = program.nodes[part[codes.PART_FIRST] : part[codes.PART_END]]
+        if part[codes.PART_KIND] != codes.WINDOWED or cast(Any, is_settled).interpreted()(part, memory):
+            continue
+        if part[codes.PART_VARIABLES] == 0 or nodes[-1, codes.NODE_HIGH] > 0:
+            continue  # soon over, mostly
+        cost = int(np.count_nonzero(nodes[:, codes.NODE_CODE] != codes.LITERAL))
+        whole += cost
+        if _is_bounded(part, nodes):
+            late += cost
+            own[:, number] = 0, codes.ALL_NUMBERS
+            counted, timed = _horizon(nodes)
+            samples, time_ns = max(samples, counted), max(time_ns, timed)
+    if not late or late < _MOST_OF_WORK * whole:
+        return None
+    first, second = (
+        replace(program, parts=np.concatenate((program.parts[:, : codes.PART_NUMBERS], row[:, None]), axis=1))
+        for row in own
+    )
+    return Halves(first, replace(second, reports=program.reports[:0]), samples, time_ns)
+
+
+def _is_bounded(part: Integers, nodes: Integers) -> bool:
+    """Return whether a part is an unbounded root that joins what bounded windows are."""
+    root = nodes[-1]
+    is_root = root[codes.NODE_A] < 0 and root[codes.NODE_HIGH] <= 0
+    if not cast(Any, is_plain).interpreted()(part) or not is_root:
+        return False
+    return bool(np.isin(nodes[:-1, codes.NODE_CODE], _BOUNDED).all())
+
+
+def _horizon(nodes: Integers) -> tuple[int, int]:
+    """Return how far ahead a part's body looks at most: in samples, and in ns besides."""
+    horizons = list[tuple[int, int]]()
+    for node in nodes[:-1].tolist():
+        operands = [horizons[d] for d in (node[codes.NODE_A], node[codes.NODE_B]) if 0 <= d < len(horizons)]
+        if node[codes.NODE_CODE] == codes.LITERAL:
+            operands = []
+        samples, time_ns = (
+            (max(ends, default=0) for ends in zip(*operands, strict=True)) if operands else (0, 0)
+        )
+        if node[codes.NODE_CODE] in codes.AHEAD_OF:
+            far = max(node[codes.NODE_LOW], node[codes.NODE_HIGH])
+            is_counted = node[codes.NODE_UNIT] == codes.SAMPLES
+            samples, time_ns = samples + far * is_counted, time_ns + far * (not is_counted)
+        horizons.append((samples, time_ns))
+    return max(samples for samples, _ in horizons), max(time_ns for _, time_ns in horizons)
+
+
+def late_start(halves: Halves, times_ns: Integers, begin: int, middle: int) -> int | None:
+    """Return the sample that the parts of the second half look at first; None if that is no later.
+
+    Args:
+        times_ns: (T,), of all samples.
+        begin, middle: the first sample of the first half, and of the second.
+    """
+    # what has closed is absorbed some samples later
+    newest = middle - 1 - halves.samples - 2 * CLOSING - BLOCK
+    if newest <= begin or halves.time_ns >= int(times_ns[newest]) - int(times_ns[begin]):
+        return None
+    start = int(np.searchsorted(times_ns, times_ns[newest] - halves.time_ns)) - 1
+    return start if start > begin else None
+
+
+def begin_late(program: Program, memory: Memory, channels: int, position: int) -> None:
+    """Have a run's parts begin at a position, as if nothing had closed before."""
+    for part in _parts_run(program):
+        base, boundary, _ = cast(Any, cells_of).interpreted()(part)
+        memory.cells[base] = memory.cells[boundary] = position
+        table = part[codes.PART_TABLE_START]
+        memory.tables[:channels, table], memory.tables[:channels, table + 1] = -np.inf, np.inf
+
+
+def closed_up_to(program: Program, memory: Memory) -> int:
+    """Return the first position that some part of a program has not absorbed."""
+    return min(int(memory.cells[part[codes.PART_CELL_START]]) for part in _parts_run(program))
+
+
+def bound_late(
+    program: Program,
+    late: Memory,
+    early: Memory,
+    channels: int,
+    which: tuple[Integers, Integers],
+    numbers: Floats,
+) -> None:
+    """Bound what a run says of the second half by what has closed in the first.
+
+    Args:
+        program: that of the second half.
+        late, early: the memories at the ends of the halves; `late` is changed.
+        which: what the numbers are (see `numbers_of`).
+        numbers: (K, T), changed.
+    """
+    for k, (number, look) in enumerate(np.transpose(which).tolist()):
+        if look not in (2, 3):  # what a part is now, nothing before matters to
+            channel = cast(Any, look_of).interpreted()(look, channels).channel
+            table = program.parts[number, codes.PART_TABLE_START]
+            low, high = early.tables[channel, table : table + 2]
+            np.clip(numbers[k], low, high, out=numbers[k])
+    for part in _parts_run(program):
+        table = part[codes.PART_TABLE_START]
+        ends = slice(table, table + 2)
+        for channel in range(channels):
+            late.tables[channel, ends] = np.clip(late.tables[channel, ends], *early.tables[channel, ends])
+
+
+def _parts_run(program: Program) -> Integers:
+    parts: Integers = program.parts[program.parts[:, codes.PART_NUMBERS] != 0]
+    return parts
 
 
 def shared_programs(program: Program, memory: Memory, channels: int) -> tuple[Program, Program] | None:

@@ -15,17 +15,23 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 
 from spatial_replay.compiled import apart, floats_at, inlined, integers_at, releasing
-from spatial_replay.cores import cores
+from spatial_replay.cores import Work, cores, drop
 from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.blocks.tile_run import run_in_blocks
 from spatial_replay.monitor.online.codes import in_channels
 from spatial_replay.monitor.online.node_numbers import Results, report
 from spatial_replay.monitor.online.program import Program
 from spatial_replay.monitor.online.run_arrays import RunArrays, Tables, arrays_at, table_of
 from spatial_replay.monitor.online.shares import (
+    begin_late,
+    bound_late,
+    closed_up_to,
     copied,
+    halves_of,
     iter_ahead,
     joined_memory,
+    late_start,
     numbers_of,
     shared_programs,
 )
@@ -41,6 +47,7 @@ from spatial_replay.monitor.online.state import (
     doubled,
     first_memory,
     has_windows,
+    know_no_columns,
     scratch_for,
     widen,
 )
@@ -121,6 +128,10 @@ def step_with_windows(
     return 0
 
 
+_MOST_HALVED = 1 << 18
+"""So many samples at most are run in two halves: the numbers of the second wait for those of the first."""
+
+
 class _Stretch(NamedTuple):
     """Samples that come together, and what is said of them: see `OnlineRun.extend`."""
 
@@ -197,8 +208,10 @@ class OnlineRun:
             done += self._run_tile(stretch, done, len(times_ns))
             # after a tile, the kernel is there, and what settles soon has
             if may_share and done < len(times_ns) and self._is_compiled:
-                may_share = False
-                done = self._run_shared(stretch, done)
+                before, done = done, self._run_halved(stretch, done)
+                if done == before:
+                    done = self._run_shared(stretch, done)
+                may_share = done > before and self._is_worth_sharing(len(times_ns) - done)
         return series
 
     @property
@@ -220,6 +233,61 @@ class OnlineRun:
         leaves, times_ns, series = stretch
         arrays = leaves, *leaves.shape[:2], times_ns, series, len(times_ns)
         self._called(self._table_at, *arrays, begin, count)
+
+    def _run_halved(self, stretch: _Stretch, begin: int) -> int:
+        """Run samples of a stretch from `begin` on in two halves at once (see `shares`).
+
+        Both begin with copies of the state, which stays as it is until they are done.
+
+        Returns:
+            How many samples of the stretch are done: as before, if they cannot be run so.
+        """
+        halves = halves_of(self._program, self._memory, self._channels)
+        if halves is None:
+            return begin
+        end = min(len(stretch.times_ns), begin + _MOST_HALVED)
+        middle = begin + (end - begin) * 17 // 32 // self._tile * self._tile
+        start = late_start(halves, stretch.times_ns, begin, middle)
+        if start is None:
+            return begin
+        first, second, which = self._share(self._program), self._share(halves.late), numbers_of(halves.late)
+        of_none = stretch._replace(series=np.empty((0, 4, len(stretch.times_ns))))
+        begin_late(halves.late, second._memory, self._channels, len(self) + start - begin)
+
+        def run_late() -> Floats:
+            second._pass_over(of_none, begin, middle)
+            return second._run_ahead(of_none, which, middle, end)
+
+        second._widen_room(2 * (middle - start) + self._tile)
+        work = Work(run_late, waits=True)
+        try:
+            work.hand_out()
+            done = begin
+            while done < middle:
+                done += first._run_tile(stretch, done, middle)
+            numbers = work.result()
+        finally:
+            drop([work])
+        if closed_up_to(halves.late, first._memory) < len(self) + start - begin:
+            self._take(first._memory, first._final, self._tile)  # as samples stand unevenly
+            know_no_columns(self._memory)
+            return middle
+        bound_late(halves.late, second._memory, first._memory, self._channels, which, numbers)
+        first._go_on_with(halves.early)
+        first._run_behind(stretch, which, numbers, middle)
+        programs, memories = (halves.early, halves.late), (first._memory, second._memory)
+        self._take(joined_memory(programs, memories), first._final, self._tile)
+        return end
+
+    def _pass_over(self, stretch: _Stretch, begin: int, end: int) -> None:
+        """Take in samples number begin … end - 1 of a stretch without running parts with windows."""
+        own = self._tables.parts[:, codes.PART_NUMBERS].copy()
+        while begin < end:
+            count = self.make_room(min(self._tile, end - begin))
+            self._tables.parts[:, codes.PART_NUMBERS] = 0
+            self._run(stretch, begin, count)
+            self._tables.parts[:, codes.PART_NUMBERS] = own
+            begin += count
 
     def _run_shared(self, stretch: _Stretch, begin: int) -> int:
         """Run the samples of a stretch from `begin` on by two runs at once (see `shares`).
@@ -245,10 +313,15 @@ class OnlineRun:
     def _share(self, program: Program) -> OnlineRun:
         """Return a run that goes on from here, of the same program but for what it computes."""
         share = copy(self)
-        share._program, share._tables = program, Tables.of(program)
         share._called = releasing(self.step)
-        share._take(copied(self._memory), np.zeros((len(program.reports), 2)), self._tile)
+        share._memory = copied(self._memory)
+        share._go_on_with(program)
         return share
+
+    def _go_on_with(self, program: Program) -> None:
+        """Compute from here on what another program does, of the same nodes."""
+        self._program, self._tables = program, Tables.of(program)
+        self._take(self._memory, np.zeros((len(program.reports), 2)), self._tile)
 
     def _run_ahead(self, stretch: _Stretch, which: tuple[Integers, Integers], begin: int, end: int) -> Floats:
         """Run samples number begin … end - 1 of a stretch; return these numbers of its parts, (K, count)."""
@@ -282,6 +355,13 @@ class OnlineRun:
         while len(memory.stamps) < (2 if self._program.keeps_history else 1) * LONG_TILE:
             memory = doubled(memory, self._channels, self._program.signals)
         self._take(memory, self._final, LONG_TILE)
+
+    def _widen_room(self, room: int) -> None:
+        """Have room for so many recent samples: each time it is doubled, columns are computed again."""
+        memory = self._memory
+        while len(memory.stamps) < room:
+            memory = doubled(memory, self._channels, self._program.signals)
+        self._take(memory, self._final, self._tile)
 
     def _take(self, memory: Memory, final: Floats, tile: int) -> None:
         """Go on with another memory, and other tiles, and the room to work in that these need."""
