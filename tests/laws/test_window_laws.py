@@ -143,11 +143,20 @@ near_windows = st.one_of(
 
 _conditioned = st.builds(Boolean, st.sampled_from(["and", "or", "->"]), st.tuples(_literals, _ahead))
 _several = st.builds(Boolean, st.sampled_from(["and", "or"]), st.tuples(_conditioned, _ahead))
-ending = st.builds(
-    Temporal,
-    st.sampled_from(["F", "G"]),
-    st.tuples(st.one_of(_conditioned, _several, _over, _deep, _beside, _behind(_ahead), _below(2))),
-    _ends,
+_endless = st.one_of(
+    st.builds(Temporal, st.sampled_from(["F", "G", "O", "H"]), st.tuples(st.one_of(_conditioned, _over))),
+    st.builds(Temporal, st.sampled_from(["U", "S"]), st.tuples(_literals, st.one_of(_conditioned, _ahead))),
+    st.builds(Temporal, st.sampled_from(["U", "S"]), st.tuples(_conditioned, _literals)),
+)
+_beside_endless = st.builds(
+    Boolean, st.sampled_from(["and", "or", "->", "<->"]), st.tuples(st.one_of(_literals, _ahead), _endless)
+)
+_below_ends = st.one_of(_conditioned, _several, _over, _deep, _beside, _behind(_ahead), _below(2))
+_ending_body = st.one_of(*[_below_ends] * 2, _endless, _beside_endless)
+ending = st.one_of(
+    *[st.builds(Temporal, st.sampled_from(["F", "G"]), st.tuples(_ending_body), _ends)] * 3,
+    st.builds(Temporal, st.sampled_from(["U", "R"]), st.tuples(_literals, _ending_body), _ends),
+    st.builds(Temporal, st.sampled_from(["U", "R"]), st.tuples(_conditioned, _conditioned), _ends),
 )
 """A window from the first sample on over what looks ahead itself."""
 
@@ -372,6 +381,7 @@ def test_memory_does_not_grow_with_a_window_from_the_first_sample():
     for body in (
         ahead("F", 0, 20, Boolean("and", (P, ahead("F", 0, 20, Q)))),  # kept at open positions
         Boolean("->", (P, ahead("F", 0, 20, Q))),  # made of signals
+        Temporal("F", (Boolean("and", (P, ahead("F", 0, 20, Q))),)),  # a table
     ):
         program = compile_formula(ahead("G", 0, 10**6, body))
         run = OnlineRun(program, room=64, tile=32)

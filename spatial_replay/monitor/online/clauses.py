@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from functools import reduce
 
 from spatial_replay.monitor.online import codes
-from spatial_replay.monitor.online.operators import NOTHING, PartRows, Row, SignalTable
+from spatial_replay.monitor.online.operators import LAST, NOTHING, PartRows, Row, SignalTable
 
 MAX_CLAUSES = 16
 """How many clauses a body may have, each a few signals; they may grow as 2**operators."""
@@ -31,9 +31,6 @@ MAX_TABLE = 5
 
 Clause = frozenset[int]
 """Rows of a part that are joined by `or` below a weak root, by `and` below a strong one."""
-
-_LAST = (1 << 63) - 1
-"""No sample comes later."""
 
 
 @dataclass(frozen=True)
@@ -321,14 +318,13 @@ class _Builder:
         assert self._ends is not None
         _, low, high = self._ends
         early = [self._signals.row(codes.NOT, self._elapsed(low))] if low > 0 else []
-        late = [self._elapsed(high + 1)] if high < _LAST else []
+        late = [self._elapsed(high + 1)] if high < LAST else []
         return [*early, *late]
 
     def _elapsed(self, distance: int) -> int:
         """Return a signal that, once a distance from the first sample on, is as good as a clause can be."""
         assert self._ends is not None
-        sign = 1 if self._is_weak else -1
-        return self._signals.row(codes.ELAPSED, unit=self._ends[0], low=distance, high=sign)
+        return self._signals.elapsed(self._ends[0], distance, 1 if self._is_weak else -1)
 
     def _literal(self, row: int) -> int:
         _, signal, is_negated = self._rows[row][:3]

@@ -173,6 +173,10 @@ class SignalTable:
             result = self.row(codes.AND, within, result)
         return result
 
+    def elapsed(self, unit: int, distance: int, sign: int) -> int:
+        """Add an infinity, of this sign once a distance from the first sample on, of the other one before."""
+        return self.row(codes.ELAPSED, unit=unit, low=distance, high=sign)
+
     def delay(self, operand: int, unit: int, distance: int, ahead: int = 0, *, is_weak: bool = False) -> int:
         """Add an operand delayed by a distance; before the first sample +inf if weak, -inf if strong."""
         return self.row(codes.DELAY + ahead, operand, 0, unit, distance, 1 if is_weak else -1)
@@ -180,6 +184,9 @@ class SignalTable:
 
 MAX_VARIABLES = 12
 """How many unbounded future operators one part may nest: its table has 2**variables entries."""
+
+LAST = (1 << 63) - 1
+"""No sample comes later, in samples or in ns."""
 
 BRIEF = (1000, 10 * 10**9)
 """So wide a window of the root, in samples or in ns, is over soon; then it costs nothing any more."""
@@ -201,8 +208,6 @@ def part_of(signals: SignalTable, node: Temporal) -> WindowedPart:
         # what a past operator over a future one is now is read at the last sample, too
         asked = node if part.is_remembering else from_first(node)
         part = WindowedPart(signals, asked, anchored=False, ends=True)
-        if part.ends and part.is_nested:
-            part = WindowedPart(signals, asked, anchored=False)
     if part.variables > MAX_VARIABLES:
         raise UsageError(
             f"a formula nests {part.variables} unbounded temporal operators under one {node.operator}; "
@@ -225,6 +230,7 @@ class PartRows:
         self.tables = 1
         self._rows: dict[Row, int] = {}
         self._is_past = False
+        self._is_told = False
 
     @property
     def fields(self) -> tuple[Row, ...]:
@@ -268,7 +274,8 @@ class PartRows:
     def is_remembering(self) -> bool:
         """Whether it is asked for at the last sample, too: a past operator stands over a future one."""
         # a root with a window of its own stands at the first sample alone
-        return self._is_past or (not self.ends and any(row[0] in codes.PAST for row in self._rows))
+        stands_alone = self.ends or self._is_told
+        return self._is_past or (not stands_alone and any(row[0] in codes.PAST for row in self._rows))
 
     @property
     def ends(self) -> bool:
@@ -325,7 +332,7 @@ class WindowedPart(PartRows):
             anchored: whether the root is a bounded operator that is only ever asked for at the first
                 sample, so that its window is a fixed stretch of the run and needs no history.
             ends: whether such a root, over what looks ahead itself, is an unbounded operator that joins no
-                more than its window, so that what has closed in there is kept as one number.
+                more than its window, so that what has closed in there is kept as one number, or one table.
         """
         super().__init__()
         self._signals = signals
@@ -410,13 +417,33 @@ class WindowedPart(PartRows):
         return result if within is None else self._join(within, result, is_both=is_since)
 
     def _ending(self, root: Temporal) -> int:
-        bound = root.bound
-        if root.operator not in "FG" or bound is None or not bound.upper:
+        formula, positive = expand(root), True
+        if isinstance(formula, Boolean) and formula.operator == "not":
+            formula, positive = formula.operands[0], False
+        if not isinstance(formula, Temporal) or formula.operator not in "FGU":
             return self._add(root, True)
-        unit, low, high = window_of(bound)
-        body, is_until = self._add(root.operands[0], True), root.operator == "F"
-        code = codes.UNTIL if is_until else codes.RELEASE
-        return self.row(code, NOTHING, body, int(not is_until), unit, low, high or 0, variable=True)
+        unit, low, high = window_of(formula.bound)
+        if not high:
+            return self._add(root, True)
+        operands = [self._add(each, positive) for each in formula.operands]
+        left, body, _ = _as_until(formula.operator, operands, formula.bound)
+        is_until = (formula.operator != "G") == positive
+        code, weak = codes.UNTIL if is_until else codes.RELEASE, int(not is_until)
+        if left == NOTHING and not self.variables and self.tables == 1:
+            return self.row(code, left, body, weak, unit, low, high, variable=True)
+        # in an until, say, positions outside the window are -inf, and so is the operand that has to hold so
+        # far where the window ends: whatever comes later is out of reach
+        self._is_told, sign = True, -1 if is_until else 1
+        outside = [self._elapsed(unit, low, -sign)] if low > 0 else []
+        outside += [self._elapsed(unit, high + 1, sign)] if high < LAST else []
+        body = reduce(partial(self._join, is_both=is_until), outside, body)
+        end = self._elapsed(unit, high, sign)
+        left = end if left == NOTHING else self._join(left, end, is_both=is_until)
+        return self.row(code, left, body, weak, variable=True)
+
+    def _elapsed(self, unit: int, distance: int, sign: int) -> int:
+        """Return the row of an infinity that changes its sign a distance from the first sample on."""
+        return self.row(codes.LITERAL, self._signals.elapsed(unit, distance, sign))
 
     def _anchored(self, formula: Formula, positive: bool) -> int:
         formula = expand(formula)
