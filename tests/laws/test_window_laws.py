@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from itertools import pairwise
 from unittest import mock
 
@@ -15,7 +16,7 @@ from laws.strategies_monitor import LEAVES, LeafRun, combinations_of, responses,
 from laws.test_monitor_laws import fewest
 from spatial_replay import UsageError
 from spatial_replay.compiled import only
-from spatial_replay.monitor.online import operators, state
+from spatial_replay.monitor.online import operators, shares, state, step
 from spatial_replay.monitor.online.program import compile_formula
 from spatial_replay.monitor.online.step import OnlineRun
 from spatial_replay.spec.formula import Boolean, Bound, Temporal
@@ -316,6 +317,48 @@ def test_two_runs_that_take_half_a_stretch_each_say_what_one_does(data, formula,
     ends = sorted({0, 4 * size // 5, *(end for end in ends if end > 4 * size // 5)})
     with only("compiled"):
         assert_same_bits(*both_ways(program_of(formula), run, ends, room=tile, tile=tile, least_shared=least))
+
+
+def test_one_run_goes_on_where_two_halves_leave_positions_between_them():
+    within = ahead("F", 0, 30, Temporal("G", (Q,), Bound(0, 300, "ns")))
+    program, size, found = compile_formula(Temporal("G", (Boolean("->", (P, within)),))), 1200, 0
+    names = [leaf.text for leaf in program.leaves]
+    for seed in range(40):
+        rng, left = np.random.default_rng(seed), []
+        times = np.cumsum(np.where(rng.random(size) < 0.02, 3000, rng.integers(1, 4, size)))
+        leaves = np.zeros((1, 2, size))
+        leaves[0, names.index(Q.text)] = rng.normal(size=size)
+        leaves[0, names.index(P.text)] = -9 - rng.random(size)
+        with only("compiled"), between_halves(left):
+            OnlineRun(program, room=32, tile=32, least_shared=150).extend(leaves, times)
+        for begin, end in left:
+            # nothing else is asked for
+            leaves[0, names.index(P.text), begin:end] = 9
+            found += 1
+        with only("compiled"):
+            halves = OnlineRun(program, room=32, tile=32, least_shared=150).extend(leaves, times)
+            assert (
+                halves.tobytes() == OnlineRun(program, least_shared=size + 1).extend(leaves, times).tobytes()
+            )
+    assert found > 0
+
+
+@contextmanager
+def between_halves(left):
+    """Note the positions that a first half has not closed, and the second one does not look at."""
+    starts = []
+
+    def started(*arguments):
+        starts.append(shares.late_start(*arguments))
+        return starts[-1]
+
+    def closed(*arguments):
+        end = shares.closed_up_to(*arguments)
+        left.extend([(end, starts[-1])] if end < starts[-1] else [])
+        return end
+
+    with mock.patch.object(step, "late_start", started), mock.patch.object(step, "closed_up_to", closed):
+        yield
 
 
 @settings(max_examples=200)

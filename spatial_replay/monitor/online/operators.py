@@ -230,7 +230,7 @@ class PartRows:
         self.tables = 1
         self._rows: dict[Row, int] = {}
         self._is_past = False
-        self._is_told = False
+        self._has_window_signals = False
 
     @property
     def fields(self) -> tuple[Row, ...]:
@@ -274,7 +274,7 @@ class PartRows:
     def is_remembering(self) -> bool:
         """Whether it is asked for at the last sample, too: a past operator stands over a future one."""
         # a root with a window of its own stands at the first sample alone
-        stands_alone = self.ends or self._is_told
+        stands_alone = self.ends or self._has_window_signals
         return self._is_past or (not stands_alone and any(row[0] in codes.PAST for row in self._rows))
 
     @property
@@ -433,13 +433,23 @@ class WindowedPart(PartRows):
             return self.row(code, left, body, weak, unit, low, high, variable=True)
         # in an until, say, positions outside the window are -inf, and so is the operand that has to hold so
         # far where the window ends: whatever comes later is out of reach
-        self._is_told, sign = True, -1 if is_until else 1
+        self._has_window_signals, sign = True, -1 if is_until else 1
         outside = [self._elapsed(unit, low, -sign)] if low > 0 else []
         outside += [self._elapsed(unit, high + 1, sign)] if high < LAST else []
         body = reduce(partial(self._join, is_both=is_until), outside, body)
-        end = self._elapsed(unit, high, sign)
-        left = end if left == NOTHING else self._join(left, end, is_both=is_until)
-        return self.row(code, left, body, weak, variable=True)
+        return self.row(code, self._until_elapsed(left, unit, high, sign), body, weak, variable=True)
+
+    def _until_elapsed(self, left: int, unit: int, distance: int, sign: int) -> int:
+        """Return the row of a root's left operand that is an infinity from a distance on."""
+        kind, signal, is_negated, *_ = self.fields[left] if left != NOTHING else (NOTHING, 0, 0)
+        if kind != codes.LITERAL:
+            end = self._elapsed(unit, distance, sign)
+            return end if left == NOTHING else self._join(left, end, is_both=sign < 0)
+        # a single signal, as clauses ask for
+        signal = self._signals.row(codes.NOT, signal) if is_negated else signal
+        either = codes.AND if sign < 0 else codes.OR
+        elapsed = self._signals.elapsed(unit, distance, sign)
+        return self.row(codes.LITERAL, self._signals.row(either, signal, elapsed))
 
     def _elapsed(self, unit: int, distance: int, sign: int) -> int:
         """Return the row of an infinity that changes its sign a distance from the first sample on."""

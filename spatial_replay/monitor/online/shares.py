@@ -62,7 +62,7 @@ class Halves(NamedTuple):
     time_ns: int
 
 
-def halves_of(program: Program, memory: Memory, channels: int) -> Halves | None:
+def halves_of(program: Program, memory: Memory) -> Halves | None:
     """Return a program in two whose parts mostly look no further than bounded windows; None for another.
 
     Args:
@@ -122,10 +122,12 @@ def _horizon(nodes: Integers) -> tuple[int, int]:
 
 
 def late_start(halves: Halves, times_ns: Integers, begin: int, middle: int) -> int | None:
-    """Return the sample that the parts of the second half look at first; None if that is no later.
+    """Return the first sample that the second half looks at.
+
+    None if it looks at all samples from `begin` on, so that halves gain nothing.
 
     Args:
-        times_ns: (T,), of all samples.
+        times_ns: (T,), of the stretch.
         begin, middle: the first sample of the first half, and of the second.
     """
     # what has closed is absorbed some samples later
@@ -146,8 +148,13 @@ def begin_late(program: Program, memory: Memory, channels: int, position: int) -
 
 
 def closed_up_to(program: Program, memory: Memory) -> int:
-    """Return the first position that some part of a program has not absorbed."""
-    return min(int(memory.cells[part[codes.PART_CELL_START]]) for part in _parts_run(program))
+    """Return the first position that some part of a program has not absorbed, of those that still matter."""
+    closed = int(memory.clock[POSITION])
+    for part in _parts_run(program):
+        # what has settled absorbs no more, and bounds the second half to one number
+        if not cast(Any, is_settled).interpreted()(part, memory):
+            closed = min(closed, int(memory.cells[part[codes.PART_CELL_START]]))
+    return closed
 
 
 def bound_late(

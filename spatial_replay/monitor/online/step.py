@@ -242,10 +242,11 @@ class OnlineRun:
         Returns:
             How many samples of the stretch are done: as before, if they cannot be run so.
         """
-        halves = halves_of(self._program, self._memory, self._channels)
+        halves = halves_of(self._program, self._memory)
         if halves is None:
             return begin
         end = min(len(stretch.times_ns), begin + _MOST_HALVED)
+        # the second half takes in the samples of the first, too, so it is a little shorter
         middle = begin + (end - begin) * 17 // 32 // self._tile * self._tile
         start = late_start(halves, stretch.times_ns, begin, middle)
         if start is None:
