@@ -195,11 +195,17 @@ class OnlineRun:
 
         Returns:
             (N, 4, T): value, now, lower and upper of each node.
+
+        Raises:
+            ValueError: the shapes do not fit; kernels would read beyond the arrays.
         """
+        wanted = len(self._program.leaves), len(times_ns)
+        if leaves.shape[1:] != wanted or len(leaves) not in (1, 2, 4):
+            raise ValueError(f"leaves of shape {leaves.shape}; a run of these needs (1, 2 or 4, *{wanted})")
         self.widen(len(leaves))
         if self._tile == TILE and len(times_ns) >= _MANY_TILES * LONG_TILE:
             self._lengthen_tiles()
-        leaves = np.ascontiguousarray(in_channels(leaves, self._channels))
+        leaves = np.ascontiguousarray(in_channels(leaves, self._channels), np.float64)
         times_ns = np.array(times_ns, np.int64)  # writable, since kernels are compiled for that
         series = np.empty((len(self._program.reports), 4, len(times_ns)))
         stretch, done = _Stretch(leaves, times_ns, series), 0
