@@ -1,6 +1,6 @@
 """Numeric kernels: plain functions over arrays and numbers, run by the interpreter or as machine code.
 
-The one module that knows the compiler. Compiling every kernel takes longer than reading a short log, and
+Compiling every kernel takes longer than reading a short log, and
 loading the compiled ones from disk takes its time, too. So a kernel is interpreted while its arrays are
 small, and compiled once that has cost about as much time as compiling it would.
 
@@ -15,21 +15,17 @@ from __future__ import annotations
 
 import ctypes
 import math
-import os
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cached_property, partial
 from operator import methodcaller
-from pathlib import Path
 from types import FunctionType
 from typing import Any, Final, Generic, Literal, ParamSpec, TypeAlias, TypeVar, cast
 
 import numpy as np
 
-from spatial_replay.code_cache import cache_folder
+from spatial_replay.compiler import ROW, Compiler, Lanes
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
@@ -186,6 +182,33 @@ def compilations(hear: Callable[[], None]) -> Iterator[None]:
         _process.listeners.remove(hear)
 
 
+def row_code(formula: Callable[..., Any]) -> Callable[..., None]:
+    """Return what fills a row, its last argument, with a formula of the rows and numbers before it.
+
+    All of these are read before anything is written, so that the row may be one of them. It has no loop: of
+    one over rows that may overlap, the compiler makes three times as many instructions.
+
+    Args:
+        formula: given `Lanes`, and rows of `ROW` numbers; a number stands for a row of nothing else.
+    """
+    return _RowCode(formula, False, None)
+
+
+def row_loop(*, backwards: bool = False, is_last_only: bool = False) -> _Making[..., Any]:
+    """Return what makes a loop over neighbouring rows, of which each follows from the one before.
+
+    It follows by a formula, which may return a second row, too, to be stored in place of what goes on.
+    The first argument is the row to begin with, and is replaced by the last one. The others are arrays of
+    rows, arrays of numbers, of which each stands for a row of nothing else, and single numbers. The last of
+    them receives the rows, and says how many there are.
+
+    Args:
+        backwards: whether the last row comes first.
+        is_last_only: whether there is no array to receive them, so that only the last row is kept.
+    """
+    return lambda formula: cast(Any, _RowCode(formula, backwards, is_last_only))
+
+
 class _Kernel(Generic[_Arguments, _Result]):
     """A function in its two forms, each made when it is first needed."""
 
@@ -247,7 +270,7 @@ class _Kernel(Generic[_Arguments, _Result]):
         if not _process.has_compiler:
             cost -= max(_COMPILER_S - _process.spent_s, 0.0)
         # asked last, since looking for the cache takes its time, too
-        return cost <= _WARM_S or (cost <= _COLD_S and not _process.holds(self))
+        return cost <= _WARM_S or (cost <= _COLD_S and not _process.holds(self.__module__, self.__name__))
 
     def _taken(self, arguments: tuple[Any, ...]) -> tuple[Any, ...]:
         """Return what the interpreter runs the function with."""
@@ -370,6 +393,62 @@ class _ArrayAt(_Kernel[[int, Any], Any]):
         return self._compiled
 
 
+class _Rows(Lanes):
+    """Formulas of rows, interpreted; `place` is how far a loop has gone on."""
+
+    place = 0
+
+    def greater(self, first: Any, second: Any) -> Any:
+        return np.maximum(first, second)
+
+    def lesser(self, first: Any, second: Any) -> Any:
+        return np.minimum(first, second)
+
+    def parted(self, at: Any, before: Any, after: Any) -> Any:
+        return np.where(np.arange(ROW) < at, before, after)
+
+    def later(self, at: Any) -> Any:
+        return at + self.place
+
+
+class _RowCode(_Kernel[..., None]):
+    """A formula of rows, or a loop over them, as instructions within the kernel that calls it."""
+
+    def __init__(self, formula: Callable[..., Any], backwards: bool, is_last_only: bool | None) -> None:
+        super().__init__(formula, {"no_cpython_wrapper": True})
+        self._backwards, self._is_last_only = backwards, is_last_only
+
+    def interpreted(self) -> Callable[..., None]:
+        formula, is_last_only = self.__wrapped__, self._is_last_only
+
+        def fill(*arguments: Any) -> None:
+            *rows, target = arguments
+            target[:] = formula(_Rows(), *rows)
+
+        def loop(row: Any, *arguments: Any) -> None:
+            lanes, inputs = _Rows(), arguments if is_last_only else arguments[:-1]
+            count = len([each for each in arguments if isinstance(each, np.ndarray)][-1])
+            for k in reversed(range(count)) if self._backwards else range(count):
+                lanes.place = k
+                row[:] = formula(
+                    lanes, row, *(each[k] if isinstance(each, np.ndarray) else each for each in inputs)
+                )
+                if not is_last_only:
+                    arguments[-1][k] = row
+
+        return fill if is_last_only is None else loop
+
+    def compiled(self) -> Callable[..., None]:
+        if self._compiled is None:
+            count = cast(FunctionType, self.__wrapped__).__code__.co_argcount - 1
+            if self._is_last_only is None:
+                self._compiled = _process.row_code(self.__wrapped__, count)
+            else:
+                form = {"backwards": self._backwards, "is_last_only": self._is_last_only}
+                self._compiled = _process.row_loop(self.__wrapped__, count - 1, **form)
+        return self._compiled
+
+
 floats_at: Final = _ArrayAt("floats_at", np.float64)
 integers_at: Final = _ArrayAt("integers_at", np.int64)
 bytes_at: Final = _ArrayAt("bytes_at", np.uint8)
@@ -377,144 +456,4 @@ flags_at: Final = _ArrayAt("flags_at", np.int8)
 """Within kernels that are given addresses; numbers need not be aligned."""
 
 
-class _Process:
-    """What this process knows about its kernels: the compiler, the cache, who listens."""
-
-    def __init__(self) -> None:
-        form = os.environ.get("SPATIAL_REPLAY_KERNELS")
-        self.only = form if form in ("compiled", "interpreted") else None
-        self.interprets = True
-        self.spent_s = 0.0
-        self.listeners: list[Callable[[], None]] = []
-        # a module that another thread is still importing is in `sys.modules`, too
-        self._compiler: Any = None
-        self._lock = threading.RLock()
-
-    @cached_property
-    def _folder(self) -> Path | None:
-        return cache_folder()
-
-    @cached_property
-    def _cached(self) -> frozenset[str]:
-        """The kernels whose machine code earlier processes have left in the cache."""
-        # a file is named after module, function and line: kernels.measure_rows-335.py311.nbi
-        files = () if self._folder is None else self._folder.rglob("*.nbi")
-        return frozenset(path.name.partition("-")[0] for path in files)
-
-    def holds(self, kernel: _Kernel[..., Any]) -> bool:
-        """Say whether the cache has machine code of a kernel."""
-        return f"{kernel.__module__.rpartition('.')[2]}.{kernel.__name__}" in self._cached
-
-    @property
-    def has_compiler(self) -> bool:
-        """Whether the compiler is loaded already."""
-        return "numba" in sys.modules
-
-    def compile(self, function: Callable[..., Any], options: dict[str, Any]) -> Any:
-        """Return a function that is compiled for the types of its arguments when it is called.
-
-        What only kernels call is optimised with these, and not before, which takes a third of the time.
-        """
-        made = self._compile(lambda numba: numba.njit, function, options)
-        # parts of it once all of it is there: threads that import both at the same time block each other
-        from numba.core.compiler_lock import global_compiler_lock
-
-        settings, compile_it = self._compiler.config, made.compile
-        level = type(settings.OPT)(1) if "no_cpython_wrapper" in options else settings.OPT
-
-        def compile_at_level(signature: object) -> object:
-            with cast(Any, global_compiler_lock):
-                before, settings.OPT = settings.OPT, level
-                try:
-                    return compile_it(signature)
-                finally:
-                    settings.OPT = before
-
-        made.compile = compile_at_level
-        return made
-
-    def compile_entry(self, function: FunctionType, options: dict[str, Any]) -> Any:
-        """Compile a function of integers; return it as what takes bytes, too, for the address of these."""
-        count = function.__code__.co_argcount
-        made = self._compile(
-            lambda numba: partial(numba.cfunc, numba.int64(*[numba.int64] * count)), function, options
-        )
-        call = ctypes.PYFUNCTYPE(ctypes.c_int64, *[ctypes.c_void_p] * count)(made.address)
-        call.machine_code = made  # type: ignore[attr-defined]  # lives as long as the function
-        return call
-
-    def call_of(self, symbol: str, function: Any) -> Any:
-        """Return what machine code calls to reach a function of integers that is compiled apart."""
-        from numba.core import codegen, types
-
-        # by its name, since it lies elsewhere in the next process, which finds its callers in the cache
-        cast(Any, codegen).ll.add_symbol(symbol, function.machine_code.address)
-        return types.ExternalFunction(symbol, function.machine_code._sig)
-
-    def array_at(self, kind: type) -> Any:
-        """Return what machine code calls to see numbers at an address as an array."""
-        self._loaded()
-        from numba.core import cgutils, types
-        from numba.extending import intrinsic
-        from numba.np import arrayobj
-
-        tools, arrays, number = cast(Any, cgutils), cast(Any, arrayobj), getattr(types, kind.__name__)
-
-        @intrinsic
-        def array_at(_context, address, shape):  # type: ignore[no-untyped-def]
-            dimensions = len(shape) if isinstance(shape, types.BaseTuple) else 1
-            made = types.Array(number, dimensions, "C")
-
-            def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
-                at, extent = arguments
-                lengths = [extent] if dimensions == 1 else tools.unpack_tuple(builder, extent)
-                kinds = signature.args[1:] if dimensions == 1 else signature.args[1]
-                sizes = zip(lengths, kinds, strict=True)
-                lengths = [context.cast(builder, *each, types.intp) for each in sizes]
-                strides = [context.get_constant(types.intp, np.dtype(kind).itemsize)]
-                for length in lengths[:0:-1]:
-                    strides.insert(0, builder.mul(strides[0], length))
-                array = arrays.make_array(made)(context, builder)
-                data = builder.inttoptr(at, array.data.type)
-                arrays.populate_array(array, data, lengths, strides, strides[-1], meminfo=None)
-                return array._getvalue()
-
-            return made(address, shape), generate
-
-        return array_at
-
-    def _compile(
-        self, form: Callable[[Any], Callable[..., Any]], function: Callable[..., Any], options: dict[str, Any]
-    ) -> Any:
-        with self._lock:
-            numba = self._loaded()
-            if self._folder is None:
-                return form(numba)(error_model="numpy", **options)(function)
-            # the folder is read from the compiler's settings when a function is decorated; they belong to
-            # the user's own functions, too, and are put back
-            before, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(self._folder)
-            try:
-                return form(numba)(cache=True, error_model="numpy", **options)(function)
-            finally:
-                numba.config.CACHE_DIR = before
-
-    def _loaded(self) -> Any:
-        """Return the compiler, which the first thread that needs it imports, while others wait."""
-        with self._lock:
-            if self._compiler is None:
-                import numba
-                from numba.core import event
-
-                class Listener(event.Listener):  # type: ignore[misc, unused-ignore]
-                    def on_start(self, event: object) -> None:
-                        for hear in tuple(_process.listeners):
-                            hear()
-
-                    def on_end(self, event: object) -> None: ...
-
-                cast(Any, event).register("numba:compile", Listener())
-                self._compiler = numba
-            return self._compiler
-
-
-_process: Final = _Process()
+_process: Final = Compiler()

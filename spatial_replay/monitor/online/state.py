@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from spatial_replay.compiled import inlined, uncounted
+from spatial_replay.compiler import ROW
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online.codes import (
     BEGUN,
@@ -31,7 +32,7 @@ stay in the processor's cache."""
 LONG_TILE = 1024
 """As many where a great many come together."""
 
-BLOCK = 32
+BLOCK = ROW
 """So many samples are run side by side: numbers that fill the vector registers of a processor."""
 
 MOST_ROWS = 4096

@@ -29,6 +29,7 @@ from spatial_replay.monitor.online.blocks.node_rows import (
     take_row,
     window_rows,
 )
+from spatial_replay.monitor.online.blocks.row_loops import fill_row
 from spatial_replay.monitor.online.blocks.span_rows import block_of
 from spatial_replay.monitor.online.closing import absorb
 from spatial_replay.monitor.online.node_columns import (
@@ -97,27 +98,22 @@ def _run_node(table_at: int, number: int, d: int, which: int, channels: int) -> 
     columns, history = memory.columns[columns_number(which)], memory.history[look.channel]
     code, a, b, first = node[codes.NODE_CODE], node[codes.NODE_A], node[codes.NODE_B], part[codes.PART_FIRST]
     target, begin = scratch.rows[node[codes.NODE_ROWS]], scratch.begins[d - first]
-    rows_of = nodes[first:, codes.NODE_ROWS]
-    in_place = rows_of[max(a, 0)] == node[codes.NODE_ROWS], rows_of[b] == node[codes.NODE_ROWS]
     one = operand_of(nodes, part, a, columns, history, scratch)
     two = operand_of(nodes, part, b, columns, history, scratch)
     is_greatest = code in (codes.PART_OR, codes.PART_WINDOW_MAX, codes.PAST_WINDOW_MAX)
     value = beyond(look.mode if code not in codes.PAST else codes.OPEN_END, node[codes.NODE_WEAK])
     if code in (codes.PART_AND, codes.PART_OR):
-        if in_place[1]:
-            join_operands_rows(block, is_greatest, two, one, True, target, begin, block.last + 1)
-        else:
-            join_operands_rows(block, is_greatest, one, two, in_place[0], target, begin, block.last + 1)
+        join_operands_rows(is_greatest, block, one, two, target, begin, block.last + 1)
     elif code in codes.BINARY_NODES:
         is_strong, is_ahead, fresh = code in (codes.UNTIL, codes.PAST_SINCE), code not in codes.PAST, begin
         if is_ahead:
-            fill(block.running[0], value)
+            fill_row(value, block.running[0])
         else:
             channel = look.channel
             begin = _start_since(node, part, block, columns[d], memory, scratch, channel, begin, target)
             scratch.begins[d - first] = begin
             fresh = max(begin, memory.cells[cells_of(part)[2] + node[codes.NODE_TABLE]] + 1)
-        recurrent_rows(block, is_strong, a >= 0, one, two, in_place[1], target, fresh, is_ahead)
+        recurrent_rows(block, is_strong, a >= 0, one, two, target, fresh, is_ahead)
     else:
         find_ends(node, block, recent, begin)
         if code in (codes.SHIFT, codes.PAST_DELAY):
@@ -162,12 +158,12 @@ def _start_since(
         running[k] = start_of_past(node, part, tables, start, scratch)
         differs = differs or running[k] != column[start - offset]
     if differs:
-        copy(running, target[start - block.lowest])
+        fill_row(running, target[start - block.lowest])
         return int(start)
     if begin == 0:
-        fill(running, np.inf if node[codes.NODE_WEAK] else -np.inf)
+        fill_row(np.inf if node[codes.NODE_WEAK] else -np.inf, running)
     else:
-        fill(running, column[begin - 1 - offset])
+        fill_row(column[begin - 1 - offset], running)
     return begin
 
 
@@ -198,11 +194,11 @@ def _join_body(
             find_closing(nodes[d], block, recent, settled, cuts == 0, closing)
             cuts += 1
     known = max(min(settled, after), base)
-    fill(block.running[0], extremum(is_until, body.column[base - offset : known - offset], start))
+    fill_row(extremum(is_until, body.column[base - offset : known - offset], start), block.running[0])
     whole = settled
     while body.begin <= whole < min(block.since + 1, after) and not (cuts and closing[whole - settled] > 0):
         whole += 1
-    current = join_positions(block, is_until, body, settled, whole)
+    current = join_positions(block, is_until, body, settled, whole, 0)
     for position in range(whole, after):
         begin = position - block.since
         if cuts:

@@ -1,8 +1,8 @@
 """Nodes of a part at its open positions, for a block of samples side by side.
 
 What a node is at a position may differ with the sample that is the last one, so of a block of samples it is a
-row of numbers, one for each. What joins two rows is one loop over neighbouring numbers, which the compiler
-turns into vector instructions: a block costs little more than each of its samples would by itself.
+row of numbers, one for each. What joins two rows is a few vector instructions: a block costs little more than
+each of its samples would by itself.
 
 Before a node's first open position, nothing changes with the block, and its numbers are those of its column
 (see `node_columns`), the same for every sample. A row's samples before its own position have no number: what
@@ -15,9 +15,38 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from spatial_replay.compiled import inlined, inlined_as, uncounted
+from spatial_replay.compiled import inlined, uncounted
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.monitor.online.sliding import copy, either, fill
+from spatial_replay.monitor.online.blocks.row_loops import (
+    each_greater,
+    each_lesser,
+    extend_greater,
+    extend_greater_from,
+    extend_lesser,
+    extend_lesser_from,
+    fill_row,
+    fill_row_until,
+    join_greater,
+    join_lesser,
+    join_number,
+    join_number_from,
+    join_rows,
+    join_rows_from,
+    repeat,
+    repeat_greater,
+    repeat_lesser,
+    run_back_greater,
+    run_back_greater_from,
+    run_back_lesser,
+    run_back_lesser_from,
+    run_greater,
+    run_lesser,
+    run_release,
+    run_since,
+    run_trigger,
+    run_until,
+)
+from spatial_replay.monitor.online.sliding import either, extremum
 
 
 class SampleBlock(NamedTuple):
@@ -56,100 +85,6 @@ class NodeRows(NamedTuple):
     begin: int
 
 
-def _joined(is_greatest: bool, first: Floats, number: Any, target: Floats) -> None:
-    (np.maximum if is_greatest else np.minimum)(first, number, out=target)
-
-
-def _joined_into(is_greatest: bool, number: Any, target: Floats) -> None:
-    _joined(is_greatest, target, number, target)
-
-
-def _joined_from(is_greatest: bool, first: Floats, number: Any, target: Floats, begin: int) -> None:
-    copy(first[:begin], target[:begin])
-    others = number[begin:] if isinstance(number, np.ndarray) else number
-    _joined(is_greatest, first[begin:], others, target[begin:])
-
-
-def _joined_both(is_greatest: bool, first: Floats, second: Floats, third: Floats, target: Floats) -> None:
-    _joined(is_greatest, first, second, target)
-    _joined(is_greatest, target, third, target)
-
-
-# A row is joined in a place of its own, or in its own place alone: the compiler has to see which.
-
-
-@inlined_as(_joined)
-def join_rows(is_greatest: bool, first: Floats, number: Floats, target: Floats) -> None:
-    if is_greatest:
-        for k in range(len(target)):
-            target[k] = max(first[k], number[k])
-    else:
-        for k in range(len(target)):
-            target[k] = min(first[k], number[k])
-
-
-@inlined_as(_joined)
-def join_number(is_greatest: bool, first: Floats, number: float, target: Floats) -> None:
-    if is_greatest:
-        for k in range(len(target)):
-            target[k] = max(first[k], number)
-    else:
-        for k in range(len(target)):
-            target[k] = min(first[k], number)
-
-
-@inlined_as(_joined_into)
-def join_rows_into(is_greatest: bool, number: Floats, target: Floats) -> None:
-    if is_greatest:
-        for k in range(len(target)):
-            target[k] = max(target[k], number[k])
-    else:
-        for k in range(len(target)):
-            target[k] = min(target[k], number[k])
-
-
-@inlined_as(_joined_into)
-def _join_number_into(is_greatest: bool, number: float, target: Floats) -> None:
-    if is_greatest:
-        for k in range(len(target)):
-            target[k] = max(target[k], number)
-    else:
-        for k in range(len(target)):
-            target[k] = min(target[k], number)
-
-
-@inlined_as(_joined_into)
-def _join_rows_whole(is_greatest: bool, number: Floats, target: Floats) -> None:
-    """Join a row that is read again at once: adding zero has all of it stored, not only what changes."""
-    if is_greatest:
-        for k in range(len(target)):
-            target[k] = max(target[k], number[k]) + 0.0
-    else:
-        for k in range(len(target)):
-            target[k] = min(target[k], number[k]) + 0.0
-
-
-@inlined_as(_joined_from)
-def _join_rows_from(is_greatest: bool, first: Floats, number: Floats, target: Floats, begin: int) -> None:
-    """Join the samples from `begin` on, and copy those before."""
-    if is_greatest:
-        for k in range(len(target)):
-            target[k] = max(first[k], number[k]) if k >= begin else first[k]
-    else:
-        for k in range(len(target)):
-            target[k] = min(first[k], number[k]) if k >= begin else first[k]
-
-
-@inlined_as(_joined_from)
-def _join_number_from(is_greatest: bool, first: Floats, number: float, target: Floats, begin: int) -> None:
-    if is_greatest:
-        for k in range(len(target)):
-            target[k] = max(first[k], number) if k >= begin else first[k]
-    else:
-        for k in range(len(target)):
-            target[k] = min(first[k], number) if k >= begin else first[k]
-
-
 @inlined
 def enter(
     is_greatest: bool, block: SampleBlock, operand: NodeRows, position: int, begin: int, current: int
@@ -165,71 +100,82 @@ def enter(
         if begin <= 0:
             join_number(is_greatest, running, number, target)
         else:
-            _join_number_from(is_greatest, running, number, target, begin)
+            join_number_from(is_greatest, running, number, target, begin)
     else:
         row = operand.rows[position - block.lowest]
         if begin <= 0:
             join_rows(is_greatest, running, row, target)
         else:
-            _join_rows_from(is_greatest, running, row, target, begin)
+            join_rows_from(is_greatest, running, row, target, begin)
     return 1 - current
 
 
-@inlined_as(_joined_both)
-def _join_both(is_greatest: bool, first: Floats, second: Floats, third: Floats, target: Floats) -> None:
-    if is_greatest:
-        for k in range(len(target)):
-            target[k] = max(max(first[k], second[k]), third[k])
-    else:
-        for k in range(len(target)):
-            target[k] = min(min(first[k], second[k]), third[k])
-
-
 @uncounted
-def join_positions(block: SampleBlock, is_greatest: bool, operand: NodeRows, begin: int, end: int) -> int:
-    """Join the first running row with the rows of begin … end - 1, none of them after the first sample.
+def join_positions(
+    block: SampleBlock, is_greatest: bool, operand: NodeRows, begin: int, end: int, current: int
+) -> int:
+    """Join the running row with the numbers at begin … end - 1, for the samples that have come by then.
 
     Returns:
-        Which of the running rows it is in the end.
+        Which of the two running rows it is now; `current` before.
     """
-    current, rows = 0, operand.rows[begin - block.lowest : max(end, begin) - block.lowest]
-    # two at a time: the running row must be stored before it is joined again
-    for k in range(0, len(rows) - 1, 2):
-        running, target = block.running[current], block.running[1 - current]
-        _join_both(is_greatest, running, rows[k], rows[k + 1], target)
-        current = 1 - current
-    if len(rows) % 2:
-        join_rows(is_greatest, block.running[current], rows[-1], block.running[1 - current])
-        current = 1 - current
+    running = block.running[current]
+    whole = max(min(end, block.since + 1), begin)
+    rows_from = max(min(operand.begin, whole), begin)
+    numbers = operand.column[begin - block.offset : rows_from - block.offset]
+    rows = operand.rows[rows_from - block.lowest : whole - block.lowest]
+    if rows_from > begin:
+        # as single numbers, of which there may be many
+        nothing = -np.inf if is_greatest else np.inf
+        join_number(is_greatest, running, extremum(is_greatest, numbers, nothing), running)
+    if is_greatest:
+        join_greater(running, rows)
+    else:
+        join_lesser(running, rows)
+    for position in range(whole, end):
+        current = enter(is_greatest, block, operand, position, position - block.since, current)
     return current
 
 
 @uncounted
 def join_operands_rows(
-    block: SampleBlock,
-    is_greatest: bool,
-    one: NodeRows,
-    two: NodeRows,
-    in_place: bool,
-    target: Floats,
-    begin: int,
-    end: int,
+    is_greatest: bool, block: SampleBlock, one: NodeRows, two: NodeRows, target: Floats, begin: int, end: int
 ) -> None:
-    """Compute an `and` or `or` at begin … end - 1.
-
-    Args:
-        in_place: whether `target` are the rows of `one`.
-    """
-    for position in range(begin, end):
-        row = target[position - block.lowest]
-        if position < one.begin:
-            fill(row, one.column[position - block.offset])
-        elif not in_place:
-            copy(one.rows[position - block.lowest], row)
-        if position < two.begin:
-            _join_number_into(is_greatest, two.column[position - block.offset], row)
+    """Compute an `and` or `or` at begin … end - 1; `target` may be the rows of an operand."""
+    while begin < end:
+        # as far as both are numbers, or rows
+        until = end
+        for change in (one.begin, two.begin):
+            until = change if begin < change < until else until
+        at, after, offset = begin - block.lowest, until - block.lowest, block.lowest - block.offset
+        rows, spare = target[at:after], block.running[0]
+        if begin < one.begin and begin < two.begin:
+            first, second = one.column[at + offset : after + offset], two.column[at + offset : after + offset]
+            if is_greatest:
+                each_greater(spare, first, second, rows)
+            else:
+                each_lesser(spare, first, second, rows)
+        elif begin < one.begin:
+            _join_numbers(
+                is_greatest, spare, one.column[at + offset : after + offset], two.rows[at:after], rows
+            )
+        elif begin < two.begin:
+            _join_numbers(
+                is_greatest, spare, two.column[at + offset : after + offset], one.rows[at:after], rows
+            )
+        elif is_greatest:
+            each_greater(spare, one.rows[at:after], two.rows[at:after], rows)
         else:
-            join_rows_into(is_greatest, two.rows[position - block.lowest], row)
+            each_lesser(spare, one.rows[at:after], two.rows[at:after], rows)
+        begin = until
+
+
+@inlined
+def _join_numbers(is_greatest: bool, spare: Floats, numbers: Floats, rows: Floats, target: Floats) -> None:
+    if is_greatest:
+        each_greater(spare, rows, numbers, target)
+    else:
+        each_lesser(spare, rows, numbers, target)
 
 
 @uncounted
@@ -258,6 +204,7 @@ def window_rows(
         ):
             until += 1
         first, count = position - begin, until - position
+        rows = target[position - block.lowest : until - block.lowest]
         if middle <= settled:
             value, at = nothing, middle
             for k in range(until - 1 - begin, first - 1, -1):
@@ -265,18 +212,49 @@ def window_rows(
                     at -= 1
                     value = either(is_greatest, value, operand.column[at - block.offset])
                 block.before[k] = value
-            fill(block.running[0], nothing)
+            fill_row(nothing, block.running[0])
             ends, numbers = afters[first : first + count], block.before[first:]
-            join_after(block, is_greatest, operand, middle, ends, numbers, True, target, position)
+            join_after(block, is_greatest, operand, middle, ends, numbers, rows)
         else:
-            fill(block.running[0], nothing)
+            fill_row(nothing, block.running[0])
             begins = starts[first : first + count]
             join_before(block, is_greatest, operand, middle, begins, target, position)
             if middle < afters[until - 1 - begin]:
-                fill(block.running[0], nothing)
+                fill_row(nothing, block.running[0])
                 ends = afters[first : first + count]
-                join_after(block, is_greatest, operand, middle, ends, block.before, False, target, position)
+                join_after(block, is_greatest, operand, middle, ends, rows, rows)
         position = until
+
+
+@uncounted
+def _run_back(
+    block: SampleBlock, is_greatest: bool, operand: NodeRows, begin: int, end: int, target: Floats
+) -> None:
+    """Join the first running row with end - 1 … begin, one after the other, and store it after each."""
+    running, since, offset, lowest = block.running[0], block.since, block.offset, block.lowest
+    rows_from, cut = max(min(operand.begin, end), begin), max(min(since + 1, end), begin)
+    at = max(rows_from, cut)
+    rows, part = operand.rows[at - lowest : end - lowest], target[at - begin : end - begin]
+    if is_greatest:
+        run_back_greater_from(running, at - since, rows, part)
+    else:
+        run_back_lesser_from(running, at - since, rows, part)
+    rows, part = operand.rows[rows_from - lowest : at - lowest], target[rows_from - begin : at - begin]
+    if rows_from < cut and is_greatest:
+        run_back_greater(running, rows, part)
+    elif rows_from < cut:
+        run_back_lesser(running, rows, part)
+    numbers, part = operand.column[cut - offset : at - offset], target[cut - begin : at - begin]
+    if cut < rows_from and is_greatest:
+        run_back_greater_from(running, cut - since, numbers, part)
+    elif cut < rows_from:
+        run_back_lesser_from(running, cut - since, numbers, part)
+    at = min(rows_from, cut)
+    numbers, part = operand.column[begin - offset : at - offset], target[: at - begin]
+    if is_greatest:
+        run_back_greater(running, numbers, part)
+    else:
+        run_back_lesser(running, numbers, part)
 
 
 @uncounted
@@ -290,88 +268,220 @@ def join_before(
     begin: int,
 ) -> None:
     """Enter the extrema from where windows start to before `at`, at positions from `begin` on."""
-    current = 0
-    for k in range(len(starts) - 1, -1, -1):
-        while at > starts[k]:
-            at -= 1
-            current = enter(is_greatest, block, operand, at, at - block.since, current)
-        copy(block.running[current], target[begin + k - block.lowest])
+    k = len(starts) - 1
+    while k >= 0:
+        first, start = k, starts[k]
+        rows_end = begin + k + 1 - block.lowest
+        if start >= at:
+            while first > 0 and starts[first - 1] >= at:
+                first -= 1
+            repeat(block.running[0], target[begin + first - block.lowest : rows_end])
+        else:
+            if start + 1 < at:
+                current = join_positions(block, is_greatest, operand, start + 1, at, 0)
+                if current:
+                    fill_row(block.running[current], block.running[0])
+            while first > 0 and starts[first - 1] == starts[first] - 1:
+                first -= 1
+            at = starts[first]
+            rows = target[begin + first - block.lowest : rows_end]
+            _run_back(block, is_greatest, operand, at, start + 1, rows)
+        k = first - 1
+
+
+@uncounted
+def _extend(
+    block: SampleBlock,
+    is_greatest: bool,
+    operand: NodeRows,
+    begin: int,
+    end: int,
+    before: Any,
+    target: Floats,
+) -> None:
+    """Join the first running row with begin … end - 1, one after the other; store it, joined, after each.
+
+    Args:
+        before: (end - begin,) or (end - begin, BLOCK), what it is joined with.
+    """
+    running, since, offset, lowest = block.running[0], block.since, block.offset, block.lowest
+    rows_from, cut = max(min(operand.begin, end), begin), max(min(since + 1, end), begin)
+    at = min(rows_from, cut)
+    numbers, part, joined = (
+        operand.column[begin - offset : at - offset],
+        target[: at - begin],
+        before[: at - begin],
+    )
+    if is_greatest:
+        extend_greater(running, numbers, joined, part)
+    else:
+        extend_lesser(running, numbers, joined, part)
+    joined, part = before[at - begin : rows_from - begin], target[at - begin : rows_from - begin]
+    numbers = operand.column[at - offset : rows_from - offset]
+    if cut < rows_from and is_greatest:
+        extend_greater_from(running, cut - since, numbers, joined, part)
+    elif cut < rows_from:
+        extend_lesser_from(running, cut - since, numbers, joined, part)
+    joined, part = before[at - begin : cut - begin], target[at - begin : cut - begin]
+    rows = operand.rows[at - lowest : cut - lowest]
+    if rows_from < cut and is_greatest:
+        extend_greater(running, rows, joined, part)
+    elif rows_from < cut:
+        extend_lesser(running, rows, joined, part)
+    at = max(rows_from, cut)
+    rows, joined, part = (
+        operand.rows[at - lowest : end - lowest],
+        before[at - begin :],
+        target[at - begin : end - begin],
+    )
+    if is_greatest:
+        extend_greater_from(running, at - since, rows, joined, part)
+    else:
+        extend_lesser_from(running, at - since, rows, joined, part)
 
 
 @uncounted
 def join_after(
-    block: SampleBlock, is_greatest: bool, operand: NodeRows, at: int, afters: Integers, before: Floats,
-    is_number: bool, target: Floats, begin: int,
+    block: SampleBlock, is_greatest: bool, operand: NodeRows, at: int, afters: Integers, before: Any,
+    target: Floats,
 ) -> None:  # fmt: skip
-    """Join the extrema from `at` to where windows end with what comes before, at positions from `begin` on.
+    """Join the extrema from `at` to where windows end with what comes before.
 
     Args:
-        before: what comes before, if `is_number`; else it stands in `target`.
+        before: an array of what comes before, of rows or of numbers.
+        target: receives the rows; `before` may be these.
     """
-    current = 0
-    for k in range(len(afters)):
-        while at < afters[k]:
-            current = enter(is_greatest, block, operand, at, at - block.since, current)
-            at += 1
-        row = target[begin + k - block.lowest]
-        if is_number:
-            join_number(is_greatest, block.running[current], before[k], row)
+    k, count = 0, len(afters)
+    while k < count:
+        until, after = k + 1, afters[k]
+        if after <= at:
+            while until < count and afters[until] <= at:
+                until += 1
+            if is_greatest:
+                repeat_greater(block.running[0], before[k:until], target[k:until])
+            else:
+                repeat_lesser(block.running[0], before[k:until], target[k:until])
         else:
-            join_rows_into(is_greatest, block.running[current], row)
+            if at < after - 1:
+                current = join_positions(block, is_greatest, operand, at, after - 1, 0)
+                if current:
+                    fill_row(block.running[current], block.running[0])
+            while until < count and afters[until] == afters[until - 1] + 1:
+                until += 1
+            at = afters[until - 1]
+            _extend(block, is_greatest, operand, after - 1, at, before[k:until], target[k:until])
+        k = until
 
 
 @inlined
-def _extend(
-    block: SampleBlock, is_greatest: bool, operand: NodeRows, in_place: bool, target: Floats, position: int
+def _step(
+    block: SampleBlock, is_strong: bool, has_left: bool, one: NodeRows, two: NodeRows, target: Floats,
+    position: int, current: int,
+) -> int:  # fmt: skip
+    """Compute an unbounded operator at one position from the running row; return which that is then."""
+    if has_left:
+        current = enter(not is_strong, block, one, position, position - block.since, current)
+    current = enter(is_strong, block, two, position, position - block.since, current)
+    fill_row(block.running[current], target[position - block.lowest])
+    return current
+
+
+@inlined
+def _run_unbounded(
+    is_strong: bool, is_ahead: bool, running: Floats, left: Any, right: Any, target: Floats
 ) -> None:
-    """Join the row of a position, none after the first sample, with that of the next one."""
-    k = position - block.lowest
-    if position < operand.begin:
-        join_number(is_greatest, target[k + 1], operand.column[position - block.offset], target[k])
-    elif in_place:
-        _join_rows_whole(is_greatest, target[k + 1], target[k])
+    if is_ahead and is_strong:
+        run_until(running, left, right, target)
+    elif is_ahead:
+        run_release(running, left, right, target)
+    elif is_strong:
+        run_since(running, left, right, target)
     else:
-        join_rows(is_greatest, target[k + 1], operand.rows[k], target[k])
+        run_trigger(running, left, right, target)
 
 
 @uncounted
 def recurrent_rows(
-    block: SampleBlock, is_strong: bool, has_left: bool, one: NodeRows, two: NodeRows, in_place: bool,
-    target: Floats, begin: int, is_ahead: bool,
+    block: SampleBlock, is_strong: bool, has_left: bool, one: NodeRows, two: NodeRows, target: Floats,
+    begin: int, is_ahead: bool,
 ) -> None:  # fmt: skip
     """Compute an unbounded until or release backwards from the last sample, a since or trigger forwards.
 
     Args:
         is_strong: whether it is an until or a since.
-        in_place: whether `target` are the rows of `two`.
+        target: receives the rows; may be those of an operand.
         begin: the first position.
         is_ahead: whether it is an until or a release. The first running row is what it is beyond the samples,
             or before `begin`.
     """
-    current, count = 0, block.last + 1 - begin
-    for k in range(count):
-        position = block.last - k if is_ahead else begin + k
-        if is_ahead and not has_left and position < block.since:
-            _extend(block, is_strong, two, in_place, target, position)
-            continue
-        if has_left:
-            current = enter(not is_strong, block, one, position, position - block.since, current)
-        current = enter(is_strong, block, two, position, position - block.since, current)
-        copy(block.running[current], target[position - block.lowest])
+    since, last, lowest, offset = block.since, block.last, block.lowest, block.offset
+    current, whole = 0, max(since + 1, begin)
+    if is_ahead:
+        for position in range(last, whole - 1, -1):
+            current = _step(block, is_strong, has_left, one, two, target, position, current)
+    running, stop = block.running[current], since + 1
+    if begin <= since and not has_left:
+        rows_from = max(min(two.begin, stop), begin)
+        rows, numbers = (
+            two.rows[rows_from - lowest : stop - lowest],
+            two.column[begin - offset : rows_from - offset],
+        )
+        part, of_numbers = (
+            target[rows_from - lowest : stop - lowest],
+            target[begin - lowest : rows_from - lowest],
+        )
+        if is_ahead and is_strong:
+            run_back_greater(running, rows, part)
+            run_back_greater(running, numbers, of_numbers)
+        elif is_ahead:
+            run_back_lesser(running, rows, part)
+            run_back_lesser(running, numbers, of_numbers)
+        elif is_strong:
+            run_greater(running, numbers, of_numbers)
+            run_greater(running, rows, part)
+        else:
+            run_lesser(running, numbers, of_numbers)
+            run_lesser(running, rows, part)
+    elif begin <= since:
+        first, second = max(min(one.begin, stop), begin), max(min(two.begin, stop), begin)
+        for k in range(3):
+            # as far as each operand is numbers, or rows
+            m = 2 - k if is_ahead else k
+            low = begin if m == 0 else (min(first, second) if m == 1 else max(first, second))
+            high = stop if m == 2 else (max(first, second) if m == 1 else min(first, second))
+            at, after = low - lowest, high - lowest
+            left, right = one.rows[at:after], two.rows[at:after]
+            of_left, of_right = (
+                one.column[low - offset : high - offset],
+                two.column[low - offset : high - offset],
+            )
+            if low >= high:
+                continue
+            if low >= one.begin and low >= two.begin:
+                _run_unbounded(is_strong, is_ahead, running, left, right, target[at:after])
+            elif low >= one.begin:
+                _run_unbounded(is_strong, is_ahead, running, left, of_right, target[at:after])
+            elif low >= two.begin:
+                _run_unbounded(is_strong, is_ahead, running, of_left, right, target[at:after])
+            else:
+                _run_unbounded(is_strong, is_ahead, running, of_left, of_right, target[at:after])
+    if not is_ahead:
+        for position in range(whole, last + 1):
+            current = _step(block, is_strong, has_left, one, two, target, position, current)
 
 
 @inlined
 def take_row(block: SampleBlock, operand: NodeRows, at: int, missing: float, target: Floats) -> None:
     """Fill a row with the numbers at a position, or with `missing` for samples before it, or all outside."""
     if at < block.offset or at > block.last:
-        fill(target, missing)
+        fill_row(missing, target)
         return
     if at < operand.begin:
-        fill(target, operand.column[at - block.offset])
+        fill_row(operand.column[at - block.offset], target)
     else:
-        copy(operand.rows[at - block.lowest], target)
+        fill_row(operand.rows[at - block.lowest], target)
     if at > block.since:
-        fill(target[: at - block.since], missing)
+        fill_row_until(at - block.since, missing, target, target)
 
 
 @uncounted
@@ -399,4 +509,4 @@ def fill_open(
     """
     for position in range(begin, end):
         row = target[position - block.lowest]
-        fill(row[: min(max(is_open_until[position - begin], 0), len(row))], value)
+        fill_row_until(is_open_until[position - begin], value, row, row)

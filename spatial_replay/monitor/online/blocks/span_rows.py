@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from spatial_replay.compiled import apart, inlined, uncounted
+from spatial_replay.compiled import apart, inlined, row_code, uncounted
+from spatial_replay.compiler import Lanes
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.blocks.node_rows import (
@@ -14,13 +17,11 @@ from spatial_replay.monitor.online.blocks.node_rows import (
     fill_open,
     join_after,
     join_before,
-    join_number,
     join_operands_rows,
     join_positions,
-    join_rows,
-    join_rows_into,
     window_rows,
 )
+from spatial_replay.monitor.online.blocks.row_loops import fill_row, join_number, join_rows
 from spatial_replay.monitor.online.blocks.spans import (
     BEGIN,
     END,
@@ -40,9 +41,7 @@ from spatial_replay.monitor.online.run_arrays import arrays_at
 from spatial_replay.monitor.online.sliding import (
     Recent,
     beyond,
-    copy,
     extremum,
-    fill,
     is_decided,
     recent_of,
     window_after,
@@ -75,31 +74,25 @@ def block_of(memory: Memory, scratch: Scratch) -> SampleBlock:
     )
 
 
-@uncounted
-def _one_bit(low: float, high: float, row: Floats, target: Floats) -> None:
-    for k in range(len(target)):
-        target[k] = max(low, min(high, row[k]))
+@row_code
+def _one_bit(lanes: Lanes, low: Any, high: Any, row: Any) -> Any:
+    return lanes.greater(low, lanes.lesser(high, row))
 
 
-@uncounted
-def _two_bits(
-    none: float, first: float, second: float, both: float, row: Floats, other: Floats, target: Floats
-) -> None:
-    for k in range(len(target)):
-        target[k] = max(max(none, min(first, row[k])), min(other[k], max(second, min(both, row[k]))))
+@row_code
+def _two_bits(lanes: Lanes, none: Any, first: Any, second: Any, both: Any, row: Any, other: Any) -> Any:
+    one = lanes.greater(none, lanes.lesser(first, row))
+    return lanes.greater(one, lanes.lesser(other, lanes.greater(second, lanes.lesser(both, row))))
 
 
 @uncounted
 def _at_corner(span: Integers, corner: int, rows: Floats, number: float, row: Floats, target: Floats) -> None:
     """Join a row with what a corner adds: the least of its number and of the rows of its bits."""
-    fill(row, number)
+    fill_row(number, row)
     for bit in range(CORNER_BITS):
         if (corner >> bit) & 1:
-            other = rows[span[ROWS_FROM + bit]]
-            for k in range(len(row)):
-                row[k] = min(row[k], other[k])
-    for k in range(len(target)):
-        target[k] = max(target[k], row[k])
+            join_rows(False, row, rows[span[ROWS_FROM + bit]], row)
+    join_rows(True, target, row, target)
 
 
 @uncounted
@@ -114,7 +107,7 @@ def read_rows(span: Integers, numbers: Floats, rows: Floats, spare: Floats, targ
             bits |= 1 << bit
             one, two = two, bit
     if bits == 0:
-        fill(target, numbers[0])
+        fill_row(numbers[0], target)
     elif one < 0:
         _one_bit(numbers[0], numbers[1 << two], rows[span[ROWS_FROM + two]], target)
     elif bits == (1 << one | 1 << two):
@@ -123,7 +116,7 @@ def read_rows(span: Integers, numbers: Floats, rows: Floats, spare: Floats, targ
             rows[span[ROWS_FROM + one]], rows[span[ROWS_FROM + two]], target,
         )  # fmt: skip
     else:
-        fill(target, numbers[0])
+        fill_row(numbers[0], target)
         for corner in range(1, 1 << CORNER_BITS):
             if not corner & ~bits:
                 _at_corner(span, corner, rows, numbers[corner], spare, target)
@@ -151,22 +144,22 @@ def _fill_wholes(
         if span[KIND] != IN_ROWS:
             read_rows(span, sums[k], joints, spare, wholes[k])
             continue
-        fill(block.running[0], -np.inf if is_greatest else np.inf)
+        fill_row(-np.inf if is_greatest else np.inf, block.running[0])
         current, whole = 0, begin
         if begin >= operand.begin:
             whole = max(min(end, block.since + 1), begin)
-            current = join_positions(block, is_greatest, operand, begin, whole)
+            current = join_positions(block, is_greatest, operand, begin, whole, 0)
         for position in range(whole, end):
             current = enter(is_greatest, block, operand, position, position - block.since, current)
-        copy(block.running[current], wholes[k])
+        fill_row(block.running[current], wholes[k])
 
 
 @uncounted
 def _fill_joint(is_greatest: bool, wholes: Floats, begin: int, end: int, target: Floats) -> None:
     """Join the rows of neighbouring spans."""
-    copy(wholes[begin], target)
+    fill_row(wholes[begin], target)
     for k in range(begin + 1, end):
-        join_rows_into(is_greatest, wholes[k], target)
+        join_rows(is_greatest, target, wholes[k], target)
 
 
 @uncounted
@@ -210,21 +203,21 @@ def _window_span_rows(
         is_number = is_number and span[ROWS_FROM + bit] < 0
     first, count = begin - block.lowest, end - begin
     if span[ROW] >= 0:
-        copy(joints[span[ROW]], block.running[0])
+        fill_row(joints[span[ROW]], block.running[0])
     else:
-        fill(block.running[0], -np.inf if is_greatest else np.inf)
+        fill_row(-np.inf if is_greatest else np.inf, block.running[0])
     if begins_in_rows:
         at = min(operands[left, END], block.last + 1)
         join_before(block, is_greatest, operand, at, block.starts[:count], target, begin)
-        fill(block.running[0], -np.inf if is_greatest else np.inf)
+        fill_row(-np.inf if is_greatest else np.inf, block.running[0])
     if begins_in_rows and not ends_in_rows and right != THROUGH:
         for k in range(count):
             _read_position(span, columns, first + k, joints, spare, numbers, block.running[0])
-            join_rows_into(is_greatest, block.running[0], target[first + k])
+            join_rows(is_greatest, target[first + k], block.running[0], target[first + k])
     elif not begins_in_rows and is_number and ends_in_rows:
         at = operands[right, BEGIN]
         numbers_before, afters = columns[0, first:], block.afters[:count]
-        join_after(block, is_greatest, operand, at, afters, numbers_before, True, target, begin)
+        join_after(block, is_greatest, operand, at, afters, numbers_before, target[first : first + count])
         return
     elif not begins_in_rows:
         for k in range(count):
@@ -232,11 +225,12 @@ def _window_span_rows(
                 join_number(is_greatest, block.running[0], columns[0, first + k], target[first + k])
                 continue
             _read_position(span, columns, first + k, joints, spare, numbers, target[first + k])
-            join_rows_into(is_greatest, block.running[0], target[first + k])
-        fill(block.running[0], -np.inf if is_greatest else np.inf)
+            join_rows(is_greatest, target[first + k], block.running[0], target[first + k])
+        fill_row(-np.inf if is_greatest else np.inf, block.running[0])
     if ends_in_rows:
         at = operands[right, BEGIN]
-        join_after(block, is_greatest, operand, at, block.afters[:count], block.before, False, target, begin)
+        rows = target[first : first + count]
+        join_after(block, is_greatest, operand, at, block.afters[:count], rows, rows)
 
 
 @uncounted
@@ -283,8 +277,6 @@ def run_spans(table_at: int, number: int, which: int, channels: int, is_end: int
             other_signal = signal_of(nodes, first + b)
             other = columns[first + b] if other_signal < 0 else history[other_signal]
             other_rows = scratch.rows[max(nodes[first + b, codes.NODE_ROWS], 0)]
-            is_first = signal < 0 and nodes[first + a, codes.NODE_ROWS] == node[codes.NODE_ROWS]
-            is_second = other_signal < 0 and nodes[first + b, codes.NODE_ROWS] == node[codes.NODE_ROWS]
             for k in range(1, scratch.span_counts[place]):
                 span, begin, end = spans[k], spans[k, BEGIN], min(spans[k, END], block.last + 1)
                 if span[KIND] != IN_ROWS or begin >= end:
@@ -297,10 +289,7 @@ def run_spans(table_at: int, number: int, which: int, channels: int, is_end: int
                     scratch.spans[b], span[RIGHT], other, scratch.corner_columns[b], other_rows, begin, end,
                     joints, spare, scratch.corner, block.lowest, other_signal < 0, block.last,
                 )  # fmt: skip
-                if is_second:
-                    join_operands_rows(block, is_greatest, two, one, True, target, begin, end)
-                else:
-                    join_operands_rows(block, is_greatest, one, two, is_first, target, begin, end)
+                join_operands_rows(is_greatest, block, one, two, target, begin, end)
         else:
             operand = NodeRows(column, rows, scratch.begins[a] if signal < 0 else block.last + 1)
             operands, count, wholes = scratch.spans[a], scratch.span_counts[a], scratch.wholes[place]
@@ -370,8 +359,8 @@ def join_body_spans(
     root = part[codes.PART_END] - 1
     is_until, current = nodes[root, codes.NODE_CODE] == codes.UNTIL, 0
     settled = max(spans[0, END], base)
-    fill(
-        block.running[0], extremum(is_until, body.column[base - block.offset : settled - block.offset], start)
+    fill_row(
+        extremum(is_until, body.column[base - block.offset : settled - block.offset], start), block.running[0]
     )
     for k in range(1, count):
         begin, end = spans[k, BEGIN], min(spans[k, END], block.last + 1)
