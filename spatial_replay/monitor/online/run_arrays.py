@@ -112,8 +112,6 @@ def arrays_at(table_at: int) -> RunArrays:
             closing=integers_at(at[_SCRATCH.closing, 0], at[_SCRATCH.closing, 1]),
             spans=integers_at(at[_SCRATCH.spans, 0], shape_3(at, _SCRATCH.spans)),
             span_counts=integers_at(at[_SCRATCH.span_counts, 0], at[_SCRATCH.span_counts, 1]),
-            corner_bits=integers_at(at[_SCRATCH.corner_bits, 0], at[_SCRATCH.corner_bits, 1]),
-            bit_of=integers_at(at[_SCRATCH.bit_of, 0], at[_SCRATCH.bit_of, 1]),
             cuts=integers_at(at[_SCRATCH.cuts, 0], at[_SCRATCH.cuts, 1]),
             corner_columns=floats_at(at[_SCRATCH.corner_columns, 0], shape_3(at, _SCRATCH.corner_columns)),
             corner=floats_at(at[_SCRATCH.corner, 0], at[_SCRATCH.corner, 1]),

@@ -137,7 +137,7 @@ class Scratch(NamedTuple):
         begins, next_begins: (D,), the first position of each node that has a row, in a block and in the next.
         closing: (positions,), the samples with which windows close.
         spans: (D, MOST_SPANS, 10), spans of neighbouring positions of each node (see `blocks.spans`).
-        span_counts, corner_bits, bit_of: (D,), how many these are; which bits they use; that of a window.
+        span_counts: (D,), how many these are.
         cuts: (2 * MOST_SPANS,), where spans begin.
         corner_columns: (D, corners, positions), nodes at each corner, in spans with tables.
         corner: (corners,), one position of these.
@@ -172,8 +172,6 @@ class Scratch(NamedTuple):
     closing: Integers
     spans: Integers
     span_counts: Integers
-    corner_bits: Integers
-    bit_of: Integers
     cuts: Integers
     corner_columns: Floats
     corner: Floats
@@ -229,7 +227,6 @@ def scratch_for(program: Program, room: int, tile: int) -> Scratch:
     open_room = room if has_windows(program) else 0
     positions = min(open_room, MOST_POSITIONS) if tile > BLOCK else 0
     wide, corners = widest if positions else 0, 1 << CORNER_BITS
-    span_counts, corner_bits, bit_of = np.zeros((3, wide), np.int64)
     return Scratch(
         columns=np.zeros((widest, tile)),
         corners=np.zeros((widest if program.parts[:, PART_IS_NESTED].any() else 0, room)),
@@ -253,9 +250,7 @@ def scratch_for(program: Program, room: int, tile: int) -> Scratch:
         next_begins=next_begins,
         closing=np.zeros(positions, np.int64),
         spans=np.zeros((wide, MOST_SPANS, 6 + CORNER_BITS), np.int64),
-        span_counts=span_counts,
-        corner_bits=corner_bits,
-        bit_of=bit_of,
+        span_counts=np.zeros(wide, np.int64),
         cuts=np.zeros(2 * MOST_SPANS, np.int64),
         corner_columns=np.zeros((wide, corners, positions)),
         corner=np.zeros(corners),

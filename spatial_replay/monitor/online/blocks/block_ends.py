@@ -46,7 +46,8 @@ def find_begins(
 
     Args:
         narrows: 1 to look at what these samples are, and not only at which windows are open.
-        is_next: 1 to enter them into `next_begins`.
+        is_next: 1 to enter them into `next_begins`; 2 to do so where only windows matter: what joins these
+            with an operator that never ends is closed when they are.
     """
     tables, memory, scratch, _ = arrays_at(table_at)
     nodes, part, look = tables.nodes, tables.parts[number], look_of(which, channels)
@@ -64,7 +65,7 @@ def find_begins(
         if code in (codes.PART_AND, codes.PART_OR, codes.PAST_SINCE, codes.PAST_TRIGGER):
             begin = min(begin, changed[node[codes.NODE_B]])
         elif code in (codes.UNTIL, codes.RELEASE):
-            begin = offset
+            begin = min(begin, changed[node[codes.NODE_B]]) if is_next == 2 else offset
         elif code in codes.AHEAD_OF:
             distance = near if code == codes.SHIFT else far
             if begin < since:
@@ -88,12 +89,13 @@ def find_begins(
 
 @uncounted
 def is_beside_one(nodes: Integers, part: Integers, stamps: Integers, offset: int, since: int) -> bool:
-    """Return whether at most one operator of a part has many open positions."""
-    wide = 0
-    for d in range(part[codes.PART_FIRST], part[codes.PART_END] - 1):
+    """Return whether at most one operator of a part has many open positions, which then looks at signals."""
+    wide, first = 0, part[codes.PART_FIRST]
+    for d in range(first, part[codes.PART_END] - 1):
         code, unit, far = nodes[d, codes.NODE_CODE], nodes[d, codes.NODE_UNIT], nodes[d, codes.NODE_HIGH]
         if code in (codes.PART_WINDOW_MAX, codes.PART_WINDOW_MIN):
-            wide += since - first_behind(stamps, offset, since - 1, unit, far) > WIDE
+            is_wide = since - first_behind(stamps, offset, since - 1, unit, far) > WIDE
+            wide += (1 if signal_of(nodes, first + nodes[d, codes.NODE_A]) >= 0 else 2) if is_wide else 0
         elif code not in (codes.LITERAL, codes.PART_AND, codes.PART_OR, codes.SHIFT):
             wide += 1
     return wide <= 1

@@ -113,11 +113,11 @@ def _run_node(table_at: int, number: int, d: int, which: int, channels: int) -> 
             begin = _start_since(node, part, block, columns[d], memory, scratch, channel, begin, target)
             scratch.begins[d - first] = begin
             fresh = max(begin, memory.cells[cells_of(part)[2] + node[codes.NODE_TABLE]] + 1)
-        recurrent_rows(block, is_strong, a >= 0, one, two, target, fresh, is_ahead)
+        recurrent_rows(block, is_strong, a >= 0, one, two, target, fresh, block.last + 1, is_ahead)
     else:
         find_ends(node, block, recent, begin)
         if code in (codes.SHIFT, codes.PAST_DELAY):
-            shift_rows(block, code == codes.SHIFT, one, target, begin, value)
+            shift_rows(block, code == codes.SHIFT, one, target, begin, block.last + 1, value)
         else:
             closed = block.last + 1
             if code in codes.AHEAD_OF and is_decided(node, look.mode):
@@ -221,7 +221,7 @@ def _read_points(
 
 
 @apart
-def _set_first(table_at: int, number: int, which: int, channels: int, at: int) -> int:
+def set_first(table_at: int, number: int, which: int, channels: int, at: int) -> int:
     """Enter one of a part's numbers at the first sample, for each sample of the block (see `windows`)."""
     tables, memory, scratch, _ = arrays_at(table_at)
     nodes, part, block = tables.nodes, tables.parts[number], block_of(memory, scratch)
@@ -347,7 +347,7 @@ def run_block(
             unjoined = memory.unjoined[number]
             begin = min(scratch.begins[root[codes.NODE_B]], since)
             unjoined[columns_number(which)] = min(unjoined[columns_number(which)], begin)
-        _set_first(table_at, number, which, channels, at)
+        set_first(table_at, number, which, channels, at)
         if which > 1:
             continue
         if part[codes.PART_IS_REMEMBERING]:
@@ -356,7 +356,7 @@ def run_block(
             # of a bound that has no columns of its own
             is_beside = bound - 4 == which if channels == 4 else look_of(bound, channels).channel == which
             if is_beside and ((part[codes.PART_NUMBERS] & ~looks) >> bound) & 1:
-                _set_first(table_at, number, bound, channels, at)
+                set_first(table_at, number, bound, channels, at)
     for k in range(at, at + count if channels < 4 else at):
         if channels == 1:
             numbers[1, k], numbers[3, k] = numbers[0, k], numbers[2, k]

@@ -403,24 +403,25 @@ def _run_unbounded(
 @uncounted
 def recurrent_rows(
     block: SampleBlock, is_strong: bool, has_left: bool, one: NodeRows, two: NodeRows, target: Floats,
-    begin: int, is_ahead: bool,
+    begin: int, end: int, is_ahead: bool,
 ) -> None:  # fmt: skip
-    """Compute an unbounded until or release backwards from the last sample, a since or trigger forwards.
+    """Compute an unbounded until or release backwards from end - 1 to `begin`, a since or trigger forwards.
 
     Args:
         is_strong: whether it is an until or a since.
         target: receives the rows; may be those of an operand.
-        begin: the first position.
-        is_ahead: whether it is an until or a release. The first running row is what it is beyond the samples,
-            or before `begin`.
+        is_ahead: whether it is an until or a release.
+
+    The first running row is what the operator is at `end`, or before `begin`, and then what it is at the last
+    position that is computed.
     """
-    since, last, lowest, offset = block.since, block.last, block.lowest, block.offset
-    current, whole = 0, max(since + 1, begin)
+    since, lowest, offset = block.since, block.lowest, block.offset
+    current, whole = 0, min(max(since + 1, begin), end)
     if is_ahead:
-        for position in range(last, whole - 1, -1):
+        for position in range(end - 1, whole - 1, -1):
             current = _step(block, is_strong, has_left, one, two, target, position, current)
-    running, stop = block.running[current], since + 1
-    if begin <= since and not has_left:
+    running, stop = block.running[current], whole
+    if begin < whole and not has_left:
         rows_from = max(min(two.begin, stop), begin)
         rows, numbers = (
             two.rows[rows_from - lowest : stop - lowest],
@@ -442,7 +443,7 @@ def recurrent_rows(
         else:
             run_lesser(running, numbers, of_numbers)
             run_lesser(running, rows, part)
-    elif begin <= since:
+    elif begin < whole:
         first, second = max(min(one.begin, stop), begin), max(min(two.begin, stop), begin)
         for k in range(3):
             # as far as each operand is numbers, or rows
@@ -466,8 +467,10 @@ def recurrent_rows(
             else:
                 _run_unbounded(is_strong, is_ahead, running, of_left, of_right, target[at:after])
     if not is_ahead:
-        for position in range(whole, last + 1):
+        for position in range(whole, end):
             current = _step(block, is_strong, has_left, one, two, target, position, current)
+    if current:
+        fill_row(block.running[1], block.running[0])
 
 
 @inlined
@@ -486,15 +489,21 @@ def take_row(block: SampleBlock, operand: NodeRows, at: int, missing: float, tar
 
 @uncounted
 def shift_rows(
-    block: SampleBlock, is_ahead: bool, operand: NodeRows, target: Floats, begin: int, missing: float
+    block: SampleBlock,
+    is_ahead: bool,
+    operand: NodeRows,
+    target: Floats,
+    begin: int,
+    end: int,
+    missing: float,
 ) -> None:
-    """Compute a shift or delay from `begin` on: `starts` says where each looks.
+    """Compute a shift or delay at begin … end - 1: `starts` says where each looks.
 
     `target` may be the rows of the operand.
     """
-    for k in range(block.last + 1 - begin):
+    for k in range(end - begin):
         # what is still to be looked at must not be replaced
-        position = begin + k if is_ahead else block.last - k
+        position = begin + k if is_ahead else end - 1 - k
         take_row(block, operand, block.starts[position - begin], missing, target[position - block.lowest])
 
 

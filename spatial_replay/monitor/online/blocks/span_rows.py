@@ -19,6 +19,9 @@ from spatial_replay.monitor.online.blocks.node_rows import (
     join_before,
     join_operands_rows,
     join_positions,
+    recurrent_rows,
+    shift_rows,
+    take_row,
     window_rows,
 )
 from spatial_replay.monitor.online.blocks.row_loops import fill_row, join_number, join_rows
@@ -34,9 +37,12 @@ from spatial_replay.monitor.online.blocks.spans import (
     ROW,
     ROWS_FROM,
     THROUGH,
+    corners_of,
     ends_between,
+    span_at,
 )
-from spatial_replay.monitor.online.node_columns import columns_number, look_of, signal_of
+from spatial_replay.monitor.online.node_columns import cells_of, columns_number, look_of, signal_of
+from spatial_replay.monitor.online.open_windows import runs_root
 from spatial_replay.monitor.online.run_arrays import arrays_at
 from spatial_replay.monitor.online.sliding import (
     Recent,
@@ -101,25 +107,18 @@ def read_rows(span: Integers, numbers: Floats, rows: Floats, spare: Floats, targ
 
     They grow with each row, so that each corner's number counts as far as all rows of its bits reach.
     """
-    bits, one, two = 0, -1, -1
-    for bit in range(CORNER_BITS):
-        if span[ROWS_FROM + bit] >= 0:
-            bits |= 1 << bit
-            one, two = two, bit
-    if bits == 0:
+    corners, row = corners_of(span), rows[max(span[ROWS_FROM], 0)]
+    if corners == 1:
         fill_row(numbers[0], target)
-    elif one < 0:
-        _one_bit(numbers[0], numbers[1 << two], rows[span[ROWS_FROM + two]], target)
-    elif bits == (1 << one | 1 << two):
-        _two_bits(
-            numbers[0], numbers[1 << one], numbers[1 << two], numbers[bits],
-            rows[span[ROWS_FROM + one]], rows[span[ROWS_FROM + two]], target,
-        )  # fmt: skip
+    elif corners == 2:
+        _one_bit(numbers[0], numbers[1], row, target)
+    elif corners == 4:
+        other = rows[span[ROWS_FROM + 1]]
+        _two_bits(numbers[0], numbers[1], numbers[2], numbers[3], row, other, target)
     else:
         fill_row(numbers[0], target)
-        for corner in range(1, 1 << CORNER_BITS):
-            if not corner & ~bits:
-                _at_corner(span, corner, rows, numbers[corner], spare, target)
+        for corner in range(1, corners):
+            _at_corner(span, corner, rows, numbers[corner], spare, target)
 
 
 @uncounted
@@ -127,7 +126,7 @@ def _read_position(
     span: Integers, columns: Floats, at: int, rows: Floats, spare: Floats, numbers: Floats, target: Floats
 ) -> None:
     """Read the table of one position."""
-    for corner in range(len(columns)):
+    for corner in range(corners_of(span)):
         numbers[corner] = columns[corner, at]
     read_rows(span, numbers, rows, spare, target)
 
@@ -257,66 +256,166 @@ def run_spans(table_at: int, number: int, which: int, channels: int, is_end: int
             entered into the columns.
     """
     tables, memory, scratch, _ = arrays_at(table_at)
+    nodes, part, block = tables.nodes, tables.parts[number], block_of(memory, scratch)
+    columns, first, root = (
+        memory.columns[columns_number(which)],
+        part[codes.PART_FIRST],
+        part[codes.PART_END] - 1,
+    )
+    has_root = runs_root(part, nodes[root])
+    for d in range(first, part[codes.PART_END]):
+        code, place = nodes[d, codes.NODE_CODE], d - first
+        if code == codes.LITERAL:
+            continue
+        if code in codes.BINARY_NODES and (has_root or d < root):
+            _run_joined(table_at, number, d, which, channels)
+        else:
+            _run_window(table_at, number, d, which, channels)
+        if is_end and d < root:
+            target = scratch.rows[max(nodes[d, codes.NODE_ROWS], 0)]
+            _fill_column(
+                scratch.spans[place], scratch.span_counts[place], scratch, place, target, columns[d], block
+            )
+    return 0
+
+
+@apart
+def _run_joined(table_at: int, number: int, d: int, which: int, channels: int) -> int:
+    """Compute the rows of a node with two operands; of one without a window, what its spans follow, too."""
+    tables, memory, scratch, _ = arrays_at(table_at)
+    nodes, part, look = tables.nodes, tables.parts[number], look_of(which, channels)
+    columns, history = memory.columns[columns_number(which)], memory.history[look.channel]
+    block, first, joints, spare = (
+        block_of(memory, scratch),
+        part[codes.PART_FIRST],
+        scratch.joints,
+        scratch.spare,
+    )
+    node, place, running = nodes[d], d - first, block.running[0]
+    code, a, b, has_left = (
+        node[codes.NODE_CODE],
+        max(node[codes.NODE_A], 0),
+        node[codes.NODE_B],
+        node[codes.NODE_A] >= 0,
+    )
+    signal, other = signal_of(nodes, first + a), signal_of(nodes, first + b)
+    of_one = columns[first + a] if signal < 0 else history[signal]
+    of_two = columns[first + b] if other < 0 else history[other]
+    one_rows = scratch.rows[max(nodes[first + a, codes.NODE_ROWS], 0)]
+    two_rows = scratch.rows[max(nodes[first + b, codes.NODE_ROWS], 0)]
+    target, spans, count = (
+        scratch.rows[max(node[codes.NODE_ROWS], 0)],
+        scratch.spans[place],
+        scratch.span_counts[place],
+    )
+    is_ahead, is_strong = (
+        code in (codes.UNTIL, codes.RELEASE),
+        code in (codes.PART_OR, codes.UNTIL, codes.PAST_SINCE),
+    )
+    is_joined = code in (codes.PART_AND, codes.PART_OR)
+    if is_ahead:
+        fill_row(beyond(look.mode, node[codes.NODE_WEAK]), running)
+    elif not is_joined and spans[0, END] > 0:
+        fill_row(columns[d, spans[0, END] - 1 - block.offset], running)
+    elif not is_joined:
+        fill_row(np.inf if node[codes.NODE_WEAK] else -np.inf, running)
+    for m in range(1, count):
+        k = count - m if is_ahead else m
+        span, begin, end = spans[k], spans[k, BEGIN], min(spans[k, END], block.last + 1)
+        if begin >= end:
+            continue
+        if span[KIND] == IN_TABLE:
+            if not is_joined:
+                fill_row(running, joints[span[ROW]])
+                at = (begin if is_ahead else end - 1) - block.lowest
+                _read_position(
+                    span, scratch.corner_columns[place], at, joints, spare, scratch.corner, running
+                )
+            continue
+        two = _operand_rows(
+            scratch.spans[b], span[RIGHT], of_two, scratch.corner_columns[b], two_rows, begin, end,
+            joints, spare, scratch.corner, block.lowest, other < 0, block.last,
+        )  # fmt: skip
+        one = two
+        if has_left:
+            one = _operand_rows(
+                scratch.spans[a], span[LEFT], of_one, scratch.corner_columns[a], one_rows, begin, end,
+                joints, spare, scratch.corner, block.lowest, signal < 0, block.last,
+            )  # fmt: skip
+        if is_joined:
+            join_operands_rows(is_strong, block, one, two, target, begin, end)
+        else:
+            recurrent_rows(block, is_strong, has_left, one, two, target, begin, end, is_ahead)
+    variable = node[codes.NODE_VARIABLE]
+    if variable >= 0:
+        at, missing = memory.cells[cells_of(part)[1] + variable], beyond(look.mode, node[codes.NODE_WEAK])
+        k = span_at(spans, count, at)
+        if block.offset <= at <= block.last and spans[k, KIND] == IN_TABLE:
+            columns_of = scratch.corner_columns[place]
+            _read_position(
+                spans[k],
+                columns_of,
+                at - block.lowest,
+                joints,
+                spare,
+                scratch.corner,
+                scratch.points[variable],
+            )
+        else:
+            take_row(
+                block, NodeRows(columns[d], target, spans[0, END]), at, missing, scratch.points[variable]
+            )
+    return 0
+
+
+@apart
+def _run_window(table_at: int, number: int, d: int, which: int, channels: int) -> int:
+    """Compute the rows of a window or shift, and what its spans, or the root, follow."""
+    tables, memory, scratch, _ = arrays_at(table_at)
     nodes, part, look = tables.nodes, tables.parts[number], look_of(which, channels)
     columns, history = memory.columns[columns_number(which)], memory.history[look.channel]
     recent, block, first = recent_of(memory, scratch), block_of(memory, scratch), part[codes.PART_FIRST]
-    newest, joints, spare = scratch.block[BLOCK_NEWEST], scratch.joints, scratch.spare
-    root = part[codes.PART_END] - 1
-    for d in range(first, part[codes.PART_END]):
-        node, place = nodes[d], d - first
-        code = node[codes.NODE_CODE]
-        if code == codes.LITERAL:
+    newest, joints, spare, root = (
+        scratch.block[BLOCK_NEWEST],
+        scratch.joints,
+        scratch.spare,
+        part[codes.PART_END] - 1,
+    )
+    node, place, value = nodes[d], d - first, beyond(look.mode, nodes[d, codes.NODE_WEAK])
+    code, a = node[codes.NODE_CODE], node[codes.NODE_B] if d == root else node[codes.NODE_A]
+    signal, spans = signal_of(nodes, first + a), scratch.spans[place]
+    is_greatest = code in (codes.PART_WINDOW_MAX, codes.PAST_WINDOW_MAX, codes.UNTIL)
+    column = columns[first + a] if signal < 0 else history[signal]
+    rows, target = (
+        scratch.rows[max(nodes[first + a, codes.NODE_ROWS], 0)],
+        scratch.rows[max(node[codes.NODE_ROWS], 0)],
+    )
+    operand = NodeRows(column, rows, scratch.begins[a] if signal < 0 else block.last + 1)
+    operands, count, wholes = scratch.spans[a], scratch.span_counts[a], scratch.wholes[place]
+    if code != codes.SHIFT:
+        _fill_wholes(block, is_greatest, operand, operands, count, scratch.sums[place], joints, spare, wholes)
+    if d == root:
+        return 0
+    for k in range(1, scratch.span_counts[place] if code != codes.SHIFT else 1):
+        left, right = spans[k, LEFT], min(spans[k, RIGHT], count)
+        if spans[k, ROW] >= 0:
+            _fill_joint(is_greatest, wholes, left + 1, right, joints[spans[k, ROW]])
+    decided = is_decided(node, look.mode) and code in (codes.PART_WINDOW_MAX, codes.PART_WINDOW_MIN)
+    for k in range(1, scratch.span_counts[place]):
+        span, begin, end = spans[k], spans[k, BEGIN], min(spans[k, END], block.last + 1)
+        if span[KIND] != IN_ROWS or begin >= end:
             continue
-        a, b = node[codes.NODE_B] if d == root else node[codes.NODE_A], node[codes.NODE_B]
-        signal, spans = signal_of(nodes, first + a), scratch.spans[place]
-        is_greatest = code in (codes.PART_OR, codes.PART_WINDOW_MAX, codes.PAST_WINDOW_MAX, codes.UNTIL)
-        column = columns[first + a] if signal < 0 else history[signal]
-        rows = scratch.rows[max(nodes[first + a, codes.NODE_ROWS], 0)]
-        target = scratch.rows[max(node[codes.NODE_ROWS], 0)]
-        if code in (codes.PART_AND, codes.PART_OR):
-            other_signal = signal_of(nodes, first + b)
-            other = columns[first + b] if other_signal < 0 else history[other_signal]
-            other_rows = scratch.rows[max(nodes[first + b, codes.NODE_ROWS], 0)]
-            for k in range(1, scratch.span_counts[place]):
-                span, begin, end = spans[k], spans[k, BEGIN], min(spans[k, END], block.last + 1)
-                if span[KIND] != IN_ROWS or begin >= end:
-                    continue
-                one = _operand_rows(
-                    scratch.spans[a], span[LEFT], column, scratch.corner_columns[a], rows, begin, end,
-                    joints, spare, scratch.corner, block.lowest, signal < 0, block.last,
-                )  # fmt: skip
-                two = _operand_rows(
-                    scratch.spans[b], span[RIGHT], other, scratch.corner_columns[b], other_rows, begin, end,
-                    joints, spare, scratch.corner, block.lowest, other_signal < 0, block.last,
-                )  # fmt: skip
-                join_operands_rows(is_greatest, block, one, two, target, begin, end)
-        else:
-            operand = NodeRows(column, rows, scratch.begins[a] if signal < 0 else block.last + 1)
-            operands, count, wholes = scratch.spans[a], scratch.span_counts[a], scratch.wholes[place]
-            _fill_wholes(
-                block, is_greatest, operand, operands, count, scratch.sums[place], joints, spare, wholes
-            )
-            if d == root:
-                continue
-            for k in range(1, scratch.span_counts[place]):
-                left, right = spans[k, LEFT], min(spans[k, RIGHT], count)
-                if spans[k, ROW] >= 0:
-                    _fill_joint(is_greatest, wholes, left + 1, right, joints[spans[k, ROW]])
-            decided = is_decided(node, look.mode) and code in codes.AHEAD_OF
-            for k in range(1, scratch.span_counts[place]):
-                span, begin, end = spans[k], spans[k, BEGIN], min(spans[k, END], block.last + 1)
-                if span[KIND] != IN_ROWS or begin >= end:
-                    continue
-                _window_span_rows(
-                    node, block, recent, span, operand, operands, scratch.corner_columns[place],
-                    joints, spare, scratch.corner, target,
-                )  # fmt: skip
-                if decided:
-                    _find_closing(node, block, recent, begin, end, newest, True, scratch.closing)
-                    value = beyond(look.mode, node[codes.NODE_WEAK])
-                    fill_open(block, scratch.closing, target, begin, end, value)
-        if is_end:
-            _fill_column(spans, scratch.span_counts[place], scratch, place, target, columns[d], block)
+        if code == codes.SHIFT:
+            ends_between(node, recent, begin, end, block.offset, block.last, block.starts, block.afters)
+            shift_rows(block, True, operand, target, begin, end, value)
+            continue
+        _window_span_rows(
+            node, block, recent, span, operand, operands, scratch.corner_columns[place],
+            joints, spare, scratch.corner, target,
+        )  # fmt: skip
+        if decided:
+            _find_closing(node, block, recent, begin, end, newest, True, scratch.closing)
+            fill_open(block, scratch.closing, target, begin, end, value)
     return 0
 
 

@@ -20,6 +20,7 @@ from spatial_replay.compiled import apart, inlined, uncounted
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.node_columns import columns_number, look_of, signal_of
+from spatial_replay.monitor.online.open_windows import runs_root
 from spatial_replay.monitor.online.run_arrays import arrays_at
 from spatial_replay.monitor.online.sliding import (
     Recent,
@@ -46,7 +47,9 @@ from spatial_replay.monitor.online.state import (
 BEGIN, END, KIND, LEFT, RIGHT, ROW = range(6)
 """What the numbers of a span stand for: its first position, and what comes after it; which kind it is; of a
 window, the operand's spans that its first and its last position lie in, and the row of what lies between, -1
-for none. The rows it follows come next, one for each bit."""
+for none; of others, the spans of both operands, and of an operator without a window the row that the next
+position is, or the one before. The rows it follows come next, its own one first, one for each bit of a
+corner."""
 
 ROWS_FROM: Final = 6
 IN_COLUMN, IN_ROWS, IN_TABLE = range(3)
@@ -57,7 +60,7 @@ THROUGH: Final = 1 << 20
 
 
 @inlined
-def _span_at(spans: Integers, count: int, position: int) -> int:
+def span_at(spans: Integers, count: int, position: int) -> int:
     """Return which span a position lies in."""
     span = count - 1
     while span > 0 and spans[span, BEGIN] > position:
@@ -119,19 +122,49 @@ def _enter_span(
 
 
 @uncounted
+def _takes_row(span: Integers, row: int) -> bool:
+    """Have a span follow a row; return False if these are too many."""
+    for bit in range(ROWS_FROM, ROWS_FROM + CORNER_BITS):
+        if span[bit] == row or row < 0:
+            return True
+        if span[bit] < 0:
+            span[bit] = row
+            return True
+    return False
+
+
+@uncounted
 def _takes_rows(span: Integers, other: Integers) -> bool:
-    """Have a span follow the rows of another, too; return False if a bit would stand for two rows."""
+    """Have a span follow the rows of another, too; return False if these are too many."""
+    fits = True
     for bit in range(CORNER_BITS):
-        row = other[ROWS_FROM + bit]
-        if row >= 0 and span[ROWS_FROM + bit] >= 0 and span[ROWS_FROM + bit] != row:
-            return False
-        span[ROWS_FROM + bit] = max(span[ROWS_FROM + bit], row)
-    return True
+        fits = fits and _takes_row(span, other[ROWS_FROM + bit])
+    return fits
+
+
+@inlined
+def corners_of(span: Integers) -> int:
+    """Return how many corners the rows that a span follows have."""
+    corners = 1
+    for bit in range(CORNER_BITS):
+        corners *= 2 if span[ROWS_FROM + bit] >= 0 else 1
+    return corners
+
+
+@uncounted
+def _corner_below(span: Integers, corner: int, other: Integers) -> int:
+    """Return which corner of an operand's span one of a span is."""
+    below = 0
+    for bit in range(CORNER_BITS):
+        for own in range(CORNER_BITS):
+            is_same = other[ROWS_FROM + bit] >= 0 and span[ROWS_FROM + own] == other[ROWS_FROM + bit]
+            below |= ((corner >> own) & 1) << bit if is_same else 0
+    return below
 
 
 @uncounted
 def _window_spans(
-    node: Integers, place: int, bit: int, decided: bool, stamps: Integers, offset: int, since: int, last: int,
+    node: Integers, place: int, decided: bool, stamps: Integers, offset: int, since: int, last: int,
     begin: int, operand: Integers, others: int, spans: Integers, cuts: Integers,
 ) -> int:  # fmt: skip
     """Find the spans of a window from `begin` on; return how many there are then, or -1 for too many."""
@@ -174,7 +207,7 @@ def _window_spans(
         else:
             start = ahead(stamps, offset, last, first, unit, near)
             reach = last_ahead(stamps, offset, last, first, unit, far)
-        left, right = _span_at(operand, others, start), _span_at(operand, others, reach)
+        left, right = span_at(operand, others, start), span_at(operand, others, reach)
         right = THROUGH if is_through else right
         # windows that hold no sample at all
         left = min(left, right)
@@ -193,32 +226,71 @@ def _window_spans(
             continue
         _enter_span(spans, count, first, end, kind, left, right, row)
         span = spans[count]
-        fits = operand[left, KIND] == IN_ROWS or _takes_rows(span, operand[left])
+        fits = kind != IN_TABLE or _takes_row(span, row)
+        fits = fits and (operand[left, KIND] == IN_ROWS or _takes_rows(span, operand[left]))
         if not is_through and operand[right, KIND] != IN_ROWS:
             fits = fits and _takes_rows(span, operand[right])
         if not fits:
             return -1
-        if kind == IN_TABLE and row >= 0:
-            span[ROWS_FROM + bit] = row
+        count += 1
+    return count
+
+
+@uncounted
+def _shift_spans(
+    node: Integers, stamps: Integers, offset: int, since: int, last: int, begin: int, operand: Integers,
+    others: int, spans: Integers, cuts: Integers,
+) -> int:  # fmt: skip
+    """Find the spans of a shift from `begin` on; return how many there are then, or -1 for too many."""
+    unit, near, found = node[codes.NODE_UNIT], node[codes.NODE_LOW], 0
+    late = min(behind(stamps, offset, last, unit, near) + 1, since)
+    for k in range(others):
+        start = _first_starting(node, stamps, offset, last, operand[k, BEGIN])
+        found = _sorted_into(cuts, found, start, begin, last + 1)
+    for at in (since, late):
+        found = _sorted_into(cuts, found, at, begin, last + 1)
+    count = 1
+    for k in range(-1, found):
+        first, end = begin if k < 0 else cuts[k], cuts[k + 1] if k + 1 < found else last + 1
+        if count >= MOST_SPANS:
+            return -1
+        if late <= first < since:
+            _enter_span(spans, count, first, end, IN_TABLE, -1, -1, -1)
+        elif first >= since:
+            _enter_span(spans, count, first, end, IN_ROWS, -1, -1, -1)
+        else:
+            left = span_at(operand, others, ahead(stamps, offset, last, first, unit, near))
+            kind = IN_ROWS if operand[left, KIND] == IN_ROWS else IN_TABLE
+            _enter_span(spans, count, first, end, kind, left, left, -1)
+            if kind == IN_TABLE:
+                _takes_rows(spans[count], operand[left])
         count += 1
     return count
 
 
 @uncounted
 def _joined_spans(
-    begin: int, last: int, one: Integers, ones: int, two: Integers, twos: int, spans: Integers
+    place: int, begin: int, last: int, one: Integers, ones: int, two: Integers, twos: int, spans: Integers
 ) -> int:
-    """Find the spans of an `and` or `or` from `begin` on; return how many there are then, or -1."""
+    """Find the spans of a node with two operands from `begin` on; return how many there are then, or -1.
+
+    Args:
+        place: of an operator without a window, which goes from one position to the next; -1 for others.
+        ones: 0 if there is no first operand.
+    """
     count, first = 1, begin
     while first <= last:
-        a, b = _span_at(one, ones, first), _span_at(two, twos, first)
-        end = min(one[a, END], two[b, END])
+        a, b = span_at(one, ones, first) if ones else -1, span_at(two, twos, first)
+        end = min(one[a, END], two[b, END]) if ones else two[b, END]
         if count >= MOST_SPANS:
             return -1
-        kind = IN_ROWS if one[a, KIND] == IN_ROWS or two[b, KIND] == IN_ROWS else IN_TABLE
-        _enter_span(spans, count, first, end, kind, a, b, -1)
-        if kind == IN_TABLE and not (_takes_rows(spans[count], one[a]) and _takes_rows(spans[count], two[b])):
-            return -1
+        is_in_rows = two[b, KIND] == IN_ROWS or (ones > 0 and one[a, KIND] == IN_ROWS)
+        row = place * MOST_SPANS + count if place >= 0 and not is_in_rows else -1
+        _enter_span(spans, count, first, end, IN_ROWS if is_in_rows else IN_TABLE, a, b, row)
+        if not is_in_rows:
+            fits = _takes_row(spans[count], row) and _takes_rows(spans[count], two[b])
+            if not fits or (ones > 0 and not _takes_rows(spans[count], one[a])):
+                return -1
         count, first = count + 1, end
     return count
 
@@ -234,39 +306,34 @@ def find_spans(table_at: int, number: int, which: int, channels: int, since: int
     """
     tables, memory, scratch, _ = arrays_at(table_at)
     nodes, part, mode = tables.nodes, tables.parts[number], look_of(which, channels).mode
-    stamps, offset, windows = memory.stamps, memory.clock[OFFSET], 0
-    first = part[codes.PART_FIRST]
-    for d in range(first, part[codes.PART_END] - 1):
+    stamps, offset = memory.stamps, memory.clock[OFFSET]
+    first, end = part[codes.PART_FIRST], part[codes.PART_END]
+    for d in range(first, end if runs_root(part, nodes[end - 1]) else end - 1):
         place, node, spans = d - first, nodes[d], scratch.spans[d - first]
         code, begin = node[codes.NODE_CODE], scratch.begins[place]
         if code == codes.LITERAL:
             _enter_span(spans, 0, offset, since, IN_COLUMN, -1, -1, -1)
             _enter_span(spans, 1, since, last + 1, IN_ROWS, -1, -1, -1)
             scratch.span_counts[place] = 2
-            scratch.corner_bits[place] = 0
             continue
         _enter_span(spans, 0, offset, begin, IN_COLUMN, -1, -1, -1)
-        a, b = node[codes.NODE_A], node[codes.NODE_B]
-        one, ones, bits = scratch.spans[a], scratch.span_counts[a], scratch.corner_bits[a]
-        count = -1
-        if code in (codes.PART_AND, codes.PART_OR):
+        a, b = max(node[codes.NODE_A], 0), node[codes.NODE_B]
+        one, ones = scratch.spans[a], scratch.span_counts[a]
+        if code in codes.BINARY_NODES:
             two, twos = scratch.spans[b], scratch.span_counts[b]
-            count = _joined_spans(begin, last, one, ones, two, twos, spans)
-            bits |= scratch.corner_bits[b]
-        elif windows < CORNER_BITS:
+            own = -1 if code in (codes.PART_AND, codes.PART_OR) else place
+            ones = ones if node[codes.NODE_A] >= 0 else 0
+            count = _joined_spans(own, begin, last, one, ones, two, twos, spans)
+        elif code == codes.SHIFT:
+            count = _shift_spans(node, stamps, offset, since, last, begin, one, ones, spans, scratch.cuts)
+        else:
             count = _window_spans(
-                node, place, windows, is_decided(node, mode) and code in codes.AHEAD_OF, stamps, offset,
+                node, place, is_decided(node, mode) and code in codes.AHEAD_OF, stamps, offset,
                 since, last, begin, one, ones, spans, scratch.cuts,
             )  # fmt: skip
-            scratch.bit_of[place] = windows
-            for k in range(1, count):
-                if spans[k, ROWS_FROM + windows] >= 0:
-                    bits |= 1 << windows
-            windows += 1
         if count < 0:
             return 0
         scratch.span_counts[place] = count
-        scratch.corner_bits[place] = bits
     return 1
 
 
@@ -402,105 +469,158 @@ def _join_right(
         target[k] = either(is_greatest, target[k], value)
 
 
+@uncounted
+def _source(spans: Integers, span: int, span_above: Integers, corner: int) -> int:
+    """Return the corner of an operand's table that one of a span above it looks at; -1 for its column."""
+    return _corner_below(span_above, corner, spans[span]) if spans[span, KIND] == IN_TABLE else -1
+
+
+@uncounted
+def _run_corner(
+    is_strong: bool, is_ahead: bool, has_left: bool, left: Floats, right: Floats, start: float, target: Floats
+) -> None:
+    """Run an operator without a window from one end of a span to the other."""
+    value, count = start, len(target)
+    if not has_left and is_strong:
+        for k in range(count):
+            at = count - 1 - k if is_ahead else k
+            value = max(right[at], value)
+            target[at] = value
+    elif not has_left:
+        for k in range(count):
+            at = count - 1 - k if is_ahead else k
+            value = min(right[at], value)
+            target[at] = value
+    elif is_strong:
+        for k in range(count):
+            at = count - 1 - k if is_ahead else k
+            value = max(right[at], min(left[at], value))
+            target[at] = value
+    else:
+        for k in range(count):
+            at = count - 1 - k if is_ahead else k
+            value = min(right[at], max(left[at], value))
+            target[at] = value
+
+
+@uncounted
+def _look_up(source: Floats, base: int, starts: Integers, target: Floats) -> None:
+    for k in range(len(target)):
+        target[k] = source[starts[k] - base]
+
+
 @apart
 def fill_tables(table_at: int, number: int, which: int, channels: int, since: int, last: int) -> int:
     """Compute what all nodes of a part are at the corners, in spans with tables, and over these spans."""
+    tables, memory, scratch, _ = arrays_at(table_at)
+    part, nodes, first = tables.parts[number], tables.nodes, tables.parts[number, codes.PART_FIRST]
+    has_root = runs_root(part, nodes[part[codes.PART_END] - 1])
+    for d in range(first, part[codes.PART_END]):
+        code, place = nodes[d, codes.NODE_CODE], d - first
+        if code in codes.BINARY_NODES and (has_root or d < part[codes.PART_END] - 1):
+            for k in range(1, scratch.span_counts[place]):
+                if scratch.spans[place, k, KIND] == IN_TABLE:
+                    _fill_joined(table_at, number, d, k, which, channels)
+        elif code != codes.LITERAL:
+            _fill_window(table_at, number, d, which, channels, last)
+    return 0
+
+
+@apart
+def _fill_joined(table_at: int, number: int, d: int, k: int, which: int, channels: int) -> int:
+    """Compute a node with two operands at the corners of one of its spans."""
+    tables, memory, scratch, _ = arrays_at(table_at)
+    nodes, first, offset = tables.nodes, tables.parts[number, codes.PART_FIRST], memory.clock[OFFSET]
+    columns = memory.columns[columns_number(which)]
+    history, lowest = memory.history[look_of(which, channels).channel], scratch.block[BLOCK_LOWEST]
+    node, span = nodes[d], scratch.spans[d - first, k]
+    code, a, b = node[codes.NODE_CODE], max(node[codes.NODE_A], 0), node[codes.NODE_B]
+    signal, other = signal_of(nodes, first + a), signal_of(nodes, first + b)
+    of_one = columns[first + a] if signal < 0 else history[signal]
+    of_two = columns[first + b] if other < 0 else history[other]
+    begin, end, has_left = span[BEGIN], span[END], node[codes.NODE_A] >= 0
+    is_strong = code in (codes.PART_OR, codes.UNTIL, codes.PAST_SINCE)
+    for corner in range(corners_of(span)):
+        at_one = _source(scratch.spans[a], span[LEFT], span, corner) if has_left else -1
+        at_two = _source(scratch.spans[b], span[RIGHT], span, corner)
+        one = scratch.corner_columns[a, max(at_one, 0)] if at_one >= 0 else of_one
+        two = scratch.corner_columns[b, max(at_two, 0)] if at_two >= 0 else of_two
+        base, base_of_two = lowest if at_one >= 0 else offset, lowest if at_two >= 0 else offset
+        target = scratch.corner_columns[d - first, corner, begin - lowest : end - lowest]
+        left, right = one[begin - base : end - base], two[begin - base_of_two : end - base_of_two]
+        if code in (codes.PART_AND, codes.PART_OR):
+            join(is_strong, left, right, target)
+        else:
+            start = np.inf if corner & 1 else -np.inf
+            is_ahead = code in (codes.UNTIL, codes.RELEASE)
+            _run_corner(is_strong, is_ahead, has_left, left, right, start, target)
+    return 0
+
+
+@apart
+def _fill_window(table_at: int, number: int, d: int, which: int, channels: int, last: int) -> int:
+    """Compute a window or shift at the corners of its spans, and what a window, or root, holds of whole spans."""
     tables, memory, scratch, _ = arrays_at(table_at)
     nodes, part, look = tables.nodes, tables.parts[number], look_of(which, channels)
     columns, history = memory.columns[columns_number(which)], memory.history[look.channel]
     recent, offset, first = recent_of(memory, scratch), memory.clock[OFFSET], part[codes.PART_FIRST]
     lowest, starts, afters = scratch.block[BLOCK_LOWEST], scratch.ends[0], scratch.ends[1]
-    for d in range(first, part[codes.PART_END]):
-        place, node = d - first, nodes[d]
-        code, is_root = node[codes.NODE_CODE], d == part[codes.PART_END] - 1
-        if code == codes.LITERAL:
+    place, node, is_root = d - first, nodes[d], d == part[codes.PART_END] - 1
+    code, a = node[codes.NODE_CODE], node[codes.NODE_B] if is_root else node[codes.NODE_A]
+    is_greatest = code in (codes.PART_WINDOW_MAX, codes.PAST_WINDOW_MAX, codes.UNTIL)
+    signal, one = signal_of(nodes, first + a), scratch.spans[a]
+    column = columns[first + a] if signal < 0 else history[signal]
+    for k in range(1, scratch.span_counts[a] if code != codes.SHIFT else 1):
+        if one[k, KIND] != IN_TABLE:
             continue
-        a, b = node[codes.NODE_B] if is_root else node[codes.NODE_A], node[codes.NODE_B]
-        is_greatest = code in (codes.PART_OR, codes.PART_WINDOW_MAX, codes.PAST_WINDOW_MAX, codes.UNTIL)
-        signal = signal_of(nodes, first + a)
-        column = columns[first + a] if signal < 0 else history[signal]
-        one, used = scratch.spans[a], scratch.corner_bits[a]
-        if code in (codes.PART_AND, codes.PART_OR):
-            other_signal = signal_of(nodes, first + b)
-            other = columns[first + b] if other_signal < 0 else history[other_signal]
-            two, used_by_two = scratch.spans[b], scratch.corner_bits[b]
-            for k in range(1, scratch.span_counts[place]):
-                span = scratch.spans[place, k]
-                if span[KIND] != IN_TABLE:
-                    continue
-                begin, end = span[BEGIN], span[END]
-                for corner in range(1 << CORNER_BITS):
-                    if corner & ~scratch.corner_bits[place]:
-                        continue
-                    target = scratch.corner_columns[place, corner, begin - lowest : end - lowest]
-                    source, base = column, offset
-                    if one[span[LEFT], KIND] == IN_TABLE:
-                        source, base = scratch.corner_columns[a, corner & used], lowest
-                    second, base_of_second = other, offset
-                    if two[span[RIGHT], KIND] == IN_TABLE:
-                        second, base_of_second = scratch.corner_columns[b, corner & used_by_two], lowest
-                    join(
-                        is_greatest,
-                        source[begin - base : end - base],
-                        second[begin - base_of_second : end - base_of_second],
-                        target,
-                    )
+        for corner in range(corners_of(one[k])):
+            source = scratch.corner_columns[a, corner, one[k, BEGIN] - lowest : one[k, END] - lowest]
+            scratch.sums[place, k, corner] = extremum(is_greatest, source, -np.inf if is_greatest else np.inf)
+    if is_root:
+        return 0
+    value = beyond(look.mode, node[codes.NODE_WEAK])
+    for k in range(1, scratch.span_counts[place]):
+        span = scratch.spans[place, k]
+        begin, end, left, right = span[BEGIN], span[END], span[LEFT], span[RIGHT]
+        if left < 0:
+            if span[KIND] == IN_TABLE:
+                fill(scratch.corner_columns[place, 0, begin - lowest : end - lowest], value)
             continue
-        # what a window, or the root, holds of its operand's spans
-        for k in range(1, scratch.span_counts[a]):
-            if one[k, KIND] != IN_TABLE:
-                continue
-            for corner in range(1 << CORNER_BITS):
-                if not corner & ~used:
-                    source = scratch.corner_columns[a, corner, one[k, BEGIN] - lowest : one[k, END] - lowest]
-                    nothing = -np.inf if is_greatest else np.inf
-                    scratch.sums[place, k, corner] = extremum(is_greatest, source, nothing)
-        if is_root:
+        has_left = one[left, KIND] != IN_ROWS
+        has_right = right != THROUGH and right != left and one[right, KIND] != IN_ROWS
+        if not has_left and not has_right:
             continue
-        value, bit = beyond(look.mode, node[codes.NODE_WEAK]), 1 << scratch.bit_of[place]
-        own = scratch.corner_bits[place]
-        for k in range(1, scratch.span_counts[place]):
-            span = scratch.spans[place, k]
-            begin, end, left, right = span[BEGIN], span[END], span[LEFT], span[RIGHT]
-            if left < 0:
-                for corner in range(1 << CORNER_BITS):
-                    if not corner & ~own:
-                        fill(scratch.corner_columns[place, corner, begin - lowest : end - lowest], value)
+        ends_between(node, recent, begin, end, offset, last, starts, afters)
+        steps, is_counted = end - 1 - begin, node[codes.NODE_UNIT] == codes.SAMPLES
+        is_at_once = code in codes.AHEAD_OF and node[codes.NODE_LOW] == 0
+        starts_evenly = (is_counted or is_at_once) and starts[steps] - starts[0] == steps
+        ends_evenly = is_counted and afters[steps] - afters[0] == steps
+        # of a span with rows of its own, what stands in tables is joined with these
+        has_row = span[KIND] == IN_TABLE and span[ROW] >= 0
+        for corner in range(0, corners_of(span), 2 if has_row else 1):
+            target = scratch.corner_columns[place, corner, begin - lowest : end - lowest]
+            at = _source(one, left, span, corner)
+            source, base = (
+                scratch.corner_columns[a, max(at, 0)] if at >= 0 else column,
+                lowest if at >= 0 else offset,
+            )
+            if code == codes.SHIFT:
+                _look_up(source, base, starts, target)
                 continue
-            has_left = one[left, KIND] != IN_ROWS
-            has_right = right != THROUGH and right != left and one[right, KIND] != IN_ROWS
-            if not has_left and not has_right:
-                continue
-            ends_between(node, recent, begin, end, offset, last, starts, afters)
-            steps, is_counted = end - 1 - begin, node[codes.NODE_UNIT] == codes.SAMPLES
-            is_at_once = code in codes.AHEAD_OF and node[codes.NODE_LOW] == 0
-            starts_evenly = (is_counted or is_at_once) and starts[steps] - starts[0] == steps
-            ends_evenly = is_counted and afters[steps] - afters[0] == steps
-            for corner in range(1 << CORNER_BITS):
-                if corner & ~(own | used) or corner & bit:
-                    continue
-                target = scratch.corner_columns[place, corner, begin - lowest : end - lowest]
-                source, base = column, offset
-                if has_left:
-                    if one[left, KIND] == IN_TABLE:
-                        source, base = scratch.corner_columns[a, corner & used], lowest
-                    if left == right:
-                        _slide(is_greatest, source, base, starts, afters, target)
-                    else:
-                        _join_left(is_greatest, source, base, starts, starts_evenly, one[left, END], target)
-                else:
-                    fill(target, -np.inf if is_greatest else np.inf)
-                if has_right:
-                    source, base = column, offset
-                    if one[right, KIND] == IN_TABLE:
-                        source, base = scratch.corner_columns[a, corner & used], lowest
-                    first_of_right = one[right, BEGIN]
-                    _join_right(is_greatest, source, base, first_of_right, afters, ends_evenly, target)
-                if not own & bit:
-                    continue
-                beside = scratch.corner_columns[place, corner | bit, begin - lowest : end - lowest]
+            if not has_left:
+                fill(target, -np.inf if is_greatest else np.inf)
+            elif left == right:
+                _slide(is_greatest, source, base, starts, afters, target)
+            else:
+                _join_left(is_greatest, source, base, starts, starts_evenly, one[left, END], target)
+            if has_right:
+                at = _source(one, right, span, corner)
+                source = scratch.corner_columns[a, max(at, 0)] if at >= 0 else column
+                base, first_of_right = lowest if at >= 0 else offset, one[right, BEGIN]
+                _join_right(is_greatest, source, base, first_of_right, afters, ends_evenly, target)
+            if has_row:
+                beside = scratch.corner_columns[place, corner + 1, begin - lowest : end - lowest]
                 copy(target, beside)
-                if span[ROWS_FROM + scratch.bit_of[place]] >= 0:
-                    # where the row between is as great as can be, say, it outdoes the rest
-                    fill(beside if is_greatest else target, np.inf if is_greatest else -np.inf)
-    return 1
+                # where the row between is as great as can be, say, it outdoes the rest
+                fill(beside if is_greatest else target, np.inf if is_greatest else -np.inf)
+    return 0

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from spatial_replay.compiled import apart, uncounted
+from spatial_replay.compiled import apart, inlined, uncounted
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.blocks.block_ends import find_begins, is_beside_one
-from spatial_replay.monitor.online.blocks.block_run import PARTIAL, WHOLE, operand_of, set_last
+from spatial_replay.monitor.online.blocks.block_run import PARTIAL, WHOLE, operand_of, set_first, set_last
 from spatial_replay.monitor.online.blocks.span_rows import block_of, join_body_spans, run_spans
 from spatial_replay.monitor.online.blocks.spans import fill_tables, find_spans
 from spatial_replay.monitor.online.closing import absorb
-from spatial_replay.monitor.online.node_columns import columns_number, look_of, tables_end
+from spatial_replay.monitor.online.node_columns import cells_of, columns_number, look_of, tables_end
 from spatial_replay.monitor.online.open_windows import (
     has_ended,
     is_cut_short,
     is_known,
-    is_plain,
     root_window,
+    runs_root,
 )
 from spatial_replay.monitor.online.run_arrays import arrays_at
 from spatial_replay.monitor.online.sliding import beyond, copy, enter_samples, fill, recent_of
@@ -30,22 +30,35 @@ from spatial_replay.monitor.online.state import (
     LOOKS,
     OFFSET,
     POSITION,
+    Memory,
 )
 from spatial_replay.monitor.online.windows import run_part
 
+_SPANNED = (
+    codes.LITERAL, codes.PART_AND, codes.PART_OR, *codes.AHEAD_OF, *codes.PAST_WINDOWS,
+    codes.UNTIL, codes.RELEASE, codes.PAST_SINCE, codes.PAST_TRIGGER,
+)  # fmt: skip
+"""Nodes that spans are found for."""
+
 
 @uncounted
-def _takes_spans(nodes: Integers, part: Integers) -> bool:
-    """Return whether a part has nothing but windows below a root that joins all that follows."""
+def _takes_spans(nodes: Integers, part: Integers, memory: Memory, begins: Integers) -> bool:
+    """Return whether spans can be found for a part, given where the rows of its nodes begin."""
+    first, cells, tables_from = part[codes.PART_FIRST], memory.cells, cells_of(part)[2]
     root = nodes[part[codes.PART_END] - 1]
-    if not is_plain(part) or root[codes.NODE_A] >= 0:
+    if part[codes.PART_VARIABLES] == 0 or (runs_root(part, root) and cells[part[codes.PART_CELL_START]] == 0):
         return False
-    for d in range(part[codes.PART_FIRST], part[codes.PART_END] - 1):
-        code = nodes[d, codes.NODE_CODE]
-        is_window = code in (codes.PART_WINDOW_MAX, codes.PART_WINDOW_MIN) or code in codes.PAST_WINDOWS
-        if not is_window and code not in (codes.LITERAL, codes.PART_AND, codes.PART_OR):
-            return False
-    return True
+    takes = True
+    for d in range(first, part[codes.PART_END]):
+        a, b, code = nodes[d, codes.NODE_A], nodes[d, codes.NODE_B], nodes[d, codes.NODE_CODE]
+        takes = takes and code in _SPANNED
+        if takes and code in (codes.PAST_SINCE, codes.PAST_TRIGGER):
+            # what they start from must not follow what is to come
+            depends = nodes[first + b, codes.NODE_DEPENDS] or (
+                a >= 0 and nodes[first + a, codes.NODE_DEPENDS]
+            )
+            takes = not depends and begins[d - first] > cells[tables_from + nodes[d, codes.NODE_TABLE]]
+    return bool(takes)
 
 
 @apart
@@ -79,6 +92,16 @@ def _set_first_of_spans(
     return 0
 
 
+@inlined
+def _set_first(
+    table_at: int, number: int, which: int, channels: int, at: int, columns_of: int, has_root: bool
+) -> None:
+    if has_root:
+        set_first(table_at, number, which, channels, at)
+    else:
+        _set_first_of_spans(table_at, number, which, channels, at, columns_of)
+
+
 @apart
 def run_wide(table_at: int, number: int, looks: int, channels: int, at: int, count: int, tile: int) -> int:
     """Run a part with many open positions over `count` samples from number `at` of a tile on (see `spans`).
@@ -96,16 +119,17 @@ def run_wide(table_at: int, number: int, looks: int, channels: int, at: int, cou
     since = memory.clock[POSITION] + at
     last = since + count - 1
     begin, _ = root_window(root, memory, last)
-    if not _takes_spans(nodes, part) or since <= offset:
+    has_root = runs_root(part, root)
+    if since <= offset:
         return 0
     if is_beside_one(nodes, part, memory.stamps, offset, since):
         return 0  # sample by sample, the width of one window alone costs next to nothing
     if begin > memory.cells[part[codes.PART_CELL_START]] or has_ended(part, root, memory, last):
         return 0  # the root leaves out some of the spans' positions
     # as long as not looked at what the samples are, this is the same for all numbers
-    find_begins(table_at, number, 0, channels, 0, 1, last + 1, last + 1)
+    find_begins(table_at, number, 0, channels, 0, 2, last + 1, last + 1)
     lowest, is_first = find_begins(table_at, number, 0, channels, 0, 0, since, last), True
-    if last + 1 - lowest > scratch.rows.shape[1]:
+    if last + 1 - lowest > scratch.rows.shape[1] or not _takes_spans(nodes, part, memory, scratch.begins):
         return 0
     block[BLOCK_LOWEST], block[BLOCK_NEWEST], block[IS_FOLLOWED] = lowest, last, 1
     for which in range(LOOKS):
@@ -126,7 +150,7 @@ def run_wide(table_at: int, number: int, looks: int, channels: int, at: int, cou
             block[BLOCK_SINCE], block[BLOCK_LAST] = begin, end
             run_spans(table_at, number, which, channels, 1 if end == last else 0)
             k = at + begin - since
-            _set_first_of_spans(table_at, number, which, channels, k, columns_number(which))
+            _set_first(table_at, number, which, channels, k, columns_number(which), has_root)
             if which > 1:
                 continue
             if part[codes.PART_IS_REMEMBERING]:
@@ -134,7 +158,7 @@ def run_wide(table_at: int, number: int, looks: int, channels: int, at: int, cou
             for bound in (4, 5):
                 is_beside = bound - 4 == which if channels == 4 else look_of(bound, channels).channel == which
                 if is_beside and ((part[codes.PART_NUMBERS] & ~looks) >> bound) & 1:
-                    _set_first_of_spans(table_at, number, bound, channels, k, columns_number(which))
+                    _set_first(table_at, number, bound, channels, k, columns_number(which), has_root)
         memory.known[number, columns_number(which)] = memory.closed[number, columns_number(which)] = last
         memory.unjoined[number, columns_number(which)] = 0
     for k in range(at, at + count if channels < 4 else at):
