@@ -430,11 +430,12 @@ class _RowCode(_Kernel[..., None]):
             count = len([each for each in arguments if isinstance(each, np.ndarray)][-1])
             for k in reversed(range(count)) if self._backwards else range(count):
                 lanes.place = k
-                row[:] = formula(
-                    lanes, row, *(each[k] if isinstance(each, np.ndarray) else each for each in inputs)
-                )
+                here = (each[k] if isinstance(each, np.ndarray) else each for each in inputs)
+                outcome = formula(lanes, row, *here)
+                result, stored = outcome if isinstance(outcome, tuple) else (outcome, outcome)
                 if not is_last_only:
-                    arguments[-1][k] = row
+                    arguments[-1][k] = stored
+                row[:] = result
 
         return fill if is_last_only is None else loop
 

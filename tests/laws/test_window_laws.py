@@ -94,6 +94,8 @@ _far = st.one_of(
     ),
 )
 
+_far_or_never = st.one_of(_far, st.none())
+
 
 def _wide_windows(depth):
     if depth == 0:
@@ -102,15 +104,22 @@ def _wide_windows(depth):
     return st.one_of(
         *[st.builds(Temporal, st.sampled_from(["F", "G"]), st.tuples(below), _far)] * 4,
         st.builds(Temporal, st.sampled_from(["O", "H"]), st.tuples(below), _far),
-        *[st.builds(Boolean, st.sampled_from(["and", "or", "->"]), st.tuples(_literals, below))] * 2,
+        st.builds(Temporal, st.sampled_from(["U", "R", "S"]), st.tuples(_literals, below), _far_or_never),
+        st.builds(Temporal, st.sampled_from(["U", "R", "S"]), st.tuples(below, _literals), _far_or_never),
+        st.builds(Temporal, st.sampled_from(["F", "G", "O", "H"]), st.tuples(below)),
+        *[st.builds(Boolean, st.sampled_from(["and", "or", "->"]), st.tuples(_literals, below))] * 3,
         st.builds(
             Boolean, st.sampled_from(["and", "or", "<->"]), st.tuples(below, _wide_windows(min(depth - 1, 1)))
         ),
     )
 
 
-wide_windows = st.builds(Temporal, st.sampled_from(["F", "G"]), st.tuples(_wide_windows(4)))
-"""Windows of some hundred samples over each other."""
+wide_windows = st.one_of(
+    *[st.builds(Temporal, st.sampled_from(["F", "G"]), st.tuples(_wide_windows(4)))] * 4,
+    st.builds(Temporal, st.sampled_from(["U", "R", "W"]), st.tuples(_literals, _wide_windows(3))),
+    st.builds(Temporal, st.sampled_from(["U", "R", "W"]), st.tuples(_wide_windows(2), _wide_windows(2))),
+)
+"""Windows of some hundred samples over each other, and operators that never end above and below them."""
 
 _near = st.one_of(
     st.builds(

@@ -374,15 +374,12 @@ def _run_window(table_at: int, number: int, d: int, which: int, channels: int) -
     tables, memory, scratch, _ = arrays_at(table_at)
     nodes, part, look = tables.nodes, tables.parts[number], look_of(which, channels)
     columns, history = memory.columns[columns_number(which)], memory.history[look.channel]
+    root = part[codes.PART_END] - 1
+    is_root = d == root and not runs_root(part, nodes[root])
     recent, block, first = recent_of(memory, scratch), block_of(memory, scratch), part[codes.PART_FIRST]
-    newest, joints, spare, root = (
-        scratch.block[BLOCK_NEWEST],
-        scratch.joints,
-        scratch.spare,
-        part[codes.PART_END] - 1,
-    )
+    newest, joints, spare = scratch.block[BLOCK_NEWEST], scratch.joints, scratch.spare
     node, place, value = nodes[d], d - first, beyond(look.mode, nodes[d, codes.NODE_WEAK])
-    code, a = node[codes.NODE_CODE], node[codes.NODE_B] if d == root else node[codes.NODE_A]
+    code, a = node[codes.NODE_CODE], node[codes.NODE_B] if is_root else node[codes.NODE_A]
     signal, spans = signal_of(nodes, first + a), scratch.spans[place]
     is_greatest = code in (codes.PART_WINDOW_MAX, codes.PAST_WINDOW_MAX, codes.UNTIL)
     column = columns[first + a] if signal < 0 else history[signal]
@@ -394,7 +391,7 @@ def _run_window(table_at: int, number: int, d: int, which: int, channels: int) -
     operands, count, wholes = scratch.spans[a], scratch.span_counts[a], scratch.wholes[place]
     if code != codes.SHIFT:
         _fill_wholes(block, is_greatest, operand, operands, count, scratch.sums[place], joints, spare, wholes)
-    if d == root:
+    if is_root:
         return 0
     for k in range(1, scratch.span_counts[place] if code != codes.SHIFT else 1):
         left, right = spans[k, LEFT], min(spans[k, RIGHT], count)

@@ -416,6 +416,61 @@ def _slide(
 
 
 @uncounted
+def _run_back(is_greatest: bool, source: Floats, start: float, target: Floats) -> None:
+    """Enter the extremum of a number and of all numbers from each on.
+
+    Four at a time, which wait for those after them only once.
+    """
+    value, whole = start, len(target) % 4
+    for k in range(len(target) - 4, whole - 1, -4):
+        a, b, c, d = source[k], source[k + 1], source[k + 2], source[k + 3]
+        c = either(is_greatest, d, c)
+        b = either(is_greatest, c, b)
+        a = either(is_greatest, b, a)
+        target[k + 3], target[k + 2] = either(is_greatest, value, d), either(is_greatest, value, c)
+        target[k + 1] = either(is_greatest, value, b)
+        value = either(is_greatest, value, a)
+        target[k] = value
+    for k in range(whole - 1, -1, -1):
+        value = either(is_greatest, value, source[k])
+        target[k] = value
+
+
+@uncounted
+def _run_on(is_greatest: bool, source: Floats, start: float, target: Floats) -> None:
+    """Enter the extremum of a number and of all numbers up to each (see `_run_back`)."""
+    value, whole = start, len(target) - len(target) % 4
+    for k in range(0, whole, 4):
+        a, b, c, d = source[k], source[k + 1], source[k + 2], source[k + 3]
+        b = either(is_greatest, a, b)
+        c = either(is_greatest, b, c)
+        d = either(is_greatest, c, d)
+        target[k], target[k + 1] = either(is_greatest, value, a), either(is_greatest, value, b)
+        target[k + 2] = either(is_greatest, value, c)
+        value = either(is_greatest, value, d)
+        target[k + 3] = value
+    for k in range(whole, len(target)):
+        value = either(is_greatest, value, source[k])
+        target[k] = value
+
+
+@uncounted
+def _run_left(is_strong: bool, left: Floats, right: Floats, start: float, target: Floats) -> None:
+    """Run an operator with a left operand back from what it is after the last position (see `_run_back`)."""
+    value, whole = start, len(target) % 2
+    for k in range(len(target) - 2, whole - 1, -2):
+        # what two positions are together waits once for those after them
+        both = either(is_strong, right[k], either(not is_strong, left[k], right[k + 1]))
+        held = either(not is_strong, left[k], left[k + 1])
+        target[k + 1] = either(is_strong, right[k + 1], either(not is_strong, left[k + 1], value))
+        value = either(is_strong, both, either(not is_strong, held, value))
+        target[k] = value
+    for k in range(whole - 1, -1, -1):
+        value = either(is_strong, right[k], either(not is_strong, left[k], value))
+        target[k] = value
+
+
+@uncounted
 def _join_left(
     is_greatest: bool, source: Floats, base: int, starts: Integers, is_even: bool, end: int, target: Floats
 ) -> None:
@@ -429,13 +484,9 @@ def _join_left(
     if is_even:
         stretch = source[starts[0] - base : starts[0] - base + count]
         if is_greatest:
-            for k in range(count - 1, -1, -1):
-                value = max(value, stretch[k])
-                target[k] = value
+            _run_back(True, stretch, value, target)
         else:
-            for k in range(count - 1, -1, -1):
-                value = min(value, stretch[k])
-                target[k] = value
+            _run_back(False, stretch, value, target)
         return
     for k in range(count - 1, -1, -1):
         while at > starts[k]:
@@ -446,21 +497,19 @@ def _join_left(
 
 @uncounted
 def _join_right(
-    is_greatest: bool, source: Floats, base: int, begin: int, afters: Integers, is_even: bool, target: Floats
-) -> None:
+    is_greatest: bool, source: Floats, base: int, begin: int, afters: Integers, is_even: bool,
+    spare: Floats, target: Floats,
+) -> None:  # fmt: skip
     """Join numbers with the extrema from `begin` to where windows end (see `_join_left`)."""
     at, count = afters[0], len(target)
     value = extremum(is_greatest, source[begin - base : at - base], -np.inf if is_greatest else np.inf)
     if is_even:
         stretch = source[at - 1 - base : at - 1 - base + count]
         if is_greatest:
-            for k in range(count):
-                value = max(value, stretch[k])
-                target[k] = max(target[k], value)
+            _run_on(True, stretch, value, spare[:count])
         else:
-            for k in range(count):
-                value = min(value, stretch[k])
-                target[k] = min(target[k], value)
+            _run_on(False, stretch, value, spare[:count])
+        join(is_greatest, target, spare[:count], target)
         return
     for k in range(count):
         while at < afters[k]:
@@ -480,27 +529,26 @@ def _run_corner(
     is_strong: bool, is_ahead: bool, has_left: bool, left: Floats, right: Floats, start: float, target: Floats
 ) -> None:
     """Run an operator without a window from one end of a span to the other."""
-    value, count = start, len(target)
-    if not has_left and is_strong:
-        for k in range(count):
-            at = count - 1 - k if is_ahead else k
-            value = max(right[at], value)
-            target[at] = value
+    if not has_left and is_ahead:
+        if is_strong:
+            _run_back(True, right, start, target)
+        else:
+            _run_back(False, right, start, target)
     elif not has_left:
-        for k in range(count):
-            at = count - 1 - k if is_ahead else k
-            value = min(right[at], value)
-            target[at] = value
-    elif is_strong:
-        for k in range(count):
-            at = count - 1 - k if is_ahead else k
-            value = max(right[at], min(left[at], value))
-            target[at] = value
+        if is_strong:
+            _run_on(True, right, start, target)
+        else:
+            _run_on(False, right, start, target)
+    elif is_ahead:
+        if is_strong:
+            _run_left(True, left, right, start, target)
+        else:
+            _run_left(False, left, right, start, target)
     else:
-        for k in range(count):
-            at = count - 1 - k if is_ahead else k
-            value = min(right[at], max(left[at], value))
-            target[at] = value
+        value = start
+        for k in range(len(target)):
+            value = either(is_strong, right[k], either(not is_strong, left[k], value))
+            target[k] = value
 
 
 @uncounted
@@ -512,7 +560,7 @@ def _look_up(source: Floats, base: int, starts: Integers, target: Floats) -> Non
 @apart
 def fill_tables(table_at: int, number: int, which: int, channels: int, since: int, last: int) -> int:
     """Compute what all nodes of a part are at the corners, in spans with tables, and over these spans."""
-    tables, memory, scratch, _ = arrays_at(table_at)
+    tables, _, scratch, _ = arrays_at(table_at)
     part, nodes, first = tables.parts[number], tables.nodes, tables.parts[number, codes.PART_FIRST]
     has_root = runs_root(part, nodes[part[codes.PART_END] - 1])
     for d in range(first, part[codes.PART_END]):
@@ -559,13 +607,15 @@ def _fill_joined(table_at: int, number: int, d: int, k: int, which: int, channel
 
 @apart
 def _fill_window(table_at: int, number: int, d: int, which: int, channels: int, last: int) -> int:
-    """Compute a window or shift at the corners of its spans, and what a window, or root, holds of whole spans."""
+    """Compute a window or shift at the corners of its spans, and what it, or the root, holds of each."""
     tables, memory, scratch, _ = arrays_at(table_at)
     nodes, part, look = tables.nodes, tables.parts[number], look_of(which, channels)
     columns, history = memory.columns[columns_number(which)], memory.history[look.channel]
     recent, offset, first = recent_of(memory, scratch), memory.clock[OFFSET], part[codes.PART_FIRST]
     lowest, starts, afters = scratch.block[BLOCK_LOWEST], scratch.ends[0], scratch.ends[1]
-    place, node, is_root = d - first, nodes[d], d == part[codes.PART_END] - 1
+    spare = scratch.extrema[0]
+    place, node, root = d - first, nodes[d], part[codes.PART_END] - 1
+    is_root = d == root and not runs_root(part, nodes[root])
     code, a = node[codes.NODE_CODE], node[codes.NODE_B] if is_root else node[codes.NODE_A]
     is_greatest = code in (codes.PART_WINDOW_MAX, codes.PAST_WINDOW_MAX, codes.UNTIL)
     signal, one = signal_of(nodes, first + a), scratch.spans[a]
@@ -617,7 +667,7 @@ def _fill_window(table_at: int, number: int, d: int, which: int, channels: int, 
                 at = _source(one, right, span, corner)
                 source = scratch.corner_columns[a, max(at, 0)] if at >= 0 else column
                 base, first_of_right = lowest if at >= 0 else offset, one[right, BEGIN]
-                _join_right(is_greatest, source, base, first_of_right, afters, ends_evenly, target)
+                _join_right(is_greatest, source, base, first_of_right, afters, ends_evenly, spare, target)
             if has_row:
                 beside = scratch.corner_columns[place, corner + 1, begin - lowest : end - lowest]
                 copy(target, beside)
