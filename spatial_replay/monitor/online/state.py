@@ -131,7 +131,7 @@ class Scratch(NamedTuple):
         series: (3, tile), what one part says in one channel.
         rows: (R, positions, BLOCK), nodes of a part at open positions, for a block of samples (see
             `blocks.node_rows`).
-        running: (2, BLOCK), a row that others are joined with, before and after.
+        running: (BLOCK,), a row that others are joined with.
         points: (16, BLOCK), a point at which a table is read, for each sample of a block.
         block: (5,), where a block of samples is (see `BLOCK_SINCE`).
         begins, next_begins: (D,), the first position of each node that has a row, in a block and in the next.
@@ -144,7 +144,7 @@ class Scratch(NamedTuple):
         sums: (D, MOST_SPANS, corners), what each of the operand's spans holds.
         wholes: (D, MOST_SPANS, BLOCK), the same as rows.
         joints: (D * MOST_SPANS, BLOCK), the rows that spans follow.
-        spare: (BLOCK,), a row.
+        spare: (2, BLOCK), rows.
         parts: (P, NUMBERS, tile), what each part says.
         nodes: (N, NUMBERS, tile), what each node of the tree says.
     """
@@ -243,7 +243,7 @@ def scratch_for(program: Program, room: int, tile: int) -> Scratch:
         ends=np.zeros((2, open_room), np.int64),
         series=np.zeros((3, tile)),
         rows=_aligned((program.rows, positions, BLOCK)),
-        running=_aligned((2, BLOCK)),
+        running=_aligned((BLOCK,)),
         points=np.zeros((16, BLOCK)),
         block=np.zeros(5, np.int64),
         begins=begins,
@@ -252,12 +252,13 @@ def scratch_for(program: Program, room: int, tile: int) -> Scratch:
         spans=np.zeros((wide, MOST_SPANS, 6 + CORNER_BITS), np.int64),
         span_counts=np.zeros(wide, np.int64),
         cuts=np.zeros(2 * MOST_SPANS, np.int64),
-        corner_columns=np.zeros((wide, corners, positions)),
+        # corners of one position in places of the processor's cache that do not exclude each other
+        corner_columns=np.zeros((wide, corners, positions + 40)),
         corner=np.zeros(corners),
         sums=np.zeros((wide, MOST_SPANS, corners)),
         wholes=_aligned((wide, MOST_SPANS, BLOCK)),
         joints=_aligned((wide * MOST_SPANS, BLOCK)),
-        spare=_aligned((BLOCK,)),
+        spare=_aligned((2, BLOCK)),
         parts=np.zeros((len(program.parts), NUMBERS, tile)),
         nodes=np.zeros((len(program.reports), NUMBERS, tile)),
     )

@@ -107,7 +107,7 @@ def _run_node(table_at: int, number: int, d: int, which: int, channels: int) -> 
     elif code in codes.BINARY_NODES:
         is_strong, is_ahead, fresh = code in (codes.UNTIL, codes.PAST_SINCE), code not in codes.PAST, begin
         if is_ahead:
-            fill_row(value, block.running[0])
+            fill_row(value, block.running)
         else:
             channel = look.channel
             begin = _start_since(node, part, block, columns[d], memory, scratch, channel, begin, target)
@@ -143,12 +143,12 @@ def _start_since(
     node: Integers, part: Integers, block: SampleBlock, column: Floats, memory: Memory, scratch: Scratch,
     channel: int, begin: int, target: Floats,
 ) -> int:  # fmt: skip
-    """Put what a since or trigger is before its first rows into the first running row.
+    """Put what a since or trigger is before its first rows into the running row.
 
     Returns:
         The position of its first row: `begin`, or that of what it starts from, if that differs.
     """
-    running, offset = block.running[0], block.offset
+    running, offset = block.running, block.offset
     start = memory.cells[cells_of(part)[2] + node[codes.NODE_TABLE]]
     tables = memory.tables[channel, part[codes.PART_TABLE_START] : tables_end(part)]
     differs = begin <= start
@@ -171,16 +171,13 @@ def _start_since(
 def _join_body(
     nodes: Integers, part: Integers, block: SampleBlock, body: NodeRows, base: int, after: int,
     start: float, is_cut: bool, recent: Recent, closing: Integers,
-) -> int:  # fmt: skip
-    """Join what the root of a part joins, from its base on, with a number.
+) -> None:  # fmt: skip
+    """Fill the running row with what the root of a part joins, from its base on, and a number.
 
     Args:
         after: what comes after the last position.
         is_cut: whether only what comes before the first open window that cuts the bound short.
         closing: room to work in.
-
-    Returns:
-        In which of the running rows the numbers are, one for each sample.
     """
     is_until, offset = nodes[part[codes.PART_END] - 1, codes.NODE_CODE] == codes.UNTIL, block.offset
     settled, cuts = max(body.begin, base), 0
@@ -194,19 +191,18 @@ def _join_body(
             find_closing(nodes[d], block, recent, settled, cuts == 0, closing)
             cuts += 1
     known = max(min(settled, after), base)
-    fill_row(extremum(is_until, body.column[base - offset : known - offset], start), block.running[0])
+    fill_row(extremum(is_until, body.column[base - offset : known - offset], start), block.running)
     whole = settled
     while body.begin <= whole < min(block.since + 1, after) and not (cuts and closing[whole - settled] > 0):
         whole += 1
-    current = join_positions(block, is_until, body, settled, whole, 0)
+    join_positions(block, is_until, body, settled, whole)
     for position in range(whole, after):
         begin = position - block.since
         if cuts:
             begin = max(begin, closing[position - settled])
             if begin > block.last - block.since:
                 break  # no window closes before the ones before it do
-        current = enter(is_until, block, body, position, begin, current)
-    return current
+        enter(is_until, block, body, position, begin)
 
 
 @uncounted
@@ -238,8 +234,8 @@ def set_first(table_at: int, number: int, which: int, channels: int, at: int) ->
         variables, points = part[codes.PART_VARIABLES], scratch.points
         _read_points(variables, table[: 1 << variables], count, points, scratch.point, scratch.order, numbers)
     elif not is_plain(part):
-        take_row(block, operand, 0, missing, block.running[0])
-        copy(block.running[0], numbers)
+        take_row(block, operand, 0, missing, block.running)
+        copy(block.running, numbers)
     elif is_known(which, part, root, memory, block.since):
         fill(numbers, missing)
     elif root[codes.NODE_A] >= 0:
@@ -248,8 +244,8 @@ def set_first(table_at: int, number: int, which: int, channels: int, at: int) ->
         recent, closing = recent_of(memory, scratch), scratch.closing
         begin, after = root_window(root, memory, block.last)
         begin = max(begin, base)
-        current = _join_body(nodes, part, block, operand, begin, after, missing, is_cut, recent, closing)
-        copy(block.running[current], numbers)
+        _join_body(nodes, part, block, operand, begin, after, missing, is_cut, recent, closing)
+        copy(block.running, numbers)
     if is_plain(part) and base > 0:
         for k in range(count):
             numbers[k] = max(table[0], min(numbers[k], table[1]))

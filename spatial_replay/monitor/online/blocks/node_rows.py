@@ -53,7 +53,7 @@ class SampleBlock(NamedTuple):
     """Some neighbouring samples, and room to work in.
 
     Attributes:
-        running: (2, BLOCK), the rows that are joined one by one take turns.
+        running: (BLOCK,), the row that others are joined with, one by one.
         starts, afters: (room,), where windows start, and what comes after them (see `find_ends`).
         before: (2 * room,), what windows hold before some position.
         since, last: the first and the last sample.
@@ -86,41 +86,27 @@ class NodeRows(NamedTuple):
 
 
 @inlined
-def enter(
-    is_greatest: bool, block: SampleBlock, operand: NodeRows, position: int, begin: int, current: int
-) -> int:
-    """Join the running row with the numbers at a position, for the samples from `begin` on.
-
-    Returns:
-        Which of the two running rows it is now; `current` before.
-    """
-    running, target = block.running[current], block.running[1 - current]
+def enter(is_greatest: bool, block: SampleBlock, operand: NodeRows, position: int, begin: int) -> None:
+    """Join the running row with the numbers at a position, for the samples from `begin` on."""
+    running = block.running
     if position < operand.begin:
         number = operand.column[position - block.offset]
         if begin <= 0:
-            join_number(is_greatest, running, number, target)
+            join_number(is_greatest, running, number, running)
         else:
-            join_number_from(is_greatest, running, number, target, begin)
+            join_number_from(is_greatest, running, number, running, begin)
     else:
         row = operand.rows[position - block.lowest]
         if begin <= 0:
-            join_rows(is_greatest, running, row, target)
+            join_rows(is_greatest, running, row, running)
         else:
-            join_rows_from(is_greatest, running, row, target, begin)
-    return 1 - current
+            join_rows_from(is_greatest, running, row, running, begin)
 
 
 @uncounted
-def join_positions(
-    block: SampleBlock, is_greatest: bool, operand: NodeRows, begin: int, end: int, current: int
-) -> int:
-    """Join the running row with the numbers at begin … end - 1, for the samples that have come by then.
-
-    Returns:
-        Which of the two running rows it is now; `current` before.
-    """
-    running = block.running[current]
-    whole = max(min(end, block.since + 1), begin)
+def join_positions(block: SampleBlock, is_greatest: bool, operand: NodeRows, begin: int, end: int) -> None:
+    """Join the running row with the numbers at begin … end - 1, for the samples that have come by then."""
+    running, whole = block.running, max(min(end, block.since + 1), begin)
     rows_from = max(min(operand.begin, whole), begin)
     numbers = operand.column[begin - block.offset : rows_from - block.offset]
     rows = operand.rows[rows_from - block.lowest : whole - block.lowest]
@@ -133,8 +119,7 @@ def join_positions(
     else:
         join_lesser(running, rows)
     for position in range(whole, end):
-        current = enter(is_greatest, block, operand, position, position - block.since, current)
-    return current
+        enter(is_greatest, block, operand, position, position - block.since)
 
 
 @uncounted
@@ -148,7 +133,7 @@ def join_operands_rows(
         for change in (one.begin, two.begin):
             until = change if begin < change < until else until
         at, after, offset = begin - block.lowest, until - block.lowest, block.lowest - block.offset
-        rows, spare = target[at:after], block.running[0]
+        rows, spare = target[at:after], block.running
         if begin < one.begin and begin < two.begin:
             first, second = one.column[at + offset : after + offset], two.column[at + offset : after + offset]
             if is_greatest:
@@ -212,15 +197,15 @@ def window_rows(
                     at -= 1
                     value = either(is_greatest, value, operand.column[at - block.offset])
                 block.before[k] = value
-            fill_row(nothing, block.running[0])
+            fill_row(nothing, block.running)
             ends, numbers = afters[first : first + count], block.before[first:]
             join_after(block, is_greatest, operand, middle, ends, numbers, rows)
         else:
-            fill_row(nothing, block.running[0])
+            fill_row(nothing, block.running)
             begins = starts[first : first + count]
             join_before(block, is_greatest, operand, middle, begins, target, position)
             if middle < afters[until - 1 - begin]:
-                fill_row(nothing, block.running[0])
+                fill_row(nothing, block.running)
                 ends = afters[first : first + count]
                 join_after(block, is_greatest, operand, middle, ends, rows, rows)
         position = until
@@ -230,8 +215,8 @@ def window_rows(
 def _run_back(
     block: SampleBlock, is_greatest: bool, operand: NodeRows, begin: int, end: int, target: Floats
 ) -> None:
-    """Join the first running row with end - 1 … begin, one after the other, and store it after each."""
-    running, since, offset, lowest = block.running[0], block.since, block.offset, block.lowest
+    """Join the running row with end - 1 … begin, one after the other, and store it after each."""
+    running, since, offset, lowest = block.running, block.since, block.offset, block.lowest
     rows_from, cut = max(min(operand.begin, end), begin), max(min(since + 1, end), begin)
     at = max(rows_from, cut)
     rows, part = operand.rows[at - lowest : end - lowest], target[at - begin : end - begin]
@@ -275,12 +260,10 @@ def join_before(
         if start >= at:
             while first > 0 and starts[first - 1] >= at:
                 first -= 1
-            repeat(block.running[0], target[begin + first - block.lowest : rows_end])
+            repeat(block.running, target[begin + first - block.lowest : rows_end])
         else:
             if start + 1 < at:
-                current = join_positions(block, is_greatest, operand, start + 1, at, 0)
-                if current:
-                    fill_row(block.running[current], block.running[0])
+                join_positions(block, is_greatest, operand, start + 1, at)
             while first > 0 and starts[first - 1] == starts[first] - 1:
                 first -= 1
             at = starts[first]
@@ -299,12 +282,12 @@ def _extend(
     before: Any,
     target: Floats,
 ) -> None:
-    """Join the first running row with begin … end - 1, one after the other; store it, joined, after each.
+    """Join the running row with begin … end - 1, one after the other; store it, joined, after each.
 
     Args:
         before: (end - begin,) or (end - begin, BLOCK), what it is joined with.
     """
-    running, since, offset, lowest = block.running[0], block.since, block.offset, block.lowest
+    running, since, offset, lowest = block.running, block.since, block.offset, block.lowest
     rows_from, cut = max(min(operand.begin, end), begin), max(min(since + 1, end), begin)
     at = min(rows_from, cut)
     numbers, part, joined = (
@@ -358,14 +341,12 @@ def join_after(
             while until < count and afters[until] <= at:
                 until += 1
             if is_greatest:
-                repeat_greater(block.running[0], before[k:until], target[k:until])
+                repeat_greater(block.running, before[k:until], target[k:until])
             else:
-                repeat_lesser(block.running[0], before[k:until], target[k:until])
+                repeat_lesser(block.running, before[k:until], target[k:until])
         else:
             if at < after - 1:
-                current = join_positions(block, is_greatest, operand, at, after - 1, 0)
-                if current:
-                    fill_row(block.running[current], block.running[0])
+                join_positions(block, is_greatest, operand, at, after - 1)
             while until < count and afters[until] == afters[until - 1] + 1:
                 until += 1
             at = afters[until - 1]
@@ -376,14 +357,13 @@ def join_after(
 @inlined
 def _step(
     block: SampleBlock, is_strong: bool, has_left: bool, one: NodeRows, two: NodeRows, target: Floats,
-    position: int, current: int,
-) -> int:  # fmt: skip
-    """Compute an unbounded operator at one position from the running row; return which that is then."""
+    position: int,
+) -> None:  # fmt: skip
+    """Compute an unbounded operator at one position from the running row."""
     if has_left:
-        current = enter(not is_strong, block, one, position, position - block.since, current)
-    current = enter(is_strong, block, two, position, position - block.since, current)
-    fill_row(block.running[current], target[position - block.lowest])
-    return current
+        enter(not is_strong, block, one, position, position - block.since)
+    enter(is_strong, block, two, position, position - block.since)
+    fill_row(block.running, target[position - block.lowest])
 
 
 @inlined
@@ -412,15 +392,15 @@ def recurrent_rows(
         target: receives the rows; may be those of an operand.
         is_ahead: whether it is an until or a release.
 
-    The first running row is what the operator is at `end`, or before `begin`, and then what it is at the last
+    The running row is what the operator is at `end`, or before `begin`, and then what it is at the last
     position that is computed.
     """
     since, lowest, offset = block.since, block.lowest, block.offset
-    current, whole = 0, min(max(since + 1, begin), end)
+    whole = min(max(since + 1, begin), end)
     if is_ahead:
         for position in range(end - 1, whole - 1, -1):
-            current = _step(block, is_strong, has_left, one, two, target, position, current)
-    running, stop = block.running[current], whole
+            _step(block, is_strong, has_left, one, two, target, position)
+    running, stop = block.running, whole
     if begin < whole and not has_left:
         rows_from = max(min(two.begin, stop), begin)
         rows, numbers = (
@@ -468,9 +448,7 @@ def recurrent_rows(
                 _run_unbounded(is_strong, is_ahead, running, of_left, of_right, target[at:after])
     if not is_ahead:
         for position in range(whole, end):
-            current = _step(block, is_strong, has_left, one, two, target, position, current)
-    if current:
-        fill_row(block.running[1], block.running[0])
+            _step(block, is_strong, has_left, one, two, target, position)
 
 
 @inlined

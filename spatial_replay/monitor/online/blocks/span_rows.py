@@ -25,6 +25,7 @@ from spatial_replay.monitor.online.blocks.node_rows import (
     window_rows,
 )
 from spatial_replay.monitor.online.blocks.row_loops import fill_row, join_number, join_rows
+from spatial_replay.monitor.online.blocks.span_tables import ends_between
 from spatial_replay.monitor.online.blocks.spans import (
     BEGIN,
     END,
@@ -38,7 +39,6 @@ from spatial_replay.monitor.online.blocks.spans import (
     ROWS_FROM,
     THROUGH,
     corners_of,
-    ends_between,
     span_at,
 )
 from spatial_replay.monitor.online.node_columns import cells_of, columns_number, look_of, signal_of
@@ -91,34 +91,34 @@ def _two_bits(lanes: Lanes, none: Any, first: Any, second: Any, both: Any, row: 
     return lanes.greater(one, lanes.lesser(other, lanes.greater(second, lanes.lesser(both, row))))
 
 
-@uncounted
-def _at_corner(span: Integers, corner: int, rows: Floats, number: float, row: Floats, target: Floats) -> None:
-    """Join a row with what a corner adds: the least of its number and of the rows of its bits."""
-    fill_row(number, row)
-    for bit in range(CORNER_BITS):
-        if (corner >> bit) & 1:
-            join_rows(False, row, rows[span[ROWS_FROM + bit]], row)
-    join_rows(True, target, row, target)
+@inlined
+def _read_four(numbers: Floats, rows: Floats, span: Integers, target: Floats) -> None:
+    row, other = rows[span[ROWS_FROM]], rows[span[ROWS_FROM + 1]]
+    _two_bits(numbers[0], numbers[1], numbers[2], numbers[3], row, other, target)
 
 
 @uncounted
 def read_rows(span: Integers, numbers: Floats, rows: Floats, spare: Floats, target: Floats) -> None:
     """Read the numbers at the corners for the rows that a span follows.
 
-    They grow with each row, so that each corner's number counts as far as all rows of its bits reach.
+    With each row, they grow from those at the corners where it is as small as can be, to those where it is as
+    great, but no further than it does.
     """
-    corners, row = corners_of(span), rows[max(span[ROWS_FROM], 0)]
+    corners = corners_of(span)
     if corners == 1:
         fill_row(numbers[0], target)
     elif corners == 2:
-        _one_bit(numbers[0], numbers[1], row, target)
-    elif corners == 4:
-        other = rows[span[ROWS_FROM + 1]]
-        _two_bits(numbers[0], numbers[1], numbers[2], numbers[3], row, other, target)
+        _one_bit(numbers[0], numbers[1], rows[span[ROWS_FROM]], target)
     else:
-        fill_row(numbers[0], target)
-        for corner in range(1, corners):
-            _at_corner(span, corner, rows, numbers[corner], spare, target)
+        _read_four(numbers, rows, span, target)
+    if corners >= 8:
+        _read_four(numbers[4:], rows, span, spare[0])
+        _one_bit(target, spare[0], rows[span[ROWS_FROM + 2]], target)
+    if corners == 16:
+        _read_four(numbers[8:], rows, span, spare[0])
+        _read_four(numbers[12:], rows, span, spare[1])
+        _one_bit(spare[0], spare[1], rows[span[ROWS_FROM + 2]], spare[0])
+        _one_bit(target, spare[0], rows[span[ROWS_FROM + 3]], target)
 
 
 @uncounted
@@ -143,14 +143,14 @@ def _fill_wholes(
         if span[KIND] != IN_ROWS:
             read_rows(span, sums[k], joints, spare, wholes[k])
             continue
-        fill_row(-np.inf if is_greatest else np.inf, block.running[0])
-        current, whole = 0, begin
+        fill_row(-np.inf if is_greatest else np.inf, block.running)
+        whole = begin
         if begin >= operand.begin:
             whole = max(min(end, block.since + 1), begin)
-            current = join_positions(block, is_greatest, operand, begin, whole, 0)
+            join_positions(block, is_greatest, operand, begin, whole)
         for position in range(whole, end):
-            current = enter(is_greatest, block, operand, position, position - block.since, current)
-        fill_row(block.running[current], wholes[k])
+            enter(is_greatest, block, operand, position, position - block.since)
+        fill_row(block.running, wholes[k])
 
 
 @uncounted
@@ -202,17 +202,17 @@ def _window_span_rows(
         is_number = is_number and span[ROWS_FROM + bit] < 0
     first, count = begin - block.lowest, end - begin
     if span[ROW] >= 0:
-        fill_row(joints[span[ROW]], block.running[0])
+        fill_row(joints[span[ROW]], block.running)
     else:
-        fill_row(-np.inf if is_greatest else np.inf, block.running[0])
+        fill_row(-np.inf if is_greatest else np.inf, block.running)
     if begins_in_rows:
         at = min(operands[left, END], block.last + 1)
         join_before(block, is_greatest, operand, at, block.starts[:count], target, begin)
-        fill_row(-np.inf if is_greatest else np.inf, block.running[0])
+        fill_row(-np.inf if is_greatest else np.inf, block.running)
     if begins_in_rows and not ends_in_rows and right != THROUGH:
         for k in range(count):
-            _read_position(span, columns, first + k, joints, spare, numbers, block.running[0])
-            join_rows(is_greatest, target[first + k], block.running[0], target[first + k])
+            _read_position(span, columns, first + k, joints, spare, numbers, block.running)
+            join_rows(is_greatest, target[first + k], block.running, target[first + k])
     elif not begins_in_rows and is_number and ends_in_rows:
         at = operands[right, BEGIN]
         numbers_before, afters = columns[0, first:], block.afters[:count]
@@ -221,11 +221,11 @@ def _window_span_rows(
     elif not begins_in_rows:
         for k in range(count):
             if is_number:
-                join_number(is_greatest, block.running[0], columns[0, first + k], target[first + k])
+                join_number(is_greatest, block.running, columns[0, first + k], target[first + k])
                 continue
             _read_position(span, columns, first + k, joints, spare, numbers, target[first + k])
-            join_rows(is_greatest, target[first + k], block.running[0], target[first + k])
-        fill_row(-np.inf if is_greatest else np.inf, block.running[0])
+            join_rows(is_greatest, target[first + k], block.running, target[first + k])
+        fill_row(-np.inf if is_greatest else np.inf, block.running)
     if ends_in_rows:
         at = operands[right, BEGIN]
         rows = target[first : first + count]
@@ -291,7 +291,7 @@ def _run_joined(table_at: int, number: int, d: int, which: int, channels: int) -
         scratch.joints,
         scratch.spare,
     )
-    node, place, running = nodes[d], d - first, block.running[0]
+    node, place, running = nodes[d], d - first, block.running
     code, a, b, has_left = (
         node[codes.NODE_CODE],
         max(node[codes.NODE_A], 0),
@@ -429,7 +429,7 @@ def _fill_column(
             if spans[k, KIND] == IN_ROWS:
                 column[position - block.offset] = target[at, sample]
             else:
-                columns, row = scratch.corner_columns[place], block.running[0]
+                columns, row = scratch.corner_columns[place], block.running
                 _read_position(spans[k], columns, at, scratch.joints, scratch.spare, scratch.corner, row)
                 column[position - block.offset] = row[sample]
 
@@ -450,21 +450,20 @@ def join_body_spans(
     nodes: Integers, part: Integers, block: SampleBlock, body: NodeRows, base: int, start: float,
     is_cut: bool, recent: Recent, newest: int, spans: Integers, count: int, wholes: Floats,
     closing: Integers,
-) -> int:  # fmt: skip
-    """Join what the root of a part joins, from its base on, with a number (see `_join_body`)."""
+) -> None:  # fmt: skip
+    """Fill the running row with what the root of a part joins, and a number (see `_join_body`)."""
     root = part[codes.PART_END] - 1
-    is_until, current = nodes[root, codes.NODE_CODE] == codes.UNTIL, 0
+    is_until = nodes[root, codes.NODE_CODE] == codes.UNTIL
     settled = max(spans[0, END], base)
     fill_row(
-        extremum(is_until, body.column[base - block.offset : settled - block.offset], start), block.running[0]
+        extremum(is_until, body.column[base - block.offset : settled - block.offset], start), block.running
     )
     for k in range(1, count):
         begin, end = spans[k, BEGIN], min(spans[k, END], block.last + 1)
         if begin >= end:
             break
         if not is_cut or _is_closed_before(nodes, part, recent, block, spans[k, END] - 1):
-            join_rows(is_until, block.running[current], wholes[k], block.running[1 - current])
-            current = 1 - current
+            join_rows(is_until, block.running, wholes[k], block.running)
             continue
         if spans[k, KIND] == IN_TABLE:
             break
@@ -476,6 +475,5 @@ def join_body_spans(
         for position in range(begin, end):
             sample = max(position - block.since, closing[position - begin])
             if sample > block.last - block.since:
-                return current
-            current = enter(is_until, block, body, position, sample, current)
-    return current
+                return
+            enter(is_until, block, body, position, sample)

@@ -8,7 +8,8 @@ from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.blocks.block_ends import find_begins, is_beside_one
 from spatial_replay.monitor.online.blocks.block_run import PARTIAL, WHOLE, operand_of, set_first, set_last
 from spatial_replay.monitor.online.blocks.span_rows import block_of, join_body_spans, run_spans
-from spatial_replay.monitor.online.blocks.spans import fill_tables, find_spans
+from spatial_replay.monitor.online.blocks.span_tables import fill_tables
+from spatial_replay.monitor.online.blocks.spans import find_spans
 from spatial_replay.monitor.online.closing import absorb
 from spatial_replay.monitor.online.node_columns import cells_of, columns_number, look_of, tables_end
 from spatial_replay.monitor.online.open_windows import (
@@ -79,13 +80,13 @@ def _set_first_of_spans(
         operand = operand_of(
             nodes, part, body, memory.columns[columns_of], memory.history[look.channel], scratch
         )
-        current = join_body_spans(
+        join_body_spans(
             nodes, part, block, operand, base, missing, is_cut_short(which, part, root, channels),
             recent_of(memory, scratch), scratch.block[BLOCK_NEWEST], scratch.spans[body],
             scratch.span_counts[body], scratch.wholes[part[codes.PART_END] - 1 - part[codes.PART_FIRST]],
             scratch.closing,
         )  # fmt: skip
-        copy(block.running[current], numbers)
+        copy(block.running, numbers)
     if base > 0:
         for k in range(count):
             numbers[k] = max(table[0], min(numbers[k], table[1]))

@@ -1,0 +1,384 @@
+"""What nodes are at the corners, in spans of positions that follow a few rows alike (see `blocks.spans`).
+
+For each corner, a node is a column of numbers, computed from those of its operands once for many blocks of
+samples.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from spatial_replay.compiled import apart, uncounted
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.monitor.online import codes
+from spatial_replay.monitor.online.blocks.spans import (
+    BEGIN,
+    END,
+    IN_ROWS,
+    IN_TABLE,
+    KIND,
+    LEFT,
+    RIGHT,
+    ROW,
+    THROUGH,
+    corner_below,
+    corners_of,
+)
+from spatial_replay.monitor.online.node_columns import columns_number, look_of, signal_of
+from spatial_replay.monitor.online.open_windows import runs_root
+from spatial_replay.monitor.online.run_arrays import arrays_at
+from spatial_replay.monitor.online.sliding import (
+    Recent,
+    beyond,
+    copy,
+    either,
+    extremum,
+    fill,
+    join,
+    recent_of,
+)
+from spatial_replay.monitor.online.state import (
+    BLOCK_LOWEST,
+    OFFSET,
+    behind,
+    first_behind,
+)
+
+
+@uncounted
+def _copy_ends(
+    ends: Integers, unknown: int, begin: int, end: int, offset: int, most: int, target: Integers
+) -> None:
+    """Copy ends of windows at begin … end - 1, known up to `unknown`; those that are later are `most`."""
+    known = max(min(unknown, end), begin) - begin
+    for k in range(known):
+        target[k] = min(ends[begin - offset + k], most)
+    for k in range(known, end - begin):
+        target[k] = most
+
+
+@uncounted
+def ends_between(
+    node: Integers, recent: Recent, begin: int, end: int, offset: int, last: int, starts: Integers,
+    afters: Integers,
+) -> None:  # fmt: skip
+    """Enter where windows of begin … end - 1 start, and what comes after them, after the sample at `last`."""
+    stamps, unit, near, far = (
+        recent.stamps,
+        node[codes.NODE_UNIT],
+        node[codes.NODE_LOW],
+        node[codes.NODE_HIGH],
+    )
+    if node[codes.NODE_CODE] in codes.AHEAD_OF and unit == codes.SAMPLES:
+        for k in range(end - begin):
+            starts[k] = min(begin + k + near, last + 1)
+        for k in range(end - begin):
+            afters[k] = min(begin + k + far, last) + 1
+        return
+    if node[codes.NODE_CODE] in codes.AHEAD_OF:
+        timed = node[codes.NODE_TIMED]
+        begun, closed = recent.window_next[timed, 1], recent.window_next[timed, 2]
+        _copy_ends(recent.window_ends[timed, 0], begun, begin, end, offset, last + 1, starts)
+        _copy_ends(recent.window_ends[timed, 1], closed, begin, end, offset, last + 1, afters)
+        return
+    start, after = (
+        first_behind(stamps, offset, begin, unit, far),
+        behind(stamps, offset, begin, unit, near) + 1,
+    )
+    for position in range(begin, end):
+        if unit == codes.SAMPLES:
+            start, after = max(position - far, offset), position - near + 1
+        else:
+            time_ns = stamps[position - offset]
+            while time_ns - stamps[start - offset] > far:
+                start += 1
+            while after <= position and time_ns - stamps[after - offset] >= near:
+                after += 1
+        starts[position - begin] = start
+        afters[position - begin] = after
+
+
+@uncounted
+def _slide(
+    is_greatest: bool, source: Floats, base: int, starts: Integers, afters: Integers, target: Floats
+) -> None:
+    """Compute extrema over windows that begin and end among the same numbers."""
+    nothing, first, count = -np.inf if is_greatest else np.inf, 0, len(target)
+    while first < count:
+        middle, until = max(afters[first], starts[first]), first + 1
+        while until < count and starts[until] < middle:
+            until += 1
+        value, at = nothing, middle
+        for k in range(until - 1, first - 1, -1):
+            while at > starts[k]:
+                at -= 1
+                value = either(is_greatest, value, source[at - base])
+            target[k] = value
+        value, at = nothing, middle
+        for k in range(first, until):
+            while at < afters[k]:
+                value = either(is_greatest, value, source[at - base])
+                at += 1
+            target[k] = either(is_greatest, target[k], value)
+        first = until
+
+
+@uncounted
+def _run_back(is_greatest: bool, source: Floats, start: float, target: Floats) -> None:
+    """Enter the extremum of a number and of all numbers from each on.
+
+    Four at a time, which wait for those after them only once.
+    """
+    value, whole = start, len(target) % 4
+    for k in range(len(target) - 4, whole - 1, -4):
+        a, b, c, d = source[k], source[k + 1], source[k + 2], source[k + 3]
+        c = either(is_greatest, d, c)
+        b = either(is_greatest, c, b)
+        a = either(is_greatest, b, a)
+        target[k + 3], target[k + 2] = either(is_greatest, value, d), either(is_greatest, value, c)
+        target[k + 1] = either(is_greatest, value, b)
+        value = either(is_greatest, value, a)
+        target[k] = value
+    for k in range(whole - 1, -1, -1):
+        value = either(is_greatest, value, source[k])
+        target[k] = value
+
+
+@uncounted
+def _run_on(is_greatest: bool, source: Floats, start: float, target: Floats) -> None:
+    """Enter the extremum of a number and of all numbers up to each (see `_run_back`)."""
+    value, whole = start, len(target) - len(target) % 4
+    for k in range(0, whole, 4):
+        a, b, c, d = source[k], source[k + 1], source[k + 2], source[k + 3]
+        b = either(is_greatest, a, b)
+        c = either(is_greatest, b, c)
+        d = either(is_greatest, c, d)
+        target[k], target[k + 1] = either(is_greatest, value, a), either(is_greatest, value, b)
+        target[k + 2] = either(is_greatest, value, c)
+        value = either(is_greatest, value, d)
+        target[k + 3] = value
+    for k in range(whole, len(target)):
+        value = either(is_greatest, value, source[k])
+        target[k] = value
+
+
+@uncounted
+def _run_left(is_strong: bool, left: Floats, right: Floats, start: float, target: Floats) -> None:
+    """Run an operator with a left operand back from what it is after the last position (see `_run_back`)."""
+    value, whole = start, len(target) % 2
+    for k in range(len(target) - 2, whole - 1, -2):
+        # what two positions are together waits once for those after them
+        both = either(is_strong, right[k], either(not is_strong, left[k], right[k + 1]))
+        held = either(not is_strong, left[k], left[k + 1])
+        target[k + 1] = either(is_strong, right[k + 1], either(not is_strong, left[k + 1], value))
+        value = either(is_strong, both, either(not is_strong, held, value))
+        target[k] = value
+    for k in range(whole - 1, -1, -1):
+        value = either(is_strong, right[k], either(not is_strong, left[k], value))
+        target[k] = value
+
+
+@uncounted
+def _join_left(
+    is_greatest: bool, source: Floats, base: int, starts: Integers, is_even: bool, end: int, target: Floats
+) -> None:
+    """Compute extrema from where windows start to before `end`.
+
+    Args:
+        is_even: whether each starts one position after the one before, so that they need not be looked up.
+    """
+    at, count = max(min(starts[len(target) - 1], end), base), len(target)
+    value = extremum(is_greatest, source[at - base : end - base], -np.inf if is_greatest else np.inf)
+    if is_even:
+        stretch = source[starts[0] - base : starts[0] - base + count]
+        if is_greatest:
+            _run_back(True, stretch, value, target)
+        else:
+            _run_back(False, stretch, value, target)
+        return
+    for k in range(count - 1, -1, -1):
+        while at > starts[k]:
+            at -= 1
+            value = either(is_greatest, value, source[at - base])
+        target[k] = value
+
+
+@uncounted
+def _join_right(
+    is_greatest: bool, source: Floats, base: int, begin: int, afters: Integers, is_even: bool,
+    spare: Floats, target: Floats,
+) -> None:  # fmt: skip
+    """Join numbers with the extrema from `begin` to where windows end (see `_join_left`)."""
+    at, count = afters[0], len(target)
+    value = extremum(is_greatest, source[begin - base : at - base], -np.inf if is_greatest else np.inf)
+    if is_even:
+        stretch = source[at - 1 - base : at - 1 - base + count]
+        if is_greatest:
+            _run_on(True, stretch, value, spare[:count])
+        else:
+            _run_on(False, stretch, value, spare[:count])
+        join(is_greatest, target, spare[:count], target)
+        return
+    for k in range(count):
+        while at < afters[k]:
+            value = either(is_greatest, value, source[at - base])
+            at += 1
+        target[k] = either(is_greatest, target[k], value)
+
+
+@uncounted
+def _source(spans: Integers, span: int, span_above: Integers, corner: int) -> int:
+    """Return the corner of an operand's table that one of a span above it looks at; -1 for its column."""
+    return corner_below(span_above, corner, spans[span]) if spans[span, KIND] == IN_TABLE else -1
+
+
+@uncounted
+def _run_corner(
+    is_strong: bool, is_ahead: bool, has_left: bool, left: Floats, right: Floats, start: float, target: Floats
+) -> None:
+    """Run an operator without a window from one end of a span to the other."""
+    if not has_left and is_ahead:
+        if is_strong:
+            _run_back(True, right, start, target)
+        else:
+            _run_back(False, right, start, target)
+    elif not has_left:
+        if is_strong:
+            _run_on(True, right, start, target)
+        else:
+            _run_on(False, right, start, target)
+    elif is_ahead:
+        if is_strong:
+            _run_left(True, left, right, start, target)
+        else:
+            _run_left(False, left, right, start, target)
+    else:
+        value = start
+        for k in range(len(target)):
+            value = either(is_strong, right[k], either(not is_strong, left[k], value))
+            target[k] = value
+
+
+@uncounted
+def _look_up(source: Floats, base: int, starts: Integers, target: Floats) -> None:
+    for k in range(len(target)):
+        target[k] = source[starts[k] - base]
+
+
+@apart
+def fill_tables(table_at: int, number: int, which: int, channels: int, since: int, last: int) -> int:
+    """Compute what all nodes of a part are at the corners, in spans with tables, and over these spans."""
+    tables, _, scratch, _ = arrays_at(table_at)
+    part, nodes, first = tables.parts[number], tables.nodes, tables.parts[number, codes.PART_FIRST]
+    has_root = runs_root(part, nodes[part[codes.PART_END] - 1])
+    for d in range(first, part[codes.PART_END]):
+        code, place = nodes[d, codes.NODE_CODE], d - first
+        if code in codes.BINARY_NODES and (has_root or d < part[codes.PART_END] - 1):
+            for k in range(1, scratch.span_counts[place]):
+                if scratch.spans[place, k, KIND] == IN_TABLE:
+                    _fill_joined(table_at, number, d, k, which, channels)
+        elif code != codes.LITERAL:
+            _fill_window(table_at, number, d, which, channels, last)
+    return 0
+
+
+@apart
+def _fill_joined(table_at: int, number: int, d: int, k: int, which: int, channels: int) -> int:
+    """Compute a node with two operands at the corners of one of its spans."""
+    tables, memory, scratch, _ = arrays_at(table_at)
+    nodes, first, offset = tables.nodes, tables.parts[number, codes.PART_FIRST], memory.clock[OFFSET]
+    columns = memory.columns[columns_number(which)]
+    history, lowest = memory.history[look_of(which, channels).channel], scratch.block[BLOCK_LOWEST]
+    node, span = nodes[d], scratch.spans[d - first, k]
+    code, a, b = node[codes.NODE_CODE], max(node[codes.NODE_A], 0), node[codes.NODE_B]
+    signal, other = signal_of(nodes, first + a), signal_of(nodes, first + b)
+    of_one = columns[first + a] if signal < 0 else history[signal]
+    of_two = columns[first + b] if other < 0 else history[other]
+    begin, end, has_left = span[BEGIN], span[END], node[codes.NODE_A] >= 0
+    is_strong = code in (codes.PART_OR, codes.UNTIL, codes.PAST_SINCE)
+    for corner in range(corners_of(span)):
+        at_one = _source(scratch.spans[a], span[LEFT], span, corner) if has_left else -1
+        at_two = _source(scratch.spans[b], span[RIGHT], span, corner)
+        one = scratch.corner_columns[a, max(at_one, 0)] if at_one >= 0 else of_one
+        two = scratch.corner_columns[b, max(at_two, 0)] if at_two >= 0 else of_two
+        base, base_of_two = lowest if at_one >= 0 else offset, lowest if at_two >= 0 else offset
+        target = scratch.corner_columns[d - first, corner, begin - lowest : end - lowest]
+        left, right = one[begin - base : end - base], two[begin - base_of_two : end - base_of_two]
+        if code in (codes.PART_AND, codes.PART_OR):
+            join(is_strong, left, right, target)
+        else:
+            start = np.inf if corner & 1 else -np.inf
+            is_ahead = code in (codes.UNTIL, codes.RELEASE)
+            _run_corner(is_strong, is_ahead, has_left, left, right, start, target)
+    return 0
+
+
+@apart
+def _fill_window(table_at: int, number: int, d: int, which: int, channels: int, last: int) -> int:
+    """Compute a window or shift at the corners of its spans, and what it, or the root, holds of each."""
+    tables, memory, scratch, _ = arrays_at(table_at)
+    nodes, part, look = tables.nodes, tables.parts[number], look_of(which, channels)
+    columns, history = memory.columns[columns_number(which)], memory.history[look.channel]
+    recent, offset, first = recent_of(memory, scratch), memory.clock[OFFSET], part[codes.PART_FIRST]
+    lowest, starts, afters = scratch.block[BLOCK_LOWEST], scratch.ends[0], scratch.ends[1]
+    spare = scratch.extrema[0]
+    place, node, root = d - first, nodes[d], part[codes.PART_END] - 1
+    is_root = d == root and not runs_root(part, nodes[root])
+    code, a = node[codes.NODE_CODE], node[codes.NODE_B] if is_root else node[codes.NODE_A]
+    is_greatest = code in (codes.PART_WINDOW_MAX, codes.PAST_WINDOW_MAX, codes.UNTIL)
+    signal, one = signal_of(nodes, first + a), scratch.spans[a]
+    column = columns[first + a] if signal < 0 else history[signal]
+    for k in range(1, scratch.span_counts[a] if code != codes.SHIFT else 1):
+        if one[k, KIND] != IN_TABLE:
+            continue
+        for corner in range(corners_of(one[k])):
+            source = scratch.corner_columns[a, corner, one[k, BEGIN] - lowest : one[k, END] - lowest]
+            scratch.sums[place, k, corner] = extremum(is_greatest, source, -np.inf if is_greatest else np.inf)
+    if is_root:
+        return 0
+    value = beyond(look.mode, node[codes.NODE_WEAK])
+    for k in range(1, scratch.span_counts[place]):
+        span = scratch.spans[place, k]
+        begin, end, left, right = span[BEGIN], span[END], span[LEFT], span[RIGHT]
+        if left < 0:
+            if span[KIND] == IN_TABLE:
+                fill(scratch.corner_columns[place, 0, begin - lowest : end - lowest], value)
+            continue
+        has_left = one[left, KIND] != IN_ROWS
+        has_right = right != THROUGH and right != left and one[right, KIND] != IN_ROWS
+        if not has_left and not has_right:
+            continue
+        ends_between(node, recent, begin, end, offset, last, starts, afters)
+        steps, is_counted = end - 1 - begin, node[codes.NODE_UNIT] == codes.SAMPLES
+        is_at_once = code in codes.AHEAD_OF and node[codes.NODE_LOW] == 0
+        starts_evenly = (is_counted or is_at_once) and starts[steps] - starts[0] == steps
+        ends_evenly = is_counted and afters[steps] - afters[0] == steps
+        # of a span with rows of its own, what stands in tables is joined with these
+        has_row = span[KIND] == IN_TABLE and span[ROW] >= 0
+        for corner in range(0, corners_of(span), 2 if has_row else 1):
+            target = scratch.corner_columns[place, corner, begin - lowest : end - lowest]
+            at = _source(one, left, span, corner)
+            source, base = (
+                scratch.corner_columns[a, max(at, 0)] if at >= 0 else column,
+                lowest if at >= 0 else offset,
+            )
+            if code == codes.SHIFT:
+                _look_up(source, base, starts, target)
+                continue
+            if not has_left:
+                fill(target, -np.inf if is_greatest else np.inf)
+            elif left == right:
+                _slide(is_greatest, source, base, starts, afters, target)
+            else:
+                _join_left(is_greatest, source, base, starts, starts_evenly, one[left, END], target)
+            if has_right:
+                at = _source(one, right, span, corner)
+                source = scratch.corner_columns[a, max(at, 0)] if at >= 0 else column
+                base, first_of_right = lowest if at >= 0 else offset, one[right, BEGIN]
+                _join_right(is_greatest, source, base, first_of_right, afters, ends_evenly, spare, target)
+            if has_row:
+                beside = scratch.corner_columns[place, corner + 1, begin - lowest : end - lowest]
+                copy(target, beside)
+                # where the row between is as great as can be, say, it outdoes the rest
+                fill(beside if is_greatest else target, np.inf if is_greatest else -np.inf)
+    return 0
