@@ -93,6 +93,29 @@ def _set_first_of_spans(
     return 0
 
 
+@uncounted
+def _find_next_begins(table_at: int, number: int, channels: int, last: int) -> None:
+    """Enter up to where the column of each node is looked at after these samples.
+
+    What an operator that never ends is joined with says when both have closed. Then only what is absorbed is
+    looked at, which is what the root joins, or what a node that depends on a table does.
+    """
+    tables, _, scratch, _ = arrays_at(table_at)
+    nodes, part = tables.nodes, tables.parts[number]
+    first, root = part[codes.PART_FIRST], part[codes.PART_END] - 1
+    find_begins(table_at, number, 0, channels, 0, 0, last + 1, last + 1)
+    find_begins(table_at, number, 0, channels, 0, 2, last + 1, last + 1)
+    for d in range(first, root + 1):
+        is_absorbed = False
+        for above in range(d + 1, root + 1):
+            is_operand = nodes[above, codes.NODE_A] == d - first or nodes[above, codes.NODE_B] == d - first
+            is_absorbed = is_absorbed or (
+                is_operand and (above == root or nodes[above, codes.NODE_DEPENDS] > 0)
+            )
+        if not is_absorbed:
+            scratch.next_begins[d - first] = scratch.begins[d - first]
+
+
 @inlined
 def _set_first(
     table_at: int, number: int, which: int, channels: int, at: int, columns_of: int, has_root: bool
@@ -128,7 +151,7 @@ def run_wide(table_at: int, number: int, looks: int, channels: int, at: int, cou
     if begin > memory.cells[part[codes.PART_CELL_START]] or has_ended(part, root, memory, last):
         return 0  # the root leaves out some of the spans' positions
     # as long as not looked at what the samples are, this is the same for all numbers
-    find_begins(table_at, number, 0, channels, 0, 2, last + 1, last + 1)
+    _find_next_begins(table_at, number, channels, last)
     lowest, is_first = find_begins(table_at, number, 0, channels, 0, 0, since, last), True
     if last + 1 - lowest > scratch.rows.shape[1] or not _takes_spans(nodes, part, memory, scratch.begins):
         return 0
