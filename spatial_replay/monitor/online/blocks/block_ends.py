@@ -89,16 +89,18 @@ def find_begins(
 
 @uncounted
 def is_beside_one(nodes: Integers, part: Integers, stamps: Integers, offset: int, since: int) -> bool:
-    """Return whether at most one operator of a part has many open positions, which then looks at signals."""
-    wide, first = 0, part[codes.PART_FIRST]
+    """Return whether a part has few open positions but those of one window over a signal, or one operator."""
+    first, count, most = part[codes.PART_FIRST], 0, 0
     for d in range(first, part[codes.PART_END] - 1):
         code, unit, far = nodes[d, codes.NODE_CODE], nodes[d, codes.NODE_UNIT], nodes[d, codes.NODE_HIGH]
-        if code in (codes.PART_WINDOW_MAX, codes.PART_WINDOW_MIN):
-            is_wide = since - first_behind(stamps, offset, since - 1, unit, far) > WIDE
-            wide += (1 if signal_of(nodes, first + nodes[d, codes.NODE_A]) >= 0 else 2) if is_wide else 0
-        elif code not in (codes.LITERAL, codes.PART_AND, codes.PART_OR, codes.SHIFT):
-            wide += 1
-    return wide <= 1
+        if code in (codes.LITERAL, codes.PART_AND, codes.PART_OR, codes.SHIFT):
+            continue
+        is_ahead = code in (codes.PART_WINDOW_MAX, codes.PART_WINDOW_MIN)
+        own = since - first_behind(stamps, offset, since - 1, unit, far) if is_ahead else WIDE
+        count += own
+        if not is_ahead or signal_of(nodes, first + nodes[d, codes.NODE_A]) >= 0:
+            most = max(most, own)
+    return bool(count - most <= WIDE // 2)
 
 
 @uncounted
