@@ -53,7 +53,17 @@ DEEP = (
     "G ({a} -> F[0,30] ({b} and F[0,30] ({c} and F[0,30] ({a} and G[0,10] {b}))))",
 )
 """The longest of these that a limit holds for, on two cores."""
-WIDE = ("G ({a} -> F[0,6000] G[0,6000] {b})",)
+WIDE = (
+    "G ({a} -> F[0,6000] G[0,6000] {b})",
+    "G ({a} -> F[0,6000] ({b} and F[0,6000] {c}))",
+    "G ({a} -> F[0,5000] ({b} and F[0,60] {c}))",
+    "G ({a} -> F[0,100] ({b} and F[0,100] ({c} and G[0,100] {a})))",
+    "G ({a} -> F[0,600] ({b} and F[0,600] ({c} and G[0,600] {a})))",
+    "G ({a} -> F ({b} and F[0,600] {c}))",
+    "G ({b} S F[0,600] {c})",
+    "G ({a} S[0,600] F[0,600] {b})",
+    "G ({a} -> {b} U[0,600] ({c} and F[0,600] {a}))",
+)
 """Longer ones: no limit holds for them."""
 CHANGES = 9
 PATIENCE_S = 60.0
