@@ -1,8 +1,8 @@
 """Numeric kernels: plain functions over arrays and numbers, run by the interpreter or as machine code.
 
-Compiling every kernel takes longer than reading a short log, and
-loading the compiled ones from disk takes its time, too. So a kernel is interpreted while its arrays are
-small, and compiled once that has cost about as much time as compiling it would.
+Compiling every kernel takes longer than reading a short log, and loading the compiled ones from disk takes
+its time, too. So a kernel is interpreted while its arrays are small, and compiled once that has cost about as
+much time as compiling it would.
 
 Both ways give the same bits: kernels use sums, products, quotients, square roots, sines and cosines of IEEE
 doubles (no fast-math, no fused contraction), and nothing else whose result depends on who computes it.
@@ -191,7 +191,7 @@ def row_code(formula: Callable[..., Any]) -> Callable[..., None]:
     Args:
         formula: given `Lanes`, and rows of `ROW` numbers; a number stands for a row of nothing else.
     """
-    return _RowCode(formula, False, None)
+    return _RowCode(formula)
 
 
 def row_loop(*, backwards: bool = False, is_last_only: bool = False) -> _Making[..., Any]:
@@ -206,7 +206,7 @@ def row_loop(*, backwards: bool = False, is_last_only: bool = False) -> _Making[
         backwards: whether the last row comes first.
         is_last_only: whether there is no array to receive them, so that only the last row is kept.
     """
-    return lambda formula: cast(Any, _RowCode(formula, backwards, is_last_only))
+    return lambda formula: cast(Any, _RowLoop(formula, backwards=backwards, is_last_only=is_last_only))
 
 
 class _Kernel(Generic[_Arguments, _Result]):
@@ -394,7 +394,7 @@ class _ArrayAt(_Kernel[[int, Any], Any]):
 
 
 class _Rows(Lanes):
-    """Formulas of rows, interpreted; `place` is how far a loop has gone on."""
+    """Formulas of rows, interpreted; `place` is that of a loop's row in its array."""
 
     place = 0
 
@@ -412,18 +412,37 @@ class _Rows(Lanes):
 
 
 class _RowCode(_Kernel[..., None]):
-    """A formula of rows, or a loop over them, as instructions within the kernel that calls it."""
+    """A formula of rows, as instructions within the kernel that calls it."""
 
-    def __init__(self, formula: Callable[..., Any], backwards: bool, is_last_only: bool | None) -> None:
+    def __init__(self, formula: Callable[..., Any]) -> None:
         super().__init__(formula, {"no_cpython_wrapper": True})
-        self._backwards, self._is_last_only = backwards, is_last_only
+        # without `Lanes`
+        self._count = cast(FunctionType, formula).__code__.co_argcount - 1
 
     def interpreted(self) -> Callable[..., None]:
-        formula, is_last_only = self.__wrapped__, self._is_last_only
+        formula = self.__wrapped__
 
         def fill(*arguments: Any) -> None:
             *rows, target = arguments
             target[:] = formula(_Rows(), *rows)
+
+        return fill
+
+    def compiled(self) -> Callable[..., None]:
+        if self._compiled is None:
+            self._compiled = _process.row_code(self.__wrapped__, self._count)
+        return self._compiled
+
+
+class _RowLoop(_RowCode):
+    """A formula of rows, as a loop within the kernel that calls it."""
+
+    def __init__(self, formula: Callable[..., Any], *, backwards: bool, is_last_only: bool) -> None:
+        super().__init__(formula)
+        self._backwards, self._is_last_only = backwards, is_last_only
+
+    def interpreted(self) -> Callable[..., None]:
+        formula, is_last_only = self.__wrapped__, self._is_last_only
 
         def loop(row: Any, *arguments: Any) -> None:
             lanes, inputs = _Rows(), arguments if is_last_only else arguments[:-1]
@@ -437,16 +456,13 @@ class _RowCode(_Kernel[..., None]):
                     arguments[-1][k] = stored
                 row[:] = result
 
-        return fill if is_last_only is None else loop
+        return loop
 
     def compiled(self) -> Callable[..., None]:
         if self._compiled is None:
-            count = cast(FunctionType, self.__wrapped__).__code__.co_argcount - 1
-            if self._is_last_only is None:
-                self._compiled = _process.row_code(self.__wrapped__, count)
-            else:
-                form = {"backwards": self._backwards, "is_last_only": self._is_last_only}
-                self._compiled = _process.row_loop(self.__wrapped__, count - 1, **form)
+            self._compiled = _process.row_loop(
+                self.__wrapped__, self._count, backwards=self._backwards, is_last_only=self._is_last_only
+            )
         return self._compiled
 
 

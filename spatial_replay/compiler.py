@@ -27,16 +27,16 @@ class Lanes(Protocol):
     """What formulas of rows consist of. Each number is made of those in its place."""
 
     def greater(self, first: Any, second: Any) -> Any:
-        """Return the greater of each two numbers, the first if they are equal."""
+        """Return the greater of each two numbers."""
 
     def lesser(self, first: Any, second: Any) -> Any:
-        """Return the lesser of each two numbers, the first if they are equal."""
+        """Return the lesser of each two numbers."""
 
     def parted(self, at: Any, before: Any, after: Any) -> Any:
         """Return one row up to a place, and another one from there on."""
 
     def later(self, at: Any) -> Any:
-        """Return a place so much later as the loop has gone on (see `row_loop` in `compiled`)."""
+        """Return a place so much later as a loop's row is from the first one of its array."""
 
 
 class Compiler:
@@ -162,7 +162,7 @@ class Compiler:
         def generate(code: _RowEmitter, kinds: Sequence[Any], values: list[Any]) -> None:
             code.loop(formula, kinds, values, backwards=backwards, is_last_only=is_last_only)
 
-        return self._emitting(generate, count + (1 if is_last_only else 2))
+        return self._emitting(generate, count if is_last_only else count + 1)
 
     def _emitting(self, generate: Callable[[_RowEmitter, Sequence[Any], list[Any]], None], count: int) -> Any:
         """Return what makes instructions of a call with `count` arguments."""
@@ -173,11 +173,7 @@ class Compiler:
         def typed(*kinds: Any) -> Any:
             def emit(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
                 code = _RowEmitter(context, builder)
-                generate(
-                    code,
-                    signature.args,
-                    [code.place_of(*each) for each in zip(signature.args, arguments, strict=True)],
-                )
+                generate(code, signature.args, list(map(code.opened, signature.args, arguments)))
                 return context.get_dummy_value()
 
             return types.void(*kinds), emit
@@ -256,8 +252,8 @@ class _RowEmitter(Lanes):
     def later(self, at: Any) -> Any:
         return self._builder.add(at, self._spread(self.place))
 
-    def place_of(self, kind: Any, value: Any) -> Any:
-        """Return the address of an array's numbers; any other value as it is."""
+    def opened(self, kind: Any, value: Any) -> Any:
+        """Return an array with its address and shape by name; any other value as it is."""
         if not isinstance(kind, self._types.Array):
             return value
         return self._arrays.make_array(kind)(self._context, self._builder, value)

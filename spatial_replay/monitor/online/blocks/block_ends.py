@@ -104,35 +104,44 @@ def is_beside_one(nodes: Integers, part: Integers, stamps: Integers, offset: int
 
 
 @uncounted
-def _copy_known(ends: Integers, unknown: int, begin: int, last: int, offset: int, target: Integers) -> None:
-    """Copy ends of windows at positions from `begin` on; they are known up to `unknown`."""
-    known = max(min(unknown, last + 1), begin) - begin
+def _copy_known(
+    ends: Integers, unknown: int, begin: int, end: int, offset: int, most: int, target: Integers
+) -> None:
+    """Copy ends of windows at begin … end - 1, known up to `unknown`; those that are later are `most`."""
+    known = max(min(unknown, end), begin) - begin
     for k in range(known):
-        target[k] = ends[begin - offset + k]
-    for k in range(known, last + 1 - begin):
-        target[k] = last + 1
+        target[k] = min(ends[begin - offset + k], most)
+    for k in range(known, end - begin):
+        target[k] = most
 
 
 @uncounted
-def find_ends(node: Integers, block: SampleBlock, recent: Recent, begin: int) -> None:
-    """Enter where windows from `begin` on start, and what comes after them; where shifts and delays look."""
-    starts, afters, stamps, offset, last = block.starts, block.afters, recent.stamps, block.offset, block.last
-    code, unit, near, far = node[0], node[codes.NODE_UNIT], node[codes.NODE_LOW], node[codes.NODE_HIGH]
+def find_ends(
+    node: Integers, recent: Recent, begin: int, end: int, offset: int, last: int, starts: Integers,
+    afters: Integers,
+) -> None:  # fmt: skip
+    """Enter where windows of begin … end - 1 start, and what comes after them; where shifts and delays look.
+
+    Args:
+        last: the last sample that counts.
+    """
+    stamps, code, unit = recent.stamps, node[codes.NODE_CODE], node[codes.NODE_UNIT]
+    near, far = node[codes.NODE_LOW], node[codes.NODE_HIGH]
     if code in codes.AHEAD_OF and unit == codes.SAMPLES:
-        for k in range(last + 1 - begin):
+        for k in range(end - begin):
             starts[k] = min(begin + k + near, last + 1)
-        for k in range(last + 1 - begin):
+        for k in range(end - begin):
             afters[k] = min(begin + k + far, last) + 1
         return
     if code in codes.AHEAD_OF:
         timed, next_ends = node[codes.NODE_TIMED], recent.window_next[node[codes.NODE_TIMED]]
-        _copy_known(recent.window_ends[timed, 0], next_ends[1], begin, last, offset, starts)
-        _copy_known(recent.window_ends[timed, 1], next_ends[2], begin, last, offset, afters)
+        _copy_known(recent.window_ends[timed, 0], next_ends[1], begin, end, offset, last + 1, starts)
+        _copy_known(recent.window_ends[timed, 1], next_ends[2], begin, end, offset, last + 1, afters)
         return
     start, after = begin, behind(stamps, offset, begin, unit, near) + 1
     if code != codes.PAST_DELAY:
         start = first_behind(stamps, offset, begin, unit, far)
-    for position in range(begin, last + 1):
+    for position in range(begin, end):
         if unit == codes.SAMPLES:
             start, after = max(position - far, offset), position - near + 1
         else:
@@ -147,18 +156,20 @@ def find_ends(node: Integers, block: SampleBlock, recent: Recent, begin: int) ->
 
 @uncounted
 def find_closing(
-    node: Integers, block: SampleBlock, recent: Recent, begin: int, is_first: bool, closing: Integers
-) -> None:
-    """Enter with which sample of the block windows ahead close, from position `begin` on.
+    node: Integers, block: SampleBlock, recent: Recent, begin: int, end: int, newest: int, is_first: bool,
+    closing: Integers,
+) -> None:  # fmt: skip
+    """Enter with which sample windows ahead of begin … end - 1 close, counted from the block's first.
 
     Args:
+        newest: the last sample for which ends of windows are known.
         is_first: whether to replace what is there, or to raise it.
     """
     far, stamps, offset = node[codes.NODE_HIGH], recent.stamps, block.offset
-    for position in range(begin, block.last + 1):
+    for position in range(begin, end):
         at = position + far
         if node[codes.NODE_UNIT] != codes.SAMPLES:
-            at = window_after(node, recent, position, offset, block.last)
+            at = window_after(node, recent, position, offset, newest)
             at -= stamps[at - 1 - offset] - stamps[position - offset] == far
         sample, k = at - block.since, position - begin
         closing[k] = sample if is_first else max(closing[k], sample)

@@ -115,13 +115,14 @@ def _run_node(table_at: int, number: int, d: int, which: int, channels: int) -> 
             fresh = max(begin, memory.cells[cells_of(part)[2] + node[codes.NODE_TABLE]] + 1)
         recurrent_rows(block, is_strong, a >= 0, one, two, target, fresh, block.last + 1, is_ahead)
     else:
-        find_ends(node, block, recent, begin)
+        find_ends(node, recent, begin, block.last + 1, block.offset, block.last, block.starts, block.afters)
         if code in (codes.SHIFT, codes.PAST_DELAY):
             shift_rows(block, code == codes.SHIFT, one, target, begin, block.last + 1, value)
         else:
             closed = block.last + 1
             if code in codes.AHEAD_OF and is_decided(node, look.mode):
-                find_closing(node, block, recent, begin, True, scratch.closing)
+                end = block.last + 1
+                find_closing(node, block, recent, begin, end, block.last, True, scratch.closing)
                 while closed > begin and scratch.closing[closed - 1 - begin] > block.last - block.since:
                     closed -= 1
             window_rows(block, is_greatest, one, target, begin, closed)
@@ -188,7 +189,7 @@ def _join_body(
             settled = max(min(settled, closed), base)
     for d in range(part[codes.PART_FIRST], part[codes.PART_END] if is_cut else 0):
         if nodes[d, codes.NODE_CUTS]:
-            find_closing(nodes[d], block, recent, settled, cuts == 0, closing)
+            find_closing(nodes[d], block, recent, settled, block.last + 1, block.last, cuts == 0, closing)
             cuts += 1
     known = max(min(settled, after), base)
     fill_row(extremum(is_until, body.column[base - offset : known - offset], start), block.running)

@@ -18,33 +18,20 @@ import numpy as np
 from spatial_replay.compiled import inlined, uncounted
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online.blocks.row_loops import (
-    each_greater,
-    each_lesser,
-    extend_greater,
-    extend_greater_from,
-    extend_lesser,
-    extend_lesser_from,
+    extend,
+    extend_from,
     fill_row,
     fill_row_until,
-    join_greater,
-    join_lesser,
-    join_number,
-    join_number_from,
+    join_all,
+    join_each,
     join_rows,
     join_rows_from,
     repeat,
-    repeat_greater,
-    repeat_lesser,
-    run_back_greater,
-    run_back_greater_from,
-    run_back_lesser,
-    run_back_lesser_from,
-    run_greater,
-    run_lesser,
-    run_release,
-    run_since,
-    run_trigger,
-    run_until,
+    repeat_joined,
+    run_back,
+    run_back_from,
+    run_on,
+    run_unbounded,
 )
 from spatial_replay.monitor.online.sliding import either, extremum
 
@@ -92,15 +79,15 @@ def enter(is_greatest: bool, block: SampleBlock, operand: NodeRows, position: in
     if position < operand.begin:
         number = operand.column[position - block.offset]
         if begin <= 0:
-            join_number(is_greatest, running, number, running)
+            join_rows(is_greatest, running, number, running)
         else:
-            join_number_from(is_greatest, running, number, running, begin)
+            join_rows_from(is_greatest, running, begin, number, running)
     else:
         row = operand.rows[position - block.lowest]
         if begin <= 0:
             join_rows(is_greatest, running, row, running)
         else:
-            join_rows_from(is_greatest, running, row, running, begin)
+            join_rows_from(is_greatest, running, begin, row, running)
 
 
 @uncounted
@@ -113,11 +100,8 @@ def join_positions(block: SampleBlock, is_greatest: bool, operand: NodeRows, beg
     if rows_from > begin:
         # as single numbers, of which there may be many
         nothing = -np.inf if is_greatest else np.inf
-        join_number(is_greatest, running, extremum(is_greatest, numbers, nothing), running)
-    if is_greatest:
-        join_greater(running, rows)
-    else:
-        join_lesser(running, rows)
+        join_rows(is_greatest, running, extremum(is_greatest, numbers, nothing), running)
+    join_all(is_greatest, running, rows)
     for position in range(whole, end):
         enter(is_greatest, block, operand, position, position - block.since)
 
@@ -132,35 +116,21 @@ def join_operands_rows(
         until = end
         for change in (one.begin, two.begin):
             until = change if begin < change < until else until
-        at, after, offset = begin - block.lowest, until - block.lowest, block.lowest - block.offset
-        rows, spare = target[at:after], block.running
+        at, after, offset = begin - block.lowest, until - block.lowest, block.offset
+        rows, running = target[at:after], block.running
+        first, second = (
+            one.column[begin - offset : until - offset],
+            two.column[begin - offset : until - offset],
+        )
         if begin < one.begin and begin < two.begin:
-            first, second = one.column[at + offset : after + offset], two.column[at + offset : after + offset]
-            if is_greatest:
-                each_greater(spare, first, second, rows)
-            else:
-                each_lesser(spare, first, second, rows)
+            join_each(is_greatest, running, first, second, rows)
         elif begin < one.begin:
-            _join_numbers(
-                is_greatest, spare, one.column[at + offset : after + offset], two.rows[at:after], rows
-            )
+            join_each(is_greatest, running, two.rows[at:after], first, rows)
         elif begin < two.begin:
-            _join_numbers(
-                is_greatest, spare, two.column[at + offset : after + offset], one.rows[at:after], rows
-            )
-        elif is_greatest:
-            each_greater(spare, one.rows[at:after], two.rows[at:after], rows)
+            join_each(is_greatest, running, one.rows[at:after], second, rows)
         else:
-            each_lesser(spare, one.rows[at:after], two.rows[at:after], rows)
+            join_each(is_greatest, running, one.rows[at:after], two.rows[at:after], rows)
         begin = until
-
-
-@inlined
-def _join_numbers(is_greatest: bool, spare: Floats, numbers: Floats, rows: Floats, target: Floats) -> None:
-    if is_greatest:
-        each_greater(spare, rows, numbers, target)
-    else:
-        each_lesser(spare, rows, numbers, target)
 
 
 @uncounted
@@ -212,7 +182,7 @@ def window_rows(
 
 
 @uncounted
-def _run_back(
+def _join_back(
     block: SampleBlock, is_greatest: bool, operand: NodeRows, begin: int, end: int, target: Floats
 ) -> None:
     """Join the running row with end - 1 … begin, one after the other, and store it after each."""
@@ -220,26 +190,15 @@ def _run_back(
     rows_from, cut = max(min(operand.begin, end), begin), max(min(since + 1, end), begin)
     at = max(rows_from, cut)
     rows, part = operand.rows[at - lowest : end - lowest], target[at - begin : end - begin]
-    if is_greatest:
-        run_back_greater_from(running, at - since, rows, part)
-    else:
-        run_back_lesser_from(running, at - since, rows, part)
-    rows, part = operand.rows[rows_from - lowest : at - lowest], target[rows_from - begin : at - begin]
-    if rows_from < cut and is_greatest:
-        run_back_greater(running, rows, part)
-    elif rows_from < cut:
-        run_back_lesser(running, rows, part)
-    numbers, part = operand.column[cut - offset : at - offset], target[cut - begin : at - begin]
-    if cut < rows_from and is_greatest:
-        run_back_greater_from(running, cut - since, numbers, part)
+    run_back_from(is_greatest, running, at - since, rows, part)
+    if rows_from < cut:
+        rows, part = operand.rows[rows_from - lowest : cut - lowest], target[rows_from - begin : cut - begin]
+        run_back(is_greatest, running, rows, part)
     elif cut < rows_from:
-        run_back_lesser_from(running, cut - since, numbers, part)
+        numbers, part = operand.column[cut - offset : at - offset], target[cut - begin : at - begin]
+        run_back_from(is_greatest, running, cut - since, numbers, part)
     at = min(rows_from, cut)
-    numbers, part = operand.column[begin - offset : at - offset], target[: at - begin]
-    if is_greatest:
-        run_back_greater(running, numbers, part)
-    else:
-        run_back_lesser(running, numbers, part)
+    run_back(is_greatest, running, operand.column[begin - offset : at - offset], target[: at - begin])
 
 
 @uncounted
@@ -268,12 +227,12 @@ def join_before(
                 first -= 1
             at = starts[first]
             rows = target[begin + first - block.lowest : rows_end]
-            _run_back(block, is_greatest, operand, at, start + 1, rows)
+            _join_back(block, is_greatest, operand, at, start + 1, rows)
         k = first - 1
 
 
 @uncounted
-def _extend(
+def _join_on(
     block: SampleBlock,
     is_greatest: bool,
     operand: NodeRows,
@@ -290,37 +249,20 @@ def _extend(
     running, since, offset, lowest = block.running, block.since, block.offset, block.lowest
     rows_from, cut = max(min(operand.begin, end), begin), max(min(since + 1, end), begin)
     at = min(rows_from, cut)
-    numbers, part, joined = (
-        operand.column[begin - offset : at - offset],
-        target[: at - begin],
-        before[: at - begin],
-    )
-    if is_greatest:
-        extend_greater(running, numbers, joined, part)
-    else:
-        extend_lesser(running, numbers, joined, part)
-    joined, part = before[at - begin : rows_from - begin], target[at - begin : rows_from - begin]
-    numbers = operand.column[at - offset : rows_from - offset]
-    if cut < rows_from and is_greatest:
-        extend_greater_from(running, cut - since, numbers, joined, part)
-    elif cut < rows_from:
-        extend_lesser_from(running, cut - since, numbers, joined, part)
-    joined, part = before[at - begin : cut - begin], target[at - begin : cut - begin]
-    rows = operand.rows[at - lowest : cut - lowest]
-    if rows_from < cut and is_greatest:
-        extend_greater(running, rows, joined, part)
+    numbers, part = operand.column[begin - offset : at - offset], target[: at - begin]
+    extend(is_greatest, running, numbers, before[: at - begin], part)
+    if cut < rows_from:
+        numbers, part = (
+            operand.column[cut - offset : rows_from - offset],
+            target[cut - begin : rows_from - begin],
+        )
+        extend_from(is_greatest, running, cut - since, numbers, before[cut - begin : rows_from - begin], part)
     elif rows_from < cut:
-        extend_lesser(running, rows, joined, part)
+        rows, part = operand.rows[rows_from - lowest : cut - lowest], target[rows_from - begin : cut - begin]
+        extend(is_greatest, running, rows, before[rows_from - begin : cut - begin], part)
     at = max(rows_from, cut)
-    rows, joined, part = (
-        operand.rows[at - lowest : end - lowest],
-        before[at - begin :],
-        target[at - begin : end - begin],
-    )
-    if is_greatest:
-        extend_greater_from(running, at - since, rows, joined, part)
-    else:
-        extend_lesser_from(running, at - since, rows, joined, part)
+    rows, part = operand.rows[at - lowest : end - lowest], target[at - begin : end - begin]
+    extend_from(is_greatest, running, at - since, rows, before[at - begin :], part)
 
 
 @uncounted
@@ -340,17 +282,14 @@ def join_after(
         if after <= at:
             while until < count and afters[until] <= at:
                 until += 1
-            if is_greatest:
-                repeat_greater(block.running, before[k:until], target[k:until])
-            else:
-                repeat_lesser(block.running, before[k:until], target[k:until])
+            repeat_joined(is_greatest, block.running, before[k:until], target[k:until])
         else:
             if at < after - 1:
                 join_positions(block, is_greatest, operand, at, after - 1)
             while until < count and afters[until] == afters[until - 1] + 1:
                 until += 1
             at = afters[until - 1]
-            _extend(block, is_greatest, operand, after - 1, at, before[k:until], target[k:until])
+            _join_on(block, is_greatest, operand, after - 1, at, before[k:until], target[k:until])
         k = until
 
 
@@ -364,20 +303,6 @@ def _step(
         enter(not is_strong, block, one, position, position - block.since)
     enter(is_strong, block, two, position, position - block.since)
     fill_row(block.running, target[position - block.lowest])
-
-
-@inlined
-def _run_unbounded(
-    is_strong: bool, is_ahead: bool, running: Floats, left: Any, right: Any, target: Floats
-) -> None:
-    if is_ahead and is_strong:
-        run_until(running, left, right, target)
-    elif is_ahead:
-        run_release(running, left, right, target)
-    elif is_strong:
-        run_since(running, left, right, target)
-    else:
-        run_trigger(running, left, right, target)
 
 
 @uncounted
@@ -403,26 +328,15 @@ def recurrent_rows(
     running, stop = block.running, whole
     if begin < whole and not has_left:
         rows_from = max(min(two.begin, stop), begin)
-        rows, numbers = (
-            two.rows[rows_from - lowest : stop - lowest],
-            two.column[begin - offset : rows_from - offset],
-        )
-        part, of_numbers = (
-            target[rows_from - lowest : stop - lowest],
-            target[begin - lowest : rows_from - lowest],
-        )
-        if is_ahead and is_strong:
-            run_back_greater(running, rows, part)
-            run_back_greater(running, numbers, of_numbers)
-        elif is_ahead:
-            run_back_lesser(running, rows, part)
-            run_back_lesser(running, numbers, of_numbers)
-        elif is_strong:
-            run_greater(running, numbers, of_numbers)
-            run_greater(running, rows, part)
+        rows, part = two.rows[rows_from - lowest : stop - lowest], target[rows_from - lowest : stop - lowest]
+        numbers = two.column[begin - offset : rows_from - offset]
+        of_numbers = target[begin - lowest : rows_from - lowest]
+        if is_ahead:
+            run_back(is_strong, running, rows, part)
+            run_back(is_strong, running, numbers, of_numbers)
         else:
-            run_lesser(running, numbers, of_numbers)
-            run_lesser(running, rows, part)
+            run_on(is_strong, running, numbers, of_numbers)
+            run_on(is_strong, running, rows, part)
     elif begin < whole:
         first, second = max(min(one.begin, stop), begin), max(min(two.begin, stop), begin)
         for k in range(3):
@@ -439,13 +353,13 @@ def recurrent_rows(
             if low >= high:
                 continue
             if low >= one.begin and low >= two.begin:
-                _run_unbounded(is_strong, is_ahead, running, left, right, target[at:after])
+                run_unbounded(is_strong, is_ahead, running, left, right, target[at:after])
             elif low >= one.begin:
-                _run_unbounded(is_strong, is_ahead, running, left, of_right, target[at:after])
+                run_unbounded(is_strong, is_ahead, running, left, of_right, target[at:after])
             elif low >= two.begin:
-                _run_unbounded(is_strong, is_ahead, running, of_left, right, target[at:after])
+                run_unbounded(is_strong, is_ahead, running, of_left, right, target[at:after])
             else:
-                _run_unbounded(is_strong, is_ahead, running, of_left, of_right, target[at:after])
+                run_unbounded(is_strong, is_ahead, running, of_left, of_right, target[at:after])
     if not is_ahead:
         for position in range(whole, end):
             _step(block, is_strong, has_left, one, two, target, position)

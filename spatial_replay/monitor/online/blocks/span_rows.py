@@ -10,6 +10,7 @@ from spatial_replay.compiled import apart, inlined, row_code, uncounted
 from spatial_replay.compiler import Lanes
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
+from spatial_replay.monitor.online.blocks.block_ends import find_closing, find_ends
 from spatial_replay.monitor.online.blocks.node_rows import (
     NodeRows,
     SampleBlock,
@@ -24,8 +25,7 @@ from spatial_replay.monitor.online.blocks.node_rows import (
     take_row,
     window_rows,
 )
-from spatial_replay.monitor.online.blocks.row_loops import fill_row, join_number, join_rows
-from spatial_replay.monitor.online.blocks.span_tables import ends_between
+from spatial_replay.monitor.online.blocks.row_loops import fill_row, join_rows
 from spatial_replay.monitor.online.blocks.spans import (
     BEGIN,
     END,
@@ -50,14 +50,12 @@ from spatial_replay.monitor.online.sliding import (
     extremum,
     is_decided,
     recent_of,
-    window_after,
 )
 from spatial_replay.monitor.online.state import (
     BLOCK_LAST,
     BLOCK_LOWEST,
     BLOCK_NEWEST,
     BLOCK_SINCE,
-    CORNER_BITS,
     OFFSET,
     Memory,
     Scratch,
@@ -144,12 +142,7 @@ def _fill_wholes(
             read_rows(span, sums[k], joints, spare, wholes[k])
             continue
         fill_row(-np.inf if is_greatest else np.inf, block.running)
-        whole = begin
-        if begin >= operand.begin:
-            whole = max(min(end, block.since + 1), begin)
-            join_positions(block, is_greatest, operand, begin, whole)
-        for position in range(whole, end):
-            enter(is_greatest, block, operand, position, position - block.since)
+        join_positions(block, is_greatest, operand, begin, end)
         fill_row(block.running, wholes[k])
 
 
@@ -159,26 +152,6 @@ def _fill_joint(is_greatest: bool, wholes: Floats, begin: int, end: int, target:
     fill_row(wholes[begin], target)
     for k in range(begin + 1, end):
         join_rows(is_greatest, target, wholes[k], target)
-
-
-@uncounted
-def _find_closing(
-    node: Integers, block: SampleBlock, recent: Recent, begin: int, end: int, newest: int, is_first: bool,
-    closing: Integers,
-) -> None:  # fmt: skip
-    """Enter with which sample windows of begin … end - 1 close, counted from the block's first.
-
-    Args:
-        is_first: whether to replace what is there, or to raise it.
-    """
-    far, stamps, offset = node[codes.NODE_HIGH], recent.stamps, block.offset
-    for position in range(begin, end):
-        at = position + far
-        if node[codes.NODE_UNIT] != codes.SAMPLES:
-            at = window_after(node, recent, position, offset, newest)
-            at -= stamps[at - 1 - offset] - stamps[position - offset] == far
-        sample, k = at - block.since, position - begin
-        closing[k] = sample if is_first else max(closing[k], sample)
 
 
 @uncounted
@@ -192,14 +165,12 @@ def _window_span_rows(
     begins_in_rows = operands[left, KIND] == IN_ROWS
     ends_in_rows = right != THROUGH and right != left and operands[right, KIND] == IN_ROWS
     if begins_in_rows or ends_in_rows:
-        ends_between(node, recent, begin, end, block.offset, block.last, block.starts, block.afters)
+        find_ends(node, recent, begin, end, block.offset, block.last, block.starts, block.afters)
     if left == right and begins_in_rows:
         window_rows(block, is_greatest, operand, target, begin, end)
         return
     # what stands in the table is the same for all samples, if no row is followed
-    is_number = True
-    for bit in range(CORNER_BITS):
-        is_number = is_number and span[ROWS_FROM + bit] < 0
+    is_number = corners_of(span) == 1
     first, count = begin - block.lowest, end - begin
     if span[ROW] >= 0:
         fill_row(joints[span[ROW]], block.running)
@@ -221,7 +192,7 @@ def _window_span_rows(
     elif not begins_in_rows:
         for k in range(count):
             if is_number:
-                join_number(is_greatest, block.running, columns[0, first + k], target[first + k])
+                join_rows(is_greatest, block.running, columns[0, first + k], target[first + k])
                 continue
             _read_position(span, columns, first + k, joints, spare, numbers, target[first + k])
             join_rows(is_greatest, target[first + k], block.running, target[first + k])
@@ -257,11 +228,8 @@ def run_spans(table_at: int, number: int, which: int, channels: int, is_end: int
     """
     tables, memory, scratch, _ = arrays_at(table_at)
     nodes, part, block = tables.nodes, tables.parts[number], block_of(memory, scratch)
-    columns, first, root = (
-        memory.columns[columns_number(which)],
-        part[codes.PART_FIRST],
-        part[codes.PART_END] - 1,
-    )
+    columns = memory.columns[columns_number(which)]
+    first, root = part[codes.PART_FIRST], part[codes.PART_END] - 1
     has_root = runs_root(part, nodes[root])
     for d in range(first, part[codes.PART_END]):
         code, place = nodes[d, codes.NODE_CODE], d - first
@@ -285,33 +253,20 @@ def _run_joined(table_at: int, number: int, d: int, which: int, channels: int) -
     tables, memory, scratch, _ = arrays_at(table_at)
     nodes, part, look = tables.nodes, tables.parts[number], look_of(which, channels)
     columns, history = memory.columns[columns_number(which)], memory.history[look.channel]
-    block, first, joints, spare = (
-        block_of(memory, scratch),
-        part[codes.PART_FIRST],
-        scratch.joints,
-        scratch.spare,
-    )
+    block, first = block_of(memory, scratch), part[codes.PART_FIRST]
+    joints, spare, numbers = scratch.joints, scratch.spare, scratch.corner
     node, place, running = nodes[d], d - first, block.running
-    code, a, b, has_left = (
-        node[codes.NODE_CODE],
-        max(node[codes.NODE_A], 0),
-        node[codes.NODE_B],
-        node[codes.NODE_A] >= 0,
-    )
+    code, has_left = node[codes.NODE_CODE], node[codes.NODE_A] >= 0
+    a, b = max(node[codes.NODE_A], 0), node[codes.NODE_B]
     signal, other = signal_of(nodes, first + a), signal_of(nodes, first + b)
     of_one = columns[first + a] if signal < 0 else history[signal]
     of_two = columns[first + b] if other < 0 else history[other]
     one_rows = scratch.rows[max(nodes[first + a, codes.NODE_ROWS], 0)]
     two_rows = scratch.rows[max(nodes[first + b, codes.NODE_ROWS], 0)]
-    target, spans, count = (
-        scratch.rows[max(node[codes.NODE_ROWS], 0)],
-        scratch.spans[place],
-        scratch.span_counts[place],
-    )
-    is_ahead, is_strong = (
-        code in (codes.UNTIL, codes.RELEASE),
-        code in (codes.PART_OR, codes.UNTIL, codes.PAST_SINCE),
-    )
+    target, tables_of = scratch.rows[max(node[codes.NODE_ROWS], 0)], scratch.corner_columns[place]
+    spans, count = scratch.spans[place], scratch.span_counts[place]
+    is_ahead = code in (codes.UNTIL, codes.RELEASE)
+    is_strong = code in (codes.PART_OR, codes.UNTIL, codes.PAST_SINCE)
     is_joined = code in (codes.PART_AND, codes.PART_OR)
     if is_ahead:
         fill_row(beyond(look.mode, node[codes.NODE_WEAK]), running)
@@ -328,19 +283,17 @@ def _run_joined(table_at: int, number: int, d: int, which: int, channels: int) -
             if not is_joined:
                 fill_row(running, joints[span[ROW]])
                 at = (begin if is_ahead else end - 1) - block.lowest
-                _read_position(
-                    span, scratch.corner_columns[place], at, joints, spare, scratch.corner, running
-                )
+                _read_position(span, tables_of, at, joints, spare, numbers, running)
             continue
         two = _operand_rows(
             scratch.spans[b], span[RIGHT], of_two, scratch.corner_columns[b], two_rows, begin, end,
-            joints, spare, scratch.corner, block.lowest, other < 0, block.last,
+            joints, spare, numbers, block.lowest, other < 0, block.last,
         )  # fmt: skip
         one = two
         if has_left:
             one = _operand_rows(
                 scratch.spans[a], span[LEFT], of_one, scratch.corner_columns[a], one_rows, begin, end,
-                joints, spare, scratch.corner, block.lowest, signal < 0, block.last,
+                joints, spare, numbers, block.lowest, signal < 0, block.last,
             )  # fmt: skip
         if is_joined:
             join_operands_rows(is_strong, block, one, two, target, begin, end)
@@ -348,23 +301,13 @@ def _run_joined(table_at: int, number: int, d: int, which: int, channels: int) -
             recurrent_rows(block, is_strong, has_left, one, two, target, begin, end, is_ahead)
     variable = node[codes.NODE_VARIABLE]
     if variable >= 0:
-        at, missing = memory.cells[cells_of(part)[1] + variable], beyond(look.mode, node[codes.NODE_WEAK])
+        at, point = memory.cells[cells_of(part)[1] + variable], scratch.points[variable]
         k = span_at(spans, count, at)
         if block.offset <= at <= block.last and spans[k, KIND] == IN_TABLE:
-            columns_of = scratch.corner_columns[place]
-            _read_position(
-                spans[k],
-                columns_of,
-                at - block.lowest,
-                joints,
-                spare,
-                scratch.corner,
-                scratch.points[variable],
-            )
+            _read_position(spans[k], tables_of, at - block.lowest, joints, spare, numbers, point)
         else:
-            take_row(
-                block, NodeRows(columns[d], target, spans[0, END]), at, missing, scratch.points[variable]
-            )
+            own = NodeRows(columns[d], target, spans[0, END])
+            take_row(block, own, at, beyond(look.mode, node[codes.NODE_WEAK]), point)
     return 0
 
 
@@ -383,10 +326,8 @@ def _run_window(table_at: int, number: int, d: int, which: int, channels: int) -
     signal, spans = signal_of(nodes, first + a), scratch.spans[place]
     is_greatest = code in (codes.PART_WINDOW_MAX, codes.PAST_WINDOW_MAX, codes.UNTIL)
     column = columns[first + a] if signal < 0 else history[signal]
-    rows, target = (
-        scratch.rows[max(nodes[first + a, codes.NODE_ROWS], 0)],
-        scratch.rows[max(node[codes.NODE_ROWS], 0)],
-    )
+    rows = scratch.rows[max(nodes[first + a, codes.NODE_ROWS], 0)]
+    target = scratch.rows[max(node[codes.NODE_ROWS], 0)]
     operand = NodeRows(column, rows, scratch.begins[a] if signal < 0 else block.last + 1)
     operands, count, wholes = scratch.spans[a], scratch.span_counts[a], scratch.wholes[place]
     if code != codes.SHIFT:
@@ -403,7 +344,7 @@ def _run_window(table_at: int, number: int, d: int, which: int, channels: int) -
         if span[KIND] != IN_ROWS or begin >= end:
             continue
         if code == codes.SHIFT:
-            ends_between(node, recent, begin, end, block.offset, block.last, block.starts, block.afters)
+            find_ends(node, recent, begin, end, block.offset, block.last, block.starts, block.afters)
             shift_rows(block, True, operand, target, begin, end, value)
             continue
         _window_span_rows(
@@ -411,7 +352,7 @@ def _run_window(table_at: int, number: int, d: int, which: int, channels: int) -
             joints, spare, scratch.corner, target,
         )  # fmt: skip
         if decided:
-            _find_closing(node, block, recent, begin, end, newest, True, scratch.closing)
+            find_closing(node, block, recent, begin, end, newest, True, scratch.closing)
             fill_open(block, scratch.closing, target, begin, end, value)
     return 0
 
@@ -470,7 +411,7 @@ def join_body_spans(
         is_first = True
         for d in range(part[codes.PART_FIRST], part[codes.PART_END]):
             if nodes[d, codes.NODE_CUTS]:
-                _find_closing(nodes[d], block, recent, begin, end, newest, is_first, closing)
+                find_closing(nodes[d], block, recent, begin, end, newest, is_first, closing)
                 is_first = False
         for position in range(begin, end):
             sample = max(position - block.since, closing[position - begin])

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from spatial_replay.compiled import apart, uncounted
+from spatial_replay.compiled import apart, inlined, uncounted
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
+from spatial_replay.monitor.online.blocks.block_ends import find_ends
 from spatial_replay.monitor.online.blocks.spans import (
     BEGIN,
     END,
@@ -28,7 +29,6 @@ from spatial_replay.monitor.online.node_columns import columns_number, look_of, 
 from spatial_replay.monitor.online.open_windows import runs_root
 from spatial_replay.monitor.online.run_arrays import arrays_at
 from spatial_replay.monitor.online.sliding import (
-    Recent,
     beyond,
     copy,
     either,
@@ -40,62 +40,7 @@ from spatial_replay.monitor.online.sliding import (
 from spatial_replay.monitor.online.state import (
     BLOCK_LOWEST,
     OFFSET,
-    behind,
-    first_behind,
 )
-
-
-@uncounted
-def _copy_ends(
-    ends: Integers, unknown: int, begin: int, end: int, offset: int, most: int, target: Integers
-) -> None:
-    """Copy ends of windows at begin … end - 1, known up to `unknown`; those that are later are `most`."""
-    known = max(min(unknown, end), begin) - begin
-    for k in range(known):
-        target[k] = min(ends[begin - offset + k], most)
-    for k in range(known, end - begin):
-        target[k] = most
-
-
-@uncounted
-def ends_between(
-    node: Integers, recent: Recent, begin: int, end: int, offset: int, last: int, starts: Integers,
-    afters: Integers,
-) -> None:  # fmt: skip
-    """Enter where windows of begin … end - 1 start, and what comes after them, after the sample at `last`."""
-    stamps, unit, near, far = (
-        recent.stamps,
-        node[codes.NODE_UNIT],
-        node[codes.NODE_LOW],
-        node[codes.NODE_HIGH],
-    )
-    if node[codes.NODE_CODE] in codes.AHEAD_OF and unit == codes.SAMPLES:
-        for k in range(end - begin):
-            starts[k] = min(begin + k + near, last + 1)
-        for k in range(end - begin):
-            afters[k] = min(begin + k + far, last) + 1
-        return
-    if node[codes.NODE_CODE] in codes.AHEAD_OF:
-        timed = node[codes.NODE_TIMED]
-        begun, closed = recent.window_next[timed, 1], recent.window_next[timed, 2]
-        _copy_ends(recent.window_ends[timed, 0], begun, begin, end, offset, last + 1, starts)
-        _copy_ends(recent.window_ends[timed, 1], closed, begin, end, offset, last + 1, afters)
-        return
-    start, after = (
-        first_behind(stamps, offset, begin, unit, far),
-        behind(stamps, offset, begin, unit, near) + 1,
-    )
-    for position in range(begin, end):
-        if unit == codes.SAMPLES:
-            start, after = max(position - far, offset), position - near + 1
-        else:
-            time_ns = stamps[position - offset]
-            while time_ns - stamps[start - offset] > far:
-                start += 1
-            while after <= position and time_ns - stamps[after - offset] >= near:
-                after += 1
-        starts[position - begin] = start
-        afters[position - begin] = after
 
 
 @uncounted
@@ -191,10 +136,7 @@ def _join_left(
     value = extremum(is_greatest, source[at - base : end - base], -np.inf if is_greatest else np.inf)
     if is_even:
         stretch = source[starts[0] - base : starts[0] - base + count]
-        if is_greatest:
-            _run_back(True, stretch, value, target)
-        else:
-            _run_back(False, stretch, value, target)
+        _run_back(is_greatest, stretch, value, target)
         return
     for k in range(count - 1, -1, -1):
         while at > starts[k]:
@@ -213,10 +155,7 @@ def _join_right(
     value = extremum(is_greatest, source[begin - base : at - base], -np.inf if is_greatest else np.inf)
     if is_even:
         stretch = source[at - 1 - base : at - 1 - base + count]
-        if is_greatest:
-            _run_on(True, stretch, value, spare[:count])
-        else:
-            _run_on(False, stretch, value, spare[:count])
+        _run_on(is_greatest, stretch, value, spare[:count])
         join(is_greatest, target, spare[:count], target)
         return
     for k in range(count):
@@ -226,10 +165,20 @@ def _join_right(
         target[k] = either(is_greatest, target[k], value)
 
 
-@uncounted
-def _source(spans: Integers, span: int, span_above: Integers, corner: int) -> int:
-    """Return the corner of an operand's table that one of a span above it looks at; -1 for its column."""
-    return corner_below(span_above, corner, spans[span]) if spans[span, KIND] == IN_TABLE else -1
+@inlined
+def _source_of(
+    tables: Floats, spans: Integers, span: int, above: Integers, corner: int, column: Floats, offset: int,
+    lowest: int,
+) -> tuple[Floats, int]:  # fmt: skip
+    """Return what an operand is in one of its spans at a corner of a span above, and the first position.
+
+    Args:
+        tables: (corners, positions), of the operand.
+        column: its numbers from `offset` on, where they are the same for all samples.
+    """
+    if spans[span, KIND] == IN_TABLE:
+        return tables[corner_below(above, corner, spans[span])], lowest
+    return column, offset
 
 
 @uncounted
@@ -238,20 +187,11 @@ def _run_corner(
 ) -> None:
     """Run an operator without a window from one end of a span to the other."""
     if not has_left and is_ahead:
-        if is_strong:
-            _run_back(True, right, start, target)
-        else:
-            _run_back(False, right, start, target)
+        _run_back(is_strong, right, start, target)
     elif not has_left:
-        if is_strong:
-            _run_on(True, right, start, target)
-        else:
-            _run_on(False, right, start, target)
+        _run_on(is_strong, right, start, target)
     elif is_ahead:
-        if is_strong:
-            _run_left(True, left, right, start, target)
-        else:
-            _run_left(False, left, right, start, target)
+        _run_left(is_strong, left, right, start, target)
     else:
         value = start
         for k in range(len(target)):
@@ -266,7 +206,7 @@ def _look_up(source: Floats, base: int, starts: Integers, target: Floats) -> Non
 
 
 @apart
-def fill_tables(table_at: int, number: int, which: int, channels: int, since: int, last: int) -> int:
+def fill_tables(table_at: int, number: int, which: int, channels: int, last: int) -> int:
     """Compute what all nodes of a part are at the corners, in spans with tables, and over these spans."""
     tables, _, scratch, _ = arrays_at(table_at)
     part, nodes, first = tables.parts[number], tables.nodes, tables.parts[number, codes.PART_FIRST]
@@ -297,13 +237,16 @@ def _fill_joined(table_at: int, number: int, d: int, k: int, which: int, channel
     begin, end, has_left = span[BEGIN], span[END], node[codes.NODE_A] >= 0
     is_strong = code in (codes.PART_OR, codes.UNTIL, codes.PAST_SINCE)
     for corner in range(corners_of(span)):
-        at_one = _source(scratch.spans[a], span[LEFT], span, corner) if has_left else -1
-        at_two = _source(scratch.spans[b], span[RIGHT], span, corner)
-        one = scratch.corner_columns[a, max(at_one, 0)] if at_one >= 0 else of_one
-        two = scratch.corner_columns[b, max(at_two, 0)] if at_two >= 0 else of_two
-        base, base_of_two = lowest if at_one >= 0 else offset, lowest if at_two >= 0 else offset
+        two, base = _source_of(
+            scratch.corner_columns[b], scratch.spans[b], span[RIGHT], span, corner, of_two, offset, lowest
+        )
+        left = right = two[begin - base : end - base]
+        if has_left:
+            one, base = _source_of(
+                scratch.corner_columns[a], scratch.spans[a], span[LEFT], span, corner, of_one, offset, lowest
+            )
+            left = one[begin - base : end - base]
         target = scratch.corner_columns[d - first, corner, begin - lowest : end - lowest]
-        left, right = one[begin - base : end - base], two[begin - base_of_two : end - base_of_two]
         if code in (codes.PART_AND, codes.PART_OR):
             join(is_strong, left, right, target)
         else:
@@ -326,13 +269,13 @@ def _fill_window(table_at: int, number: int, d: int, which: int, channels: int, 
     is_root = d == root and not runs_root(part, nodes[root])
     code, a = node[codes.NODE_CODE], node[codes.NODE_B] if is_root else node[codes.NODE_A]
     is_greatest = code in (codes.PART_WINDOW_MAX, codes.PAST_WINDOW_MAX, codes.UNTIL)
-    signal, one = signal_of(nodes, first + a), scratch.spans[a]
+    signal, one, below = signal_of(nodes, first + a), scratch.spans[a], scratch.corner_columns[a]
     column = columns[first + a] if signal < 0 else history[signal]
     for k in range(1, scratch.span_counts[a] if code != codes.SHIFT else 1):
         if one[k, KIND] != IN_TABLE:
             continue
         for corner in range(corners_of(one[k])):
-            source = scratch.corner_columns[a, corner, one[k, BEGIN] - lowest : one[k, END] - lowest]
+            source = below[corner, one[k, BEGIN] - lowest : one[k, END] - lowest]
             scratch.sums[place, k, corner] = extremum(is_greatest, source, -np.inf if is_greatest else np.inf)
     if is_root:
         return 0
@@ -348,7 +291,7 @@ def _fill_window(table_at: int, number: int, d: int, which: int, channels: int, 
         has_right = right != THROUGH and right != left and one[right, KIND] != IN_ROWS
         if not has_left and not has_right:
             continue
-        ends_between(node, recent, begin, end, offset, last, starts, afters)
+        find_ends(node, recent, begin, end, offset, last, starts, afters)
         steps, is_counted = end - 1 - begin, node[codes.NODE_UNIT] == codes.SAMPLES
         is_at_once = code in codes.AHEAD_OF and node[codes.NODE_LOW] == 0
         starts_evenly = (is_counted or is_at_once) and starts[steps] - starts[0] == steps
@@ -357,11 +300,7 @@ def _fill_window(table_at: int, number: int, d: int, which: int, channels: int, 
         has_row = span[KIND] == IN_TABLE and span[ROW] >= 0
         for corner in range(0, corners_of(span), 2 if has_row else 1):
             target = scratch.corner_columns[place, corner, begin - lowest : end - lowest]
-            at = _source(one, left, span, corner)
-            source, base = (
-                scratch.corner_columns[a, max(at, 0)] if at >= 0 else column,
-                lowest if at >= 0 else offset,
-            )
+            source, base = _source_of(below, one, left, span, corner, column, offset, lowest)
             if code == codes.SHIFT:
                 _look_up(source, base, starts, target)
                 continue
@@ -372,10 +311,8 @@ def _fill_window(table_at: int, number: int, d: int, which: int, channels: int, 
             else:
                 _join_left(is_greatest, source, base, starts, starts_evenly, one[left, END], target)
             if has_right:
-                at = _source(one, right, span, corner)
-                source = scratch.corner_columns[a, max(at, 0)] if at >= 0 else column
-                base, first_of_right = lowest if at >= 0 else offset, one[right, BEGIN]
-                _join_right(is_greatest, source, base, first_of_right, afters, ends_evenly, spare, target)
+                source, base = _source_of(below, one, right, span, corner, column, offset, lowest)
+                _join_right(is_greatest, source, base, one[right, BEGIN], afters, ends_evenly, spare, target)
             if has_row:
                 beside = scratch.corner_columns[place, corner + 1, begin - lowest : end - lowest]
                 copy(target, beside)

@@ -20,9 +20,7 @@ from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.node_columns import look_of
 from spatial_replay.monitor.online.open_windows import runs_root
 from spatial_replay.monitor.online.run_arrays import arrays_at
-from spatial_replay.monitor.online.sliding import (
-    is_decided,
-)
+from spatial_replay.monitor.online.sliding import is_decided
 from spatial_replay.monitor.online.state import (
     CORNER_BITS,
     MOST_SPANS,
@@ -113,11 +111,11 @@ def _enter_span(
 @uncounted
 def _takes_row(span: Integers, row: int) -> bool:
     """Have a span follow a row; return False if these are too many."""
-    for bit in range(ROWS_FROM, ROWS_FROM + CORNER_BITS):
-        if span[bit] == row or row < 0:
+    for bit in range(CORNER_BITS):
+        if span[ROWS_FROM + bit] == row or row < 0:
             return True
-        if span[bit] < 0:
-            span[bit] = row
+        if span[ROWS_FROM + bit] < 0:
+            span[ROWS_FROM + bit] = row
             return True
     return False
 
@@ -252,6 +250,7 @@ def _shift_spans(
             kind = IN_ROWS if operand[left, KIND] == IN_ROWS else IN_TABLE
             _enter_span(spans, count, first, end, kind, left, left, -1)
             if kind == IN_TABLE:
+                # no more than these, so that they fit
                 _takes_rows(spans[count], operand[left])
         count += 1
     return count

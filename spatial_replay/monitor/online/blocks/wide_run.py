@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from spatial_replay.compiled import apart, inlined, uncounted
+from spatial_replay.compiled import apart, uncounted
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.blocks.block_ends import find_begins, is_beside_one
@@ -66,10 +66,15 @@ def _takes_spans(nodes: Integers, part: Integers, memory: Memory, begins: Intege
 def _set_first_of_spans(
     table_at: int, number: int, which: int, channels: int, at: int, columns_of: int
 ) -> int:
-    """Enter one of a part's numbers at the first sample, as `_set_first` does, from the spans of its body."""
+    """Enter one of a part's numbers at the first sample, as `set_first` does, from the spans of its body.
+
+    A root with a column of its own needs none of these.
+    """
     tables, memory, scratch, _ = arrays_at(table_at)
     nodes, part, block = tables.nodes, tables.parts[number], block_of(memory, scratch)
     look, root = look_of(which, channels), nodes[part[codes.PART_END] - 1]
+    if runs_root(part, root):
+        return int(set_first(table_at, number, which, channels, at))
     table = memory.tables[look.channel, part[codes.PART_TABLE_START] : tables_end(part)]
     missing, count = beyond(look.mode, root[codes.NODE_WEAK]), block.last + 1 - block.since
     numbers, body = scratch.parts[number, which, at : at + count], root[codes.NODE_B]
@@ -116,16 +121,6 @@ def _find_next_begins(table_at: int, number: int, channels: int, last: int) -> N
             scratch.next_begins[d - first] = scratch.begins[d - first]
 
 
-@inlined
-def _set_first(
-    table_at: int, number: int, which: int, channels: int, at: int, columns_of: int, has_root: bool
-) -> None:
-    if has_root:
-        set_first(table_at, number, which, channels, at)
-    else:
-        _set_first_of_spans(table_at, number, which, channels, at, columns_of)
-
-
 @apart
 def run_wide(table_at: int, number: int, looks: int, channels: int, at: int, count: int, tile: int) -> int:
     """Run a part with many open positions over `count` samples from number `at` of a tile on (see `spans`).
@@ -143,7 +138,6 @@ def run_wide(table_at: int, number: int, looks: int, channels: int, at: int, cou
     since = memory.clock[POSITION] + at
     last = since + count - 1
     begin, _ = root_window(root, memory, last)
-    has_root = runs_root(part, root)
     if since <= offset:
         return 0
     if is_beside_one(nodes, part, memory.stamps, offset, since):
@@ -168,13 +162,13 @@ def run_wide(table_at: int, number: int, looks: int, channels: int, at: int, cou
         if is_first and len(memory.window_next):
             enter_samples(nodes, part, memory.stamps, memory.window_ends, memory.window_next, offset, last)
         is_first = False
-        fill_tables(table_at, number, which, channels, since, last)
+        fill_tables(table_at, number, which, channels, last)
         for begin in range(since, last + 1, BLOCK):
             end = min(begin + BLOCK - 1, last)
             block[BLOCK_SINCE], block[BLOCK_LAST] = begin, end
             run_spans(table_at, number, which, channels, 1 if end == last else 0)
             k = at + begin - since
-            _set_first(table_at, number, which, channels, k, columns_number(which), has_root)
+            _set_first_of_spans(table_at, number, which, channels, k, columns_number(which))
             if which > 1:
                 continue
             if part[codes.PART_IS_REMEMBERING]:
@@ -182,7 +176,7 @@ def run_wide(table_at: int, number: int, looks: int, channels: int, at: int, cou
             for bound in (4, 5):
                 is_beside = bound - 4 == which if channels == 4 else look_of(bound, channels).channel == which
                 if is_beside and ((part[codes.PART_NUMBERS] & ~looks) >> bound) & 1:
-                    _set_first(table_at, number, bound, channels, k, columns_number(which), has_root)
+                    _set_first_of_spans(table_at, number, bound, channels, k, columns_number(which))
         memory.known[number, columns_number(which)] = memory.closed[number, columns_number(which)] = last
         memory.unjoined[number, columns_number(which)] = 0
     for k in range(at, at + count if channels < 4 else at):
