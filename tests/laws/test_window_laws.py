@@ -309,7 +309,8 @@ def test_interpreted_spans_have_the_same_bits(formula, run):
 def test_two_runs_that_share_a_stretch_say_what_one_does(data, formula, run, room, tile, least):
     ends = data.draw(stretches(len(run)))
     with only("compiled"):  # the work is shared once there is machine code
-        assert_same_bits(*both_ways(program_of(formula), run, ends, room=room, tile=tile, least_shared=least))
+        options = {"room": room, "tile": tile, "least_shared": least, "threads": 2}
+        assert_same_bits(*both_ways(program_of(formula), run, ends, **options))
 
 
 @settings(max_examples=800)
@@ -319,54 +320,59 @@ def test_two_runs_that_share_a_stretch_say_what_one_does(data, formula, run, roo
     run=long_runs(500, 900),
     tile=st.sampled_from([20, 33, 64]),
     least=st.sampled_from([200, 300]),
+    threads=st.integers(2, 6),
 )
-def test_two_runs_that_take_half_a_stretch_each_say_what_one_does(data, formula, run, tile, least):
+def test_runs_that_take_a_section_of_a_stretch_each_say_what_one_does(
+    data, formula, run, tile, least, threads
+):
     ends, size = data.draw(stretches(len(run))), len(run)
-    # a stretch that has a middle, and then others
+    # a stretch of several sections, and then others
     ends = sorted({0, 4 * size // 5, *(end for end in ends if end > 4 * size // 5)})
     with only("compiled"):
-        assert_same_bits(*both_ways(program_of(formula), run, ends, room=tile, tile=tile, least_shared=least))
+        options = {"room": tile, "tile": tile, "least_shared": least, "threads": threads}
+        assert_same_bits(*both_ways(program_of(formula), run, ends, **options))
 
 
-def test_one_run_goes_on_where_two_halves_leave_positions_between_them():
+@pytest.mark.parametrize("threads", [2, 3, 5])
+def test_one_run_goes_on_where_sections_leave_positions_between_them(threads):
     within = ahead("F", 0, 30, Temporal("G", (Q,), Bound(0, 300, "ns")))
-    program, size, found = compile_formula(Temporal("G", (Boolean("->", (P, within)),))), 1200, 0
+    program, size, found = compile_formula(Temporal("G", (Boolean("->", (P, within)),))), 1200, set()
     names = [leaf.text for leaf in program.leaves]
+    options = {"room": 32, "tile": 32, "least_shared": 150, "threads": threads}
     for seed in range(40):
         rng, left = np.random.default_rng(seed), []
         times = np.cumsum(np.where(rng.random(size) < 0.02, 3000, rng.integers(1, 4, size)))
         leaves = np.zeros((1, 2, size))
         leaves[0, names.index(Q.text)] = rng.normal(size=size)
         leaves[0, names.index(P.text)] = -9 - rng.random(size)
-        with only("compiled"), between_halves(left):
-            OnlineRun(program, room=32, tile=32, least_shared=150).extend(leaves, times)
-        for begin, end in left:
+        with only("compiled"), between_sections(left):
+            OnlineRun(program, **options).extend(leaves, times)
+        for section, begin, end in left:
             # nothing else is asked for
             leaves[0, names.index(P.text), begin:end] = 9
-            found += 1
+            found.add(section)
         with only("compiled"):
-            halves = OnlineRun(program, room=32, tile=32, least_shared=150).extend(leaves, times)
-            assert (
-                halves.tobytes() == OnlineRun(program, least_shared=size + 1).extend(leaves, times).tobytes()
-            )
-    assert found > 0
+            sections = OnlineRun(program, **options).extend(leaves, times)
+            assert sections.tobytes() == OnlineRun(program, threads=1).extend(leaves, times).tobytes()
+    assert found >= set(range(1, threads))
 
 
 @contextmanager
-def between_halves(left):
-    """Note the positions that a first half has not closed, and the second one does not look at."""
+def between_sections(left):
+    """Note the positions that the section before has not closed and one does not look at, and which one."""
     starts = []
 
     def started(*arguments):
-        starts.append(shares.late_start(*arguments))
-        return starts[-1]
+        found = shares.starts_of(*arguments)
+        starts[:] = enumerate(found, 1)
+        return found
 
     def closed(*arguments):
-        end = shares.closed_up_to(*arguments)
-        left.extend([(end, starts[-1])] if end < starts[-1] else [])
+        end, (section, start) = shares.closed_up_to(*arguments), starts.pop(0)
+        left.extend([(section, end, start.seen)] if end < start.seen else [])
         return end
 
-    with mock.patch.object(step, "late_start", started), mock.patch.object(step, "closed_up_to", closed):
+    with mock.patch.object(step, "starts_of", started), mock.patch.object(step, "closed_up_to", closed):
         yield
 
 
@@ -377,7 +383,8 @@ def test_two_runs_that_share_several_roots_say_what_one_does(data, formula, run,
     # a long stretch, and then others
     ends = sorted({0, size // 2, *(end for end in ends if end > size // 2)})
     with only("compiled"):
-        assert_same_bits(*both_ways(program_of(formula), run, ends, room=tile, tile=tile, least_shared=60))
+        options = {"room": tile, "tile": tile, "least_shared": 60, "threads": 2}
+        assert_same_bits(*both_ways(program_of(formula), run, ends, **options))
 
 
 @settings(max_examples=200)

@@ -1,17 +1,19 @@
-"""A long stretch of samples on two cores: each takes one half of them, or some numbers of the parts.
+"""A long stretch of samples on several cores: each takes a section of them, or some numbers of the parts.
 
-*Halves*: with nothing but bounded windows below an unbounded root, what is open at a sample depends on the
-samples around it alone, and what has closed is no more than a bound. So another run begins in the middle, as
-if nothing had closed before, and its numbers are bounded afterwards by what has closed in the first half.
+*Sections*: with nothing but bounded windows below an unbounded root, what is open at a sample depends on the
+samples around it alone, and what has closed is no more than a bound. So other runs begin further on, each
+as if nothing had closed before, and their numbers are bounded by what has closed in the sections before. The
+run of the first section then says what all nodes are in the others, too, and takes the numbers of these piece
+by piece.
 
 *Shares*: nothing that is open in a part matters to another one, nor do the columns of one number to those of
 another (see `windows`). So two runs of the same samples share these: the one that says what all nodes are
-takes what it has not computed from the other, which goes ahead of it tile by tile.
+takes what it has not computed from the other, which goes ahead of it piece by piece.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple, TypeAlias, cast
@@ -36,7 +38,10 @@ _TWICE = 1.2
 """So many times the work it takes to have a part in both shares."""
 
 _MOST_OF_WORK = 0.8
-"""So much of the work at least is done in halves, or none."""
+"""So much of the work at least is done in sections, or none."""
+
+_ENTERING = 0.15
+"""So much of the work is to enter the numbers of all nodes."""
 
 _BOUNDED = (
     codes.LITERAL, codes.PART_AND, codes.PART_OR, codes.PAST_DELAY, *codes.AHEAD_OF, *codes.PAST_WINDOWS,
@@ -47,12 +52,12 @@ _Unit: TypeAlias = tuple[float, int, int]
 """What one run computes: its cost, the part, and the numbers, a bit for each."""
 
 
-class Halves(NamedTuple):
-    """A program in two, for two halves of a stretch.
+class Sections(NamedTuple):
+    """A program in two, for the sections of a stretch.
 
     Attributes:
-        early: all but the parts that `late` runs: of the second half, this is left to do.
-        late: the parts that are run in halves, without a tree.
+        early: all but the parts that `late` runs: of later sections, this is left to do.
+        late: the parts that are run in sections, without a tree.
         samples, time_ns: so far ahead at most these look from a position.
     """
 
@@ -62,7 +67,14 @@ class Halves(NamedTuple):
     time_ns: int
 
 
-def halves_of(program: Program, memory: Memory) -> Halves | None:
+class SectionStart(NamedTuple):
+    """Where a later section begins: the first sample that its run looks at, and the first of its own."""
+
+    seen: int
+    own: int
+
+
+def sections_of(program: Program, memory: Memory) -> Sections | None:
     """Return a program in two whose parts mostly look no further than bounded windows; None for another.
 
     Args:
@@ -91,7 +103,7 @@ def halves_of(program: Program, memory: Memory) -> Halves | None:
         replace(program, parts=np.concatenate((program.parts[:, : codes.PART_NUMBERS], row[:, None]), axis=1))
         for row in own
     )
-    return Halves(first, replace(second, reports=program.reports[:0]), samples, time_ns)
+    return Sections(first, replace(second, reports=program.reports[:0]), samples, time_ns)
 
 
 def _is_bounded(part: Integers, nodes: Integers) -> bool:
@@ -121,21 +133,49 @@ def _horizon(nodes: Integers) -> tuple[int, int]:
     return max(samples for samples, _ in horizons), max(time_ns for _, time_ns in horizons)
 
 
-def late_start(halves: Halves, times_ns: Integers, begin: int, middle: int) -> int | None:
-    """Return the first sample that the second half looks at.
+def late_start(sections: Sections, times_ns: Integers, begin: int, own: int) -> int | None:
+    """Return the first sample that a later section looks at.
 
-    None if it looks at all samples from `begin` on, so that halves gain nothing.
+    None if it looks at all samples from `begin` on, so that it gains nothing.
 
     Args:
         times_ns: (T,), of the stretch.
-        begin, middle: the first sample of the first half, and of the second.
+        begin, own: the first sample of the first section, and of this one.
     """
     # what has closed is absorbed some samples later
-    newest = middle - 1 - halves.samples - 2 * CLOSING - BLOCK
-    if newest <= begin or halves.time_ns >= int(times_ns[newest]) - int(times_ns[begin]):
+    newest = own - 1 - sections.samples - 2 * CLOSING - BLOCK
+    if newest <= begin or sections.time_ns >= int(times_ns[newest]) - int(times_ns[begin]):
         return None
-    start = int(np.searchsorted(times_ns, times_ns[newest] - halves.time_ns)) - 1
+    start = int(np.searchsorted(times_ns, times_ns[newest] - sections.time_ns)) - 1
     return start if start > begin else None
+
+
+def starts_of(sections: Sections, times_ns: Integers, begin: int, end: int, most: int) -> list[SectionStart]:
+    """Return where the later sections of samples `begin` to before `end` begin; none if they gain nothing.
+
+    The run of the first section enters the numbers of all nodes for all, so its section is shorter by as much
+    as that takes. What the others look at before their own is work of theirs: so much at least is their own.
+
+    Args:
+        times_ns: as for `late_start`.
+        most: so many sections at most.
+    """
+    middle = (begin + end) // 2
+    seen = late_start(sections, times_ns, begin, middle)
+    if seen is None:
+        return []
+    before = (middle - seen) / (end - begin)
+    for others in range(most - 1, 0, -1):
+        # both take as long: first + ENTERING * (1 - first) and (1 - first) / others + before
+        first = max((1 / others + before - _ENTERING) / (1 / others + 1 - _ENTERING), before)
+        if first < 1 and (1 - first) / others >= before:
+            break
+    else:
+        return []
+    ends = np.linspace(begin + first * (end - begin), end, others + 1).astype(int)[:-1].tolist()
+    found = [late_start(sections, times_ns, begin, own) for own in ends]
+    starts = [SectionStart(seen, own) for seen, own in zip(found, ends, strict=True) if seen is not None]
+    return starts if len(starts) == len(ends) else []
 
 
 def begin_late(program: Program, memory: Memory, channels: int, position: int) -> None:
@@ -151,25 +191,20 @@ def closed_up_to(program: Program, memory: Memory) -> int:
     """Return the first position that some part of a program has not absorbed, of those that still matter."""
     closed = int(memory.clock[POSITION])
     for part in _parts_run(program):
-        # what has settled absorbs no more, and bounds the second half to one number
+        # what has settled absorbs no more, and bounds later sections to one number
         if not cast(Any, is_settled).interpreted()(part, memory):
             closed = min(closed, int(memory.cells[part[codes.PART_CELL_START]]))
     return closed
 
 
 def bound_late(
-    program: Program,
-    late: Memory,
-    early: Memory,
-    channels: int,
-    which: tuple[Integers, Integers],
-    numbers: Floats,
+    program: Program, tables: Floats, channels: int, which: tuple[Integers, Integers], numbers: Floats
 ) -> None:
-    """Bound what a run says of the second half by what has closed in the first.
+    """Bound what a run says of samples of a later section by what has closed before.
 
     Args:
-        program: that of the second half.
-        late, early: the memories at the ends of the halves; `late` is changed.
+        program: that of later sections.
+        tables: `Memory.tables` at the end of the section before.
         which: what the numbers are (see `numbers_of`).
         numbers: (K, T), changed.
     """
@@ -177,13 +212,16 @@ def bound_late(
         if look not in (2, 3):  # what a part is now, nothing before matters to
             channel = cast(Any, look_of).interpreted()(look, channels).channel
             table = program.parts[number, codes.PART_TABLE_START]
-            low, high = early.tables[channel, table : table + 2]
-            np.clip(numbers[k], low, high, out=numbers[k])
+            np.clip(numbers[k], *tables[channel, table : table + 2], out=numbers[k])
+
+
+def bound_memory(program: Program, late: Memory, tables: Floats, channels: int) -> None:
+    """Bound the memory at the end of a later section as `bound_late` does numbers."""
     for part in _parts_run(program):
         table = part[codes.PART_TABLE_START]
         ends = slice(table, table + 2)
         for channel in range(channels):
-            late.tables[channel, ends] = np.clip(late.tables[channel, ends], *early.tables[channel, ends])
+            late.tables[channel, ends] = np.clip(late.tables[channel, ends], *tables[channel, ends])
 
 
 def _parts_run(program: Program) -> Integers:
@@ -265,34 +303,45 @@ def joined_memory(programs: tuple[Program, Program], memories: tuple[Memory, Mem
     return memory
 
 
-def iter_ahead(
-    run: Callable[[int, int], Floats], tiles: Sequence[tuple[int, int]]
-) -> Generator[Floats, None, None]:
-    """Yield what is run for each tile, the next of which another thread runs in the meantime.
+class RunAhead:
+    """Pieces of a stretch, run by another thread while the numbers of those before are worked with.
 
-    One is begun when the one before is done, so that no two threads run at once.
-
-    Args:
-        run: runs samples, given the first and the one after the last.
-        tiles: one after the other.
+    As a context, it begins with the first piece, and when left lets none begin any more. Each begins when the
+    one before is done, so that no two threads run at once.
     """
 
-    def run_next(number: int) -> Floats:
-        numbers = run(*tiles[number])
-        if number + 1 in works:
-            works[number + 1].hand_out()
+    def __init__(self, run: Callable[[int, int], Floats], pieces: Sequence[tuple[int, int]]) -> None:
+        """Prepare it.
+
+        Args:
+            run: runs samples, given the first and the one after the last.
+            pieces: one after the other.
+        """
+        self._run, self._pieces = run, pieces
+        # half of a piece cannot be run again, as other work is that was interrupted
+        self._works = {at: Work(partial(self._run_next, at), waits=True) for at in range(len(pieces))}
+
+    def _run_next(self, at: int) -> Floats:
+        numbers = self._run(*self._pieces[at])
+        if at + 1 in self._works:
+            self._works[at + 1].hand_out()
         return numbers
 
-    # half of a tile cannot be run again, as other work is that was interrupted
-    works = {number: Work(partial(run_next, number), waits=True) for number in range(len(tiles))}
-    try:
-        works[0].hand_out()
-        for number in range(len(tiles)):
-            numbers = works[number].result()
-            del works[number]
-            yield numbers
-    finally:
-        drop(works.values())
+    def __enter__(self) -> RunAhead:
+        """Begin with the first piece."""
+        self._works[0].hand_out()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Let no further piece begin, and wait until none is run."""
+        drop(self._works.values())
+
+    def __iter__(self) -> Iterator[tuple[int, Floats]]:
+        """Yield the first sample of each piece, and what was run for it, once."""
+        for at, (begin, _) in enumerate(self._pieces):
+            numbers = self._works[at].result()
+            del self._works[at]
+            yield begin, numbers
 
 
 def numbers_of(program: Program) -> tuple[Integers, Integers]:

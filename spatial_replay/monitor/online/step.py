@@ -7,15 +7,16 @@ same bits, because the only arithmetic is minima, maxima and negation.
 
 from __future__ import annotations
 
-from contextlib import closing
+from contextlib import ExitStack
 from copy import copy
+from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple, cast
 
 import numpy as np
 
 from spatial_replay.compiled import apart, floats_at, inlined, integers_at, releasing
-from spatial_replay.cores import Work, cores, drop
+from spatial_replay.cores import cores
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.blocks.tile_run import run_in_blocks
@@ -24,16 +25,18 @@ from spatial_replay.monitor.online.node_numbers import Results, report
 from spatial_replay.monitor.online.program import Program
 from spatial_replay.monitor.online.run_arrays import RunArrays, Tables, arrays_at, table_of
 from spatial_replay.monitor.online.shares import (
+    RunAhead,
+    SectionStart,
     begin_late,
     bound_late,
+    bound_memory,
     closed_up_to,
     copied,
-    halves_of,
-    iter_ahead,
     joined_memory,
-    late_start,
     numbers_of,
+    sections_of,
     shared_programs,
+    starts_of,
 )
 from spatial_replay.monitor.online.signals import step_signals
 from spatial_replay.monitor.online.state import (
@@ -128,8 +131,17 @@ def step_with_windows(
     return 0
 
 
-_MOST_HALVED = 1 << 18
-"""So many samples at most are run in two halves: the numbers of the second wait for those of the first."""
+_SECTIONS_SHARED = 4
+"""Twice as many samples as are worth two cores are worth so many more, and so on."""
+
+_MOST_THREADS = 8
+"""So many share the work at most: the one that enters the numbers of all nodes has enough to do by then."""
+
+_MOST_IN_SECTIONS = 1 << 18
+"""So many samples at most are run in sections at once: numbers of later ones wait for those of the first."""
+
+_TILES_AT_ONCE = 4
+"""So many tiles are handed over together: fewer, and waiting for each other takes longer."""
 
 
 class _Stretch(NamedTuple):
@@ -150,21 +162,23 @@ class OnlineRun:
     """
 
     def __init__(
-        self, program: Program, *, room: int = 2 * TILE, tile: int = TILE, least_shared: int | None = None
-    ) -> None:
+        self, program: Program, *, room: int = 2 * TILE, tile: int = TILE,
+        least_shared: int = _WORTH_TWO_CORES, threads: int | None = None,
+    ) -> None:  # fmt: skip
         """Start before the first sample.
 
         Args:
             room: the number of recent samples there is room for at first (it doubles when needed).
             tile: how many samples are run together, at most. Samples that come one by one are faster with 1,
                 since the numbers worked with then lie closer together.
-            least_shared: from so many samples that come together on, two threads share the work; with None,
-                from very many on, if there are two cores.
+            least_shared: from so many samples that come together on, several threads share the work.
+            threads: how many may; with None, as many as there are cores.
         """
         self._program = program
         self.step = step_with_windows if has_windows(program) else step
         self._called = self.step
         self._least_shared = least_shared
+        self._threads = min(cores(), _MOST_THREADS) if threads is None else threads
         if not program.keeps_history:
             room = tile
         self._tables = Tables.of(program)
@@ -214,7 +228,7 @@ class OnlineRun:
             done += self._run_tile(stretch, done, len(times_ns))
             # after a tile, the kernel is there, and what settles soon has
             if may_share and done < len(times_ns) and self._is_compiled:
-                before, done = done, self._run_halved(stretch, done)
+                before, done = done, self._run_in_sections(stretch, done)
                 if done == before:
                     done = self._run_shared(stretch, done)
                 may_share = done > before and self._is_worth_sharing(len(times_ns) - done)
@@ -225,9 +239,7 @@ class OnlineRun:
         return bool(getattr(self.step, "is_compiled", False))
 
     def _is_worth_sharing(self, count: int) -> bool:
-        if self._least_shared is None:
-            return count >= _WORTH_TWO_CORES and cores() > 1
-        return count >= self._least_shared
+        return count >= self._least_shared and self._threads > 1
 
     def _run_tile(self, stretch: _Stretch, begin: int, end: int) -> int:
         """Run the first samples of a stretch's number begin … end - 1; return how many."""
@@ -240,51 +252,76 @@ class OnlineRun:
         arrays = leaves, *leaves.shape[:2], times_ns, series, len(times_ns)
         self._called(self._table_at, *arrays, begin, count)
 
-    def _run_halved(self, stretch: _Stretch, begin: int) -> int:
-        """Run samples of a stretch from `begin` on in two halves at once (see `shares`).
+    def _run_in_sections(self, stretch: _Stretch, begin: int) -> int:
+        """Run samples of a stretch from `begin` on in several sections at once (see `shares`).
 
-        Both begin with copies of the state, which stays as it is until they are done.
+        All begin with copies of the state, which stays as it is until they are done.
 
         Returns:
             How many samples of the stretch are done: as before, if they cannot be run so.
         """
-        halves = halves_of(self._program, self._memory)
-        if halves is None:
+        sections = sections_of(self._program, self._memory)
+        if sections is None:
             return begin
-        end = min(len(stretch.times_ns), begin + _MOST_HALVED)
-        # the second half takes in the samples of the first, too, so it is a little shorter
-        middle = begin + (end - begin) * 17 // 32 // self._tile * self._tile
-        start = late_start(halves, stretch.times_ns, begin, middle)
-        if start is None:
+        end = min(len(stretch.times_ns), begin + _MOST_IN_SECTIONS)
+        most = min(self._threads, 1 + _SECTIONS_SHARED * (end - begin) // self._least_shared)
+        starts = starts_of(sections, stretch.times_ns, begin, end, most)
+        if not starts:
             return begin
-        first, second, which = self._share(self._program), self._share(halves.late), numbers_of(halves.late)
+        first, late_runs = self._share(self._program), dict[int, OnlineRun]()
+        which = numbers_of(sections.late)
         of_none = stretch._replace(series=np.empty((0, 4, len(stretch.times_ns))))
-        begin_late(halves.late, second._memory, self._channels, len(self) + start - begin)
 
-        def run_late() -> Floats:
-            second._pass_over(of_none, begin, middle)
-            return second._run_ahead(of_none, which, middle, end)
+        def run_late(start: SectionStart, at: int, after: int) -> Floats:
+            if at == start.own:
+                late_runs[at] = self._late_run(sections.late, of_none, begin, start)
+            return late_runs[start.own]._run_ahead(of_none, which, at, after)
 
-        second._widen_room(2 * (middle - start) + self._tile)
-        work = Work(run_late, waits=True)
-        try:
-            work.hand_out()
+        ends = [start.own for start in starts[1:]] + [end]
+        with ExitStack() as running:
+            sections_ahead = [
+                running.enter_context(RunAhead(partial(run_late, start), self._pieces(start.own, after)))
+                for start, after in zip(starts, ends, strict=True)
+            ]
             done = begin
-            while done < middle:
-                done += first._run_tile(stretch, done, middle)
-            numbers = work.result()
-        finally:
-            drop([work])
-        if closed_up_to(halves.late, first._memory) < len(self) + start - begin:
-            self._take(first._memory, first._final, self._tile)  # as samples stand unevenly
-            know_no_columns(self._memory)
-            return middle
-        bound_late(halves.late, second._memory, first._memory, self._channels, which, numbers)
-        first._go_on_with(halves.early)
-        first._run_behind(stretch, which, numbers, middle)
-        programs, memories = (halves.early, halves.late), (first._memory, second._memory)
-        self._take(joined_memory(programs, memories), first._final, self._tile)
-        return end
+            while done < starts[0].own:
+                done += first._run_tile(stretch, done, starts[0].own)
+            memory = late = first._memory
+            for start, after, ahead in zip(starts, ends, sections_ahead, strict=True):
+                if closed_up_to(sections.late, late) < len(self) + start.seen - begin:
+                    break  # as samples stand unevenly
+                if start is starts[0]:
+                    first._go_on_with(sections.early)
+                tables = late.tables.copy()
+                for at, numbers in ahead:
+                    bound_late(sections.late, tables, self._channels, which, numbers)
+                    first._run_behind(stretch, which, numbers, at)
+                late, done = late_runs[start.own]._memory, after
+                bound_memory(sections.late, late, tables, self._channels)
+        if done > starts[0].own:
+            memory = joined_memory((sections.early, sections.late), (first._memory, late))
+        self._take(memory, first._final, self._tile)
+        know_no_columns(self._memory)
+        return done
+
+    def _late_run(self, program: Program, stretch: _Stretch, begin: int, start: SectionStart) -> OnlineRun:
+        """Return a run of a later section, up to its own samples.
+
+        Args:
+            program: of later sections.
+            begin: the first sample of the first section.
+        """
+        # of its own, since the other sections that run must not find the parts set aside
+        run = self._share(replace(program, parts=program.parts.copy()))
+        begin_late(program, run._memory, self._channels, len(self) + start.seen - begin)
+        run._widen_room(2 * (start.own - start.seen) + self._tile)
+        run._pass_over(stretch, begin, start.own)
+        return run
+
+    def _pieces(self, begin: int, end: int) -> list[tuple[int, int]]:
+        """Return what is handed from one run to another at a time, of samples `begin` to before `end`."""
+        length = _TILES_AT_ONCE * self._tile
+        return [(at, min(at + length, end)) for at in range(begin, end, length)]
 
     def _pass_over(self, stretch: _Stretch, begin: int, end: int) -> None:
         """Take in samples number begin … end - 1 of a stretch without running parts with windows."""
@@ -309,10 +346,9 @@ class OnlineRun:
             return begin
         first, second = map(self._share, programs)
         which, end = numbers_of(second._program), len(stretch.times_ns)
-        tiles = [(at, min(at + self._tile, end)) for at in range(begin, end, self._tile)]
         of_none = stretch._replace(series=np.empty((0, 4, end)))
-        with closing(iter_ahead(partial(second._run_ahead, of_none, which), tiles)) as ahead:
-            for (at, _), numbers in zip(tiles, ahead, strict=True):
+        with RunAhead(partial(second._run_ahead, of_none, which), self._pieces(begin, end)) as ahead:
+            for at, numbers in ahead:
                 first._run_behind(stretch, which, numbers, at)
         self._take(joined_memory(programs, (first._memory, second._memory)), first._final, self._tile)
         return end
