@@ -209,6 +209,15 @@ def row_loop(*, backwards: bool = False, is_last_only: bool = False) -> _Making[
     return lambda formula: cast(Any, _RowLoop(formula, backwards=backwards, is_last_only=is_last_only))
 
 
+def row_fold(formula: Callable[..., Any]) -> Callable[[Any, float], float]:
+    """Return what joins all numbers of an array of rows, and another number, into one.
+
+    Args:
+        formula: joins two rows; in any order, it gives the same.
+    """
+    return cast(Callable[[Any, float], float], _RowFold(formula))
+
+
 class _Kernel(Generic[_Arguments, _Result]):
     """A function in its two forms, each made when it is first needed."""
 
@@ -410,6 +419,13 @@ class _Rows(Lanes):
     def later(self, at: Any) -> Any:
         return at + self.place
 
+    def moved(self, row: Any, by: int) -> Any:
+        places = np.arange(ROW)
+        return row[np.where((places + by >= 0) & (places + by < ROW), places + by, places)]
+
+    def spread(self, row: Any, at: int) -> Any:
+        return np.full(ROW, row[at])
+
 
 class _RowCode(_Kernel[..., None]):
     """A formula of rows, as instructions within the kernel that calls it."""
@@ -463,6 +479,28 @@ class _RowLoop(_RowCode):
             self._compiled = _process.row_loop(
                 self.__wrapped__, self._count, backwards=self._backwards, is_last_only=self._is_last_only
             )
+        return self._compiled
+
+
+class _RowFold(_Kernel[[Any, float], float]):
+    """A formula that joins rows, as a loop within the kernel that calls it, down to one number."""
+
+    def __init__(self, formula: Callable[..., Any]) -> None:
+        super().__init__(formula, {"no_cpython_wrapper": True})
+
+    def interpreted(self) -> Callable[[Any, float], float]:
+        formula: Any = self.__wrapped__
+
+        def fold(rows: Any, start: float) -> float:
+            for number in rows.ravel():
+                start = formula(_Rows(), start, number)
+            return start
+
+        return fold
+
+    def compiled(self) -> Callable[[Any, float], float]:
+        if self._compiled is None:
+            self._compiled = _process.row_fold(self.__wrapped__)
         return self._compiled
 
 

@@ -38,6 +38,12 @@ class Lanes(Protocol):
     def later(self, at: Any) -> Any:
         """Return a place so much later as a loop's row is from the first one of its array."""
 
+    def moved(self, row: Any, by: int) -> Any:
+        """Return the numbers so many places on, or back where it is negative; beyond the row, its own."""
+
+    def spread(self, row: Any, at: int) -> Any:
+        """Return a row of nothing but the number at a place."""
+
 
 class Compiler:
     """What this process knows of its kernels: which form they take, the compiler, the cache, who listens."""
@@ -164,6 +170,23 @@ class Compiler:
 
         return self._emitting(generate, count if is_last_only else count + 1)
 
+    def row_fold(self, formula: Callable[..., Any]) -> Any:
+        """Return what machine code calls to join many rows, and a number, into one number."""
+        self._loaded()
+        from numba.core import types
+        from numba.extending import intrinsic
+
+        @intrinsic
+        def fold(_context, rows, start):  # type: ignore[no-untyped-def]
+            def emit(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+                code = _RowEmitter(context, builder)
+                rows, start = map(code.opened, signature.args, arguments)
+                return code.fold(formula, signature.args[0], rows, start)
+
+            return types.float64(rows, start), emit
+
+        return fold
+
     def _emitting(self, generate: Callable[[_RowEmitter, Sequence[Any], list[Any]], None], count: int) -> Any:
         """Return what makes instructions of a call with `count` arguments."""
         self._loaded()
@@ -252,6 +275,13 @@ class _RowEmitter(Lanes):
     def later(self, at: Any) -> Any:
         return self._builder.add(at, self._spread(self.place))
 
+    def moved(self, row: Any, by: int) -> Any:
+        places = [place + by if 0 <= place + by < ROW else place for place in range(ROW)]
+        return self._shuffled(row, places)
+
+    def spread(self, row: Any, at: int) -> Any:
+        return self._shuffled(row, [at] * ROW)
+
     def opened(self, kind: Any, value: Any) -> Any:
         """Return an array with its address and shape by name; any other value as it is."""
         if not isinstance(kind, self._types.Array):
@@ -277,8 +307,35 @@ class _RowEmitter(Lanes):
         arrays = [k for k in range(1, len(values)) if isinstance(kinds[k], self._types.Array)]
         count = builder.extract_value(values[arrays[-1]].shape, 0)
         constants = {k: self._spread(values[k]) for k in over if k not in arrays}
-        begin, body, end = builder.block, *(builder.append_basic_block() for _ in range(2))
         start = self._load(carried)
+
+        def run(row: Any) -> Any:
+            inputs = [constants[k] if k in constants else self._element(kinds[k], values[k]) for k in over]
+            outcome = formula(self, row, *inputs)
+            result, stored = outcome if isinstance(outcome, tuple) else (outcome, outcome)
+            if not is_last_only:
+                self._store(stored, self._address(kinds[-1], values[-1]))
+            return result
+
+        self._store(self._run_over(count, start, run, backwards=backwards), carried)
+
+    def fold(self, formula: Callable[..., Any], kind: Any, rows: Any, start: Any) -> Any:
+        """Join many rows with a number, and then all numbers of the row that this gives."""
+        builder = self._builder
+        count = builder.extract_value(rows.shape, 0)
+        row = self._run_over(
+            count, self._spread(start), lambda row: formula(self, row, self._element(kind, rows)),
+            backwards=False,
+        )  # fmt: skip
+        width = ROW // 2
+        while width:
+            row, width = formula(self, row, self.moved(row, width)), width // 2
+        return builder.extract_element(row, self._code.IntType(32)(0))
+
+    def _run_over(self, count: Any, start: Any, run: Callable[[Any], Any], *, backwards: bool) -> Any:
+        """Emit a loop over so many rows, in which each row follows from the one before; return the last."""
+        builder = self._builder
+        begin, body, end = builder.block, *(builder.append_basic_block() for _ in range(2))
         builder.cbranch(builder.icmp_signed(">", count, self._index(0)), body, end)
         builder.position_at_end(body)
         done, row = builder.phi(self._index), builder.phi(self._row)
@@ -286,11 +343,7 @@ class _RowEmitter(Lanes):
         row.add_incoming(start, begin)
         after = builder.add(done, self._index(1))
         self.place = builder.sub(count, after) if backwards else done
-        inputs = [constants[k] if k in constants else self._element(kinds[k], values[k]) for k in over]
-        outcome = formula(self, row, *inputs)
-        result, stored = outcome if isinstance(outcome, tuple) else (outcome, outcome)
-        if not is_last_only:
-            self._store(stored, self._address(kinds[-1], values[-1]))
+        result = run(row)
         done.add_incoming(after, builder.block)
         row.add_incoming(result, builder.block)
         builder.cbranch(builder.icmp_signed("<", after, count), body, end)
@@ -299,7 +352,7 @@ class _RowEmitter(Lanes):
         final = builder.phi(self._row)
         final.add_incoming(start, begin)
         final.add_incoming(result, last)
-        self._store(final, carried)
+        return final
 
     def _address(self, kind: Any, array: Any) -> Any:
         """Return where the row, or the number, at the loop's place is."""
@@ -319,8 +372,12 @@ class _RowEmitter(Lanes):
 
     def _spread(self, number: Any) -> Any:
         """Return a row of one number."""
-        narrow = self._code.IntType(32)
         nothing = self._code.Constant(self._code.VectorType(number.type, ROW), self._code.Undefined)
-        first = self._builder.insert_element(nothing, number, narrow(0))
-        places = self._code.Constant(self._code.VectorType(narrow, ROW), [0] * ROW)
-        return self._builder.shuffle_vector(first, nothing, places)
+        first = self._builder.insert_element(nothing, number, self._code.IntType(32)(0))
+        return self._shuffled(first, [0] * ROW)
+
+    def _shuffled(self, row: Any, places: list[int]) -> Any:
+        """Return the numbers of a row that stand at these places."""
+        wanted = self._code.Constant(self._code.VectorType(self._code.IntType(32), ROW), places)
+        nothing = self._code.Constant(row.type, self._code.Undefined)
+        return self._builder.shuffle_vector(row, nothing, wanted)

@@ -82,23 +82,27 @@ def run_instructions(
                 mirror = channel ^ 1 if channels > 1 else channel
                 target = columns[i, channel]
                 first, second, opposite = columns[a, channel], columns[b, channel], columns[a, mirror]
-                # a loop for each operation: a single one would ask for each sample which it is
+                # a loop for each operation, since a single one would ask for each sample which it is; over
+                # slices, of which the compiler sees that the numbers stand side by side
                 if op == CONSTANT:
                     for k in range(count):
                         target[k] = constants[a]
                 elif op == MEASURED:
                     sign = 0.0 if channel < 2 else -1.0 if channel == 2 else 1.0
+                    source, spread = values[a, t : t + count], spreads[a, t : t + count]
                     for k in range(count):
-                        target[k] = values[a, t + k]
+                        target[k] = source[k]
                     if sign:
                         for k in range(count):
-                            target[k] += sign * spreads[a, t + k]
+                            target[k] += sign * spread[k]
                 elif op == SIGNAL:
+                    source = signals[a, t : t + count]
                     for k in range(count):
-                        target[k] = signals[a, t + k]
+                        target[k] = source[k]
                 elif op == CLOSEST:
+                    source = closest[a, channel, t : t + count]
                     for k in range(count):
-                        target[k] = closest[a, channel, t + k]
+                        target[k] = source[k]
                 elif op == ADD:
                     for k in range(count):
                         target[k] = first[k] + second[k]
@@ -130,12 +134,13 @@ def run_instructions(
                     for k in range(count):
                         target[k] = max(first[k], second[k])
                 else:
+                    states = members[c, t : t + count]
                     for k in range(count):
                         value = second[k]
                         # unknown membership: the body may or may not count, so its interval is all reals
-                        if members[c, t + k] < 0:
+                        if states[k] < 0:
                             value = np.inf if channel % 2 else -np.inf
-                        if members[c, t + k] == 0:
+                        if states[k] == 0:
                             target[k] = first[k]
                         elif op == AND_MEMBER:
                             target[k] = min(first[k], value)
@@ -143,8 +148,9 @@ def run_instructions(
                             target[k] = max(first[k], value)
         for j in range(len(outputs)):
             for channel in range(channels):
+                source, target = columns[outputs[j], channel], leaves[channel, j, t : t + count]
                 for k in range(count):
-                    leaves[channel, j, t + k] = columns[outputs[j], channel, k]
+                    target[k] = source[k]
 
 
 MAX_BINDINGS = 20_000

@@ -105,6 +105,13 @@ def _set_now(rule: int, into: Floats, first: Floats, last: Floats, count: int) -
                 into[number, k] = -np.inf
 
 
+@uncounted
+def _copy_known(source: Floats, target: Floats) -> None:
+    """Copy numbers; adding zero turns -0.0 into 0.0, so that equal numbers are equal bits."""
+    for k in range(len(target)):
+        target[k] = source[k] + 0.0
+
+
 @inlined
 def _write_series(numbers: Floats, t: int, count: int, series: Floats) -> None:
     """Write value, now, lower and upper of every node; NaN where the ends of value or now differ.
@@ -114,19 +121,20 @@ def _write_series(numbers: Floats, t: int, count: int, series: Floats) -> None:
     for n in range(numbers.shape[0]):
         for which in range(2):
             low, high = numbers[n, 2 * which], numbers[n, 2 * which + 1]
+            if count == 1:  # a slice costs more than its only number
+                series[n, which, t] = low[0] + 0.0 if low[0] == high[0] else np.nan
+                series[n, 2 + which, t] = numbers[n, 4 + which, 0] + 0.0
+                continue
+            target = series[n, which, t : t + count]
             for k in range(count):
-                series[n, which, t + k] = low[k] + 0.0 if low[k] == high[k] else np.nan
-        for which in range(2):
-            end = numbers[n, 4 + which]
-            for k in range(count):
-                series[n, 2 + which, t + k] = end[k] + 0.0
+                target[k] = low[k] + 0.0 if low[k] == high[k] else np.nan
+            _copy_known(numbers[n, 4 + which, :count], series[n, 2 + which, t : t + count])
 
 
 @uncounted
-def _copy_known(source: Floats, target: Floats) -> None:
-    """Copy numbers; adding zero turns -0.0 into 0.0, so that equal numbers are equal bits."""
+def _fill_known(number: float, target: Floats) -> None:
     for k in range(len(target)):
-        target[k] = source[k] + 0.0
+        target[k] = number + 0.0
 
 
 @uncounted
@@ -167,8 +175,7 @@ def _report_known(
         lower, upper = series[n, 2, t:end], series[n, 3, t:end]
         if code == codes.REPORT_SIGNAL:
             for which in (0, 2, 3):
-                for k in range(t, end):
-                    series[n, which, k] = memory.firsts[0, index] + 0.0
+                _fill_known(memory.firsts[0, index], series[n, which, t:end])
             _copy_known(memory.history[0, index, begin : begin + count], now)
         elif code == codes.REPORT_PART:
             part = scratch.parts[index]
@@ -184,8 +191,7 @@ def _report_known(
                 first = series[operands[start], 1, t:end]
                 _combine_known(codes.REPORT_OR, now, first, first, last, last)
             else:
-                for k in range(count):
-                    now[k] = np.inf if rule == codes.NOW_TRUE else -np.inf
+                _fill_known(np.inf if rule == codes.NOW_TRUE else -np.inf, now)
         elif code == codes.REPORT_PAST:
             of = operands[start]
             for which in (0, 2, 3):

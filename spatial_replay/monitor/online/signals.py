@@ -35,14 +35,17 @@ def step_signals(
             first = history[channel, a, begin : begin + count]
             second = history[channel, b, begin : begin + count]
             if code == codes.LEAF:
+                # sliced, so that the compiler sees that the numbers stand side by side
+                leaf = leaves[channel, a, t : t + count]
                 for k in range(count):
-                    target[k] = leaves[channel, a, t + k]
+                    target[k] = leaf[k]
             elif code == codes.CONSTANT:
                 for k in range(count):
                     target[k] = signals[s, 4] * np.inf
             elif code == codes.NOT:
+                opposite = history[mirror, a, begin : begin + count]
                 for k in range(count):
-                    target[k] = -history[mirror, a, begin + k]
+                    target[k] = -opposite[k]
             elif code == codes.AND:
                 for k in range(count):
                     target[k] = min(first[k], second[k])

@@ -7,11 +7,12 @@ instructions.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from spatial_replay.compiled import inlined, uncounted
+from spatial_replay.compiled import inlined, row_fold, row_loop, uncounted
+from spatial_replay.compiler import ROW, Lanes
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.state import Memory, Scratch, behind, first_behind
@@ -20,6 +21,8 @@ NEAR = 16
 """So far behind the last sample, what a window in seconds begins with is found by walking back."""
 STRIDE = 16
 """So many numbers are filled with one at a time, at first."""
+_HALVES = (1, 2, 4, 8, 16)
+"""So many places apart, one after the other, numbers of a row are joined until each has all from it on."""
 
 
 class Recent(NamedTuple):
@@ -85,25 +88,137 @@ def join_changed(
     return begin
 
 
+def _greater(lanes: Lanes, row: Any, other: Any) -> Any:
+    return lanes.greater(row, other)
+
+
+def _lesser(lanes: Lanes, row: Any, other: Any) -> Any:
+    return lanes.lesser(row, other)
+
+
+_greatest, _least = row_fold(_greater), row_fold(_lesser)
+
+
 @uncounted
 def extremum(is_greatest: bool, source: Floats, start: float) -> float:
-    """Return the greatest or least number and `start`, in four strands that need not wait for each other."""
-    a = b = c = d = start
-    count = len(source)
-    whole = count - count % 4
+    """Return the greatest or least number and `start`."""
+    value, count = start, len(source)
+    whole = count - count % ROW
+    if whole > 0:
+        rows = source[:whole].reshape((whole // ROW, ROW))
+        value = _greatest(rows, start) if is_greatest else _least(rows, start)
     if is_greatest:
-        for k in range(0, whole, 4):
-            a, b = max(a, source[k]), max(b, source[k + 1])
-            c, d = max(c, source[k + 2]), max(d, source[k + 3])
         for k in range(whole, count):
-            a = max(a, source[k])
-        return max(max(a, b), max(c, d))
-    for k in range(0, whole, 4):
-        a, b = min(a, source[k]), min(b, source[k + 1])
-        c, d = min(c, source[k + 2]), min(d, source[k + 3])
+            value = max(value, source[k])
+    else:
+        for k in range(whole, count):
+            value = min(value, source[k])
+    return value
+
+
+def _greatest_back(lanes: Lanes, row: Any, numbers: Any) -> Any:
+    for by in _HALVES:
+        numbers = lanes.greater(numbers, lanes.moved(numbers, by))
+    found = lanes.greater(row, numbers)
+    return lanes.spread(found, 0), found
+
+
+def _least_back(lanes: Lanes, row: Any, numbers: Any) -> Any:
+    for by in _HALVES:
+        numbers = lanes.lesser(numbers, lanes.moved(numbers, by))
+    found = lanes.lesser(row, numbers)
+    return lanes.spread(found, 0), found
+
+
+def _greatest_on(lanes: Lanes, row: Any, numbers: Any) -> Any:
+    for by in _HALVES:
+        numbers = lanes.greater(numbers, lanes.moved(numbers, -by))
+    found = lanes.greater(row, numbers)
+    return lanes.spread(found, ROW - 1), found
+
+
+def _least_on(lanes: Lanes, row: Any, numbers: Any) -> Any:
+    for by in _HALVES:
+        numbers = lanes.lesser(numbers, lanes.moved(numbers, -by))
+    found = lanes.lesser(row, numbers)
+    return lanes.spread(found, ROW - 1), found
+
+
+def _greatest_on_beside(lanes: Lanes, row: Any, numbers: Any, before: Any) -> Any:
+    row, found = _greatest_on(lanes, row, numbers)
+    return row, lanes.greater(before, found)
+
+
+def _least_on_beside(lanes: Lanes, row: Any, numbers: Any, before: Any) -> Any:
+    row, found = _least_on(lanes, row, numbers)
+    return row, lanes.lesser(before, found)
+
+
+_run_greatest_back = row_loop(backwards=True)(_greatest_back)
+_run_least_back = row_loop(backwards=True)(_least_back)
+_run_greatest_on, _run_least_on = row_loop()(_greatest_on), row_loop()(_least_on)
+_join_greatest_on, _join_least_on = row_loop()(_greatest_on_beside), row_loop()(_least_on_beside)
+
+
+@uncounted
+def extrema_from(is_greatest: bool, source: Floats, start: float, row: Floats, target: Floats) -> None:
+    """Enter the extremum of a number and of all numbers from each on.
+
+    Args:
+        row: (ROW,), room to work in.
+    """
+    count, value = len(target), start
+    rest = count % ROW
+    if count >= ROW:
+        row[:] = start
+        shape = count // ROW, ROW
+        numbers, rows = source[rest:count].reshape(shape), target[rest:].reshape(shape)
+        if is_greatest:
+            _run_greatest_back(row, numbers, rows)
+        else:
+            _run_least_back(row, numbers, rows)
+        value = row[0]
+    for k in range(1, rest + 1):
+        value = either(is_greatest, value, source[rest - k])
+        target[rest - k] = value
+
+
+@uncounted
+def extrema_up_to(is_greatest: bool, source: Floats, start: float, row: Floats, target: Floats) -> None:
+    """Enter the extremum of a number and of all numbers up to each (see `extrema_from`)."""
+    count, value = len(target), start
+    whole = count - count % ROW
+    if count >= ROW:
+        row[:] = start
+        shape = count // ROW, ROW
+        numbers, rows = source[:whole].reshape(shape), target[:whole].reshape(shape)
+        if is_greatest:
+            _run_greatest_on(row, numbers, rows)
+        else:
+            _run_least_on(row, numbers, rows)
+        value = row[0]
     for k in range(whole, count):
-        a = min(a, source[k])
-    return min(min(a, b), min(c, d))
+        value = either(is_greatest, value, source[k])
+        target[k] = value
+
+
+@uncounted
+def join_extrema_up_to(is_greatest: bool, source: Floats, start: float, row: Floats, target: Floats) -> None:
+    """Join numbers with what `extrema_up_to` enters."""
+    count, value = len(target), start
+    whole = count - count % ROW
+    if count >= ROW:
+        row[:] = start
+        shape = count // ROW, ROW
+        numbers, rows = source[:whole].reshape(shape), target[:whole].reshape(shape)
+        if is_greatest:
+            _join_greatest_on(row, numbers, rows, rows)
+        else:
+            _join_least_on(row, numbers, rows, rows)
+        value = row[0]
+    for k in range(whole, count):
+        value = either(is_greatest, value, source[k])
+        target[k] = either(is_greatest, target[k], value)
 
 
 @uncounted

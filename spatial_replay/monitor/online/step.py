@@ -74,8 +74,9 @@ def _begin(memory: Memory, times_ns: Integers, t: int, count: int) -> int:
     if not clock[KEEPS]:
         clock[OFFSET] = clock[POSITION]
     begin = clock[POSITION] - clock[OFFSET]
+    stamps, times_ns = memory.stamps[begin : begin + count], times_ns[t : t + count]
     for k in range(count):
-        memory.stamps[begin + k] = times_ns[t + k]
+        stamps[k] = times_ns[k]
     return int(begin)
 
 

@@ -72,12 +72,10 @@ def _fill_columns(
     for d in range(part[codes.PART_FIRST], part[codes.PART_END]):
         code, a, b = nodes[d, codes.NODE_CODE], nodes[d, codes.NODE_A], nodes[d, codes.NODE_B]
         column = columns[d - part[codes.PART_FIRST]]
-        if code == codes.LITERAL and b:
+        if code == codes.LITERAL:
+            signal = history[mirror if b else channel, a, begin : begin + count]
             for k in range(count):
-                column[k] = -history[mirror, a, begin + k]
-        elif code == codes.LITERAL:
-            for k in range(count):
-                column[k] = history[channel, a, begin + k]
+                column[k] = -signal[k] if b else signal[k]
         elif nodes[d, codes.NODE_DEPENDS]:
             continue
         elif code == codes.PART_AND:
@@ -225,12 +223,14 @@ def _read_clauses(
         if number in (4, 5):
             signal = part[codes.PART_LOWER] if number == 4 else part[codes.PART_UPPER]
         channel = (0 if number < 2 else wide_low) + (nominal_high if number % 2 else 0)
+        source, target = memory.history[channel, signal, begin : begin + count], numbers[number]
+        if beside < 0:
+            for k in range(count):
+                target[k] = source[k]
+            continue
+        other = scratch.parts[beside, number]
         for k in range(count):
-            value = memory.history[channel, signal, begin + k]
-            if beside >= 0:
-                other = scratch.parts[beside, number, k]
-                value = min(value, other) if is_minimum else max(value, other)
-            numbers[number, k] = value
+            target[k] = min(source[k], other[k]) if is_minimum else max(source[k], other[k])
 
 
 @uncounted

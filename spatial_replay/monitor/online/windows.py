@@ -230,8 +230,9 @@ def forget(table_at: int, channels: int) -> int:
     moved, kept = keep - offset, position - keep
     if 2 * moved < len(memory.stamps):
         return 0
+    stamps = memory.stamps[moved : moved + kept]
     for k in range(kept):
-        memory.stamps[k] = memory.stamps[k + moved]
+        memory.stamps[k] = stamps[k]
     for channel in range(channels):
         for s in range(len(signals)):
             if signals[s, codes.SIGNAL_IS_KEPT]:

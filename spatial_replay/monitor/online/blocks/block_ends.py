@@ -109,8 +109,9 @@ def _copy_known(
 ) -> None:
     """Copy ends of windows at begin … end - 1, known up to `unknown`; those that are later are `most`."""
     known = max(min(unknown, end), begin) - begin
+    ends = ends[begin - offset : begin - offset + known]
     for k in range(known):
-        target[k] = min(ends[begin - offset + k], most)
+        target[k] = min(ends[k], most)
     for k in range(known, end - begin):
         target[k] = most
 

@@ -33,7 +33,7 @@ from spatial_replay.monitor.online.blocks.row_loops import (
     run_on,
     run_unbounded,
 )
-from spatial_replay.monitor.online.sliding import either, extremum
+from spatial_replay.monitor.online.sliding import either, extrema_from, extremum
 
 
 class SampleBlock(NamedTuple):
@@ -161,14 +161,9 @@ def window_rows(
         first, count = position - begin, until - position
         rows = target[position - block.lowest : until - block.lowest]
         if middle <= settled:
-            value, at = nothing, middle
-            for k in range(until - 1 - begin, first - 1, -1):
-                while at > starts[k]:
-                    at -= 1
-                    value = either(is_greatest, value, operand.column[at - block.offset])
-                block.before[k] = value
+            _enter_before(block, is_greatest, operand.column, starts[first : first + count], middle)
             fill_row(nothing, block.running)
-            ends, numbers = afters[first : first + count], block.before[first:]
+            ends, numbers = afters[first : first + count], block.before
             join_after(block, is_greatest, operand, middle, ends, numbers, rows)
         else:
             fill_row(nothing, block.running)
@@ -179,6 +174,25 @@ def window_rows(
                 ends = afters[first : first + count]
                 join_after(block, is_greatest, operand, middle, ends, rows, rows)
         position = until
+
+
+@uncounted
+def _enter_before(
+    block: SampleBlock, is_greatest: bool, column: Floats, starts: Integers, middle: int
+) -> None:
+    """Enter the extrema of numbers from where windows start to before some position."""
+    count, nothing = len(starts), -np.inf if is_greatest else np.inf
+    at = max(min(starts[count - 1], middle), block.offset)
+    value = extremum(is_greatest, column[at - block.offset : middle - block.offset], nothing)
+    if starts[count - 1] - starts[0] == count - 1 and starts[count - 1] < middle:
+        numbers = column[starts[0] - block.offset : at + 1 - block.offset]
+        extrema_from(is_greatest, numbers, value, block.running, block.before[:count])
+        return
+    for k in range(1, count + 1):
+        while at > starts[count - k]:
+            at -= 1
+            value = either(is_greatest, value, column[at - block.offset])
+        block.before[count - k] = value
 
 
 @uncounted

@@ -30,11 +30,13 @@ from spatial_replay.monitor.online.open_windows import runs_root
 from spatial_replay.monitor.online.run_arrays import arrays_at
 from spatial_replay.monitor.online.sliding import (
     beyond,
-    copy,
     either,
+    extrema_from,
+    extrema_up_to,
     extremum,
     fill,
     join,
+    join_extrema_up_to,
     recent_of,
 )
 from spatial_replay.monitor.online.state import (
@@ -45,71 +47,24 @@ from spatial_replay.monitor.online.state import (
 
 @uncounted
 def _slide(
-    is_greatest: bool, source: Floats, base: int, starts: Integers, afters: Integers, target: Floats
-) -> None:
+    is_greatest: bool, source: Floats, base: int, starts: Integers, afters: Integers, row: Floats,
+    spare: Floats, target: Floats,
+) -> None:  # fmt: skip
     """Compute extrema over windows that begin and end among the same numbers."""
-    nothing, first, count = -np.inf if is_greatest else np.inf, 0, len(target)
+    first, count = 0, len(target)
     while first < count:
         middle, until = max(afters[first], starts[first]), first + 1
         while until < count and starts[until] < middle:
             until += 1
-        value, at = nothing, middle
-        for k in range(until - 1, first - 1, -1):
-            while at > starts[k]:
-                at -= 1
-                value = either(is_greatest, value, source[at - base])
-            target[k] = value
-        value, at = nothing, middle
-        for k in range(first, until):
-            while at < afters[k]:
-                value = either(is_greatest, value, source[at - base])
-                at += 1
-            target[k] = either(is_greatest, target[k], value)
+        some, others = starts[first:until], afters[first:until]
+        _join_left(is_greatest, source, base, some, False, middle, row, spare, target[first:until])
+        _join_right(is_greatest, source, base, middle, others, False, row, spare, target[first:until])
         first = until
 
 
 @uncounted
-def _run_back(is_greatest: bool, source: Floats, start: float, target: Floats) -> None:
-    """Enter the extremum of a number and of all numbers from each on.
-
-    Four at a time, which wait for those after them only once.
-    """
-    value, whole = start, len(target) % 4
-    for k in range(len(target) - 4, whole - 1, -4):
-        a, b, c, d = source[k], source[k + 1], source[k + 2], source[k + 3]
-        c = either(is_greatest, d, c)
-        b = either(is_greatest, c, b)
-        a = either(is_greatest, b, a)
-        target[k + 3], target[k + 2] = either(is_greatest, value, d), either(is_greatest, value, c)
-        target[k + 1] = either(is_greatest, value, b)
-        value = either(is_greatest, value, a)
-        target[k] = value
-    for k in range(whole - 1, -1, -1):
-        value = either(is_greatest, value, source[k])
-        target[k] = value
-
-
-@uncounted
-def _run_on(is_greatest: bool, source: Floats, start: float, target: Floats) -> None:
-    """Enter the extremum of a number and of all numbers up to each (see `_run_back`)."""
-    value, whole = start, len(target) - len(target) % 4
-    for k in range(0, whole, 4):
-        a, b, c, d = source[k], source[k + 1], source[k + 2], source[k + 3]
-        b = either(is_greatest, a, b)
-        c = either(is_greatest, b, c)
-        d = either(is_greatest, c, d)
-        target[k], target[k + 1] = either(is_greatest, value, a), either(is_greatest, value, b)
-        target[k + 2] = either(is_greatest, value, c)
-        value = either(is_greatest, value, d)
-        target[k + 3] = value
-    for k in range(whole, len(target)):
-        value = either(is_greatest, value, source[k])
-        target[k] = value
-
-
-@uncounted
 def _run_left(is_strong: bool, left: Floats, right: Floats, start: float, target: Floats) -> None:
-    """Run an operator with a left operand back from what it is after the last position (see `_run_back`)."""
+    """Run an operator with a left operand back from what it is after the last position, two at a time."""
     value, whole = start, len(target) % 2
     for k in range(len(target) - 2, whole - 1, -2):
         # what two positions are together waits once for those after them
@@ -125,44 +80,45 @@ def _run_left(is_strong: bool, left: Floats, right: Floats, start: float, target
 
 @uncounted
 def _join_left(
-    is_greatest: bool, source: Floats, base: int, starts: Integers, is_even: bool, end: int, target: Floats
-) -> None:
+    is_greatest: bool, source: Floats, base: int, starts: Integers, is_even: bool, end: int, row: Floats,
+    spare: Floats, target: Floats,
+) -> None:  # fmt: skip
     """Compute extrema from where windows start to before `end`.
 
     Args:
         is_even: whether each starts one position after the one before, so that they need not be looked up.
+        row, spare: (ROW,) and (room,), room to work in.
     """
-    at, count = max(min(starts[len(target) - 1], end), base), len(target)
+    first, count = starts[0], len(target)
+    at = max(min(starts[count - 1], end), base)
     value = extremum(is_greatest, source[at - base : end - base], -np.inf if is_greatest else np.inf)
     if is_even:
-        stretch = source[starts[0] - base : starts[0] - base + count]
-        _run_back(is_greatest, stretch, value, target)
+        extrema_from(is_greatest, source[first - base : first - base + count], value, row, target)
         return
-    for k in range(count - 1, -1, -1):
-        while at > starts[k]:
-            at -= 1
-            value = either(is_greatest, value, source[at - base])
-        target[k] = value
+    before = max(at - first, 0)
+    extrema_from(is_greatest, source[first - base : at - base], value, row, spare[:before])
+    spare[before] = value
+    for k in range(count):
+        target[k] = spare[min(starts[k] - first, before)]
 
 
 @uncounted
 def _join_right(
     is_greatest: bool, source: Floats, base: int, begin: int, afters: Integers, is_even: bool,
-    spare: Floats, target: Floats,
+    row: Floats, spare: Floats, target: Floats,
 ) -> None:  # fmt: skip
     """Join numbers with the extrema from `begin` to where windows end (see `_join_left`)."""
-    at, count = afters[0], len(target)
+    # windows that hold no sample at all end before they begin
+    at, count = max(afters[0], begin), len(target)
     value = extremum(is_greatest, source[begin - base : at - base], -np.inf if is_greatest else np.inf)
     if is_even:
-        stretch = source[at - 1 - base : at - 1 - base + count]
-        _run_on(is_greatest, stretch, value, spare[:count])
-        join(is_greatest, target, spare[:count], target)
+        # the first number is in the value, too
+        join_extrema_up_to(is_greatest, source[at - 1 - base : at - 1 - base + count], value, row, target)
         return
+    spare[0], last = value, max(afters[count - 1], at)
+    extrema_up_to(is_greatest, source[at - base : last - base], value, row, spare[1 : 1 + last - at])
     for k in range(count):
-        while at < afters[k]:
-            value = either(is_greatest, value, source[at - base])
-            at += 1
-        target[k] = either(is_greatest, target[k], value)
+        target[k] = either(is_greatest, target[k], spare[max(afters[k] - at, 0)])
 
 
 @inlined
@@ -183,13 +139,14 @@ def _source_of(
 
 @uncounted
 def _run_corner(
-    is_strong: bool, is_ahead: bool, has_left: bool, left: Floats, right: Floats, start: float, target: Floats
-) -> None:
+    is_strong: bool, is_ahead: bool, has_left: bool, left: Floats, right: Floats, start: float, row: Floats,
+    target: Floats,
+) -> None:  # fmt: skip
     """Run an operator without a window from one end of a span to the other."""
     if not has_left and is_ahead:
-        _run_back(is_strong, right, start, target)
+        extrema_from(is_strong, right, start, row, target)
     elif not has_left:
-        _run_on(is_strong, right, start, target)
+        extrema_up_to(is_strong, right, start, row, target)
     elif is_ahead:
         _run_left(is_strong, left, right, start, target)
     else:
@@ -252,7 +209,7 @@ def _fill_joined(table_at: int, number: int, d: int, k: int, which: int, channel
         else:
             start = np.inf if corner & 1 else -np.inf
             is_ahead = code in (codes.UNTIL, codes.RELEASE)
-            _run_corner(is_strong, is_ahead, has_left, left, right, start, target)
+            _run_corner(is_strong, is_ahead, has_left, left, right, start, scratch.running, target)
     return 0
 
 
@@ -264,7 +221,7 @@ def _fill_window(table_at: int, number: int, d: int, which: int, channels: int, 
     columns, history = memory.columns[columns_number(which)], memory.history[look.channel]
     recent, offset, first = recent_of(memory, scratch), memory.clock[OFFSET], part[codes.PART_FIRST]
     lowest, starts, afters = scratch.block[BLOCK_LOWEST], scratch.ends[0], scratch.ends[1]
-    spare = scratch.extrema[0]
+    row, spare = scratch.running, scratch.extrema[0]
     place, node, root = d - first, nodes[d], part[codes.PART_END] - 1
     is_root = d == root and not runs_root(part, nodes[root])
     code, a = node[codes.NODE_CODE], node[codes.NODE_B] if is_root else node[codes.NODE_A]
@@ -291,11 +248,14 @@ def _fill_window(table_at: int, number: int, d: int, which: int, channels: int, 
         has_right = right != THROUGH and right != left and one[right, KIND] != IN_ROWS
         if not has_left and not has_right:
             continue
-        find_ends(node, recent, begin, end, offset, last, starts, afters)
         steps, is_counted = end - 1 - begin, node[codes.NODE_UNIT] == codes.SAMPLES
+        find_ends(node, recent, begin, begin + 1, offset, last, starts, afters)
+        find_ends(node, recent, end - 1, end, offset, last, starts[steps:], afters[steps:])
         is_at_once = code in codes.AHEAD_OF and node[codes.NODE_LOW] == 0
         starts_evenly = (is_counted or is_at_once) and starts[steps] - starts[0] == steps
         ends_evenly = is_counted and afters[steps] - afters[0] == steps
+        if left == right or code == codes.SHIFT or not (starts_evenly and ends_evenly):
+            find_ends(node, recent, begin, end, offset, last, starts, afters)
         # of a span with rows of its own, what stands in tables is joined with these
         has_row = span[KIND] == IN_TABLE and span[ROW] >= 0
         for corner in range(0, corners_of(span), 2 if has_row else 1):
@@ -304,18 +264,20 @@ def _fill_window(table_at: int, number: int, d: int, which: int, channels: int, 
             if code == codes.SHIFT:
                 _look_up(source, base, starts, target)
                 continue
+            if has_row:
+                # where the row between is as great as can be, say, it outdoes the rest
+                beside = scratch.corner_columns[place, corner + 1, begin - lowest : end - lowest]
+                target, other = (target, beside) if is_greatest else (beside, target)
+                fill(other, np.inf if is_greatest else -np.inf)
             if not has_left:
                 fill(target, -np.inf if is_greatest else np.inf)
             elif left == right:
-                _slide(is_greatest, source, base, starts, afters, target)
+                _slide(is_greatest, source, base, starts, afters, row, spare, target)
             else:
-                _join_left(is_greatest, source, base, starts, starts_evenly, one[left, END], target)
+                at = one[left, END]
+                _join_left(is_greatest, source, base, starts, starts_evenly, at, row, spare, target)
             if has_right:
                 source, base = _source_of(below, one, right, span, corner, column, offset, lowest)
-                _join_right(is_greatest, source, base, one[right, BEGIN], afters, ends_evenly, spare, target)
-            if has_row:
-                beside = scratch.corner_columns[place, corner + 1, begin - lowest : end - lowest]
-                copy(target, beside)
-                # where the row between is as great as can be, say, it outdoes the rest
-                fill(beside if is_greatest else target, np.inf if is_greatest else -np.inf)
+                at = one[right, BEGIN]
+                _join_right(is_greatest, source, base, at, afters, ends_evenly, row, spare, target)
     return 0
