@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from spatial_replay.compiled import elementwise, long_kernel
+from spatial_replay.compiled import elementwise, inlined_as, long_kernel
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Flags, Floats, Integers
 from spatial_replay.monitor.atoms.closest_pair import ClosestPair, number_of_closest
@@ -56,6 +56,32 @@ TILE = 128
 """Samples processed together: few, so that their columns stay in the processor's cache."""
 
 
+def _copy_each_to(source: Floats, row: int, begin: int, count: int, target: Floats) -> None:
+    for k in range(count):
+        target[k] = source[row, begin + k]
+
+
+@inlined_as(_copy_each_to)
+def _copy_to(source: Floats, row: int, begin: int, count: int, target: Floats) -> None:
+    """Copy some numbers of a row; as a slice, of which the compiler sees that they stand side by side."""
+    numbers = source[row, begin : begin + count]
+    for k in range(count):
+        target[k] = numbers[k]
+
+
+def _copy_each_from(source: Floats, target: Floats, channel: int, row: int, begin: int, count: int) -> None:
+    for k in range(count):
+        target[channel, row, begin + k] = source[k]
+
+
+@inlined_as(_copy_each_from)
+def _copy_from(source: Floats, target: Floats, channel: int, row: int, begin: int, count: int) -> None:
+    """Copy numbers to some of a row (see `_copy_to`)."""
+    numbers = target[channel, row, begin : begin + count]
+    for k in range(count):
+        numbers[k] = source[k]
+
+
 @elementwise
 @long_kernel
 def run_instructions(
@@ -82,27 +108,21 @@ def run_instructions(
                 mirror = channel ^ 1 if channels > 1 else channel
                 target = columns[i, channel]
                 first, second, opposite = columns[a, channel], columns[b, channel], columns[a, mirror]
-                # a loop for each operation, since a single one would ask for each sample which it is; over
-                # slices, of which the compiler sees that the numbers stand side by side
+                # a loop for each operation: a single one would ask for each sample which it is
                 if op == CONSTANT:
                     for k in range(count):
                         target[k] = constants[a]
                 elif op == MEASURED:
                     sign = 0.0 if channel < 2 else -1.0 if channel == 2 else 1.0
-                    source, spread = values[a, t : t + count], spreads[a, t : t + count]
-                    for k in range(count):
-                        target[k] = source[k]
+                    _copy_to(values, a, t, count, target)
                     if sign:
                         for k in range(count):
-                            target[k] += sign * spread[k]
+                            target[k] += sign * spreads[a, t + k]
                 elif op == SIGNAL:
-                    source = signals[a, t : t + count]
-                    for k in range(count):
-                        target[k] = source[k]
+                    _copy_to(signals, a, t, count, target)
                 elif op == CLOSEST:
-                    source = closest[a, channel, t : t + count]
                     for k in range(count):
-                        target[k] = source[k]
+                        target[k] = closest[a, channel, t + k]
                 elif op == ADD:
                     for k in range(count):
                         target[k] = first[k] + second[k]
@@ -134,13 +154,12 @@ def run_instructions(
                     for k in range(count):
                         target[k] = max(first[k], second[k])
                 else:
-                    states = members[c, t : t + count]
                     for k in range(count):
                         value = second[k]
                         # unknown membership: the body may or may not count, so its interval is all reals
-                        if states[k] < 0:
+                        if members[c, t + k] < 0:
                             value = np.inf if channel % 2 else -np.inf
-                        if states[k] == 0:
+                        if members[c, t + k] == 0:
                             target[k] = first[k]
                         elif op == AND_MEMBER:
                             target[k] = min(first[k], value)
@@ -148,9 +167,7 @@ def run_instructions(
                             target[k] = max(first[k], value)
         for j in range(len(outputs)):
             for channel in range(channels):
-                source, target = columns[outputs[j], channel], leaves[channel, j, t : t + count]
-                for k in range(count):
-                    target[k] = source[k]
+                _copy_from(columns[outputs[j], channel], leaves, channel, j, t, count)
 
 
 MAX_BINDINGS = 20_000

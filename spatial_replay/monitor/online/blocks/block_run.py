@@ -20,8 +20,8 @@ from spatial_replay.monitor.online.blocks.block_ends import (
 from spatial_replay.monitor.online.blocks.node_rows import (
     NodeRows,
     SampleBlock,
-    enter,
     fill_open,
+    join_closed,
     join_operands_rows,
     join_positions,
     recurrent_rows,
@@ -193,17 +193,14 @@ def _join_body(
             cuts += 1
     known = max(min(settled, after), base)
     fill_row(extremum(is_until, body.column[base - offset : known - offset], start), block.running)
+    if cuts == 0:
+        join_positions(block, is_until, body, settled, after)
+        return
     whole = settled
-    while body.begin <= whole < min(block.since + 1, after) and not (cuts and closing[whole - settled] > 0):
+    while body.begin <= whole < min(block.since + 1, after) and closing[whole - settled] <= 0:
         whole += 1
     join_positions(block, is_until, body, settled, whole)
-    for position in range(whole, after):
-        begin = position - block.since
-        if cuts:
-            begin = max(begin, closing[position - settled])
-            if begin > block.last - block.since:
-                break  # no window closes before the ones before it do
-        enter(is_until, block, body, position, begin)
+    join_closed(block, is_until, body, whole, after, closing[whole - settled :])
 
 
 @uncounted

@@ -23,6 +23,7 @@ from spatial_replay.monitor.online.blocks.row_loops import (
     fill_row,
     fill_row_until,
     join_all,
+    join_all_from,
     join_each,
     join_rows,
     join_rows_from,
@@ -33,7 +34,7 @@ from spatial_replay.monitor.online.blocks.row_loops import (
     run_on,
     run_unbounded,
 )
-from spatial_replay.monitor.online.sliding import either, extrema_from, extremum
+from spatial_replay.monitor.online.sliding import extrema_from, extremum
 
 
 class SampleBlock(NamedTuple):
@@ -102,8 +103,44 @@ def join_positions(block: SampleBlock, is_greatest: bool, operand: NodeRows, beg
         nothing = -np.inf if is_greatest else np.inf
         join_rows(is_greatest, running, extremum(is_greatest, numbers, nothing), running)
     join_all(is_greatest, running, rows)
-    for position in range(whole, end):
-        enter(is_greatest, block, operand, position, position - block.since)
+    if end > whole:
+        rows_from = max(min(operand.begin, end), whole)
+        numbers = operand.column[whole - block.offset : rows_from - block.offset]
+        join_all_from(is_greatest, running, whole - block.since, numbers)
+        rows = operand.rows[rows_from - block.lowest : end - block.lowest]
+        join_all_from(is_greatest, running, rows_from - block.since, rows)
+
+
+@uncounted
+def join_closed(
+    block: SampleBlock, is_greatest: bool, operand: NodeRows, begin: int, end: int, closing: Integers
+) -> bool:
+    """Join the running row with the numbers at begin … end - 1, for the samples that these count for.
+
+    Args:
+        closing: from which sample on each does, counted from the block's first, if that is not before its
+            own; none of them from an earlier one than the one before.
+
+    Returns:
+        Whether all of them count for some sample.
+    """
+    position, count = begin, block.last + 1 - block.since
+    while position < end:
+        at = max(closing[position - begin], position - block.since)
+        if at >= count:
+            return False
+        # as far as each counts from one sample later on, and both are numbers, or rows
+        until, stop = position + 1, min(end, operand.begin) if position < operand.begin else end
+        while until < stop and max(closing[until - begin], until - block.since) == at + until - position:
+            until += 1
+        if position < operand.begin:
+            numbers = operand.column[position - block.offset : until - block.offset]
+            join_all_from(is_greatest, block.running, at, numbers)
+        else:
+            rows = operand.rows[position - block.lowest : until - block.lowest]
+            join_all_from(is_greatest, block.running, at, rows)
+        position = until
+    return True
 
 
 @uncounted
@@ -181,18 +218,17 @@ def _enter_before(
     block: SampleBlock, is_greatest: bool, column: Floats, starts: Integers, middle: int
 ) -> None:
     """Enter the extrema of numbers from where windows start to before some position."""
-    count, nothing = len(starts), -np.inf if is_greatest else np.inf
+    count, first = len(starts), starts[0]
     at = max(min(starts[count - 1], middle), block.offset)
-    value = extremum(is_greatest, column[at - block.offset : middle - block.offset], nothing)
-    if starts[count - 1] - starts[0] == count - 1 and starts[count - 1] < middle:
-        numbers = column[starts[0] - block.offset : at + 1 - block.offset]
-        extrema_from(is_greatest, numbers, value, block.running, block.before[:count])
-        return
-    for k in range(1, count + 1):
-        while at > starts[count - k]:
-            at -= 1
-            value = either(is_greatest, value, column[at - block.offset])
-        block.before[count - k] = value
+    value = -np.inf if is_greatest else np.inf
+    value = extremum(is_greatest, column[at - block.offset : middle - block.offset], value)
+    size = max(at - first, 0)
+    from_each = block.before[count : count + size + 1]
+    numbers = column[first - block.offset : at - block.offset]
+    extrema_from(is_greatest, numbers, value, block.running, from_each[:size])
+    from_each[size] = value
+    for k in range(count):
+        block.before[k] = from_each[min(starts[k] - first, size)]
 
 
 @uncounted

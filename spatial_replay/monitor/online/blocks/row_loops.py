@@ -105,6 +105,8 @@ def _weak(lanes: Lanes, row: Any, left: Any, right: Any) -> Any:
 _one_greater, _one_lesser = row_code(_greater), row_code(_lesser)
 _one_greater_from, _one_lesser_from = row_code(_greater_from), row_code(_lesser_from)
 _all_greater, _all_lesser = row_loop(is_last_only=True)(_greater), row_loop(is_last_only=True)(_lesser)
+_all_greater_from = row_loop(is_last_only=True)(_greater_later)
+_all_lesser_from = row_loop(is_last_only=True)(_lesser_later)
 _on_greater, _on_lesser = row_loop()(_greater), row_loop()(_lesser)
 _back_greater, _back_lesser = row_loop(backwards=True)(_greater), row_loop(backwards=True)(_lesser)
 _back_greater_from = row_loop(backwards=True)(_greater_later)
@@ -146,6 +148,15 @@ def join_all(is_greatest: bool, row: Floats, rows: Any) -> None:
         _all_greater(row, rows)
     else:
         _all_lesser(row, rows)
+
+
+@inlined
+def join_all_from(is_greatest: bool, row: Floats, at: int, rows: Any) -> None:
+    """The same for the samples from a place on, which is one later for each next row."""
+    if is_greatest:
+        _all_greater_from(row, at, rows)
+    else:
+        _all_lesser_from(row, at, rows)
 
 
 @inlined

@@ -14,10 +14,10 @@ from spatial_replay.monitor.online.blocks.block_ends import find_closing, find_e
 from spatial_replay.monitor.online.blocks.node_rows import (
     NodeRows,
     SampleBlock,
-    enter,
     fill_open,
     join_after,
     join_before,
+    join_closed,
     join_operands_rows,
     join_positions,
     recurrent_rows,
@@ -413,8 +413,5 @@ def join_body_spans(
             if nodes[d, codes.NODE_CUTS]:
                 find_closing(nodes[d], block, recent, begin, end, newest, is_first, closing)
                 is_first = False
-        for position in range(begin, end):
-            sample = max(position - block.since, closing[position - begin])
-            if sample > block.last - block.since:
-                return
-            enter(is_until, block, body, position, sample)
+        if not join_closed(block, is_until, body, begin, end, closing):
+            return
