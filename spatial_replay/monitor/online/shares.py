@@ -13,7 +13,7 @@ takes what it has not computed from the other, which goes ahead of it piece by p
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple, TypeAlias, cast
@@ -133,7 +133,7 @@ def _horizon(nodes: Integers) -> tuple[int, int]:
     return max(samples for samples, _ in horizons), max(time_ns for _, time_ns in horizons)
 
 
-def late_start(sections: Sections, times_ns: Integers, begin: int, own: int) -> int | None:
+def _late_start(sections: Sections, times_ns: Integers, begin: int, own: int) -> int | None:
     """Return the first sample that a later section looks at.
 
     None if it looks at all samples from `begin` on, so that it gains nothing.
@@ -161,7 +161,7 @@ def starts_of(sections: Sections, times_ns: Integers, begin: int, end: int, most
         most: so many sections at most.
     """
     middle = (begin + end) // 2
-    seen = late_start(sections, times_ns, begin, middle)
+    seen = _late_start(sections, times_ns, begin, middle)
     if seen is None:
         return []
     before = (middle - seen) / (end - begin)
@@ -173,7 +173,7 @@ def starts_of(sections: Sections, times_ns: Integers, begin: int, end: int, most
     else:
         return []
     ends = np.linspace(begin + first * (end - begin), end, others + 1).astype(int)[:-1].tolist()
-    found = [late_start(sections, times_ns, begin, own) for own in ends]
+    found = [_late_start(sections, times_ns, begin, own) for own in ends]
     starts = [SectionStart(seen, own) for seen, own in zip(found, ends, strict=True) if seen is not None]
     return starts if len(starts) == len(ends) else []
 
@@ -306,12 +306,11 @@ def joined_memory(programs: tuple[Program, Program], memories: tuple[Memory, Mem
 class RunAhead:
     """Pieces of a stretch, run by another thread while the numbers of those before are worked with.
 
-    As a context, it begins with the first piece, and when left lets none begin any more. Each begins when the
-    one before is done, so that no two threads run at once.
+    Each begins when the one before is done, so that no two of these run at once.
     """
 
     def __init__(self, run: Callable[[int, int], Floats], pieces: Sequence[tuple[int, int]]) -> None:
-        """Prepare it.
+        """Prepare it; `begin` is apart, so that what has to stop it can know it before it begins.
 
         Args:
             run: runs samples, given the first and the one after the last.
@@ -327,14 +326,9 @@ class RunAhead:
             self._works[at + 1].hand_out()
         return numbers
 
-    def __enter__(self) -> RunAhead:
-        """Begin with the first piece."""
+    def begin(self) -> None:
+        """Have the first piece run."""
         self._works[0].hand_out()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """Let no further piece begin, and wait until none is run."""
-        drop(self._works.values())
 
     def __iter__(self) -> Iterator[tuple[int, Floats]]:
         """Yield the first sample of each piece, and what was run for it, once."""
@@ -342,6 +336,11 @@ class RunAhead:
             numbers = self._works[at].result()
             del self._works[at]
             yield begin, numbers
+
+    @staticmethod
+    def stop(several: Iterable[RunAhead]) -> None:
+        """Have no further piece begin of any, and wait until none is run."""
+        drop([work for each in several for work in each._works.values()])
 
 
 def numbers_of(program: Program) -> tuple[Integers, Integers]:

@@ -2,7 +2,7 @@
 
 Extrema over windows are computed by doubling: over 1, 2, 4, … numbers from each on, of which any two cover a
 window. Each of these passes is a plain loop over neighbouring numbers, which the compiler turns into vector
-instructions.
+instructions. Extrema from each number on, or up to each, are found by doubling within rows of numbers.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ NEAR = 16
 """So far behind the last sample, what a window in seconds begins with is found by walking back."""
 STRIDE = 16
 """So many numbers are filled with one at a time, at first."""
-_HALVES = (1, 2, 4, 8, 16)
+_APART = tuple(1 << doubled for doubled in range(ROW.bit_length() - 1))
 """So many places apart, one after the other, numbers of a row are joined until each has all from it on."""
 
 
@@ -88,15 +88,17 @@ def join_changed(
     return begin
 
 
-def _greater(lanes: Lanes, row: Any, other: Any) -> Any:
+def greater(lanes: Lanes, row: Any, other: Any) -> Any:
+    """Return the formula of the greater numbers of two rows."""
     return lanes.greater(row, other)
 
 
-def _lesser(lanes: Lanes, row: Any, other: Any) -> Any:
+def lesser(lanes: Lanes, row: Any, other: Any) -> Any:
+    """Return the formula of the lesser numbers of two rows."""
     return lanes.lesser(row, other)
 
 
-_greatest, _least = row_fold(_greater), row_fold(_lesser)
+_greatest, _least = row_fold(greater), row_fold(lesser)
 
 
 @uncounted
@@ -117,28 +119,28 @@ def extremum(is_greatest: bool, source: Floats, start: float) -> float:
 
 
 def _greatest_back(lanes: Lanes, row: Any, numbers: Any) -> Any:
-    for by in _HALVES:
+    for by in _APART:
         numbers = lanes.greater(numbers, lanes.moved(numbers, by))
     found = lanes.greater(row, numbers)
     return lanes.spread(found, 0), found
 
 
 def _least_back(lanes: Lanes, row: Any, numbers: Any) -> Any:
-    for by in _HALVES:
+    for by in _APART:
         numbers = lanes.lesser(numbers, lanes.moved(numbers, by))
     found = lanes.lesser(row, numbers)
     return lanes.spread(found, 0), found
 
 
 def _greatest_on(lanes: Lanes, row: Any, numbers: Any) -> Any:
-    for by in _HALVES:
+    for by in _APART:
         numbers = lanes.greater(numbers, lanes.moved(numbers, -by))
     found = lanes.greater(row, numbers)
     return lanes.spread(found, ROW - 1), found
 
 
 def _least_on(lanes: Lanes, row: Any, numbers: Any) -> Any:
-    for by in _HALVES:
+    for by in _APART:
         numbers = lanes.lesser(numbers, lanes.moved(numbers, -by))
     found = lanes.lesser(row, numbers)
     return lanes.spread(found, ROW - 1), found

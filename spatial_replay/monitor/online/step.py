@@ -7,7 +7,6 @@ same bits, because the only arithmetic is minima, maxima and negation.
 
 from __future__ import annotations
 
-from contextlib import ExitStack
 from copy import copy
 from dataclasses import replace
 from functools import partial
@@ -132,8 +131,8 @@ def step_with_windows(
     return 0
 
 
-_SECTIONS_SHARED = 4
-"""Twice as many samples as are worth two cores are worth so many more, and so on."""
+_LATER_SECTIONS = 4
+"""So many later sections at most for each `least_shared` samples."""
 
 _MOST_THREADS = 8
 """So many share the work at most: the one that enters the numbers of all nodes has enough to do by then."""
@@ -265,7 +264,7 @@ class OnlineRun:
         if sections is None:
             return begin
         end = min(len(stretch.times_ns), begin + _MOST_IN_SECTIONS)
-        most = min(self._threads, 1 + _SECTIONS_SHARED * (end - begin) // self._least_shared)
+        most = min(self._threads, 1 + _LATER_SECTIONS * (end - begin) // self._least_shared)
         starts = starts_of(sections, stretch.times_ns, begin, end, most)
         if not starts:
             return begin
@@ -279,30 +278,35 @@ class OnlineRun:
             return late_runs[start.own]._run_ahead(of_none, which, at, after)
 
         ends = [start.own for start in starts[1:]] + [end]
-        with ExitStack() as running:
-            sections_ahead = [
-                running.enter_context(RunAhead(partial(run_late, start), self._pieces(start.own, after)))
-                for start, after in zip(starts, ends, strict=True)
-            ]
+        ahead = [
+            RunAhead(partial(run_late, start), self._pieces(start.own, after))
+            for start, after in zip(starts, ends, strict=True)
+        ]
+        try:
+            for each in ahead:
+                each.begin()
             done = begin
             while done < starts[0].own:
                 done += first._run_tile(stretch, done, starts[0].own)
             memory = late = first._memory
-            for start, after, ahead in zip(starts, ends, sections_ahead, strict=True):
+            for start, after, pieces in zip(starts, ends, ahead, strict=True):
                 if closed_up_to(sections.late, late) < len(self) + start.seen - begin:
                     break  # as samples stand unevenly
                 if start is starts[0]:
                     first._go_on_with(sections.early)
                 tables = late.tables.copy()
-                for at, numbers in ahead:
+                for at, numbers in pieces:
                     bound_late(sections.late, tables, self._channels, which, numbers)
                     first._run_behind(stretch, which, numbers, at)
                 late, done = late_runs[start.own]._memory, after
                 bound_memory(sections.late, late, tables, self._channels)
+        finally:
+            RunAhead.stop(ahead)
         if done > starts[0].own:
             memory = joined_memory((sections.early, sections.late), (first._memory, late))
+        else:
+            know_no_columns(memory)
         self._take(memory, first._final, self._tile)
-        know_no_columns(self._memory)
         return done
 
     def _late_run(self, program: Program, stretch: _Stretch, begin: int, start: SectionStart) -> OnlineRun:
@@ -348,9 +352,13 @@ class OnlineRun:
         first, second = map(self._share, programs)
         which, end = numbers_of(second._program), len(stretch.times_ns)
         of_none = stretch._replace(series=np.empty((0, 4, end)))
-        with RunAhead(partial(second._run_ahead, of_none, which), self._pieces(begin, end)) as ahead:
+        ahead = RunAhead(partial(second._run_ahead, of_none, which), self._pieces(begin, end))
+        try:
+            ahead.begin()
             for at, numbers in ahead:
                 first._run_behind(stretch, which, numbers, at)
+        finally:
+            RunAhead.stop([ahead])
         self._take(joined_memory(programs, (first._memory, second._memory)), first._final, self._tile)
         return end
 

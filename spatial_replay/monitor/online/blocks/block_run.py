@@ -161,7 +161,7 @@ def _start_since(
     if differs:
         fill_row(running, target[start - block.lowest])
         return int(start)
-    if begin == 0:
+    if begin <= offset:
         fill_row(np.inf if node[codes.NODE_WEAK] else -np.inf, running)
     else:
         fill_row(column[begin - 1 - offset], running)

@@ -43,7 +43,7 @@ class SampleBlock(NamedTuple):
     Attributes:
         running: (BLOCK,), the row that others are joined with, one by one.
         starts, afters: (room,), where windows start, and what comes after them (see `find_ends`).
-        before: (2 * room,), what windows hold before some position.
+        before: (2 * room,), what windows hold before some position, and room to find that in.
         since, last: the first and the last sample.
         lowest: the position of the first row.
         offset: that of the first number of a column.
@@ -217,7 +217,10 @@ def window_rows(
 def _enter_before(
     block: SampleBlock, is_greatest: bool, column: Floats, starts: Integers, middle: int
 ) -> None:
-    """Enter the extrema of numbers from where windows start to before some position."""
+    """Enter the extrema of numbers from where windows start to before a position into the first of `before`.
+
+    The running row is room to work in.
+    """
     count, first = len(starts), starts[0]
     at = max(min(starts[count - 1], middle), block.offset)
     value = -np.inf if is_greatest else np.inf

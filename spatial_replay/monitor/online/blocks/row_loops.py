@@ -11,6 +11,7 @@ from typing import Any
 from spatial_replay.compiled import inlined, row_code, row_loop
 from spatial_replay.compiler import Lanes
 from spatial_replay.geometry.arrays import Floats
+from spatial_replay.monitor.online.sliding import greater, lesser
 
 
 @row_code
@@ -32,14 +33,6 @@ def repeat(lanes: Lanes, row: Any) -> Any:
 
 
 # -------------------------------------------------------------------------------------------- formulas
-
-
-def _greater(lanes: Lanes, row: Any, other: Any) -> Any:
-    return lanes.greater(row, other)
-
-
-def _lesser(lanes: Lanes, row: Any, other: Any) -> Any:
-    return lanes.lesser(row, other)
 
 
 def _greater_from(lanes: Lanes, row: Any, at: Any, other: Any) -> Any:
@@ -102,13 +95,13 @@ def _weak(lanes: Lanes, row: Any, left: Any, right: Any) -> Any:
     return lanes.lesser(lanes.greater(row, left), right)
 
 
-_one_greater, _one_lesser = row_code(_greater), row_code(_lesser)
+_one_greater, _one_lesser = row_code(greater), row_code(lesser)
 _one_greater_from, _one_lesser_from = row_code(_greater_from), row_code(_lesser_from)
-_all_greater, _all_lesser = row_loop(is_last_only=True)(_greater), row_loop(is_last_only=True)(_lesser)
+_all_greater, _all_lesser = row_loop(is_last_only=True)(greater), row_loop(is_last_only=True)(lesser)
 _all_greater_from = row_loop(is_last_only=True)(_greater_later)
 _all_lesser_from = row_loop(is_last_only=True)(_lesser_later)
-_on_greater, _on_lesser = row_loop()(_greater), row_loop()(_lesser)
-_back_greater, _back_lesser = row_loop(backwards=True)(_greater), row_loop(backwards=True)(_lesser)
+_on_greater, _on_lesser = row_loop()(greater), row_loop()(lesser)
+_back_greater, _back_lesser = row_loop(backwards=True)(greater), row_loop(backwards=True)(lesser)
 _back_greater_from = row_loop(backwards=True)(_greater_later)
 _back_lesser_from = row_loop(backwards=True)(_lesser_later)
 _extend_greater, _extend_lesser = row_loop()(_greater_beside), row_loop()(_lesser_beside)

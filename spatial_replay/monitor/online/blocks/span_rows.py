@@ -270,7 +270,7 @@ def _run_joined(table_at: int, number: int, d: int, which: int, channels: int) -
     is_joined = code in (codes.PART_AND, codes.PART_OR)
     if is_ahead:
         fill_row(beyond(look.mode, node[codes.NODE_WEAK]), running)
-    elif not is_joined and spans[0, END] > 0:
+    elif not is_joined and spans[0, END] > block.offset:
         fill_row(columns[d, spans[0, END] - 1 - block.offset], running)
     elif not is_joined:
         fill_row(np.inf if node[codes.NODE_WEAK] else -np.inf, running)

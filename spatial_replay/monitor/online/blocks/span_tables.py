@@ -87,7 +87,7 @@ def _join_left(
 
     Args:
         is_even: whether each starts one position after the one before, so that they need not be looked up.
-        row, spare: (ROW,) and (room,), room to work in.
+        row, spare: (ROW,) and (2 * room,), room to work in.
     """
     first, count = starts[0], len(target)
     at = max(min(starts[count - 1], end), base)
@@ -254,6 +254,7 @@ def _fill_window(table_at: int, number: int, d: int, which: int, channels: int, 
         is_at_once = code in codes.AHEAD_OF and node[codes.NODE_LOW] == 0
         starts_evenly = (is_counted or is_at_once) and starts[steps] - starts[0] == steps
         ends_evenly = is_counted and afters[steps] - afters[0] == steps
+        # of windows that start and end evenly, only the first and the last are looked at
         if left == right or code == codes.SHIFT or not (starts_evenly and ends_evenly):
             find_ends(node, recent, begin, end, offset, last, starts, afters)
         # of a span with rows of its own, what stands in tables is joined with these

@@ -158,6 +158,7 @@ def _window_spans(
     unit, near, far = node[codes.NODE_UNIT], node[codes.NODE_LOW], node[codes.NODE_HIGH]
     is_past, found = node[codes.NODE_CODE] in codes.PAST_WINDOWS, 0
     for k in range(others):
+        # two of this span, and four of the window's own, have to fit in
         if found > 2 * MOST_SPANS - 8:
             return -1
         first, start = operand[k, BEGIN], _first_starting(node, stamps, offset, last, operand[k, BEGIN])
