@@ -43,6 +43,9 @@ _MOST_OF_WORK = 0.8
 _ENTERING = 0.15
 """So much of the work is to enter the numbers of all nodes."""
 
+_OWN = 2
+"""So many times what it looks at before are a later section's own samples, at least."""
+
 _BOUNDED = (
     codes.LITERAL, codes.PART_AND, codes.PART_OR, codes.PAST_DELAY, *codes.AHEAD_OF, *codes.PAST_WINDOWS,
 )  # fmt: skip
@@ -167,8 +170,10 @@ def starts_of(sections: Sections, times_ns: Integers, begin: int, end: int, most
     before = (middle - seen) / (end - begin)
     for others in range(most - 1, 0, -1):
         # both take as long: first + ENTERING * (1 - first) and (1 - first) / others + before
-        first = max((1 / others + before - _ENTERING) / (1 / others + 1 - _ENTERING), before)
-        if first < 1 and (1 - first) / others >= before:
+        first = (1 / others + before - _ENTERING) / (1 / others + 1 - _ENTERING)
+        # no later one looks at the first sample
+        first = max(first, 1.25 * before)
+        if (1 - first) / others >= _OWN * before:
             break
     else:
         return []
