@@ -10,9 +10,11 @@ from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
+
 from spatial_replay.annotate.specification import reported_trees
 from spatial_replay.errors import UsageError
-from spatial_replay.geometry.arrays import Floats
+from spatial_replay.geometry.arrays import Empty, Floats
 from spatial_replay.logs.messages import Attachment, Channel, Messages, merge
 from spatial_replay.logs.topics import AUTOMATON, DERIVED, SCENE
 from spatial_replay.monitor.instances import Instance
@@ -89,9 +91,9 @@ class AnnotatedEvaluation:
         self._extent: SceneBounds | None = None
         self._has_samples = False
 
-    def extend(self, trace: Trace) -> list[SeriesBlock]:
-        """Take in the next samples; return one block for each of `trees`."""
-        return [block for evaluation in self._evaluations for block in evaluation.extend(trace)]
+    def extend(self, trace: Trace, empty: Empty = np.empty) -> list[SeriesBlock]:
+        """Take in the next samples; return one block for each of `trees`, in memory that `empty` gives."""
+        return [block for evaluation in self._evaluations for block in evaluation.extend(trace, empty)]
 
     def messages(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> list[Messages]:
         """Return what to write beside samples, from the blocks that `extend` returned for them."""

@@ -5,7 +5,7 @@ Ragged rows keep rows of unequal length in one flat array: row r is `values[star
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, Final, TypeAlias
 
 import numpy as np
@@ -17,6 +17,9 @@ Floats: TypeAlias = NDArray[np.float64]
 Integers: TypeAlias = NDArray[np.int64]
 Flags: TypeAlias = NDArray[np.int8]
 Booleans: TypeAlias = NDArray[np.bool_]
+
+Empty: TypeAlias = Callable[[tuple[int, ...]], Floats]
+"""Returns an array of some shape whose numbers are not set yet, as `numpy.empty` does."""
 
 
 def read_only_floats(values: ArrayLike) -> Floats:

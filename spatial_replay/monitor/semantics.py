@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Literal, NamedTuple, Protocol, TypeAlias, cast, get_args
 
+import numpy as np
+
 from spatial_replay.errors import UsageError
-from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.geometry.arrays import Empty, Floats, Integers
 from spatial_replay.monitor.online.program import Program
 from spatial_replay.monitor.online.step import OnlineRun
 from spatial_replay.monitor.paper.evaluator import PaperRun, check_operators, left_out
@@ -48,8 +50,8 @@ class Run(Protocol):
     def final(self) -> Floats:
         """(N, 2): lower and upper end of each node's value if the log ends here."""
 
-    def extend(self, leaves: Floats, times_ns: Integers) -> Floats:
-        """Add samples; return value, now, lower and upper of each node, (N, 4, T)."""
+    def extend(self, leaves: Floats, times_ns: Integers, empty: Empty = np.empty) -> Floats:
+        """Add samples; return value, now, lower and upper of each node, (N, 4, T), in memory that `empty` gives."""
 
     def __len__(self) -> int:
         """Return how many samples were added."""

@@ -14,7 +14,7 @@ from itertools import accumulate, pairwise
 import numpy as np
 
 from spatial_replay.errors import TraceError
-from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.geometry.arrays import Empty, Floats, Integers
 from spatial_replay.monitor.atoms.delays import look_back, tail
 from spatial_replay.monitor.atoms.live import SampleLeaves
 from spatial_replay.monitor.atoms.measurements import leaf_values
@@ -101,8 +101,8 @@ class InstanceStream:
         """The root's verdict if the log ends here; unknown before the first sample."""
         return final_verdict(*self.final[0]) if len(self) else Verdict.UNKNOWN
 
-    def extend(self, scene: TraceScene) -> SeriesBlock:
-        """Add the samples of a scene that fall into the instance's window."""
+    def extend(self, scene: TraceScene, empty: Empty = np.empty) -> SeriesBlock:
+        """Add the samples of a scene that fall into the instance's window; `empty` gives memory for numbers."""
         times = scene.trace.times_ns[scene.skip :]
         begin, end = window_of(times, self.instance.start_ns, self.instance.end_ns)
         times = times[begin:end]
@@ -115,7 +115,7 @@ class InstanceStream:
         positions = np.arange(scene.skip + begin, scene.skip + end, dtype=np.int64)
         first_ns = int(scene.trace.times_ns[0])
         leaves = self._evaluator.leaves_within_log(leaves, positions, times, first_ns)
-        series = self._run.extend(leaves, times)
+        series = self._run.extend(leaves, times, empty)
         self.robustness = series[:, 0, -1].copy()
         if self._evaluator.has_open_end:
             self._settle(times, series)
@@ -154,8 +154,11 @@ class EvaluationStream:
         self._reach = look_back([stream.instance.formula for stream in self.streams])
         self._before: Trace | None = None
 
-    def extend(self, trace: Trace) -> list[SeriesBlock]:
+    def extend(self, trace: Trace, empty: Empty = np.empty) -> list[SeriesBlock]:
         """Add the next samples; return one block for each of `streams`.
+
+        Args:
+            empty: gives memory for the numbers of nodes.
 
         Raises:
             TraceError: samples that do not come after the previous ones.
@@ -176,7 +179,7 @@ class EvaluationStream:
                 trace = Trace.concatenate([recent, trace])
         self._before = trace
         scene = TraceScene(trace, self._regions, skip)
-        return [stream.extend(scene) for stream in self.streams]
+        return [stream.extend(scene, empty) for stream in self.streams]
 
 
 class LiveStream:

@@ -31,6 +31,7 @@ from spatial_replay.monitor.verdict import Verdict, worst_verdict
 from spatial_replay.replay.engine import Replayed, idle_templates, replayed_specs
 from spatial_replay.replay.kept_messages import KEEP_ALL
 from spatial_replay.replay.own_messages import OwnMessages
+from spatial_replay.replay.reused_memory import ReusedMemory
 from spatial_replay.replay.selection import (
     DEFAULT_OPTIONS,
     LogNames,
@@ -110,6 +111,7 @@ class LoadedLog:
         self.name, self.options, self._keep = source.name, replace(options, keep=None), options.keep
         self._source, self._saved = source, saved
         self._looks_back = look_before(files)
+        self._memory = ReusedMemory(MOST_NUMBERS)
         self._attachments = source.attachments
         self._files, self._kept = tuple(files), logged_specifications(files)
         self.own = OwnMessages(selection)
@@ -218,7 +220,8 @@ class LoadedLog:
             edited.files, instances, options.semantics, self._attachments, units=units_of(self._source)
         )
         self._check_size(evaluation)
-        return Evaluated(self, edited, selection, evaluation, tuple(evaluation.extend(self.trace)))
+        blocks = evaluation.extend(self.trace, self._memory.empty)
+        return Evaluated(self, edited, selection, evaluation, tuple(blocks))
 
     def _constants(self, files: Sequence[Specification]) -> Mapping[str, Constant]:
         return MappingProxyType(

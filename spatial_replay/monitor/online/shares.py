@@ -283,8 +283,7 @@ def _assigned(program: Program, units: list[_Unit]) -> tuple[float, Integers]:
 
 def copied(memory: Memory) -> Memory:
     """Return a copy of a run's memory, of which columns are to be computed again."""
-    # zeros take up memory once they are touched
-    again = {name: np.zeros(getattr(memory, name).shape, getattr(memory, name).dtype) for name in _AGAIN}
+    again = {name: np.empty_like(getattr(memory, name)) for name in _AGAIN}
     others = {name: values.copy() for name, values in memory._asdict().items() if name not in again}
     copy = Memory(**others, **again)
     know_no_columns(copy)

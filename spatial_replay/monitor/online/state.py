@@ -229,7 +229,7 @@ def scratch_for(program: Program, room: int, tile: int) -> Scratch:
     wide, corners = widest if positions else 0, 1 << CORNER_BITS
     return Scratch(
         columns=np.zeros((widest, tile)),
-        corners=np.zeros((widest if program.parts[:, PART_IS_NESTED].any() else 0, room)),
+        corners=np.empty((widest if program.parts[:, PART_IS_NESTED].any() else 0, room)),
         low=low,
         high=high,
         plain=plain,
@@ -239,7 +239,7 @@ def scratch_for(program: Program, room: int, tile: int) -> Scratch:
         order=np.zeros(16, np.int64),
         starts=np.zeros(most_tables),
         fresh=np.zeros(largest),
-        extrema=np.zeros((2, 2 * open_room)),
+        extrema=np.empty((2, 2 * open_room)),
         ends=np.zeros((2, open_room), np.int64),
         series=np.zeros((3, tile)),
         rows=_aligned((program.rows, positions, BLOCK)),
@@ -253,9 +253,9 @@ def scratch_for(program: Program, room: int, tile: int) -> Scratch:
         span_counts=np.zeros(wide, np.int64),
         cuts=np.zeros(2 * MOST_SPANS, np.int64),
         # corners of one position in places of the processor's cache that do not exclude each other
-        corner_columns=np.zeros((wide, corners, positions + 40)),
+        corner_columns=np.empty((wide, corners, positions + 40)),
         corner=np.zeros(corners),
-        sums=np.zeros((wide, MOST_SPANS, corners)),
+        sums=np.empty((wide, MOST_SPANS, corners)),
         wholes=_aligned((wide, MOST_SPANS, BLOCK)),
         joints=_aligned((wide * MOST_SPANS, BLOCK)),
         spare=_aligned((2, BLOCK)),
@@ -265,9 +265,9 @@ def scratch_for(program: Program, room: int, tile: int) -> Scratch:
 
 
 def _aligned(shape: tuple[int, ...]) -> Floats:
-    """Return zeros that begin where a line of the processor's cache does."""
+    """Return numbers, not set, that begin where a line of the processor's cache does."""
     size, line = int(np.prod(shape)), 64
-    room = np.zeros(size + line // 8)
+    room = np.empty(size + line // 8)
     begin = -room.ctypes.data % line // 8
     return room[begin : begin + size].reshape(shape)
 
@@ -291,31 +291,30 @@ def know_no_columns(memory: Memory) -> None:
     memory.window_next[:] = -1
 
 
-def doubled(memory: Memory, channels: int, signals: Integers) -> Memory:
-    """Return the memory with twice the room for recent samples; only channels in use take up memory.
+def with_room(memory: Memory, room: int, channels: int, signals: Integers) -> Memory:
+    """Return the memory with more room for recent samples; only channels in use take up memory.
 
     Args:
+        room: that of the memory, doubled any number of times.
         signals: (S, 8), those of the program; of some, only the newest sample is looked at.
     """
     old = len(memory.stamps)
-    history = np.zeros((*memory.history.shape[:2], 2 * old))
+    history = np.empty((*memory.history.shape[:2], room))
     for signal in np.flatnonzero(signals[:, SIGNAL_IS_KEPT]).tolist():
         history[:channels, signal, :old] = memory.history[:channels, signal]
-    wedges = np.zeros((*memory.wedges.shape[:2], 2 * old), np.int64)
-    heights = np.zeros((*memory.heights.shape[:3], 2 * old))
+    wedges = np.empty((*memory.wedges.shape[:2], room), np.int64)
+    heights = np.empty((*memory.heights.shape[:3], room))
     for window, channel in np.ndindex(len(wedges), channels):
         entries = np.arange(*memory.wedge_ends[window, channel, :2])
-        wedges[window, channel, entries % (2 * old)] = memory.wedges[window, channel, entries % old]
+        wedges[window, channel, entries % room] = memory.wedges[window, channel, entries % old]
         if window < len(heights):
-            heights[window, channel][:, entries % (2 * old)] = memory.heights[window, channel][
-                :, entries % old
-            ]
+            heights[window, channel][:, entries % room] = memory.heights[window, channel][:, entries % old]
     know_no_columns(memory)
     return memory._replace(
-        columns=np.zeros((*memory.columns.shape[:2], 2 * old)),
-        joined=np.zeros((*memory.joined.shape[:2], 2 * old // JOINED + 1)),
-        window_ends=np.zeros((*memory.window_ends.shape[:2], 2 * old), np.int64),
-        stamps=np.concatenate((memory.stamps, np.zeros(old, np.int64))),
+        columns=np.empty((*memory.columns.shape[:2], room)),
+        joined=np.empty((*memory.joined.shape[:2], room // JOINED + 1)),
+        window_ends=np.empty((*memory.window_ends.shape[:2], room), np.int64),
+        stamps=np.concatenate((memory.stamps, np.zeros(room - old, np.int64))),
         history=history,
         wedges=wedges,
         heights=heights,

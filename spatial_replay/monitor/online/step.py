@@ -16,7 +16,7 @@ import numpy as np
 
 from spatial_replay.compiled import apart, floats_at, inlined, integers_at, releasing
 from spatial_replay.cores import cores
-from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.geometry.arrays import Empty, Floats, Integers
 from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.blocks.tile_run import run_in_blocks
 from spatial_replay.monitor.online.codes import in_channels
@@ -46,12 +46,12 @@ from spatial_replay.monitor.online.state import (
     START_NS,
     TILE,
     Memory,
-    doubled,
     first_memory,
     has_windows,
     know_no_columns,
     scratch_for,
     widen,
+    with_room,
 )
 from spatial_replay.monitor.online.tables import step_tables
 from spatial_replay.monitor.online.windows import forget
@@ -199,13 +199,14 @@ class OnlineRun:
         """(N, 2): lower and upper end of each node's value if the run ends here."""
         return self._final.copy()
 
-    def extend(self, leaves: Floats, times_ns: Integers) -> Floats:
+    def extend(self, leaves: Floats, times_ns: Integers, empty: Empty = np.empty) -> Floats:
         """Add samples.
 
         Args:
             leaves: (C, A, T), the program's leaves: exact values for C = 1, the ends of the interval given
                 what is unknown for C = 2, those and the same ends with uncertainty for C = 4.
             times_ns: (T,), increasing and after the previous samples.
+            empty: gives memory for what is returned.
 
         Returns:
             (N, 4, T): value, now, lower and upper of each node.
@@ -221,7 +222,7 @@ class OnlineRun:
             self._lengthen_tiles()
         leaves = np.ascontiguousarray(in_channels(leaves, self._channels), np.float64)
         times_ns = np.array(times_ns, np.int64)  # writable, since kernels are compiled for that
-        series = np.empty((len(self._program.reports), 4, len(times_ns)))
+        series = empty((len(self._program.reports), 4, len(times_ns)))
         stretch, done = _Stretch(leaves, times_ns, series), 0
         may_share = has_windows(self._program) and self._is_worth_sharing(len(times_ns))
         while done < len(times_ns):
@@ -268,13 +269,15 @@ class OnlineRun:
         starts = starts_of(sections, stretch.times_ns, begin, end, most)
         if not starts:
             return begin
-        first, late_runs = self._share(self._program), dict[int, OnlineRun]()
+        # twice what is looked at, so that samples are seldom moved to the front
+        room = 2 * max(own - seen for seen, own in starts) + self._tile
+        first, late_runs = self._share(self._program, room), dict[int, OnlineRun]()
         which = numbers_of(sections.late)
         of_none = stretch._replace(series=np.empty((0, 4, len(stretch.times_ns))))
 
         def run_late(start: SectionStart, at: int, after: int) -> Floats:
             if at == start.own:
-                late_runs[at] = self._late_run(sections.late, of_none, begin, start)
+                late_runs[at] = self._late_run(sections.late, of_none, begin, start, room)
             return late_runs[start.own]._run_ahead(of_none, which, at, after)
 
         ends = [start.own for start in starts[1:]] + [end]
@@ -309,17 +312,19 @@ class OnlineRun:
         self._take(memory, first._final, self._tile)
         return done
 
-    def _late_run(self, program: Program, stretch: _Stretch, begin: int, start: SectionStart) -> OnlineRun:
+    def _late_run(
+        self, program: Program, stretch: _Stretch, begin: int, start: SectionStart, room: int
+    ) -> OnlineRun:
         """Return a run of a later section, up to its own samples.
 
         Args:
             program: of later sections.
             begin: the first sample of the first section.
+            room: for so many recent samples, at least.
         """
         # of its own, since the other sections that run must not find the parts set aside
-        run = self._share(replace(program, parts=program.parts.copy()))
+        run = self._share(replace(program, parts=program.parts.copy()), room)
         begin_late(program, run._memory, self._channels, len(self) + start.seen - begin)
-        run._widen_room(2 * (start.own - start.seen) + self._tile)
         run._pass_over(stretch, begin, start.own)
         return run
 
@@ -362,18 +367,23 @@ class OnlineRun:
         self._take(joined_memory(programs, (first._memory, second._memory)), first._final, self._tile)
         return end
 
-    def _share(self, program: Program) -> OnlineRun:
-        """Return a run that goes on from here, of the same program but for what it computes."""
+    def _share(self, program: Program, room: int = 0) -> OnlineRun:
+        """Return a run that goes on from here, of the same program but for what it computes.
+
+        Args:
+            room: for so many recent samples, at least.
+        """
         share = copy(self)
         share._called = releasing(self.step)
         share._memory = copied(self._memory)
-        share._go_on_with(program)
+        share._go_on_with(program, room)
         return share
 
-    def _go_on_with(self, program: Program) -> None:
+    def _go_on_with(self, program: Program, room: int = 0) -> None:
         """Compute from here on what another program does, of the same nodes."""
         self._program, self._tables = program, Tables.of(program)
-        self._take(self._memory, np.zeros((len(program.reports), 2)), self._tile)
+        self._final = np.zeros((len(program.reports), 2))
+        self._widen_room(room, self._tile)
 
     def _run_ahead(self, stretch: _Stretch, which: tuple[Integers, Integers], begin: int, end: int) -> Floats:
         """Run samples number begin … end - 1 of a stretch; return these numbers of its parts, (K, count)."""
@@ -403,17 +413,16 @@ class OnlineRun:
 
     def _lengthen_tiles(self) -> None:
         """Run more samples together from now on: with many, the calls cost more than what the cache saves."""
-        memory = self._memory
-        while len(memory.stamps) < (2 if self._program.keeps_history else 1) * LONG_TILE:
-            memory = doubled(memory, self._channels, self._program.signals)
-        self._take(memory, self._final, LONG_TILE)
+        self._widen_room((2 if self._program.keeps_history else 1) * LONG_TILE, LONG_TILE)
 
-    def _widen_room(self, room: int) -> None:
-        """Have room for so many recent samples: each time it is doubled, columns are computed again."""
-        memory = self._memory
-        while len(memory.stamps) < room:
-            memory = doubled(memory, self._channels, self._program.signals)
-        self._take(memory, self._final, self._tile)
+    def _widen_room(self, least: int, tile: int) -> None:
+        """Have room for so many recent samples, and run so many together: columns are computed again."""
+        memory, room = self._memory, len(self._memory.stamps)
+        while room < least:
+            room *= 2
+        if room > len(memory.stamps):
+            memory = with_room(memory, room, self._channels, self._program.signals)
+        self._take(memory, self._final, tile)
 
     def _take(self, memory: Memory, final: Floats, tile: int) -> None:
         """Go on with another memory, and other tiles, and the room to work in that these need."""
@@ -438,6 +447,5 @@ class OnlineRun:
             if drop(self._table_at, self._channels):
                 offset = int(clock[OFFSET])
             elif used == room:
-                memory = doubled(self._memory, self._channels, self._program.signals)
-                self._take(memory, self._final, self._tile)
+                self._widen_room(2 * room, self._tile)
         return min(wanted, len(self._memory.stamps) - (position - offset))

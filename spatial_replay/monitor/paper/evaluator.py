@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from spatial_replay.errors import UsageError
-from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.geometry.arrays import Empty, Floats, Integers
 from spatial_replay.monitor.atoms.delays import iter_delays
 from spatial_replay.monitor.online.codes import low_and_high
 from spatial_replay.monitor.paper.kernel import PaperMemory, step_paper
@@ -63,12 +63,13 @@ class PaperRun:
         """(N, 2): twice each node's value on the samples so far; NaN where it is undetermined."""
         return np.repeat(self._value[:, None], 2, axis=1)
 
-    def extend(self, leaves: Floats, times_ns: Integers) -> Floats:
+    def extend(self, leaves: Floats, times_ns: Integers, empty: Empty = np.empty) -> Floats:
         """Add samples.
 
         Args:
             leaves: (C, A, T), as for `OnlineRun.extend`, with NaN where a leaf is left out (see `left_out`).
             times_ns: (T,), increasing and after the previous samples.
+            empty: gives memory for what is returned.
 
         Returns:
             (N, 4, T): value, now, lower and upper of each node; the last two are the first.
@@ -81,7 +82,7 @@ class PaperRun:
         numbers = np.ascontiguousarray(leaves[low])
         lost = ((numbers != leaves[high]) & ~np.isnan(numbers)).astype(np.int8)
         times_ns = np.array(times_ns, np.int64)  # writable, since kernels are compiled for that
-        series = np.empty((len(self._table.rows), 4, len(times_ns)))
+        series = empty((len(self._table.rows), 4, len(times_ns)))
         for t in range(0, len(times_ns), _TILE):
             count = min(_TILE, len(times_ns) - t)
             self._make_room(self._position + count)
