@@ -51,7 +51,7 @@ class Run(Protocol):
         """(N, 2): lower and upper end of each node's value if the log ends here."""
 
     def extend(self, leaves: Floats, times_ns: Integers, empty: Empty = np.empty) -> Floats:
-        """Add samples; return value, now, lower and upper of each node, (N, 4, T), in memory that `empty` gives."""
+        """Add samples; return value, now, lower and upper of each node, (N, 4, T), as `empty` gives them."""
 
     def __len__(self) -> int:
         """Return how many samples were added."""

@@ -102,7 +102,11 @@ class InstanceStream:
         return final_verdict(*self.final[0]) if len(self) else Verdict.UNKNOWN
 
     def extend(self, scene: TraceScene, empty: Empty = np.empty) -> SeriesBlock:
-        """Add the samples of a scene that fall into the instance's window; `empty` gives memory for numbers."""
+        """Add the samples of a scene that fall into the instance's window.
+
+        Args:
+            empty: gives memory for the numbers of nodes.
+        """
         times = scene.trace.times_ns[scene.skip :]
         begin, end = window_of(times, self.instance.start_ns, self.instance.end_ns)
         times = times[begin:end]

@@ -1,7 +1,7 @@
 """Memory that is used again: large arrays of one evaluation after those of another.
 
-An operating system clears memory before it gives it, and takes it back when it is freed. Where the same log is
-evaluated again and again, that costs a fifth of an evaluation of many nodes.
+An operating system clears memory before it gives it, and takes it back when it is freed. Where the same log
+is evaluated again and again, that costs a fifth of an evaluation of many nodes.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class ReusedMemory:
         """Hold no memory yet.
 
         Args:
-            most: so many numbers at most are held for arrays to come; of more, what was free for longest goes.
+            most: so many numbers at most are held for arrays to come; what was free for longest goes first.
         """
         self._most = most
         self._free: dict[int, Floats] = {}
@@ -38,14 +38,15 @@ class ReusedMemory:
             return np.empty(shape)
         memory = self._taken(count)
         # what is cut from an array refers to it alone as long as its own memory is no array
-        array = np.frombuffer(memoryview(memory), np.float64, count)
+        array = np.frombuffer(memory.data, np.float64, count)
         weakref.finalize(array, self._give_back, memory).atexit = False
         return array.reshape(shape)
 
     def _taken(self, count: int) -> Floats:
         """Return memory for so many numbers, and not for many more: the smallest that is free, or new one."""
-        fitting = [(len(each), key) for key, each in self._free.copy().items() if count <= len(each) <= 2 * count]
-        for _, key in sorted(fitting):
+        sizes = {key: len(each) for key, each in self._free.copy().items()}
+        fitting = [key for key, size in sizes.items() if count <= size <= 2 * count]
+        for key in sorted(fitting, key=sizes.__getitem__):
             # another thread may have taken it
             if (memory := self._free.pop(key, None)) is not None:
                 return memory

@@ -73,17 +73,26 @@ BINARY_NODES = (
 
 # columns of parts: nodes, numbers of variables and tables, where its tables and its cells start
 PART_FIRST, PART_END, PART_VARIABLES, PART_TABLES, PART_TABLE_START, PART_CELL_START = range(6)
-PART_KIND, PART_IS_REMEMBERING, PART_END_CORNER = 6, 7, 8  # the corner that ends a run
+PART_KIND, PART_END_CORNER = 6, 8  # the corner that ends a run
+# whether what its nodes are at the last sample is asked for: what it is itself, or another part
+PART_IS_REMEMBERING = 7
 PART_IS_NESTED = 9  # whether a node below the root depends on a variable, or any on a table
 # of clauses: signals, whether they join by minimum, and the part beside them, -1 for none
 PART_ENDING, PART_LOWER, PART_UPPER, PART_IS_MINIMUM, PART_BESIDE = 10, 11, 12, 13, 14
 # whether the bound that is not known at once is the value but for positions where a window of those nodes
 # is open that cut it
 PART_IS_CUT = 15
+# the part, this one or another, and its node that is what this part is at the last sample; -1 if nobody asks
+PART_LAST_IN, PART_LAST_NODE = 16, 17
+# which bounds follow from its table alone until its root has ended, a bit for each: what may still come
+# outdoes all that is open
+PART_KNOWN = 18
 # which of its numbers a run computes, a bit for each: all, but where two runs share them (see `shares`)
-PART_NUMBERS = 16
-PART_WIDTH = 17
+PART_NUMBERS = 19
+PART_WIDTH = 20
 ALL_NUMBERS = (1 << 8) - 1
+LAST_NUMBERS = 1 << 2 | 1 << 3  # what a part is at the last sample
+LOWER, UPPER = 4, 5  # its bounds, with uncertainty
 # kinds of parts
 TABLE, WINDOWED, CLAUSES = 0, 1, 2  # see `tables`, `windows`, `clauses`
 

@@ -135,14 +135,20 @@ def runs_root(part: Integers, root: Integers) -> bool:
 
 
 @inlined
-def has_ended(part: Integers, root: Integers, memory: Memory, last: int) -> bool:
+def is_over(root: Integers, memory: Memory, last: int) -> bool:
     """Return whether no later sample can fall into the window of a root that counts from the first one."""
     far = root[codes.NODE_HIGH]
-    if not is_plain(part) or far <= 0:
+    if far <= 0:
         return False
     if root[codes.NODE_UNIT] == codes.SAMPLES:
         return bool(last >= far)
     return bool(memory.stamps[last - memory.clock[OFFSET]] - memory.clock[START_NS] >= far)
+
+
+@inlined
+def has_ended(part: Integers, root: Integers, memory: Memory, last: int) -> bool:
+    """Return whether the window of a part's root is over, where that is all that depends on a variable."""
+    return is_plain(part) and is_over(root, memory, last)
 
 
 @inlined
@@ -163,10 +169,17 @@ def root_window(root: Integers, memory: Memory, last: int) -> tuple[int, int]:
 
 @inlined
 def is_known(which: int, part: Integers, root: Integers, memory: Memory, last: int) -> bool:
-    """Return whether what may still come outdoes all that is open, whatever that is."""
-    is_bound = is_plain(part) and root[codes.NODE_A] < 0 and which in (4, 5)
-    is_best = (which == 5) == (root[codes.NODE_CODE] == codes.UNTIL)
-    return is_bound and is_best and not has_ended(part, root, memory, last)
+    """Return whether one of a part's numbers is a bound that follows from its table (see `known_number`)."""
+    return (part[codes.PART_KNOWN] >> which) & 1 == 1 and not is_over(root, memory, last)
+
+
+@inlined
+def known_number(which: int, part: Integers, memory: Memory, channel: int) -> float:
+    """Return a bound that is known: what comes outdoes all that is open, whatever that is."""
+    if memory.cells[part[codes.PART_CELL_START]] == 0:
+        return -np.inf if which == codes.LOWER else np.inf
+    best = (1 << part[codes.PART_VARIABLES]) - 1 if which == codes.UPPER else 0
+    return float(memory.tables[channel, part[codes.PART_TABLE_START] + best])
 
 
 @inlined

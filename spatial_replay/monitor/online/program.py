@@ -83,6 +83,7 @@ def compile_formula(formula: Formula) -> Program:
     signals, parts = SignalTable(), _Parts()
     reports: list[Row] = []
     operand_ids: list[int] = []
+    asked = set[int]()
     for node, operands in _nodes_with_operands(formula):
         ends = (len(operand_ids), len(operand_ids) + len(operands))
         operand_ids.extend(operands)
@@ -100,18 +101,21 @@ def compile_formula(formula: Formula) -> Program:
             else:
                 number = parts.add_node(node, signals)
                 reports.append((codes.REPORT_PART, number, _now_rule(node), *ends))
+                if node.operator not in FUTURE_OPERATORS:
+                    asked.add(number)
+    node_rows, part_rows, most_rows = parts.finished(asked)
     return Program(
         leaves=tuple(signals.leaves),
         signals=signals.array(parts.literals),
-        nodes=array_of_rows(parts.node_rows, codes.NODE_WIDTH),
-        parts=array_of_rows(parts.part_rows, codes.PART_WIDTH),
+        nodes=array_of_rows(node_rows, codes.NODE_WIDTH),
+        parts=array_of_rows(part_rows, codes.PART_WIDTH),
         reports=array_of_rows(reports, codes.REPORT_WIDTH),
         operands=np.array(operand_ids, np.int64),
         windows=signals.windows,
         table_size=parts.table_size,
         cells=parts.cells,
         timed=parts.timed,
-        rows=parts.rows,
+        rows=most_rows,
         keeps_history=signals.keeps_history or parts.keeps_history,
     )
 
@@ -124,15 +128,15 @@ class _Parts:
     """
 
     def __init__(self) -> None:
-        self.part_rows: list[Row] = []
-        self.node_rows: list[Row] = []
         self.table_size = 0
         self.cells = 0
         self.timed = 0
-        self.rows = 0
         self.keeps_history = False
         self.literals = set[int]()
         self._built: dict[tuple[tuple[Row, ...], bool] | Row, int] = {}
+        self._part_rows: list[Row] = []
+        self._node_rows: list[Row] = []
+        self._rows: list[tuple[Row, ...]] = []
 
     def add_node(self, node: Temporal, signals: SignalTable) -> int:
         """Add the part of a node that looks ahead, and return its number."""
@@ -145,10 +149,12 @@ class _Parts:
         beside = NOTHING if clauses.beside is None else self.add(clauses.beside, signals)
         own = (clauses.ending, clauses.lower, clauses.upper, int(clauses.is_minimum), beside)
         if own not in self._built:
-            self._built[own] = len(self.part_rows)
-            end = len(self.node_rows)
-            row = (end, end, 0, 0, self.table_size, self.cells, codes.CLAUSES, 0, 0, 0, *own, 0)
-            self.part_rows.append((*row, codes.ALL_NUMBERS))
+            self._built[own] = len(self._part_rows)
+            end = len(self._node_rows)
+            self._part_rows.append(
+                (end, end, 0, 0, self.table_size, self.cells, codes.CLAUSES, 0, 0, 0, *own, 0)
+            )
+            self._rows.append(())
         return self._built[own]
 
     def add(self, part: PartRows, signals: SignalTable) -> int:
@@ -158,12 +164,12 @@ class _Parts:
             signals: receives those that a part with windows looks at negated.
         """
         rows = part.rows() if part.is_flat else tuple(_looked_up(row, signals) for row in part.rows())
-        key = rows, part.is_remembering
+        key = rows, part.is_flat
         if key in self._built:
             return self._built[key]
-        self._built[key] = len(self.part_rows)
-        first, cutting = len(self.node_rows), _cutting(rows)
-        self.part_rows.append(
+        self._built[key] = len(self._part_rows)
+        first, cutting = len(self._node_rows), _cutting(rows)
+        self._part_rows.append(
             (
                 first,
                 first + len(rows),
@@ -172,27 +178,118 @@ class _Parts:
                 self.table_size,
                 self.cells,
                 codes.TABLE if part.is_flat else codes.WINDOWED,
-                int(part.is_remembering),
+                0,
                 part.end_corner,
                 int(part.is_nested),
                 *[NOTHING] * 5,
                 int(cutting is not None),
-                codes.ALL_NUMBERS,
             )
         )
-        places = _places_of_rows(rows)
+        self._rows.append(rows)
         for number, row in enumerate(rows):
             is_timed = row[codes.NODE_CODE] in codes.AHEAD_OF and row[codes.NODE_UNIT] != codes.SAMPLES
             cuts = cutting is not None and number in cutting
-            self.node_rows.append((*row, self.timed if is_timed else NOTHING, int(cuts), places[number]))
+            self._node_rows.append((*row, self.timed if is_timed else NOTHING, int(cuts)))
             if row[codes.NODE_CODE] == codes.LITERAL and not part.is_flat:
                 self.literals.add(row[codes.NODE_A])
             self.timed += is_timed
-        self.rows = max(self.rows, 1 + max(places))
         self.table_size += part.tables << part.variables
         self.cells += 1 + part.variables + part.tables
         self.keeps_history |= not part.is_flat
         return self._built[key]
+
+    def finished(self, asked: set[int]) -> tuple[list[Row], list[Row], int]:
+        """Return the rows of all nodes, those of all parts, and how many nodes of a part need rows at once.
+
+        Args:
+            asked: the parts of which it is asked what they are at the last sample.
+        """
+        last_in = self._nodes_at_last(asked)
+        hosts = {number for number, _ in last_in.values()}
+        parts = [
+            (
+                *row[: codes.PART_IS_REMEMBERING],
+                int(number in hosts),
+                *row[codes.PART_IS_REMEMBERING + 1 :],
+                *last_in.get(number, (NOTHING, NOTHING)),
+                _known_bounds(self._rows[number]),
+                codes.ALL_NUMBERS,
+            )
+            for number, row in enumerate(self._part_rows)
+        ]
+        places: list[int] = []
+        for number, rows in enumerate(self._rows):
+            places += _places_of_rows(rows, {node for host, node in last_in.values() if host == number})
+        nodes = [(*row, place) for row, place in zip(self._node_rows, places, strict=True)]
+        return nodes, parts, 1 + max(places, default=NOTHING)
+
+    def _nodes_at_last(self, asked: set[int]) -> dict[int, tuple[int, int]]:
+        """Return for parts that are asked for at the last sample the part, and the node of it, that say so.
+
+        Below an operator that never ends, a past one is run at every position anyway.
+        """
+        found, known = dict[int, tuple[int, int]](), dict[int, tuple[int, int]]()
+        trees_known = dict[Row, int]()
+        for number, (part, rows) in enumerate(zip(self._part_rows, self._rows, strict=True)):
+            if part[codes.PART_KIND] != codes.WINDOWED:
+                continue
+            trees = _trees(rows, trees_known)
+            if number in asked:
+                found[number] = known.get(trees[-1], (number, len(rows) - 1))
+            code, high = rows[-1][codes.NODE_CODE], rows[-1][codes.NODE_HIGH]
+            never_ends = code in (codes.UNTIL, codes.RELEASE) and high <= 0
+            if never_ends or found.get(number, (NOTHING,))[0] == number:
+                known = {tree: (number, node) for node, tree in enumerate(trees)} | known
+        return found
+
+
+def _known_bounds(rows: tuple[Row, ...]) -> int:
+    """Return which bounds follow from a part's table, whatever is open, a bit for each.
+
+    What comes may always violate `G x`, so that its lower bound is as small as can be. Its upper one is as
+    great as can be wherever x is: where it is `F y`, which what comes may always satisfy, or `F y or z`, say.
+    The table then says what follows from what has closed, if the same holds for all of its variables.
+    """
+    if not rows or rows[-1][codes.NODE_VARIABLE] == NOTHING:
+        return 0
+    if rows[-1][codes.NODE_CODE] == codes.RELEASE:
+        own, other, free, held = codes.LOWER, codes.UPPER, codes.UNTIL, codes.RELEASE
+        either, both = codes.PART_OR, codes.PART_AND
+    elif rows[-1][codes.NODE_CODE] == codes.UNTIL:
+        own, other, free, held = codes.UPPER, codes.LOWER, codes.RELEASE, codes.UNTIL
+        either, both = codes.PART_AND, codes.PART_OR
+    else:
+        return 0
+    # whether a node is as great, or as small, as can be in the other bound
+    outdone: list[bool] = []
+    for code, a, b, *_ in rows:
+        if code == either:
+            outdone.append(outdone[a] or outdone[b])
+        elif code == both:
+            outdone.append(outdone[a] and outdone[b])
+        elif code == free:
+            outdone.append(a == NOTHING or outdone[a] or outdone[b])
+        else:
+            outdone.append(code == held and outdone[b])
+    variables = [node for node, row in enumerate(rows) if row[codes.NODE_VARIABLE] != NOTHING]
+    is_known = {own: rows[-1][codes.NODE_A] == NOTHING, other: all(outdone[node] for node in variables)}
+    return sum(1 << bound for bound, known in is_known.items() if known)
+
+
+def _trees(rows: tuple[Row, ...], known: dict[Row, int]) -> list[int]:
+    """Return for each row of a part a number that it has in common with all that say the same.
+
+    Args:
+        known: these numbers, extended.
+    """
+    trees: list[int] = []
+    for row in rows:
+        code, a, b = row[: codes.NODE_B + 1]
+        below = (a, b) if code == codes.LITERAL else tuple(trees[each] for each in operand_rows(code, a, b))
+        # without the numbers of its variable and its table, which are its part's own
+        tree = (code, *row[codes.NODE_WEAK : codes.NODE_VARIABLE], *below)
+        trees.append(known.setdefault(tree, len(known)))
+    return trees
 
 
 def _looked_up(row: Row, signals: SignalTable) -> Row:
@@ -203,13 +300,17 @@ def _looked_up(row: Row, signals: SignalTable) -> Row:
     return (code, signals.row(codes.NOT, signal), 0, *rest)
 
 
-def _places_of_rows(rows: tuple[Row, ...]) -> list[int]:
+def _places_of_rows(rows: tuple[Row, ...], kept: set[int]) -> list[int]:
     """Return where the rows of each node are, in as few places as will do; -1 for literals.
 
     A node takes the place of an operand that nothing else looks at again, unless it would replace what it is
     still going to look at itself: windows that begin elsewhere than with their position do.
+
+    Args:
+        kept: nodes that are looked at after all others.
     """
     looked_at = {each: number for number, row in enumerate(rows) for each in operand_rows(*row[:3])}
+    looked_at |= dict.fromkeys(kept, len(rows))
     places, free = list[int](), list[int]()
     for number, (code, *operands) in enumerate(rows):
         if code == codes.LITERAL:

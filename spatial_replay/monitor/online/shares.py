@@ -29,7 +29,7 @@ from spatial_replay.monitor.online.open_windows import is_plain, looks_of
 from spatial_replay.monitor.online.program import Program
 from spatial_replay.monitor.online.state import BLOCK, NUMBERS, OFFSET, POSITION, Memory, know_no_columns
 
-_LOWER, _UPPER = 1 << 4, 1 << 5
+_LOWER, _UPPER = 1 << codes.LOWER, 1 << codes.UPPER
 
 _AGAIN = ("columns", "joined", "window_ends")
 """What a copy of the memory computes again."""
@@ -102,11 +102,8 @@ def sections_of(program: Program, memory: Memory) -> Sections | None:
             samples, time_ns = max(samples, counted), max(time_ns, timed)
     if not late or late < _MOST_OF_WORK * whole:
         return None
-    first, second = (
-        replace(program, parts=np.concatenate((program.parts[:, : codes.PART_NUMBERS], row[:, None]), axis=1))
-        for row in own
-    )
-    return Sections(first, replace(second, reports=program.reports[:0]), samples, time_ns)
+    first, second = _programs_of(program, own)
+    return Sections(first, second, samples, time_ns)
 
 
 def _is_bounded(part: Integers, nodes: Integers) -> bool:
@@ -230,7 +227,7 @@ def bound_memory(program: Program, late: Memory, tables: Floats, channels: int) 
 
 
 def _parts_run(program: Program) -> Integers:
-    parts: Integers = program.parts[program.parts[:, codes.PART_NUMBERS] != 0]
+    parts: Integers = program.parts[program.parts[:, codes.PART_NUMBERS] & ~codes.LAST_NUMBERS != 0]
     return parts
 
 
@@ -261,6 +258,19 @@ def shared_programs(program: Program, memory: Memory, channels: int) -> tuple[Pr
     )
     if lightest >= 0.9 * sum(cost for cost, *_ in whole):
         return None
+    return _programs_of(program, numbers)
+
+
+def _programs_of(program: Program, numbers: Integers) -> tuple[Program, Program]:
+    """Return a program as two, given which numbers of each part these compute, (2, P).
+
+    The second one computes none of the tree.
+    """
+    numbers = numbers & ~codes.LAST_NUMBERS
+    for number, host in enumerate(program.parts[:, codes.PART_LAST_IN].tolist()):
+        # what a part is at the last sample comes with the value of the one that says so
+        if host >= 0:
+            numbers[:, number] |= np.where(numbers[:, host] & 1, codes.LAST_NUMBERS, 0)
     first, second = (
         replace(program, parts=np.concatenate((program.parts[:, : codes.PART_NUMBERS], own[:, None]), axis=1))
         for own in numbers

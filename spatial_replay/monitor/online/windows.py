@@ -31,6 +31,7 @@ from spatial_replay.monitor.online.open_windows import (
     is_cut_short,
     is_known,
     is_plain,
+    known_number,
     looks_of,
     reach,
     root_window,
@@ -100,12 +101,14 @@ def _value_at_first(
     look, at, root = look_of(which, channels), columns_number(which), nodes[part[codes.PART_END] - 1]
     base, variables = memory.cells[part[codes.PART_CELL_START]], part[codes.PART_VARIABLES]
     tables = memory.tables[look.channel, part[codes.PART_TABLE_START] : tables_end(part)]
+    if is_known(which, part, root, memory, last):
+        return known_number(which, part, memory, look.channel)
     if is_plain(part):
         has_more = not has_ended(part, root, memory, last)
         value = beyond(look.mode if has_more else codes.OPEN_END, root[codes.NODE_WEAK])
         if root[codes.NODE_A] >= 0:
             value = memory.columns[at, part[codes.PART_END] - 1, base - offset] if base <= last else value
-        elif not is_known(which, part, root, memory, last):
+        else:
             begin, end = root_window(root, memory, last)
             if is_cut_short(which, part, root, channels):
                 at = look.channel
@@ -125,17 +128,33 @@ def _value_at_first(
 
 @inlined
 def _value_at_last(
-    nodes: Integers, part: Integers, which: int, channel: int, memory: Memory, offset: int, last: int
+    nodes: Integers, part: Integers, d: int, which: int, channel: int, memory: Memory, offset: int, last: int
 ) -> float:
-    """Return what a part is at the last sample, once its columns are brought up."""
+    """Return what a node of a part is at the last sample, once the part's columns are brought up."""
     root = nodes[part[codes.PART_END] - 1]
-    if runs_root(part, root):
-        return float(memory.columns[which, part[codes.PART_END] - 1, last - offset])
+    if d < part[codes.PART_END] - 1 or runs_root(part, root):
+        return float(memory.columns[which, d, last - offset])
     d = part[codes.PART_FIRST] + root[codes.NODE_B]
     signal = signal_of(nodes, d)
     body = (memory.columns[which, d] if signal < 0 else memory.history[channel, signal])[last - offset]
     value = beyond(codes.OPEN_END, root[codes.NODE_WEAK])
     return either(root[codes.NODE_CODE] == codes.UNTIL, float(body), value)
+
+
+@uncounted
+def _enter_last(
+    nodes: Integers, parts: Integers, number: int, which: int, channels: int, memory: Memory,
+    scratch: Scratch, offset: int, last: int, k: int,
+) -> None:  # fmt: skip
+    """Enter what a part says of itself, and of others, at the last sample."""
+    channel = look_of(which, channels).channel
+    for other in range(len(parts)):
+        if parts[other, codes.PART_LAST_IN] == number:
+            d = parts[number, codes.PART_FIRST] + parts[other, codes.PART_LAST_NODE]
+            value = _value_at_last(nodes, parts[number], d, which, channel, memory, offset, last)
+            scratch.parts[other, which + 2, k] = value
+            if channels == 1:
+                scratch.parts[other, 3, k] = value
 
 
 @apart
@@ -162,7 +181,8 @@ def run_part(table_at: int, number: int, channels: int, begin: int, end: int, co
         last = position + k
         if is_settled(part, memory):
             for which in range(NUMBERS):
-                if (own >> which) & 1:
+                # what is now goes on, and is said by another part
+                if (own & ~codes.LAST_NUMBERS) >> which & 1:
                     channel = look_of(which, channels).channel
                     numbers[which, k] = memory.tables[channel, part[codes.PART_TABLE_START]]
             continue
@@ -185,8 +205,8 @@ def run_part(table_at: int, number: int, channels: int, begin: int, end: int, co
                     tables.nodes, part, number, which, channels, memory, scratch, offset, last
                 )
                 if which < 2 and part[codes.PART_IS_REMEMBERING]:
-                    numbers[which + 2, k] = _value_at_last(
-                        tables.nodes, part, which, look_of(which, channels).channel, memory, offset, last
+                    _enter_last(
+                        tables.nodes, tables.parts, number, which, channels, memory, scratch, offset, last, k
                     )
         if last % CLOSING == CLOSING - 1:
             absorb(table_at, number, channels, last)
@@ -207,7 +227,7 @@ def _kept_from(table_at: int, last: int) -> int:
     for p in range(parts.shape[0]):
         part = parts[p]
         is_open = part[codes.PART_KIND] == codes.WINDOWED and not is_settled(part, memory)
-        if is_open and part[codes.PART_NUMBERS]:
+        if is_open and part[codes.PART_NUMBERS] & ~codes.LAST_NUMBERS:
             base = min(memory.cells[part[codes.PART_CELL_START]], last)
             reach(table_at, p, base, last, last)
             for d in range(part[codes.PART_END] - part[codes.PART_FIRST]):

@@ -44,7 +44,9 @@ from spatial_replay.monitor.online.open_windows import (
     has_ended,
     is_cut_short,
     is_known,
+    is_over,
     is_plain,
+    known_number,
     root_window,
     runs_root,
 )
@@ -228,14 +230,15 @@ def set_first(table_at: int, number: int, which: int, channels: int, at: int) ->
     numbers = scratch.parts[number, which, at : at + count]
     place = root[codes.NODE_B] if is_plain(part) else end - part[codes.PART_FIRST]
     operand = operand_of(nodes, part, place, columns, memory.history[look.channel], scratch)
+    if is_known(which, part, root, memory, block.since):
+        fill(numbers, known_number(which, part, memory, look.channel))
+        return 0
     if not is_plain(part) and base > 0:
         variables, points = part[codes.PART_VARIABLES], scratch.points
         _read_points(variables, table[: 1 << variables], count, points, scratch.point, scratch.order, numbers)
     elif not is_plain(part):
         take_row(block, operand, 0, missing, block.running)
         copy(block.running, numbers)
-    elif is_known(which, part, root, memory, block.since):
-        fill(numbers, missing)
     elif root[codes.NODE_A] >= 0:
         copy(scratch.points[root[codes.NODE_VARIABLE]], numbers)
     else:
@@ -252,24 +255,31 @@ def set_first(table_at: int, number: int, which: int, channels: int, at: int) ->
 
 @uncounted
 def set_last(table_at: int, number: int, which: int, channels: int, at: int) -> None:
-    """Enter what a part is at each sample of the block (see `windows`)."""
+    """Enter what a part says of itself, and of others, at each sample of the block (see `windows`)."""
     tables, memory, scratch, _ = arrays_at(table_at)
     nodes, part, block = tables.nodes, tables.parts[number], block_of(memory, scratch)
     end, root = part[codes.PART_END] - 1, nodes[part[codes.PART_END] - 1]
-    place = end - part[codes.PART_FIRST] if runs_root(part, root) else root[codes.NODE_B]
     history = memory.history[look_of(which, channels).channel]
-    operand = operand_of(nodes, part, place, memory.columns[which], history, scratch)
     value, is_until = beyond(codes.OPEN_END, root[codes.NODE_WEAK]), root[codes.NODE_CODE] == codes.UNTIL
-    for k in range(block.last + 1 - block.since):
-        position = block.since + k
-        number_now = (
-            operand.column[position - block.offset]
-            if position < operand.begin
-            else operand.rows[position - block.lowest, k]
-        )
-        if not runs_root(part, root):
-            number_now = either(is_until, number_now, value)
-        scratch.parts[number, which + 2, at + k] = number_now
+    for other in range(len(tables.parts)):
+        if tables.parts[other, codes.PART_LAST_IN] != number:
+            continue
+        place = tables.parts[other, codes.PART_LAST_NODE]
+        is_joined = place == end - part[codes.PART_FIRST] and not runs_root(part, root)
+        place = root[codes.NODE_B] if is_joined else place
+        operand = operand_of(nodes, part, place, memory.columns[which], history, scratch)
+        for k in range(block.last + 1 - block.since):
+            position = block.since + k
+            number_now = (
+                operand.column[position - block.offset]
+                if position < operand.begin
+                else operand.rows[position - block.lowest, k]
+            )
+            if is_joined:
+                number_now = either(is_until, number_now, value)
+            scratch.parts[other, which + 2, at + k] = number_now
+            if channels == 1:
+                scratch.parts[other, 3, at + k] = number_now
 
 
 @apart
@@ -306,7 +316,7 @@ def run_block(
     lowest = find_begins(table_at, number, 0, channels, 0, 0, since, last)
     if last + 1 - lowest > most:
         return 0
-    if has_ended(part, root, memory, last) and not has_ended(part, root, memory, since):
+    if is_over(root, memory, last) and not is_over(root, memory, since):
         return 0  # the samples of a block are all of one kind
     is_wide = last + 1 - lowest > WIDE
     narrows = 1 if is_wide and is_whole else 0

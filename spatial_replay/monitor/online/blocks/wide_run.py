@@ -16,11 +16,12 @@ from spatial_replay.monitor.online.open_windows import (
     has_ended,
     is_cut_short,
     is_known,
+    is_over,
     root_window,
     runs_root,
 )
 from spatial_replay.monitor.online.run_arrays import arrays_at
-from spatial_replay.monitor.online.sliding import beyond, copy, enter_samples, fill, recent_of
+from spatial_replay.monitor.online.sliding import beyond, copy, enter_samples, recent_of
 from spatial_replay.monitor.online.state import (
     BLOCK,
     BLOCK_LAST,
@@ -73,25 +74,20 @@ def _set_first_of_spans(
     tables, memory, scratch, _ = arrays_at(table_at)
     nodes, part, block = tables.nodes, tables.parts[number], block_of(memory, scratch)
     look, root = look_of(which, channels), nodes[part[codes.PART_END] - 1]
-    if runs_root(part, root):
+    if runs_root(part, root) or is_known(which, part, root, memory, block.since):
         return int(set_first(table_at, number, which, channels, at))
     table = memory.tables[look.channel, part[codes.PART_TABLE_START] : tables_end(part)]
     missing, count = beyond(look.mode, root[codes.NODE_WEAK]), block.last + 1 - block.since
     numbers, body = scratch.parts[number, which, at : at + count], root[codes.NODE_B]
     base = memory.cells[part[codes.PART_CELL_START]]
-    if is_known(which, part, root, memory, block.since):
-        fill(numbers, missing)
-    else:
-        operand = operand_of(
-            nodes, part, body, memory.columns[columns_of], memory.history[look.channel], scratch
-        )
-        join_body_spans(
-            nodes, part, block, operand, base, missing, is_cut_short(which, part, root, channels),
-            recent_of(memory, scratch), scratch.block[BLOCK_NEWEST], scratch.spans[body],
-            scratch.span_counts[body], scratch.wholes[part[codes.PART_END] - 1 - part[codes.PART_FIRST]],
-            scratch.closing,
-        )  # fmt: skip
-        copy(block.running, numbers)
+    operand = operand_of(nodes, part, body, memory.columns[columns_of], memory.history[look.channel], scratch)
+    join_body_spans(
+        nodes, part, block, operand, base, missing, is_cut_short(which, part, root, channels),
+        recent_of(memory, scratch), scratch.block[BLOCK_NEWEST], scratch.spans[body],
+        scratch.span_counts[body], scratch.wholes[part[codes.PART_END] - 1 - part[codes.PART_FIRST]],
+        scratch.closing,
+    )  # fmt: skip
+    copy(block.running, numbers)
     if base > 0:
         for k in range(count):
             numbers[k] = max(table[0], min(numbers[k], table[1]))
@@ -144,6 +140,8 @@ def run_wide(table_at: int, number: int, looks: int, channels: int, at: int, cou
         return 0  # sample by sample, the width of one window alone costs next to nothing
     if begin > memory.cells[part[codes.PART_CELL_START]] or has_ended(part, root, memory, last):
         return 0  # the root leaves out some of the spans' positions
+    if is_over(root, memory, last) and not is_over(root, memory, since):
+        return 0  # the samples are all of one kind
     # as long as not looked at what the samples are, this is the same for all numbers
     _find_next_begins(table_at, number, channels, last)
     lowest, is_first = find_begins(table_at, number, 0, channels, 0, 0, since, last), True
