@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import pairwise
 from unittest import mock
 
@@ -16,7 +17,7 @@ from laws.strategies_monitor import LEAVES, LeafRun, combinations_of, responses,
 from laws.test_monitor_laws import fewest
 from spatial_replay import UsageError
 from spatial_replay.compiled import only
-from spatial_replay.monitor.online import operators, shares, state, step
+from spatial_replay.monitor.online import codes, operators, shares, state, step
 from spatial_replay.monitor.online.program import compile_formula
 from spatial_replay.monitor.online.step import OnlineRun
 from spatial_replay.spec.formula import Boolean, Bound, Temporal
@@ -169,6 +170,48 @@ ending = st.one_of(
     st.builds(Temporal, st.sampled_from(["U", "R"]), st.tuples(_conditioned, _conditioned), _ends),
 )
 """A window from the first sample on over what looks ahead itself."""
+
+_brief = st.one_of(
+    st.builds(lambda low, more: Bound(low, low + more, "samples"), st.integers(0, 2), st.integers(0, 9)),
+    st.builds(
+        lambda low, more: Bound(low, low + more, "ns"), st.sampled_from([0, 0, 100]), st.integers(0, 900)
+    ),
+)
+
+
+def _one_way(window, until, depth, bounds):
+    """What only rises, or only falls, as samples come; past operators over it, and literals beside it."""
+    if depth == 0:
+        return _literals
+    below = _one_way(window, until, depth - 1, bounds)
+    return st.one_of(
+        *[st.builds(Temporal, st.just(window), st.tuples(below), bounds)] * 3,
+        st.builds(Temporal, st.just(until), st.tuples(below, below), bounds),
+        st.builds(Temporal, st.sampled_from(["O", "H"]), st.tuples(below), bounds),
+        *[st.builds(Boolean, st.sampled_from(["and", "or"]), st.tuples(_literals, below))] * 2,
+    )
+
+
+def _outdone(depth, bounds):
+    rising, falling = (_one_way(*ahead, depth, bounds) for ahead in (("F", "U"), ("G", "R")))
+    both = st.builds(Boolean, st.sampled_from(["and", "or", "->"]), st.tuples(rising, falling))
+    within = st.builds(Temporal, st.sampled_from(["F", "G"]), st.tuples(st.one_of(rising, falling)), bounds)
+    roots = ("G", st.one_of(rising, rising, both, within)), ("F", st.one_of(falling, falling, both, within))
+    return st.one_of(
+        *[st.builds(Temporal, st.just(root), st.tuples(body)) for root, body in roots],
+        *[
+            st.builds(
+                Temporal,
+                st.just(root),
+                st.tuples(st.builds(Boolean, st.just(by), st.tuples(_literals, body))),
+            )
+            for (root, body), by in zip(roots, ("or", "and"), strict=True)
+        ],
+    )
+
+
+outdone, outdone_widely = _outdone(3, _brief), _outdone(2, _far)
+"""Roots that what they join may be outdone by, long before its windows close."""
 
 # ------------------------------------------------------------------------------------------------- runs
 
@@ -411,6 +454,27 @@ def assert_as_defined(formula, program, run, ends, **options):
     for series, finals in ways:
         np.testing.assert_array_equal(series, expected.series)
         np.testing.assert_array_equal(finals[-1], expected.final)
+
+
+@settings(max_examples=600)
+@given(
+    data=st.data(),
+    case=st.one_of(*[st.tuples(outdone, long_runs())] * 2, st.tuples(outdone_widely, long_runs(700, 1000))),
+    tile=st.sampled_from([1, 33, 256]),
+)
+def test_leaving_out_what_matters_no_more_changes_nothing(data, case, tile):
+    formula, run = case
+    program = compile_formula(formula)
+    parts = program.parts.copy()
+    parts[:, [codes.PART_LIMIT, codes.PART_IS_ONE_WAY]] = operators.NOTHING, 0
+    if not state.has_windows(program) or (parts == program.parts).all():
+        return
+    ends, leaves, times = data.draw(stretches(len(run))), run.values(program.leaves), np.array(run.times_ns)
+    runs = [OnlineRun(each, tile=tile) for each in (program, replace(program, parts=parts))]
+    for begin, end in pairwise(ends):
+        part = fewest(leaves[:, :, begin:end])
+        one, other = (each.extend(part, times[begin:end]) for each in runs)
+        assert_same_bits([one], [other])
 
 
 # how wide such a window may be that is not made of signals

@@ -36,7 +36,7 @@ from spatial_replay.monitor.online.sliding import (
     run_shift,
     run_window,
 )
-from spatial_replay.monitor.online.state import OFFSET, Memory, Scratch
+from spatial_replay.monitor.online.state import OFFSET, OUTDONE, Memory, Scratch
 from spatial_replay.monitor.online.tables import corner_value, read_table
 
 CLOSING = 16
@@ -158,9 +158,56 @@ def absorb(table_at: int, number: int, channels: int, last: int) -> int:
         _absorb_nested(table_at, number, nodes, part, memory, scratch, channels, offset, last)
     else:
         _absorb_plain(table_at, number, nodes, part, memory, channels, offset, last)
+    outdone, scratch.block[OUTDONE] = scratch.block[OUTDONE], 0
+    _absorb_outdone(part, nodes[part[codes.PART_END] - 1], outdone, memory, channels, offset, last)
     if memory.cells[base] > before:
         find_lows(table_at, number, last)
     return 0
+
+
+@inlined
+def is_outdone(part: Integers, root: Integers, memory: Memory, channel: int, value: float) -> bool:
+    """Return whether a number at least as good for a root as one of its operand cannot change what it is.
+
+    `G` is never more than its table says, so that what it joins matters no more once it is at least that.
+    """
+    start = part[codes.PART_TABLE_START]
+    if root[codes.NODE_CODE] == codes.UNTIL:
+        return bool(value <= memory.tables[channel, start])
+    return bool(value >= memory.tables[channel, start + 1])
+
+
+@inlined
+def looks_for_outdone(part: Integers, memory: Memory, channels: int) -> bool:
+    """Return whether what a root joins may be outdone by what it is already, where windows are open."""
+    goes_one_way = part[codes.PART_IS_ONE_WAY] and part[codes.PART_NUMBERS] & 1 and channels <= 2
+    return bool(goes_one_way and memory.cells[part[codes.PART_CELL_START]] > 0)
+
+
+@uncounted
+def _absorb_outdone(
+    part: Integers, root: Integers, outdone: int, memory: Memory, channels: int, offset: int, last: int
+) -> None:
+    """Absorb positions whose windows are open, but which do not change the table any more.
+
+    Args:
+        outdone: what comes after those that are known to be outdone.
+    """
+    base, boundary, _ = cells_of(part)
+    limit, position = part[codes.PART_LIMIT], memory.cells[base]
+    if position == 0:
+        return
+    begin = max(position, outdone)
+    stop = last + 1 if limit >= 0 else begin
+    for channel in range(channels):
+        if settled_look(part, channel, channels) < 0:
+            continue
+        signal, k = memory.history[channel, limit], begin
+        while k < stop and is_outdone(part, root, memory, channel, signal[k - offset]):
+            k += 1
+        stop = k
+    if stop > position:
+        memory.cells[base] = memory.cells[boundary] = stop
 
 
 @uncounted

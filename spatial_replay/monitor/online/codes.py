@@ -87,9 +87,13 @@ PART_LAST_IN, PART_LAST_NODE = 16, 17
 # which bounds follow from its table alone until its root has ended, a bit for each: what may still come
 # outdoes all that is open
 PART_KNOWN = 18
+# the signal that what a root joins by the minimum is at least, by the maximum at most; -1 for none
+PART_LIMIT = 19
+# whether what a root joins by the minimum never falls as samples come, by the maximum never rises
+PART_IS_ONE_WAY = 20
 # which of its numbers a run computes, a bit for each: all, but where two runs share them (see `shares`)
-PART_NUMBERS = 19
-PART_WIDTH = 20
+PART_NUMBERS = 21
+PART_WIDTH = 22
 ALL_NUMBERS = (1 << 8) - 1
 LAST_NUMBERS = 1 << 2 | 1 << 3  # what a part is at the last sample
 LOWER, UPPER = 4, 5  # its bounds, with uncertainty

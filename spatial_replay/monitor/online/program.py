@@ -137,6 +137,7 @@ class _Parts:
         self._part_rows: list[Row] = []
         self._node_rows: list[Row] = []
         self._rows: list[tuple[Row, ...]] = []
+        self._limits: list[int] = []
 
     def add_node(self, node: Temporal, signals: SignalTable) -> int:
         """Add the part of a node that looks ahead, and return its number."""
@@ -155,6 +156,7 @@ class _Parts:
                 (end, end, 0, 0, self.table_size, self.cells, codes.CLAUSES, 0, 0, 0, *own, 0)
             )
             self._rows.append(())
+            self._limits.append(NOTHING)
         return self._built[own]
 
     def add(self, part: PartRows, signals: SignalTable) -> int:
@@ -186,6 +188,9 @@ class _Parts:
             )
         )
         self._rows.append(rows)
+        limit = NOTHING if part.is_flat or part.is_nested else _limit(rows, signals)
+        self._limits.append(limit)
+        self.literals |= {limit} - {NOTHING}
         for number, row in enumerate(rows):
             is_timed = row[codes.NODE_CODE] in codes.AHEAD_OF and row[codes.NODE_UNIT] != codes.SAMPLES
             cuts = cutting is not None and number in cutting
@@ -213,6 +218,8 @@ class _Parts:
                 *row[codes.PART_IS_REMEMBERING + 1 :],
                 *last_in.get(number, (NOTHING, NOTHING)),
                 _known_bounds(self._rows[number]),
+                self._limits[number],
+                int(not row[codes.PART_IS_NESTED] and _is_one_way(self._rows[number])),
                 codes.ALL_NUMBERS,
             )
             for number, row in enumerate(self._part_rows)
@@ -274,6 +281,63 @@ def _known_bounds(rows: tuple[Row, ...]) -> int:
     variables = [node for node, row in enumerate(rows) if row[codes.NODE_VARIABLE] != NOTHING]
     is_known = {own: rows[-1][codes.NODE_A] == NOTHING, other: all(outdone[node] for node in variables)}
     return sum(1 << bound for bound, known in is_known.items() if known)
+
+
+def _limit(rows: tuple[Row, ...], signals: SignalTable) -> int:
+    """Return the signal that what a root joins never passes, whatever comes; -1 for none.
+
+    `F[0,9] x` is at least what x is there, `x or y` at least what x is, though y looks ahead, and so on. What
+    `G` joins matters no more once it is known to be at least what `G` cannot exceed any more.
+
+    Args:
+        signals: extended.
+    """
+    code, left, body, *_, high = rows[-1][: codes.NODE_HIGH + 1]
+    if left != NOTHING or high > 0 or rows[-1][codes.NODE_VARIABLE] == NOTHING:
+        return NOTHING
+    if code == codes.RELEASE:
+        either, both, join, meet = codes.PART_OR, codes.PART_AND, codes.OR, codes.AND
+        windows, running = (codes.PART_WINDOW_MAX, codes.PAST_WINDOW_MAX), (codes.UNTIL, codes.PAST_SINCE)
+    elif code == codes.UNTIL:
+        either, both, join, meet = codes.PART_AND, codes.PART_OR, codes.AND, codes.OR
+        windows, running = (codes.PART_WINDOW_MIN, codes.PAST_WINDOW_MIN), (codes.RELEASE, codes.PAST_TRIGGER)
+    else:
+        return NOTHING
+    limits: list[int] = []
+    for own, a, b, _, _, low, *_ in rows[: body + 1]:
+        limit = NOTHING
+        if own == codes.LITERAL:
+            limit = a
+        elif own in windows and low == 0:
+            limit = limits[a]
+        elif own in running:
+            limit = limits[b]
+        elif own in (either, both) and NOTHING not in (limits[a], limits[b]):
+            limit = signals.row(join if own == either else meet, limits[a], limits[b])
+        elif own == either:
+            limit = max(limits[a], limits[b])
+        limits.append(limit)
+    return limits[body]
+
+
+def _is_one_way(rows: tuple[Row, ...]) -> bool:
+    """Return whether what a root joins by the minimum never falls as samples come, or the other way round.
+
+    What `F` finds remains, and what is still to come can only add to it.
+    """
+    if not rows or rows[-1][codes.NODE_A] != NOTHING or rows[-1][codes.NODE_HIGH] > 0:
+        return False
+    if rows[-1][codes.NODE_CODE] == codes.RELEASE:
+        ahead, is_weak = (codes.PART_WINDOW_MAX, codes.UNTIL, codes.SHIFT), 0
+    elif rows[-1][codes.NODE_CODE] == codes.UNTIL:
+        ahead, is_weak = (codes.PART_WINDOW_MIN, codes.RELEASE, codes.SHIFT), 1
+    else:
+        return False
+    free = (codes.LITERAL, codes.PART_AND, codes.PART_OR, codes.PAST_DELAY, *codes.PAST_WINDOWS)
+    return all(
+        row[codes.NODE_CODE] in free or (row[codes.NODE_CODE] in ahead and row[codes.NODE_WEAK] == is_weak)
+        for row in rows[:-1]
+    )
 
 
 def _trees(rows: tuple[Row, ...], known: dict[Row, int]) -> list[int]:

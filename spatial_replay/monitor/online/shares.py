@@ -40,6 +40,9 @@ _TWICE = 1.2
 _MOST_OF_WORK = 0.8
 """So much of the work at least is done in sections, or none."""
 
+_SOON = 0.25
+"""Windows that close within so much of a stretch are waited for before it is shared."""
+
 _ENTERING = 0.15
 """So much of the work is to enter the numbers of all nodes."""
 
@@ -75,6 +78,33 @@ class SectionStart(NamedTuple):
 
     seen: int
     own: int
+
+
+def is_narrow(program: Program, memory: Memory, left: int) -> bool:
+    """Return whether little is open in a run, or soon may be, so that one thread is as fast as several.
+
+    Where what a root joins is outdone by what it is already, positions matter no more long before their
+    windows close (see `closing`).
+
+    Args:
+        left: the samples that are to be run.
+    """
+    position, offset = int(memory.clock[POSITION]), int(memory.clock[OFFSET])
+    stamps = memory.stamps[: position - offset]
+    for part in _parts_run(program):
+        nodes = program.nodes[part[codes.PART_FIRST] : part[codes.PART_END]]
+        if part[codes.PART_KIND] != codes.WINDOWED or cast(Any, is_settled).interpreted()(part, memory):
+            continue
+        if part[codes.PART_VARIABLES] == 0 or nodes[-1, codes.NODE_HIGH] > 0:
+            continue  # soon over, mostly
+        if part[codes.PART_LIMIT] < 0 and not part[codes.PART_IS_ONE_WAY]:
+            return False
+        samples, time_ns = _horizon(nodes)
+        width = samples + time_ns * (len(stamps) - 1) / max(int(stamps[-1] - stamps[0]), 1)
+        base = int(memory.cells[part[codes.PART_CELL_START]])
+        if width > left * _SOON if base == 0 else 2 * (position - base) > width:
+            return False
+    return True
 
 
 def sections_of(program: Program, memory: Memory) -> Sections | None:

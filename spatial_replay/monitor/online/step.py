@@ -31,6 +31,7 @@ from spatial_replay.monitor.online.shares import (
     bound_memory,
     closed_up_to,
     copied,
+    is_narrow,
     joined_memory,
     numbers_of,
     sections_of,
@@ -140,6 +141,9 @@ _MOST_THREADS = 8
 _MOST_IN_SECTIONS = 1 << 18
 """So many samples at most are run in sections at once: numbers of later ones wait for those of the first."""
 
+_TILES_ALONE = 8
+"""So many tiles are run before it is looked again whether several threads are worth it."""
+
 _TILES_AT_ONCE = 4
 """So many tiles are handed over together: fewer, and waiting for each other takes longer."""
 
@@ -223,12 +227,15 @@ class OnlineRun:
         leaves = np.ascontiguousarray(in_channels(leaves, self._channels), np.float64)
         times_ns = np.array(times_ns, np.int64)  # writable, since kernels are compiled for that
         series = empty((len(self._program.reports), 4, len(times_ns)))
-        stretch, done = _Stretch(leaves, times_ns, series), 0
+        stretch, done, alone = _Stretch(leaves, times_ns, series), 0, 0
         may_share = has_windows(self._program) and self._is_worth_sharing(len(times_ns))
         while done < len(times_ns):
             done += self._run_tile(stretch, done, len(times_ns))
             # after a tile, the kernel is there, and what settles soon has
-            if may_share and done < len(times_ns) and self._is_compiled:
+            if may_share and alone <= done < len(times_ns) and self._is_compiled:
+                if is_narrow(self._program, self._memory, len(times_ns) - done):
+                    alone = done + _TILES_ALONE * self._tile
+                    continue
                 before, done = done, self._run_in_sections(stretch, done)
                 if done == before:
                     done = self._run_shared(stretch, done)

@@ -17,7 +17,13 @@ import numpy as np
 from spatial_replay.compiled import apart, inlined, uncounted
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
-from spatial_replay.monitor.online.closing import CLOSING, absorb, is_settled
+from spatial_replay.monitor.online.closing import (
+    CLOSING,
+    absorb,
+    is_outdone,
+    is_settled,
+    looks_for_outdone,
+)
 from spatial_replay.monitor.online.node_columns import (
     columns_number,
     look_of,
@@ -51,6 +57,7 @@ from spatial_replay.monitor.online.state import (
     JOINED,
     NUMBERS,
     OFFSET,
+    OUTDONE,
     POSITION,
     Memory,
     Scratch,
@@ -157,6 +164,22 @@ def _enter_last(
                 scratch.parts[other, 3, k] = value
 
 
+@uncounted
+def _outdone_up_to(
+    nodes: Integers, part: Integers, channels: int, memory: Memory, offset: int, last: int
+) -> int:
+    """Return what comes after the positions where what the root joins is outdone (see `closing`)."""
+    root, position = nodes[part[codes.PART_END] - 1], memory.cells[part[codes.PART_CELL_START]]
+    d, stop = part[codes.PART_FIRST] + root[codes.NODE_B], last + 1
+    signal = signal_of(nodes, d)
+    for which in range(channels):
+        body, k = memory.columns[which, d] if signal < 0 else memory.history[which, signal], position
+        while k < stop and is_outdone(part, root, memory, which, body[k - offset]):
+            k += 1
+        stop = k
+    return int(stop)
+
+
 @apart
 def run_windows(table_at: int, channels: int, count: int) -> int:
     """Run all parts with windows over the next `count` samples, one by one.
@@ -209,6 +232,9 @@ def run_part(table_at: int, number: int, channels: int, begin: int, end: int, co
                         tables.nodes, tables.parts, number, which, channels, memory, scratch, offset, last, k
                     )
         if last % CLOSING == CLOSING - 1:
+            scratch.block[OUTDONE] = 0
+            if looks_for_outdone(part, memory, channels):
+                scratch.block[OUTDONE] = _outdone_up_to(tables.nodes, part, channels, memory, offset, last)
             absorb(table_at, number, channels, last)
     return 0
 

@@ -31,7 +31,7 @@ from spatial_replay.monitor.online.blocks.node_rows import (
 )
 from spatial_replay.monitor.online.blocks.row_loops import fill_row
 from spatial_replay.monitor.online.blocks.span_rows import block_of
-from spatial_replay.monitor.online.closing import absorb
+from spatial_replay.monitor.online.closing import absorb, is_outdone, looks_for_outdone
 from spatial_replay.monitor.online.node_columns import (
     cells_of,
     columns_number,
@@ -70,6 +70,7 @@ from spatial_replay.monitor.online.state import (
     LOOKS,
     MOST_ROWS,
     OFFSET,
+    OUTDONE,
     POSITION,
     Memory,
     Scratch,
@@ -282,6 +283,25 @@ def set_last(table_at: int, number: int, which: int, channels: int, at: int) -> 
                 scratch.parts[other, 3, at + k] = number_now
 
 
+@uncounted
+def _find_outdone(table_at: int, number: int, which: int, channels: int) -> None:
+    """Enter up to where what the root joins is outdone, at the last sample of the block (see `closing`)."""
+    tables, memory, scratch, _ = arrays_at(table_at)
+    nodes, part, block = tables.nodes, tables.parts[number], block_of(memory, scratch)
+    root, position = nodes[part[codes.PART_END] - 1], memory.cells[part[codes.PART_CELL_START]]
+    if not looks_for_outdone(part, memory, channels):
+        return
+    history, sample = memory.history[which], block.last - block.since
+    body = operand_of(nodes, part, root[codes.NODE_B], memory.columns[which], history, scratch)
+    while position <= block.last:
+        is_row = position >= body.begin
+        value = body.rows[position - block.lowest, sample] if is_row else body.column[position - block.offset]
+        if not is_outdone(part, root, memory, which, value):
+            break
+        position += 1
+    scratch.block[OUTDONE] = position if which == 0 else min(scratch.block[OUTDONE], position)
+
+
 @apart
 def run_block(
     table_at: int,
@@ -327,7 +347,7 @@ def run_block(
                 narrowed = find_begins(table_at, number, which, channels, narrows, 0, since, last)
                 if last + 1 - narrowed > WIDE:
                     return 0
-    block[BLOCK_SINCE], block[BLOCK_LAST], block[BLOCK_LOWEST] = since, last, lowest
+    block[BLOCK_SINCE], block[BLOCK_LAST], block[BLOCK_LOWEST], block[OUTDONE] = since, last, lowest, 0
     block[IS_FOLLOWED] = 1 if is_followed and not is_wide else 0
     for d in range(first, end):
         # one that never ends stays open although what it is joined with has closed
@@ -354,6 +374,7 @@ def run_block(
         set_first(table_at, number, which, channels, at)
         if which > 1:
             continue
+        _find_outdone(table_at, number, which, channels)
         if part[codes.PART_IS_REMEMBERING]:
             set_last(table_at, number, which, channels, at)
         for bound in (4, 5):

@@ -41,6 +41,7 @@ from spatial_replay.monitor.online.blocks.spans import (
     corners_of,
     span_at,
 )
+from spatial_replay.monitor.online.closing import is_outdone, looks_for_outdone
 from spatial_replay.monitor.online.node_columns import cells_of, columns_number, look_of, signal_of
 from spatial_replay.monitor.online.open_windows import runs_root
 from spatial_replay.monitor.online.run_arrays import arrays_at
@@ -57,6 +58,7 @@ from spatial_replay.monitor.online.state import (
     BLOCK_NEWEST,
     BLOCK_SINCE,
     OFFSET,
+    OUTDONE,
     Memory,
     Scratch,
     is_closed,
@@ -355,6 +357,39 @@ def _run_window(table_at: int, number: int, d: int, which: int, channels: int) -
             find_closing(node, block, recent, begin, end, newest, True, scratch.closing)
             fill_open(block, scratch.closing, target, begin, end, value)
     return 0
+
+
+@uncounted
+def find_outdone_in_spans(table_at: int, number: int, which: int, channels: int) -> None:
+    """Enter up to where what the root joins is outdone, at the last sample of the block (see `closing`)."""
+    tables, memory, scratch, _ = arrays_at(table_at)
+    nodes, part, block = tables.nodes, tables.parts[number], block_of(memory, scratch)
+    root, position = nodes[part[codes.PART_END] - 1], memory.cells[part[codes.PART_CELL_START]]
+    if not looks_for_outdone(part, memory, channels):
+        return
+    place, sample, row = root[codes.NODE_B], block.last - block.since, block.running
+    d = part[codes.PART_FIRST] + place
+    signal, spans, rows = (
+        signal_of(nodes, d),
+        scratch.spans[place],
+        scratch.rows[max(nodes[d, codes.NODE_ROWS], 0)],
+    )
+    column = memory.columns[which, d] if signal < 0 else memory.history[which, signal]
+    k = span_at(spans, scratch.span_counts[place], position)
+    while position <= block.last:
+        while position >= spans[k, END]:
+            k += 1
+        at, kind = position - block.lowest, spans[k, KIND] if signal < 0 else IN_COLUMN
+        if kind == IN_TABLE:
+            columns = scratch.corner_columns[place]
+            _read_position(spans[k], columns, at, scratch.joints, scratch.spare, scratch.corner, row)
+            value = row[sample]
+        else:
+            value = rows[at, sample] if kind == IN_ROWS else column[position - block.offset]
+        if not is_outdone(part, root, memory, which, value):
+            break
+        position += 1
+    scratch.block[OUTDONE] = position if which == 0 else min(scratch.block[OUTDONE], position)
 
 
 @uncounted
