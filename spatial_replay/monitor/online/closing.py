@@ -1,4 +1,4 @@
-"""Positions of a part whose windows have closed, absorbed into its table.
+"""Positions of a part whose windows have closed, or which matter no more, absorbed into its table.
 
 What depends on a variable, or on the table of a past operator, is run over the positions that matter, once
 for each corner of the table.
@@ -36,7 +36,7 @@ from spatial_replay.monitor.online.sliding import (
     run_shift,
     run_window,
 )
-from spatial_replay.monitor.online.state import OFFSET, OUTDONE, Memory, Scratch
+from spatial_replay.monitor.online.state import OFFSET, Memory, Scratch
 from spatial_replay.monitor.online.tables import corner_value, read_table
 
 CLOSING = 16
@@ -143,8 +143,12 @@ def run_dependent(table_at: int, number: int, channel: int, at: int, corner: int
 
 
 @apart
-def absorb(table_at: int, number: int, channels: int, last: int) -> int:
-    """Move a part's base forward over every position whose windows have all closed."""
+def absorb(table_at: int, number: int, channels: int, last: int, outdone: int) -> int:
+    """Move a part's base forward over every position whose windows have all closed, or which matters no more.
+
+    Args:
+        outdone: what comes after positions that are known to matter no more (see `is_outdone`), 0 for none.
+    """
     tables, memory, scratch, _ = arrays_at(table_at)
     nodes, part, offset = tables.nodes, tables.parts[number], memory.clock[OFFSET]
     base = cells_of(part)[0]
@@ -158,7 +162,6 @@ def absorb(table_at: int, number: int, channels: int, last: int) -> int:
         _absorb_nested(table_at, number, nodes, part, memory, scratch, channels, offset, last)
     else:
         _absorb_plain(table_at, number, nodes, part, memory, channels, offset, last)
-    outdone, scratch.block[OUTDONE] = scratch.block[OUTDONE], 0
     _absorb_outdone(part, nodes[part[codes.PART_END] - 1], outdone, memory, channels, offset, last)
     if memory.cells[base] > before:
         find_lows(table_at, number, last)
@@ -167,7 +170,7 @@ def absorb(table_at: int, number: int, channels: int, last: int) -> int:
 
 @inlined
 def is_outdone(part: Integers, root: Integers, memory: Memory, channel: int, value: float) -> bool:
-    """Return whether a number at least as good for a root as one of its operand cannot change what it is.
+    """Return whether it makes no difference to a root how good its operand is, if at least this.
 
     `G` is never more than its table says, so that what it joins matters no more once it is at least that.
     """
@@ -198,14 +201,14 @@ def _absorb_outdone(
     if position == 0:
         return
     begin = max(position, outdone)
-    stop = last + 1 if limit >= 0 else begin
-    for channel in range(channels):
+    stop, is_first = begin, True
+    for channel in range(channels if limit >= 0 else 0):
         if settled_look(part, channel, channels) < 0:
             continue
-        signal, k = memory.history[channel, limit], begin
-        while k < stop and is_outdone(part, root, memory, channel, signal[k - offset]):
+        signal, k, end = memory.history[channel, limit], begin, last + 1 if is_first else stop
+        while k < end and is_outdone(part, root, memory, channel, signal[k - offset]):
             k += 1
-        stop = k
+        stop, is_first = k, False
     if stop > position:
         memory.cells[base] = memory.cells[boundary] = stop
 

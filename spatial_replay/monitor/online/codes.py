@@ -73,9 +73,8 @@ BINARY_NODES = (
 
 # columns of parts: nodes, numbers of variables and tables, where its tables and its cells start
 PART_FIRST, PART_END, PART_VARIABLES, PART_TABLES, PART_TABLE_START, PART_CELL_START = range(6)
-PART_KIND, PART_END_CORNER = 6, 8  # the corner that ends a run
-# whether what its nodes are at the last sample is asked for: what it is itself, or another part
-PART_IS_REMEMBERING = 7
+# the kind; whether it says what it, or another part, is at the last sample; the corner that ends a run
+PART_KIND, PART_IS_REMEMBERING, PART_END_CORNER = 6, 7, 8
 PART_IS_NESTED = 9  # whether a node below the root depends on a variable, or any on a table
 # of clauses: signals, whether they join by minimum, and the part beside them, -1 for none
 PART_ENDING, PART_LOWER, PART_UPPER, PART_IS_MINIMUM, PART_BESIDE = 10, 11, 12, 13, 14

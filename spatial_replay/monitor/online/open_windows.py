@@ -178,8 +178,8 @@ def known_number(which: int, part: Integers, memory: Memory, channel: int) -> fl
     """Return a bound that is known: what comes outdoes all that is open, whatever that is."""
     if memory.cells[part[codes.PART_CELL_START]] == 0:
         return -np.inf if which == codes.LOWER else np.inf
-    best = (1 << part[codes.PART_VARIABLES]) - 1 if which == codes.UPPER else 0
-    return float(memory.tables[channel, part[codes.PART_TABLE_START] + best])
+    corner = (1 << part[codes.PART_VARIABLES]) - 1 if which == codes.UPPER else 0
+    return float(memory.tables[channel, part[codes.PART_TABLE_START] + corner])
 
 
 @inlined

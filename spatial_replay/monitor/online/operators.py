@@ -205,8 +205,8 @@ def part_of(signals: SignalTable, node: Temporal) -> WindowedPart:
     bounded = node.operator in FUTURE_OPERATORS and (node.bound is not None or node.operator in ("X", "WX"))
     part = WindowedPart(signals, node if bounded else from_all(node), anchored=bounded)
     if bounded and not part.is_flat:
-        # what a past operator over a future one is now is read at the last sample, too
-        asked = node if part.is_remembering else from_first(node)
+        # at the first sample, what looks back is another formula
+        asked = node if part.looks_back else from_first(node)
         part = WindowedPart(signals, asked, anchored=False, ends=True)
     if part.variables > MAX_VARIABLES:
         raise UsageError(
@@ -271,8 +271,8 @@ class PartRows:
         return self.tables > 1 or any(row[-1] for row in self.fields[:-1])
 
     @property
-    def is_remembering(self) -> bool:
-        """Whether it is asked for at the last sample, too: a past operator stands over a future one."""
+    def looks_back(self) -> bool:
+        """Whether a past operator over a future one is left, so that not the first sample alone matters."""
         # a root with a window of its own stands at the first sample alone
         stands_alone = self.ends or self._has_window_signals
         return self._is_past or (not stands_alone and any(row[0] in codes.PAST for row in self._rows))

@@ -14,6 +14,7 @@ A formula becomes three tables, each with operands first:
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -250,6 +251,53 @@ class _Parts:
         return found
 
 
+class _Direction(NamedTuple):
+    """What a root that joins by the minimum meets below it; by the maximum, all of it the other way round.
+
+    Attributes:
+        either, both: the nodes that are as great as the greater, and as the smaller one of their operands.
+        signal_either, signal_both: the same for signals.
+        window, past_window, until: those that are great once their operand is.
+        release: those that are great as long as it is.
+        worst, best: the bounds of the smallest, and of the greatest continuation.
+        weak: what `NODE_WEAK` is where what is still to come counts as small.
+    """
+
+    either: int
+    both: int
+    signal_either: int
+    signal_both: int
+    window: int
+    past_window: int
+    until: int
+    release: int
+    worst: int
+    best: int
+    weak: int
+
+
+_BY_MINIMUM = _Direction(
+    codes.PART_OR, codes.PART_AND, codes.OR, codes.AND, codes.PART_WINDOW_MAX, codes.PAST_WINDOW_MAX,
+    codes.UNTIL, codes.RELEASE, codes.LOWER, codes.UPPER, 0,
+)  # fmt: skip
+_BY_MAXIMUM = _Direction(
+    codes.PART_AND, codes.PART_OR, codes.AND, codes.OR, codes.PART_WINDOW_MIN, codes.PAST_WINDOW_MIN,
+    codes.RELEASE, codes.UNTIL, codes.UPPER, codes.LOWER, 1,
+)  # fmt: skip
+
+
+def _direction_of(rows: tuple[Row, ...]) -> _Direction | None:
+    """Return what a part's root is in, if it is a variable: one that never ends, or not before its window."""
+    if not rows or rows[-1][codes.NODE_VARIABLE] == NOTHING:
+        return None
+    return {codes.RELEASE: _BY_MINIMUM, codes.UNTIL: _BY_MAXIMUM}.get(rows[-1][codes.NODE_CODE])
+
+
+def _never_ends(rows: tuple[Row, ...]) -> bool:
+    """Return whether a root joins all that its operand is from some position on."""
+    return rows[-1][codes.NODE_A] == NOTHING and rows[-1][codes.NODE_HIGH] <= 0
+
+
 def _known_bounds(rows: tuple[Row, ...]) -> int:
     """Return which bounds follow from a part's table, whatever is open, a bit for each.
 
@@ -257,29 +305,25 @@ def _known_bounds(rows: tuple[Row, ...]) -> int:
     great as can be wherever x is: where it is `F y`, which what comes may always satisfy, or `F y or z`, say.
     The table then says what follows from what has closed, if the same holds for all of its variables.
     """
-    if not rows or rows[-1][codes.NODE_VARIABLE] == NOTHING:
+    way = _direction_of(rows)
+    if way is None:
         return 0
-    if rows[-1][codes.NODE_CODE] == codes.RELEASE:
-        own, other, free, held = codes.LOWER, codes.UPPER, codes.UNTIL, codes.RELEASE
-        either, both = codes.PART_OR, codes.PART_AND
-    elif rows[-1][codes.NODE_CODE] == codes.UNTIL:
-        own, other, free, held = codes.UPPER, codes.LOWER, codes.RELEASE, codes.UNTIL
-        either, both = codes.PART_AND, codes.PART_OR
-    else:
-        return 0
-    # whether a node is as great, or as small, as can be in the other bound
+    # whether a node is as great as can be in the best continuation
     outdone: list[bool] = []
     for code, a, b, *_ in rows:
-        if code == either:
+        if code == way.either:
             outdone.append(outdone[a] or outdone[b])
-        elif code == both:
+        elif code == way.both:
             outdone.append(outdone[a] and outdone[b])
-        elif code == free:
+        elif code == way.until:
             outdone.append(a == NOTHING or outdone[a] or outdone[b])
         else:
-            outdone.append(code == held and outdone[b])
+            outdone.append(code == way.release and outdone[b])
     variables = [node for node, row in enumerate(rows) if row[codes.NODE_VARIABLE] != NOTHING]
-    is_known = {own: rows[-1][codes.NODE_A] == NOTHING, other: all(outdone[node] for node in variables)}
+    is_known = {
+        way.worst: rows[-1][codes.NODE_A] == NOTHING,
+        way.best: all(outdone[node] for node in variables),
+    }
     return sum(1 << bound for bound, known in is_known.items() if known)
 
 
@@ -292,32 +336,26 @@ def _limit(rows: tuple[Row, ...], signals: SignalTable) -> int:
     Args:
         signals: extended.
     """
-    code, left, body, *_, high = rows[-1][: codes.NODE_HIGH + 1]
-    if left != NOTHING or high > 0 or rows[-1][codes.NODE_VARIABLE] == NOTHING:
-        return NOTHING
-    if code == codes.RELEASE:
-        either, both, join, meet = codes.PART_OR, codes.PART_AND, codes.OR, codes.AND
-        windows, running = (codes.PART_WINDOW_MAX, codes.PAST_WINDOW_MAX), (codes.UNTIL, codes.PAST_SINCE)
-    elif code == codes.UNTIL:
-        either, both, join, meet = codes.PART_AND, codes.PART_OR, codes.AND, codes.OR
-        windows, running = (codes.PART_WINDOW_MIN, codes.PAST_WINDOW_MIN), (codes.RELEASE, codes.PAST_TRIGGER)
-    else:
+    way = _direction_of(rows)
+    if way is None or not _never_ends(rows):
         return NOTHING
     limits: list[int] = []
-    for own, a, b, _, _, low, *_ in rows[: body + 1]:
+    for code, a, b, _, _, low, *_ in rows[: rows[-1][codes.NODE_B] + 1]:
         limit = NOTHING
-        if own == codes.LITERAL:
+        if code == codes.LITERAL:
             limit = a
-        elif own in windows and low == 0:
+        elif code in (way.window, way.past_window) and low == 0:
             limit = limits[a]
-        elif own in running:
+        elif code == way.until:
             limit = limits[b]
-        elif own in (either, both) and NOTHING not in (limits[a], limits[b]):
-            limit = signals.row(join if own == either else meet, limits[a], limits[b])
-        elif own == either:
-            limit = max(limits[a], limits[b])
+        elif code in (way.either, way.both) and NOTHING not in (limits[a], limits[b]):
+            join = way.signal_either if code == way.either else way.signal_both
+            limit = signals.row(join, limits[a], limits[b])
+        elif code == way.either:
+            # one is known, or none
+            limit = limits[b] if limits[a] == NOTHING else limits[a]
         limits.append(limit)
-    return limits[body]
+    return limits[-1]
 
 
 def _is_one_way(rows: tuple[Row, ...]) -> bool:
@@ -325,17 +363,13 @@ def _is_one_way(rows: tuple[Row, ...]) -> bool:
 
     What `F` finds remains, and what is still to come can only add to it.
     """
-    if not rows or rows[-1][codes.NODE_A] != NOTHING or rows[-1][codes.NODE_HIGH] > 0:
-        return False
-    if rows[-1][codes.NODE_CODE] == codes.RELEASE:
-        ahead, is_weak = (codes.PART_WINDOW_MAX, codes.UNTIL, codes.SHIFT), 0
-    elif rows[-1][codes.NODE_CODE] == codes.UNTIL:
-        ahead, is_weak = (codes.PART_WINDOW_MIN, codes.RELEASE, codes.SHIFT), 1
-    else:
+    way = _direction_of(rows)
+    if way is None or not _never_ends(rows):
         return False
     free = (codes.LITERAL, codes.PART_AND, codes.PART_OR, codes.PAST_DELAY, *codes.PAST_WINDOWS)
+    ahead = (way.window, way.until, codes.SHIFT)
     return all(
-        row[codes.NODE_CODE] in free or (row[codes.NODE_CODE] in ahead and row[codes.NODE_WEAK] == is_weak)
+        row[codes.NODE_CODE] in free or (row[codes.NODE_CODE] in ahead and row[codes.NODE_WEAK] == way.weak)
         for row in rows[:-1]
     )
 

@@ -80,31 +80,35 @@ class SectionStart(NamedTuple):
     own: int
 
 
-def is_narrow(program: Program, memory: Memory, left: int) -> bool:
-    """Return whether little is open in a run, or soon may be, so that one thread is as fast as several.
+def open_share(program: Program, memory: Memory, left: int) -> float:
+    """Return how much of what windows span is open in a run, infinity if never less than all of it.
 
     Where what a root joins is outdone by what it is already, positions matter no more long before their
-    windows close (see `closing`).
+    windows close (see `closing`), so that one thread is as fast as several. 0 if windows close for the first
+    time soon.
 
     Args:
         left: the samples that are to be run.
     """
     position, offset = int(memory.clock[POSITION]), int(memory.clock[OFFSET])
-    stamps = memory.stamps[: position - offset]
-    for part in _parts_run(program):
+    stamps, widest = memory.stamps[: position - offset], 0.0
+    per_ns = (len(stamps) - 1) / max(int(stamps[-1] - stamps[0]), 1)
+    for number, part in enumerate(program.parts):
         nodes = program.nodes[part[codes.PART_FIRST] : part[codes.PART_END]]
         if part[codes.PART_KIND] != codes.WINDOWED or cast(Any, is_settled).interpreted()(part, memory):
             continue
-        if part[codes.PART_VARIABLES] == 0 or nodes[-1, codes.NODE_HIGH] > 0:
-            continue  # soon over, mostly
+        if part[codes.PART_VARIABLES] == 0 and part[codes.PART_LAST_IN] != number:
+            continue  # soon over
         if part[codes.PART_LIMIT] < 0 and not part[codes.PART_IS_ONE_WAY]:
-            return False
+            return np.inf
         samples, time_ns = _horizon(nodes)
-        width = samples + time_ns * (len(stamps) - 1) / max(int(stamps[-1] - stamps[0]), 1)
-        base = int(memory.cells[part[codes.PART_CELL_START]])
-        if width > left * _SOON if base == 0 else 2 * (position - base) > width:
-            return False
-    return True
+        width, base = samples + time_ns * per_ns, int(memory.cells[part[codes.PART_CELL_START]])
+        if base > 0:
+            # what closes within a block is absorbed with it
+            widest = max(widest, (position - base) / (width + BLOCK))
+        elif width > left * _SOON:
+            return np.inf
+    return widest
 
 
 def sections_of(program: Program, memory: Memory) -> Sections | None:

@@ -62,10 +62,9 @@ POSITION, OFFSET, START_NS, KEEPS = range(4)
 CLOCK = 4
 """What the clock of a run holds."""
 
-BLOCK_SINCE, BLOCK_LAST, BLOCK_LOWEST, IS_FOLLOWED, BLOCK_NEWEST, OUTDONE = range(6)
+BLOCK_SINCE, BLOCK_LAST, BLOCK_LOWEST, IS_FOLLOWED, BLOCK_NEWEST = range(5)
 """What the numbers of a block stand for: see `SampleBlock` and `run_block` in `blocks`; and the last of the
-samples that are run together (see `blocks.spans`). What comes after the positions that the root of the part
-joins no more, 0 if that is not known (see `closing`)."""
+samples that are run together (see `blocks.spans`)."""
 
 
 class Memory(NamedTuple):
@@ -134,7 +133,7 @@ class Scratch(NamedTuple):
             `blocks.node_rows`).
         running: (BLOCK,), a row that others are joined with.
         points: (16, BLOCK), a point at which a table is read, for each sample of a block.
-        block: (6,), where a block of samples is (see `BLOCK_SINCE`).
+        block: (5,), where a block of samples is (see `BLOCK_SINCE`).
         begins, next_begins: (D,), the first position of each node that has a row, in a block and in the next.
         closing: (positions,), the samples with which windows close.
         spans: (D, MOST_SPANS, 10), spans of neighbouring positions of each node (see `blocks.spans`).
@@ -246,7 +245,7 @@ def scratch_for(program: Program, room: int, tile: int) -> Scratch:
         rows=_aligned((program.rows, positions, BLOCK)),
         running=_aligned((BLOCK,)),
         points=np.zeros((16, BLOCK)),
-        block=np.zeros(6, np.int64),
+        block=np.zeros(5, np.int64),
         begins=begins,
         next_begins=next_begins,
         closing=np.zeros(positions, np.int64),

@@ -31,9 +31,9 @@ from spatial_replay.monitor.online.shares import (
     bound_memory,
     closed_up_to,
     copied,
-    is_narrow,
     joined_memory,
     numbers_of,
+    open_share,
     sections_of,
     shared_programs,
     starts_of,
@@ -141,6 +141,9 @@ _MOST_THREADS = 8
 _MOST_IN_SECTIONS = 1 << 18
 """So many samples at most are run in sections at once: numbers of later ones wait for those of the first."""
 
+_NARROW = 0.75
+"""So much at most of what windows span is open where one thread is as fast as several."""
+
 _TILES_ALONE = 8
 """So many tiles are run before it is looked again whether several threads are worth it."""
 
@@ -227,14 +230,17 @@ class OnlineRun:
         leaves = np.ascontiguousarray(in_channels(leaves, self._channels), np.float64)
         times_ns = np.array(times_ns, np.int64)  # writable, since kernels are compiled for that
         series = empty((len(self._program.reports), 4, len(times_ns)))
-        stretch, done, alone = _Stretch(leaves, times_ns, series), 0, 0
+        stretch, done = _Stretch(leaves, times_ns, series), 0
+        alone, was_narrow = 0, True
         may_share = has_windows(self._program) and self._is_worth_sharing(len(times_ns))
         while done < len(times_ns):
             done += self._run_tile(stretch, done, len(times_ns))
             # after a tile, the kernel is there, and what settles soon has
             if may_share and alone <= done < len(times_ns) and self._is_compiled:
-                if is_narrow(self._program, self._memory, len(times_ns) - done):
-                    alone = done + _TILES_ALONE * self._tile
+                share = open_share(self._program, self._memory, len(times_ns) - done)
+                if share <= _NARROW or (share <= 1 and was_narrow):
+                    # one position may have waited longer than usual
+                    alone, was_narrow = done + _TILES_ALONE * self._tile, share <= _NARROW
                     continue
                 before, done = done, self._run_in_sections(stretch, done)
                 if done == before:

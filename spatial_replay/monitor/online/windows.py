@@ -1,10 +1,10 @@
 """Bounded operators below unbounded ones, and past operators above future ones.
 
 Such a part's value at its oldest open positions changes with every sample, so the samples since then are
-stored. Its table (see `tables`) belongs to a *base*: the last position of the root all of whose windows have
-closed, or that of some samples ago. Later positions are columns of numbers (see `open_windows`), which are
-read into the table. A past operator with a future operator below it carries a table of its own from base to
-base.
+stored. Its table (see `tables`) belongs to a *base*: the last position of the root up to which all windows
+have closed, or do not matter any more (see `closing`), or that of some samples ago. Later positions are
+columns of numbers (see `open_windows`), which are read into the table. A past operator with a future
+operator below it carries a table of its own from base to base.
 
 A part's cells hold: the base, as the next position to absorb; for each variable, its position in the table;
 for each table of a past operator, the position it belongs to (-1: before the first).
@@ -57,7 +57,6 @@ from spatial_replay.monitor.online.state import (
     JOINED,
     NUMBERS,
     OFFSET,
-    OUTDONE,
     POSITION,
     Memory,
     Scratch,
@@ -232,10 +231,10 @@ def run_part(table_at: int, number: int, channels: int, begin: int, end: int, co
                         tables.nodes, tables.parts, number, which, channels, memory, scratch, offset, last, k
                     )
         if last % CLOSING == CLOSING - 1:
-            scratch.block[OUTDONE] = 0
+            outdone = 0
             if looks_for_outdone(part, memory, channels):
-                scratch.block[OUTDONE] = _outdone_up_to(tables.nodes, part, channels, memory, offset, last)
-            absorb(table_at, number, channels, last)
+                outdone = _outdone_up_to(tables.nodes, part, channels, memory, offset, last)
+            absorb(table_at, number, channels, last, outdone)
     return 0
 
 

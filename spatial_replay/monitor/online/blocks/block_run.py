@@ -70,7 +70,6 @@ from spatial_replay.monitor.online.state import (
     LOOKS,
     MOST_ROWS,
     OFFSET,
-    OUTDONE,
     POSITION,
     Memory,
     Scratch,
@@ -284,13 +283,11 @@ def set_last(table_at: int, number: int, which: int, channels: int, at: int) -> 
 
 
 @uncounted
-def _find_outdone(table_at: int, number: int, which: int, channels: int) -> None:
-    """Enter up to where what the root joins is outdone, at the last sample of the block (see `closing`)."""
+def _outdone_in_rows(table_at: int, number: int, which: int) -> int:
+    """Return what comes after the positions where what the root joins is outdone after a block."""
     tables, memory, scratch, _ = arrays_at(table_at)
     nodes, part, block = tables.nodes, tables.parts[number], block_of(memory, scratch)
     root, position = nodes[part[codes.PART_END] - 1], memory.cells[part[codes.PART_CELL_START]]
-    if not looks_for_outdone(part, memory, channels):
-        return
     history, sample = memory.history[which], block.last - block.since
     body = operand_of(nodes, part, root[codes.NODE_B], memory.columns[which], history, scratch)
     while position <= block.last:
@@ -299,7 +296,7 @@ def _find_outdone(table_at: int, number: int, which: int, channels: int) -> None
         if not is_outdone(part, root, memory, which, value):
             break
         position += 1
-    scratch.block[OUTDONE] = position if which == 0 else min(scratch.block[OUTDONE], position)
+    return int(position)
 
 
 @apart
@@ -347,7 +344,7 @@ def run_block(
                 narrowed = find_begins(table_at, number, which, channels, narrows, 0, since, last)
                 if last + 1 - narrowed > WIDE:
                     return 0
-    block[BLOCK_SINCE], block[BLOCK_LAST], block[BLOCK_LOWEST], block[OUTDONE] = since, last, lowest, 0
+    block[BLOCK_SINCE], block[BLOCK_LAST], block[BLOCK_LOWEST] = since, last, lowest
     block[IS_FOLLOWED] = 1 if is_followed and not is_wide else 0
     for d in range(first, end):
         # one that never ends stays open although what it is joined with has closed
@@ -358,6 +355,7 @@ def run_block(
     if len(memory.window_next):
         ends, next_ends = memory.window_ends, memory.window_next
         enter_samples(nodes, part, memory.stamps, ends, next_ends, memory.clock[OFFSET], last)
+    outdone = 0
     for which in range(LOOKS):
         if not (looks >> which) & 1:
             continue
@@ -374,7 +372,9 @@ def run_block(
         set_first(table_at, number, which, channels, at)
         if which > 1:
             continue
-        _find_outdone(table_at, number, which, channels)
+        if looks_for_outdone(part, memory, channels):
+            found = _outdone_in_rows(table_at, number, which)
+            outdone = found if which == 0 else min(outdone, found)
         if part[codes.PART_IS_REMEMBERING]:
             set_last(table_at, number, which, channels, at)
         for bound in (4, 5):
@@ -386,5 +386,5 @@ def run_block(
         if channels == 1:
             numbers[1, k], numbers[3, k] = numbers[0, k], numbers[2, k]
         numbers[6, k], numbers[7, k] = numbers[0, k], numbers[1, k]
-    absorb(table_at, number, channels, last)
+    absorb(table_at, number, channels, last, outdone)
     return PARTIAL if block[IS_FOLLOWED] else WHOLE

@@ -41,7 +41,7 @@ from spatial_replay.monitor.online.blocks.spans import (
     corners_of,
     span_at,
 )
-from spatial_replay.monitor.online.closing import is_outdone, looks_for_outdone
+from spatial_replay.monitor.online.closing import is_outdone
 from spatial_replay.monitor.online.node_columns import cells_of, columns_number, look_of, signal_of
 from spatial_replay.monitor.online.open_windows import runs_root
 from spatial_replay.monitor.online.run_arrays import arrays_at
@@ -58,7 +58,6 @@ from spatial_replay.monitor.online.state import (
     BLOCK_NEWEST,
     BLOCK_SINCE,
     OFFSET,
-    OUTDONE,
     Memory,
     Scratch,
     is_closed,
@@ -360,13 +359,11 @@ def _run_window(table_at: int, number: int, d: int, which: int, channels: int) -
 
 
 @uncounted
-def find_outdone_in_spans(table_at: int, number: int, which: int, channels: int) -> None:
-    """Enter up to where what the root joins is outdone, at the last sample of the block (see `closing`)."""
+def outdone_in_spans(table_at: int, number: int, which: int) -> int:
+    """Return what comes after the positions where what the root joins is outdone after a block."""
     tables, memory, scratch, _ = arrays_at(table_at)
     nodes, part, block = tables.nodes, tables.parts[number], block_of(memory, scratch)
     root, position = nodes[part[codes.PART_END] - 1], memory.cells[part[codes.PART_CELL_START]]
-    if not looks_for_outdone(part, memory, channels):
-        return
     place, sample, row = root[codes.NODE_B], block.last - block.since, block.running
     d = part[codes.PART_FIRST] + place
     signal, spans, rows = (
@@ -389,7 +386,7 @@ def find_outdone_in_spans(table_at: int, number: int, which: int, channels: int)
         if not is_outdone(part, root, memory, which, value):
             break
         position += 1
-    scratch.block[OUTDONE] = position if which == 0 else min(scratch.block[OUTDONE], position)
+    return int(position)
 
 
 @uncounted

@@ -9,13 +9,13 @@ from spatial_replay.monitor.online.blocks.block_ends import find_begins, is_besi
 from spatial_replay.monitor.online.blocks.block_run import PARTIAL, WHOLE, operand_of, set_first, set_last
 from spatial_replay.monitor.online.blocks.span_rows import (
     block_of,
-    find_outdone_in_spans,
     join_body_spans,
+    outdone_in_spans,
     run_spans,
 )
 from spatial_replay.monitor.online.blocks.span_tables import fill_tables
 from spatial_replay.monitor.online.blocks.spans import find_spans
-from spatial_replay.monitor.online.closing import absorb
+from spatial_replay.monitor.online.closing import absorb, looks_for_outdone
 from spatial_replay.monitor.online.node_columns import cells_of, columns_number, look_of, tables_end
 from spatial_replay.monitor.online.open_windows import (
     has_ended,
@@ -36,7 +36,6 @@ from spatial_replay.monitor.online.state import (
     IS_FOLLOWED,
     LOOKS,
     OFFSET,
-    OUTDONE,
     POSITION,
     Memory,
 )
@@ -153,7 +152,7 @@ def run_wide(table_at: int, number: int, looks: int, channels: int, at: int, cou
     lowest, is_first = find_begins(table_at, number, 0, channels, 0, 0, since, last), True
     if last + 1 - lowest > scratch.rows.shape[1] or not _takes_spans(nodes, part, memory, scratch.begins):
         return 0
-    block[BLOCK_LOWEST], block[BLOCK_NEWEST], block[IS_FOLLOWED], block[OUTDONE] = lowest, last, 1, 0
+    block[BLOCK_LOWEST], block[BLOCK_NEWEST], block[IS_FOLLOWED], outdone = lowest, last, 1, 0
     for which in range(LOOKS):
         if not (looks >> which) & 1:
             continue
@@ -181,13 +180,14 @@ def run_wide(table_at: int, number: int, looks: int, channels: int, at: int, cou
                 is_beside = bound - 4 == which if channels == 4 else look_of(bound, channels).channel == which
                 if is_beside and ((part[codes.PART_NUMBERS] & ~looks) >> bound) & 1:
                     _set_first_of_spans(table_at, number, bound, channels, k, columns_number(which))
-        if which < 2:
-            find_outdone_in_spans(table_at, number, which, channels)
+        if which < 2 and looks_for_outdone(part, memory, channels):
+            found = outdone_in_spans(table_at, number, which)
+            outdone = found if which == 0 else min(outdone, found)
         memory.known[number, columns_number(which)] = memory.closed[number, columns_number(which)] = last
         memory.unjoined[number, columns_number(which)] = 0
     for k in range(at, at + count if channels < 4 else at):
         if channels == 1:
             numbers[1, k], numbers[3, k] = numbers[0, k], numbers[2, k]
         numbers[6, k], numbers[7, k] = numbers[0, k], numbers[1, k]
-    absorb(table_at, number, channels, last)
+    absorb(table_at, number, channels, last, outdone)
     return PARTIAL
