@@ -99,10 +99,13 @@ def open_share(program: Program, memory: Memory, left: int) -> float:
             continue
         if part[codes.PART_VARIABLES] == 0 and part[codes.PART_LAST_IN] != number:
             continue  # soon over
-        if part[codes.PART_LIMIT] < 0 and not part[codes.PART_IS_ONE_WAY]:
-            return np.inf
         samples, time_ns = _horizon(nodes)
         width, base = samples + time_ns * per_ns, int(memory.cells[part[codes.PART_CELL_START]])
+        far, is_counted = nodes[-1, codes.NODE_HIGH], nodes[-1, codes.NODE_UNIT] == codes.SAMPLES
+        if far > 0 and far * (1 if is_counted else per_ns) + width - position <= left * _SOON:
+            continue
+        if part[codes.PART_LIMIT] < 0 and not part[codes.PART_IS_ONE_WAY]:
+            return np.inf
         if base > 0:
             # what closes within a block is absorbed with it
             widest = max(widest, (position - base) / (width + BLOCK))

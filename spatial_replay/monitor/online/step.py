@@ -141,7 +141,7 @@ _MOST_THREADS = 8
 _MOST_IN_SECTIONS = 1 << 18
 """So many samples at most are run in sections at once: numbers of later ones wait for those of the first."""
 
-_NARROW = 0.75
+_NARROW = 0.3
 """So much at most of what windows span is open where one thread is as fast as several."""
 
 _TILES_ALONE = 8
