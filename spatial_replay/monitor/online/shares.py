@@ -41,7 +41,8 @@ _MOST_OF_WORK = 0.8
 """So much of the work at least is done in sections, or none."""
 
 _SOON = 0.25
-"""Windows that close within so much of a stretch are waited for before it is shared."""
+"""Windows that close within so much of a stretch are waited for before it is shared; within a fourth of that,
+where a signal alone may outdo what is open."""
 
 _ENTERING = 0.15
 """So much of the work is to enter the numbers of all nodes."""
@@ -109,7 +110,7 @@ def open_share(program: Program, memory: Memory, left: int) -> float:
         if base > 0:
             # what closes within a block is absorbed with it
             widest = max(widest, (position - base) / (width + BLOCK))
-        elif width > left * _SOON:
+        elif width > left * (_SOON if part[codes.PART_IS_ONE_WAY] else _SOON / 4):
             return np.inf
     return widest
 
