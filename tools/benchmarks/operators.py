@@ -92,7 +92,8 @@ def bench_online_windows(bench: Any) -> None:
         for unit, group in (("samples", in_samples), ("seconds", in_seconds)):
             flat = [fastest[width] for width in group]
             bench.ratio(f"{name}, {unit}: slowest to quickest", max(flat) / min(flat), WIDER_LIMIT)
-        bench.ratio(f"{name}: to G (a -> b)", max(fastest.values()) / fastest[""], 6.0)
+        # what has no window is some 35 ns a sample, of which half is to enter the numbers
+        bench.ratio(f"{name}: to G (a -> b)", max(fastest.values()) / fastest[""], 8.0)
 
 
 def _online_times(texts: dict[str, str], leaves: Any) -> dict[str, list[float]]:
