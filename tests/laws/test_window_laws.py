@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from itertools import pairwise
 from unittest import mock
@@ -288,6 +288,13 @@ def program_of(formula):
     return program
 
 
+def leaving_out_nothing(program):
+    """The same program, of which positions count until their windows close."""
+    parts = program.parts.copy()
+    parts[:, [codes.PART_LIMIT, codes.PART_IS_ONE_WAY]] = operators.NOTHING, 0
+    return replace(program, parts=parts)
+
+
 def both_ways(program, run, ends, **options):
     """What a run says in stretches, and sample by sample: (N, 4, T), and (N, 2) after each stretch."""
     leaves, times = run.values(program.leaves), np.array(run.times_ns)
@@ -348,10 +355,11 @@ def test_interpreted_spans_have_the_same_bits(formula, run):
     room=rooms,
     tile=st.sampled_from([8, 20, 33, 40, 77]),
     least=st.sampled_from([10, 50, 100]),
+    is_wide=st.booleans(),
 )
-def test_two_runs_that_share_a_stretch_say_what_one_does(data, formula, run, room, tile, least):
+def test_two_runs_that_share_a_stretch_say_what_one_does(data, formula, run, room, tile, least, is_wide):
     ends = data.draw(stretches(len(run)))
-    with only("compiled"):  # the work is shared once there is machine code
+    with only("compiled"), wide_open(is_wide):  # the work is shared once there is machine code
         options = {"room": room, "tile": tile, "least_shared": least, "threads": 2}
         assert_same_bits(*both_ways(program_of(formula), run, ends, **options))
 
@@ -371,7 +379,7 @@ def test_runs_that_take_a_section_of_a_stretch_each_say_what_one_does(
     ends, size = data.draw(stretches(len(run))), len(run)
     # a stretch of several sections, and then others
     ends = sorted({0, 4 * size // 5, *(end for end in ends if end > 4 * size // 5)})
-    with only("compiled"):
+    with only("compiled"), wide_open():
         options = {"room": tile, "tile": tile, "least_shared": least, "threads": threads}
         assert_same_bits(*both_ways(program_of(formula), run, ends, **options))
 
@@ -379,7 +387,7 @@ def test_runs_that_take_a_section_of_a_stretch_each_say_what_one_does(
 @pytest.mark.parametrize("threads", [2, 3, 5])
 def test_one_run_goes_on_where_sections_leave_positions_between_them(threads):
     within = ahead("F", 0, 30, Temporal("G", (Q,), Bound(0, 300, "ns")))
-    program, found = compile_formula(Temporal("G", (Boolean("->", (P, within)),))), set()
+    program, found = leaving_out_nothing(compile_formula(Temporal("G", (Boolean("->", (P, within)),)))), set()
     size = 600 * threads  # so that each section is worth it
     names = [leaf.text for leaf in program.leaves]
     options = {"room": 32, "tile": 32, "least_shared": 150, "threads": threads}
@@ -389,16 +397,23 @@ def test_one_run_goes_on_where_sections_leave_positions_between_them(threads):
         leaves = np.zeros((1, 2, size))
         leaves[0, names.index(Q.text)] = rng.normal(size=size)
         leaves[0, names.index(P.text)] = -9 - rng.random(size)
-        with only("compiled"), between_sections(left):
+        with only("compiled"), wide_open(), between_sections(left):
             OnlineRun(program, **options).extend(leaves, times)
         for section, begin, end in left:
             # nothing else is asked for
             leaves[0, names.index(P.text), begin:end] = 9
             found.add(section)
-        with only("compiled"):
+        with only("compiled"), wide_open():
             sections = OnlineRun(program, **options).extend(leaves, times)
             assert sections.tobytes() == OnlineRun(program, threads=1).extend(leaves, times).tobytes()
     assert found >= set(range(1, threads))
+
+
+@contextmanager
+def wide_open(is_so=True):
+    """Have the work shared however little is open."""
+    with mock.patch.object(step, "open_share", lambda *_: np.inf) if is_so else nullcontext():
+        yield
 
 
 @contextmanager
@@ -426,7 +441,7 @@ def test_two_runs_that_share_several_roots_say_what_one_does(data, formula, run,
     ends, size = data.draw(stretches(len(run))), len(run)
     # a long stretch, and then others
     ends = sorted({0, size // 2, *(end for end in ends if end > size // 2)})
-    with only("compiled"):
+    with only("compiled"), wide_open():
         options = {"room": tile, "tile": tile, "least_shared": 60, "threads": 2}
         assert_same_bits(*both_ways(program_of(formula), run, ends, **options))
 
@@ -465,12 +480,11 @@ def assert_as_defined(formula, program, run, ends, **options):
 def test_leaving_out_what_matters_no_more_changes_nothing(data, case, tile):
     formula, run = case
     program = compile_formula(formula)
-    parts = program.parts.copy()
-    parts[:, [codes.PART_LIMIT, codes.PART_IS_ONE_WAY]] = operators.NOTHING, 0
-    if not state.has_windows(program) or (parts == program.parts).all():
+    whole = leaving_out_nothing(program)
+    if not state.has_windows(program) or (whole.parts == program.parts).all():
         return
     ends, leaves, times = data.draw(stretches(len(run))), run.values(program.leaves), np.array(run.times_ns)
-    runs = [OnlineRun(each, tile=tile) for each in (program, replace(program, parts=parts))]
+    runs = [OnlineRun(each, tile=tile) for each in (program, whole)]
     for begin, end in pairwise(ends):
         part = fewest(leaves[:, :, begin:end])
         one, other = (each.extend(part, times[begin:end]) for each in runs)
