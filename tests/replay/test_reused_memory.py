@@ -58,11 +58,11 @@ def test_what_was_free_for_longest_goes_first():
     newest = {array.ctypes.data for array in arrays[2:]}
     while arrays:
         arrays.pop(0)
-    # other memory that is asked for meanwhile takes the place of what is held no longer
-    meanwhile = [np.ones(LARGE) for _ in range(2)]
+    # what others ask for takes the place of what is held no longer
+    others = [np.ones(LARGE) for _ in range(2)]
     again = [memory.empty((LARGE,)) for _ in range(3)]
     assert {array.ctypes.data for array in again} == newest
-    assert newest.isdisjoint({array.ctypes.data for array in meanwhile})
+    assert newest.isdisjoint({array.ctypes.data for array in others})
 
 
 def test_threads_never_share_what_is_in_use():

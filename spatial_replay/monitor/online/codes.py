@@ -81,7 +81,7 @@ PART_ENDING, PART_LOWER, PART_UPPER, PART_IS_MINIMUM, PART_BESIDE = 10, 11, 12, 
 # whether the bound that is not known at once is the value but for positions where a window of those nodes
 # is open that cut it
 PART_IS_CUT = 15
-# the part, this one or another, and its node that is what this part is at the last sample; -1 if nobody asks
+# the part, itself or another, and its node that is what this one is at the last sample; -1 if not asked for
 PART_LAST_IN, PART_LAST_NODE = 16, 17
 # which bounds follow from its table alone until its root has ended, a bit for each: what may still come
 # outdoes all that is open
