@@ -193,7 +193,7 @@ def _report_known(
             else:
                 _fill_known(np.inf if rule == codes.NOW_TRUE else -np.inf, now)
         elif code == codes.REPORT_PAST:
-            of = operands[start]
+            of = operands[stop - 1]
             for which in (0, 2, 3):
                 _copy_known(series[of, which, t:end], series[n, which, t:end])
             if rule == codes.NOW_OF_SIGNAL:
@@ -260,7 +260,7 @@ def report(
             _copy_numbers(scratch.parts[index], rows, count)
             _set_now(rule, rows, numbers[operands[start]], numbers[operands[stop - 1]], count)
         elif code == codes.REPORT_PAST:
-            _copy_numbers(numbers[operands[start]], rows, count)
+            _copy_numbers(numbers[operands[stop - 1]], rows, count)
             for end in range(2):
                 for k in range(count):
                     if rule == codes.NOW_OF_SIGNAL:

@@ -64,8 +64,8 @@ def from_all(node: Temporal) -> Temporal:
 def at_last(node: Temporal) -> Formula | None:
     """Return what, at the first sample, is what a past operator over a future one is at the last one.
 
-    That is a formula without future operators for `O F x`, of which now is what was so far; for `O x` and
-    `H x`, else, it is `F x` and `G x`. None if there is none, or if the operator is another one at the first.
+    That is a formula without future operators for `O F x` and `a S F x`, of which now is what was so far; for
+    `O x` and `H x`, else, it is `F x` and `G x`. None if there is none, or if the operator is another one at the first.
     """
     around = _around(node)
     if isinstance(around, Boolean) and not looks_ahead(around.operands[0]):
@@ -96,16 +96,21 @@ def recurring(node: Temporal) -> Temporal:
 def _around(node: Temporal) -> Temporal | Boolean:
     """Return `O F x`, over windows that begin at once, as `O x or F x`; `H G x` as `H x and G x`.
 
-    What a sample before looks at is up to now, or ahead of now as far as now itself looks at most.
+    What a sample before looks at is up to now, or ahead of now as far as now itself looks at most. So
+    `a S F x` is `a S x or F x`: of all samples at which `F x` may look at a later one, a has to last for the
+    shortest time from that one itself on, or not at all.
     """
     inner, is_negated = _below(node)
-    if node.operator not in "OH" or not isinstance(inner, Temporal) or inner.operator not in _OPPOSITE:
+    if node.operator not in "OHS" or not isinstance(inner, Temporal) or inner.operator not in _OPPOSITE:
         return node
     ahead: TemporalOperator = "F" if (inner.operator == "F") != is_negated else "G"
-    if (ahead == "F") != (node.operator == "O") or not _is_at_once(node.bound, inner.bound):
+    if (ahead == "G") != (node.operator == "H") or not _is_at_once(node.bound, inner.bound):
         return node
+    *left, _ = node.operands
     operand = _negated(inner.operands[0]) if is_negated else inner.operands[0]
-    sides = Temporal(node.operator, (operand,), node.bound), Temporal(ahead, (operand,), inner.bound)
+    if left and any(map(looks_ahead, (*left, operand))):
+        return node  # both would be computed at all open positions
+    sides = Temporal(node.operator, (*left, operand), node.bound), Temporal(ahead, (operand,), inner.bound)
     return Boolean("or" if ahead == "F" else "and", sides)
 
 
@@ -137,8 +142,8 @@ _OPPOSITE: Mapping[str, str] = MappingProxyType({"F": "G", "G": "F"})
 
 
 def _below(node: Temporal) -> tuple[Formula, bool]:
-    """Return what stands below an operator and below `not`, and whether these negate it."""
-    other, is_negated = expand(node.operands[0]), False
+    """Return what stands below an operator, last, and below `not`, and whether these negate it."""
+    other, is_negated = expand(node.operands[-1]), False
     while isinstance(other, Boolean) and other.operator == "not":
         other, is_negated = expand(other.operands[0]), not is_negated
     return other, is_negated
