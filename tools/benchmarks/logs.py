@@ -105,7 +105,7 @@ def bench_reading(measure: Any) -> None:
     """Reading our own log, all samples into columns: once, again, and with one core."""
     count = 200_000
     kept = {name: os.environ.get(name) for name in ("SPATIAL_REPLAY_CACHE", "SPATIAL_REPLAY_SAMPLES")}
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, _as_the_command_line():
         log = Path(folder) / "run.mcap"
         record_source(Moving(count), log)
         os.environ["SPATIAL_REPLAY_CACHE"] = folder

@@ -21,7 +21,7 @@ import numpy as np
 import zstandard
 
 from spatial_replay.compiled import bytes_at, copying_kernel, integers_at
-from spatial_replay.cores import Work, drop, first_result
+from spatial_replay.cores import Work, cores, drop, first_result
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.byte_ranges import is_planned, plan_reads
 from spatial_replay.logs.checksums import crc32, joined_checksum
@@ -48,14 +48,15 @@ _ZSTD = 4 | int.from_bytes(b"zstd", "little") << 32
 """The compression of our own chunks in their heads: a length, and a name."""
 _OUR_HEAD = _FIXED_HEAD + 4 + 8
 """How long these heads are."""
-_TOGETHER, _TOGETHER_BYTES = 32, 2**20
-"""Chunks, and their bytes, that a thread takes at once."""
-_CACHED_BYTES = 2**20
+_TOGETHER, _TOGETHER_BYTES = 32, 2**22
+"""Chunks, and their bytes, that a thread takes at once: with fewer, it waits for the interpreter more often."""
+_LARGEST_OF_OURS = 2**20
+"""Bytes, uncompressed, of a chunk that is read together with others."""
+_CACHED_BYTES = 2**21
 """So many are decompressed before they are split: they stay in the cache."""
 _AHEAD, _AHEAD_BYTES = 24, 2**24
-"""How many times as many are read ahead, at most, and their bytes: more than a block of samples has."""
-_LEAST_AHEAD = 8
-"""So many are read ahead however large they are, so that each thread has work."""
+"""How many times as many are read ahead, at most, and their bytes: more than a block of samples has. However
+large they are, each thread has one."""
 _MOST_SPREAD = 1.5
 """Times their own bytes that chunks and what lies between them may have, to be read at once."""
 
@@ -198,7 +199,7 @@ def iter_records(
             waiting.append((size, Work(partial(reader.read, group), waits=is_planned(stream))))
             waiting[-1][1].hand_out()
             ahead += size
-            if len(waiting) > _AHEAD or (ahead > _AHEAD_BYTES and len(waiting) > _LEAST_AHEAD):
+            if len(waiting) > _AHEAD or (ahead > _AHEAD_BYTES and len(waiting) > cores()):
                 found = first_result(work for _, work in waiting)
                 size, _ = waiting.popleft()
                 ahead -= size
@@ -337,7 +338,7 @@ def _gathered_by_struct(data: Bytes, table: Integers, frames: Bytes) -> bool:
             return False
         start, stop, size, checksum, _ = _CHUNK_HEAD.unpack_from(record, RECORD_HEAD.size)
         name, stored = struct.unpack_from("<QQ", record, _OUR_HEAD - 16)
-        if name != _ZSTD or not checksum or size > _TOGETHER_BYTES or not start <= stop < 2**63:
+        if name != _ZSTD or not checksum or size > _LARGEST_OF_OURS or not start <= stop < 2**63:
             return False
         if stored != len(record) - _OUR_HEAD:
             return False
@@ -372,7 +373,7 @@ def _gather_frames(data: Bytes, table: Integers, frames: Bytes) -> bool:
         stored = integers_at(at + _OUR_HEAD - 8, 1)[0]
         if integers_at(at + _OUR_HEAD - 16, 1)[0] != _ZSTD or checksum == 0 or stored != length - _OUR_HEAD:
             return False
-        if size < 0 or size > _TOGETHER_BYTES or start < 0 or stop < start:
+        if size < 0 or size > _LARGEST_OF_OURS or start < 0 or stop < start:
             return False
         frame, to = at + _OUR_HEAD, target + used
         words = stored // 8
