@@ -291,7 +291,7 @@ def program_of(formula):
 def leaving_out_nothing(program):
     """The same program, of which positions count until their windows close."""
     parts = program.parts.copy()
-    parts[:, [codes.PART_LIMIT, codes.PART_IS_ONE_WAY]] = operators.NOTHING, 0
+    parts[:, [codes.PART_LIMIT, codes.PART_OUTDONE_BY]] = operators.NOTHING, codes.BY_NOTHING
     return replace(program, parts=parts)
 
 

@@ -49,7 +49,8 @@ _ZSTD = 4 | int.from_bytes(b"zstd", "little") << 32
 _OUR_HEAD = _FIXED_HEAD + 4 + 8
 """How long these heads are."""
 _TOGETHER, _TOGETHER_BYTES = 32, 2**22
-"""Chunks, and their bytes, that a thread takes at once: with fewer, it waits for the interpreter more often."""
+"""Chunks, and their bytes, that a thread takes at once: with fewer, it waits for the interpreter
+more often."""
 _LARGEST_OF_OURS = 2**20
 """Bytes, uncompressed, of a chunk that is read together with others."""
 _CACHED_BYTES = 2**21

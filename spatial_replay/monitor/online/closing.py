@@ -181,10 +181,10 @@ def is_outdone(part: Integers, root: Integers, memory: Memory, channel: int, val
 
 
 @inlined
-def looks_for_outdone(part: Integers, memory: Memory, channels: int) -> bool:
-    """Return whether what a root joins may be outdone by what it is already, where windows are open."""
-    goes_one_way = part[codes.PART_IS_ONE_WAY] and part[codes.PART_NUMBERS] & 1 and channels <= 2
-    return bool(goes_one_way and memory.cells[part[codes.PART_CELL_START]] > 0)
+def looks_for_outdone(part: Integers, memory: Memory, channels: int, by: int) -> bool:
+    """Return whether anything, `by` at least, says what is outdone of what a root joins."""
+    is_said = part[codes.PART_OUTDONE_BY] >= by and part[codes.PART_NUMBERS] & 1 and channels <= 2
+    return bool(is_said and memory.cells[part[codes.PART_CELL_START]] > 0)
 
 
 @uncounted

@@ -88,8 +88,10 @@ PART_LAST_IN, PART_LAST_NODE = 16, 17
 PART_KNOWN = 18
 # the signal that what a root joins by the minimum is at least, by the maximum at most; -1 for none
 PART_LIMIT = 19
-# whether what a root joins by the minimum never falls as samples come, by the maximum never rises
-PART_IS_ONE_WAY = 20
+# what says that what a root joins by the minimum falls no more, by the maximum rises no more, while windows
+# are open: nothing; the worst that may come, where spans are found (see `blocks.spans`); or its value
+PART_OUTDONE_BY = 20
+BY_NOTHING, BY_WORST, BY_VALUE = 0, 1, 2
 # which of its numbers a run computes, a bit for each: all, but where two runs share them (see `shares`)
 PART_NUMBERS = 21
 PART_WIDTH = 22

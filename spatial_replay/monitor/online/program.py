@@ -220,7 +220,7 @@ class _Parts:
                 *last_in.get(number, (NOTHING, NOTHING)),
                 _known_bounds(self._rows[number]),
                 self._limits[number],
-                int(not row[codes.PART_IS_NESTED] and _is_one_way(self._rows[number])),
+                codes.BY_NOTHING if row[codes.PART_IS_NESTED] else _outdone_by(self._rows[number]),
                 codes.ALL_NUMBERS,
             )
             for number, row in enumerate(self._part_rows)
@@ -358,20 +358,27 @@ def _limit(rows: tuple[Row, ...], signals: SignalTable) -> int:
     return limits[-1]
 
 
-def _is_one_way(rows: tuple[Row, ...]) -> bool:
-    """Return whether what a root joins by the minimum never falls as samples come, or the other way round.
+def _outdone_by(rows: tuple[Row, ...]) -> int:
+    """Return what says that what a root joins by the minimum falls no more, or the other way round.
 
-    What `F` finds remains, and what is still to come can only add to it.
+    What `F` finds remains, and what is still to come can only add to it, so that its value says so. Of `G`
+    only what has closed does: where it is open, the worst may still come.
     """
     way = _direction_of(rows)
     if way is None or not _never_ends(rows):
-        return False
+        return codes.BY_NOTHING
     free = (codes.LITERAL, codes.PART_AND, codes.PART_OR, codes.PAST_DELAY, *codes.PAST_WINDOWS)
     ahead = (way.window, way.until, codes.SHIFT)
-    return all(
-        row[codes.NODE_CODE] in free or (row[codes.NODE_CODE] in ahead and row[codes.NODE_WEAK] == way.weak)
-        for row in rows[:-1]
-    )
+    found = codes.BY_VALUE
+    for row in rows[:-1]:
+        code, low = row[codes.NODE_CODE], row[codes.NODE_LOW]
+        if code in free or (code in ahead and row[codes.NODE_WEAK] == way.weak):
+            continue
+        # one that has not begun would be as good as can be
+        if code not in (codes.PART_WINDOW_MAX, codes.PART_WINDOW_MIN) or low > 0:
+            return codes.BY_NOTHING
+        found = codes.BY_WORST
+    return found
 
 
 def _trees(rows: tuple[Row, ...], known: dict[Row, int]) -> list[int]:

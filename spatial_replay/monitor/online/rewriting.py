@@ -65,7 +65,8 @@ def at_last(node: Temporal) -> Formula | None:
     """Return what, at the first sample, is what a past operator over a future one is at the last one.
 
     That is a formula without future operators for `O F x` and `a S F x`, of which now is what was so far; for
-    `O x` and `H x`, else, it is `F x` and `G x`. None if there is none, or if the operator is another one at the first.
+    `O x` and `H x`, else, it is `F x` and `G x`. None if there is none, or if the operator is another one at
+    the first.
     """
     around = _around(node)
     if isinstance(around, Boolean) and not looks_ahead(around.operands[0]):

@@ -105,12 +105,12 @@ def open_share(program: Program, memory: Memory, left: int) -> float:
         far, is_counted = nodes[-1, codes.NODE_HIGH], nodes[-1, codes.NODE_UNIT] == codes.SAMPLES
         if far > 0 and far * (1 if is_counted else per_ns) + width - position <= left * _SOON:
             continue
-        if part[codes.PART_LIMIT] < 0 and not part[codes.PART_IS_ONE_WAY]:
+        if part[codes.PART_LIMIT] < 0 and part[codes.PART_OUTDONE_BY] == codes.BY_NOTHING:
             return np.inf
         if base > 0:
             # what closes within a block is absorbed with it
             widest = max(widest, (position - base) / (width + BLOCK))
-        elif width > left * (_SOON if part[codes.PART_IS_ONE_WAY] else _SOON / 4):
+        elif width > left * (_SOON if part[codes.PART_OUTDONE_BY] == codes.BY_VALUE else _SOON / 4):
             return np.inf
     return widest
 

@@ -43,7 +43,7 @@ from spatial_replay.monitor.online.blocks.spans import (
 )
 from spatial_replay.monitor.online.closing import is_outdone
 from spatial_replay.monitor.online.node_columns import cells_of, columns_number, look_of, signal_of
-from spatial_replay.monitor.online.open_windows import runs_root
+from spatial_replay.monitor.online.open_windows import reach, runs_root
 from spatial_replay.monitor.online.run_arrays import arrays_at
 from spatial_replay.monitor.online.sliding import (
     Recent,
@@ -360,30 +360,39 @@ def _run_window(table_at: int, number: int, d: int, which: int, channels: int) -
 
 @uncounted
 def outdone_in_spans(table_at: int, number: int, which: int) -> int:
-    """Return what comes after the positions where what the root joins is outdone after a block."""
+    """Return what comes after the positions where what the root joins is outdone after a block.
+
+    Where its value does not say so, the worst that may come does, which is a corner of a table: as rows are
+    no better than that, nor is what windows hold that are open after all samples of the spans.
+    """
     tables, memory, scratch, _ = arrays_at(table_at)
     nodes, part, block = tables.nodes, tables.parts[number], block_of(memory, scratch)
     root, position = nodes[part[codes.PART_END] - 1], memory.cells[part[codes.PART_CELL_START]]
     place, sample, row = root[codes.NODE_B], block.last - block.since, block.running
-    d = part[codes.PART_FIRST] + place
-    signal, spans, rows = (
-        signal_of(nodes, d),
-        scratch.spans[place],
-        scratch.rows[max(nodes[d, codes.NODE_ROWS], 0)],
-    )
+    d, is_said = part[codes.PART_FIRST] + place, part[codes.PART_OUTDONE_BY] == codes.BY_VALUE
+    signal, spans = signal_of(nodes, d), scratch.spans[place]
+    rows, columns = scratch.rows[max(nodes[d, codes.NODE_ROWS], 0)], scratch.corner_columns[place]
     column = memory.columns[which, d] if signal < 0 else memory.history[which, signal]
+    # where windows close with one of the samples, no table says it; that is absorbed as it is
+    first = scratch.next_begins[place] if signal < 0 and not is_said else position
+    if first > position and reach(table_at, number, first - 1, first - 1, block.last):
+        position = first
     k = span_at(spans, scratch.span_counts[place], position)
     while position <= block.last:
         while position >= spans[k, END]:
             k += 1
         at, kind = position - block.lowest, spans[k, KIND] if signal < 0 else IN_COLUMN
-        if kind == IN_TABLE:
-            columns = scratch.corner_columns[place]
+        if kind == IN_COLUMN:
+            value = column[position - block.offset]
+        elif not is_said:
+            worst = corners_of(spans[k]) - 1 if root[codes.NODE_CODE] == codes.UNTIL else 0
+            value = columns[worst, at]
+        elif kind == IN_TABLE:
             _read_position(spans[k], columns, at, scratch.joints, scratch.spare, scratch.corner, row)
             value = row[sample]
         else:
-            value = rows[at, sample] if kind == IN_ROWS else column[position - block.offset]
-        if not is_outdone(part, root, memory, which, value):
+            value = rows[at, sample]
+        if (kind == IN_ROWS and not is_said) or not is_outdone(part, root, memory, which, value):
             break
         position += 1
     return int(position)
@@ -420,20 +429,27 @@ def _is_closed_before(nodes: Integers, part: Integers, recent: Recent, block: Sa
 
 @uncounted
 def join_body_spans(
-    nodes: Integers, part: Integers, block: SampleBlock, body: NodeRows, base: int, start: float,
-    is_cut: bool, recent: Recent, newest: int, spans: Integers, count: int, wholes: Floats,
+    nodes: Integers, part: Integers, block: SampleBlock, body: NodeRows, base: int, after: int,
+    start: float, is_cut: bool, recent: Recent, newest: int, spans: Integers, count: int, wholes: Floats,
     closing: Integers,
 ) -> None:  # fmt: skip
-    """Fill the running row with what the root of a part joins, and a number (see `_join_body`)."""
+    """Fill the running row with what the root of a part joins, and a number (see `_join_body`).
+
+    Args:
+        base, after: where the first span begins that it joins, or an earlier position that has a number; and
+            where the last one ends.
+    """
     root = part[codes.PART_END] - 1
     is_until = nodes[root, codes.NODE_CODE] == codes.UNTIL
-    settled = max(spans[0, END], base)
+    settled = max(min(spans[0, END], after), base)
     fill_row(
         extremum(is_until, body.column[base - block.offset : settled - block.offset], start), block.running
     )
     for k in range(1, count):
         begin, end = spans[k, BEGIN], min(spans[k, END], block.last + 1)
-        if begin >= end:
+        if end <= base:
+            continue
+        if begin >= min(end, after):
             break
         if not is_cut or _is_closed_before(nodes, part, recent, block, spans[k, END] - 1):
             join_rows(is_until, block.running, wholes[k], block.running)

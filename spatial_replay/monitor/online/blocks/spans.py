@@ -18,7 +18,7 @@ from spatial_replay.compiled import apart, inlined, uncounted
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.node_columns import look_of
-from spatial_replay.monitor.online.open_windows import runs_root
+from spatial_replay.monitor.online.open_windows import root_window, runs_root
 from spatial_replay.monitor.online.run_arrays import arrays_at
 from spatial_replay.monitor.online.sliding import is_decided
 from spatial_replay.monitor.online.state import (
@@ -284,6 +284,21 @@ def _joined_spans(
     return count
 
 
+@uncounted
+def _cut_span(spans: Integers, count: int, at: int) -> int:
+    """Have a span begin at a position, if that has rows or tables; return how many there are, or -1."""
+    k = span_at(spans, count, at)
+    if k == 0 or spans[k, BEGIN] == at or at >= spans[k, END]:
+        return count
+    if count >= MOST_SPANS:
+        return -1
+    for later in range(count, k, -1):
+        for number in range(spans.shape[1]):
+            spans[later, number] = spans[later - 1, number]
+    spans[k, END] = spans[k + 1, BEGIN] = at
+    return count + 1
+
+
 @apart
 def find_spans(table_at: int, number: int, which: int, channels: int, since: int, last: int) -> int:
     """Find the spans of all nodes of a part, for one of its numbers and the samples from `since` to `last`.
@@ -323,4 +338,11 @@ def find_spans(table_at: int, number: int, which: int, channels: int, since: int
         if count < 0:
             return 0
         scratch.span_counts[place] = count
-    return 1
+    if runs_root(part, nodes[end - 1]):
+        return 1
+    # the root joins whole spans, and none outside its window
+    body = nodes[end - 1, codes.NODE_B]
+    for at in root_window(nodes[end - 1], memory, last):
+        count = scratch.span_counts[body]
+        scratch.span_counts[body] = _cut_span(scratch.spans[body], count, at) if count > 0 else count
+    return 1 if scratch.span_counts[body] > 0 else 0

@@ -10,7 +10,7 @@ from spatial_replay.monitor.online.blocks.block_run import PARTIAL, WHOLE, run_b
 from spatial_replay.monitor.online.blocks.wide_run import run_wide
 from spatial_replay.monitor.online.closing import is_settled
 from spatial_replay.monitor.online.node_columns import columns_number
-from spatial_replay.monitor.online.open_windows import looks_of
+from spatial_replay.monitor.online.open_windows import is_over, looks_of
 from spatial_replay.monitor.online.run_arrays import arrays_at
 from spatial_replay.monitor.online.state import BLOCK, LOOKS, POSITION
 from spatial_replay.monitor.online.windows import run_part
@@ -36,14 +36,24 @@ def _reach(known: Integers, looks: int, last: int) -> bool:
 
 
 @uncounted
-def _samples_together(table_at: int, number: int, channels: int, since: int) -> int:
-    """Return for how many samples spans are found together: the more positions are open, the more."""
+def _samples_together(table_at: int, number: int, channels: int, since: int, most: int) -> int:
+    """Return for how many samples spans are found together: the more positions are open, the more.
+
+    Args:
+        most: so many at most.
+    """
+    tables, memory, _, _ = arrays_at(table_at)
+    root = tables.nodes[tables.parts[number, codes.PART_END] - 1]
     count = since - find_begins(table_at, number, 0, channels, 0, 0, since, since)
     together = 0
     if count > SPANNED:
         together = 2 * BLOCK
         while 3 * together * together < 4 * count and together < MOST_TOGETHER:
             together *= 2
+    together = min(together, most)
+    # they are all of one kind
+    while together > 1 and is_over(root, memory, since + together - 1) and not is_over(root, memory, since):
+        together -= 1
     return together
 
 
@@ -70,7 +80,7 @@ def run_in_blocks(table_at: int, channels: int, count: int) -> int:
             if size < WORTHWHILE or not is_up:
                 size = 1
             else:
-                together = min(_samples_together(table_at, number, channels, position + k), stop - k)
+                together = _samples_together(table_at, number, channels, position + k, stop - k)
                 after = run_wide(table_at, number, looks, channels, k, together, count) if together else 0
                 if after:
                     k, state = k + together, after

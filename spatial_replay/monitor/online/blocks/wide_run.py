@@ -78,19 +78,21 @@ def _set_first_of_spans(
     """
     tables, memory, scratch, _ = arrays_at(table_at)
     nodes, part, block = tables.nodes, tables.parts[number], block_of(memory, scratch)
-    look, root = look_of(which, channels), nodes[part[codes.PART_END] - 1]
+    first, end = part[codes.PART_FIRST], part[codes.PART_END] - 1
+    look, root = look_of(which, channels), nodes[end]
     if runs_root(part, root) or is_known(which, part, root, memory, block.since):
         return int(set_first(table_at, number, which, channels, at))
     table = memory.tables[look.channel, part[codes.PART_TABLE_START] : tables_end(part)]
-    missing, count = beyond(look.mode, root[codes.NODE_WEAK]), block.last + 1 - block.since
+    mode = codes.OPEN_END if has_ended(part, root, memory, block.since) else look.mode
+    missing, count = beyond(mode, root[codes.NODE_WEAK]), block.last + 1 - block.since
     numbers, body = scratch.parts[number, which, at : at + count], root[codes.NODE_B]
-    base = memory.cells[part[codes.PART_CELL_START]]
+    base, (begin, after) = memory.cells[part[codes.PART_CELL_START]], root_window(root, memory, block.last)
     operand = operand_of(nodes, part, body, memory.columns[columns_of], memory.history[look.channel], scratch)
     join_body_spans(
-        nodes, part, block, operand, base, missing, is_cut_short(which, part, root, channels),
-        recent_of(memory, scratch), scratch.block[BLOCK_NEWEST], scratch.spans[body],
-        scratch.span_counts[body], scratch.wholes[part[codes.PART_END] - 1 - part[codes.PART_FIRST]],
-        scratch.closing,
+        nodes, part, block, operand, max(base, begin), after, missing,
+        is_cut_short(which, part, root, channels), recent_of(memory, scratch),
+        scratch.block[BLOCK_NEWEST], scratch.spans[body], scratch.span_counts[body],
+        scratch.wholes[end - first], scratch.closing,
     )  # fmt: skip
     copy(block.running, numbers)
     if base > 0:
@@ -138,13 +140,10 @@ def run_wide(table_at: int, number: int, looks: int, channels: int, at: int, cou
     root, block, offset = nodes[part[codes.PART_END] - 1], scratch.block, memory.clock[OFFSET]
     since = memory.clock[POSITION] + at
     last = since + count - 1
-    begin, _ = root_window(root, memory, last)
     if since <= offset:
         return 0
     if is_beside_one(nodes, part, memory.stamps, offset, since):
         return 0  # sample by sample, the width of one window alone costs next to nothing
-    if begin > memory.cells[part[codes.PART_CELL_START]] or has_ended(part, root, memory, last):
-        return 0  # the root leaves out some of the spans' positions
     if is_over(root, memory, last) and not is_over(root, memory, since):
         return 0  # the samples are all of one kind
     # as long as not looked at what the samples are, this is the same for all numbers
@@ -180,7 +179,7 @@ def run_wide(table_at: int, number: int, looks: int, channels: int, at: int, cou
                 is_beside = bound - 4 == which if channels == 4 else look_of(bound, channels).channel == which
                 if is_beside and ((part[codes.PART_NUMBERS] & ~looks) >> bound) & 1:
                     _set_first_of_spans(table_at, number, bound, channels, k, columns_number(which))
-        if which < 2 and looks_for_outdone(part, memory, channels):
+        if which < 2 and looks_for_outdone(part, memory, channels, codes.BY_WORST):
             found = outdone_in_spans(table_at, number, which)
             outdone = found if which == 0 else min(outdone, found)
         memory.known[number, columns_number(which)] = memory.closed[number, columns_number(which)] = last
