@@ -83,18 +83,22 @@ PART_ENDING, PART_LOWER, PART_UPPER, PART_IS_MINIMUM, PART_BESIDE = 10, 11, 12, 
 PART_IS_CUT = 15
 # the part, itself or another, and its node that is what this one is at the last sample; -1 if not asked for
 PART_LAST_IN, PART_LAST_NODE = 16, 17
-# which bounds follow from its table alone until its root has ended, a bit for each: what may still come
-# outdoes all that is open
+# which bounds follow from its table alone until its root has ended, a bit for each, and even then, a bit
+# higher up: what may still come outdoes all that is open
 PART_KNOWN = 18
+EVEN_IF_OVER = 1 << 8
 # the signal that what a root joins by the minimum is at least, by the maximum at most; -1 for none
 PART_LIMIT = 19
 # what says that what a root joins by the minimum falls no more, by the maximum rises no more, while windows
 # are open: nothing; the worst that may come, where spans are found (see `blocks.spans`); or its value
 PART_OUTDONE_BY = 20
 BY_NOTHING, BY_WORST, BY_VALUE = 0, 1, 2
-# which of its numbers a run computes, a bit for each: all, but where two runs share them (see `shares`)
-PART_NUMBERS = 21
-PART_WIDTH = 22
+# how far from the first sample on the root joins what its operand is, and the unit; -1 if it never ends
+PART_END_UNIT, PART_ENDS_AT = 21, 22
+# which of its numbers a run computes, a bit for each: all but what a past operator is at first, where that is
+# its operand, and but where two runs share them (see `shares`)
+PART_NUMBERS = 23
+PART_WIDTH = 24
 ALL_NUMBERS = (1 << 8) - 1
 LAST_NUMBERS = 1 << 2 | 1 << 3  # what a part is at the last sample
 LOWER, UPPER = 4, 5  # its bounds, with uncertainty
@@ -107,7 +111,8 @@ REPORT_WIDTH = 5
 # codes of reports: a row is a node as written, so that here, alone, `xor`, `->` and `<->` have codes;
 # rows for their expansions would cost eight numbers a sample each
 REPORT_SIGNAL, REPORT_PART = 0, 1
-# a past operator that is, at the first sample, its operand; now it is a signal, or what a part is at first
+# a past operator that is, at the first sample, its operand; now it is a signal, or what a part is at first or
+# at last
 REPORT_PAST = 9
 REPORT_NOT, REPORT_AND, REPORT_OR, REPORT_XOR, REPORT_IMPLIES, REPORT_IFF, REPORT_SPEC = 2, 3, 4, 5, 6, 7, 8
 REPORT_OF_BOOLEAN = MappingProxyType(
@@ -122,7 +127,7 @@ REPORT_OF_BOOLEAN = MappingProxyType(
     }
 )
 NOW_LAST_OPERAND, NOW_EITHER, NOW_TRUE, NOW_FALSE, NOW_OF_PART = 0, 1, 2, 3, 4
-NOW_OF_SIGNAL, NOW_OF_VALUE = 5, 6  # of `REPORT_PAST`
+NOW_OF_SIGNAL, NOW_OF_VALUE = 5, 6  # of `REPORT_PAST`, and `NOW_OF_PART`
 
 # how a run over the recent samples treats what lies beyond the last one
 OPEN_END, OPEN_LOW, OPEN_HIGH, OPEN_CORNER = 0, 1, 2, 3

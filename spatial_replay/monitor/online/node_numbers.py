@@ -199,7 +199,7 @@ def _report_known(
             if rule == codes.NOW_OF_SIGNAL:
                 _copy_known(memory.history[0, index, begin : begin + count], now)
             else:
-                _copy_known(scratch.parts[index, 0, :count], now)
+                _copy_known(scratch.parts[index, 2 if rule == codes.NOW_OF_PART else 0, :count], now)
         elif code == codes.REPORT_NOT:
             of = operands[start]
             _oppose_known(series[of, 0, t:end], value)
@@ -261,12 +261,13 @@ def report(
             _set_now(rule, rows, numbers[operands[start]], numbers[operands[stop - 1]], count)
         elif code == codes.REPORT_PAST:
             _copy_numbers(numbers[operands[stop - 1]], rows, count)
+            of_first = 2 if rule == codes.NOW_OF_PART else 0
             for end in range(2):
                 for k in range(count):
                     if rule == codes.NOW_OF_SIGNAL:
                         rows[2 + end, k] = memory.history[end * nominal_high, index, begin + k]
                     else:
-                        rows[2 + end, k] = scratch.parts[index, end, k]
+                        rows[2 + end, k] = scratch.parts[index, of_first + end, k]
         elif code == codes.REPORT_NOT:
             child = numbers[operands[start]]
             for pair in range(0, NUMBERS, 2):

@@ -135,12 +135,12 @@ def runs_root(part: Integers, root: Integers) -> bool:
 
 
 @inlined
-def is_over(root: Integers, memory: Memory, last: int) -> bool:
+def is_over(part: Integers, memory: Memory, last: int) -> bool:
     """Return whether no later sample can fall into the window of a root that counts from the first one."""
-    far = root[codes.NODE_HIGH]
-    if far <= 0:
+    far = part[codes.PART_ENDS_AT]
+    if far < 0:
         return False
-    if root[codes.NODE_UNIT] == codes.SAMPLES:
+    if part[codes.PART_END_UNIT] == codes.SAMPLES:
         return bool(last >= far)
     return bool(memory.stamps[last - memory.clock[OFFSET]] - memory.clock[START_NS] >= far)
 
@@ -148,7 +148,7 @@ def is_over(root: Integers, memory: Memory, last: int) -> bool:
 @inlined
 def has_ended(part: Integers, root: Integers, memory: Memory, last: int) -> bool:
     """Return whether the window of a part's root is over, where that is all that depends on a variable."""
-    return is_plain(part) and is_over(root, memory, last)
+    return is_plain(part) and root[codes.NODE_HIGH] > 0 and is_over(part, memory, last)
 
 
 @inlined
@@ -168,9 +168,10 @@ def root_window(root: Integers, memory: Memory, last: int) -> tuple[int, int]:
 
 
 @inlined
-def is_known(which: int, part: Integers, root: Integers, memory: Memory, last: int) -> bool:
+def is_known(which: int, part: Integers, memory: Memory, last: int) -> bool:
     """Return whether one of a part's numbers is a bound that follows from its table (see `known_number`)."""
-    return (part[codes.PART_KNOWN] >> which) & 1 == 1 and not is_over(root, memory, last)
+    known = part[codes.PART_KNOWN] >> which
+    return known & 1 == 1 and (known & codes.EVEN_IF_OVER > 0 or not is_over(part, memory, last))
 
 
 @inlined
@@ -201,7 +202,7 @@ def looks_of(
     if part[codes.PART_VARIABLES] == 0 and memory.cells[part[codes.PART_CELL_START]] > 0:
         return int(looks & own)  # its numbers at the first sample stand in its table
     for which in (4, 5):
-        is_other = is_known(which, part, root, memory, position) or is_cut_short(which, part, root, channels)
+        is_other = is_known(which, part, memory, position) or is_cut_short(which, part, root, channels)
         if not is_other:
             looks |= 1 << which
     if is_last and channels == 4:

@@ -15,7 +15,7 @@ import numpy as np
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.monitor.online import codes
-from spatial_replay.monitor.online.rewriting import from_all, from_first, looks_ahead, simplified
+from spatial_replay.monitor.online.rewriting import from_all, from_first, looks_ahead, merged, simplified
 from spatial_replay.spec.formula import (
     FUTURE_OPERATORS,
     Atom,
@@ -177,6 +177,11 @@ class SignalTable:
         """Add an infinity, of this sign once a distance from the first sample on, of the other one before."""
         return self.row(codes.ELAPSED, unit=unit, low=distance, high=sign)
 
+    def elapsed_at(self, signal: int) -> tuple[int, int] | None:
+        """Return the unit and the distance of what `elapsed` adds; None for another row."""
+        code, _, _, unit, distance, _ = next(islice(self._rows, signal, None))
+        return (unit, distance) if code == codes.ELAPSED else None
+
     def delay(self, operand: int, unit: int, distance: int, ahead: int = 0, *, is_weak: bool = False) -> int:
         """Add an operand delayed by a distance; before the first sample +inf if weak, -inf if strong."""
         return self.row(codes.DELAY + ahead, operand, 0, unit, distance, 1 if is_weak else -1)
@@ -206,7 +211,7 @@ def part_of(signals: SignalTable, node: Temporal) -> WindowedPart:
     part = WindowedPart(signals, node if bounded else from_all(node), anchored=bounded)
     if bounded and not part.is_flat:
         # at the first sample, what looks back is another formula
-        asked = node if part.looks_back else from_first(node)
+        asked = node if part.looks_back else from_first(merged(node))
         part = WindowedPart(signals, asked, anchored=False, ends=True)
     if part.variables > MAX_VARIABLES:
         raise UsageError(
@@ -420,9 +425,9 @@ class WindowedPart(PartRows):
         formula, positive = expand(root), True
         if isinstance(formula, Boolean) and formula.operator == "not":
             formula, positive = formula.operands[0], False
-        if not isinstance(formula, Temporal) or formula.operator not in "FGU":
+        if not isinstance(formula, Temporal) or formula.operator not in "FGUX":
             return self._add(root, True)
-        unit, low, high = window_of(formula.bound)
+        unit, low, high = window_of(Bound(1, 1, "samples") if formula.operator == "X" else formula.bound)
         if not high:
             return self._add(root, True)
         operands = [self._add(each, positive) for each in formula.operands]

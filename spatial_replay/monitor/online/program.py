@@ -13,6 +13,7 @@ A formula becomes three tables, each with operands first:
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -84,7 +85,8 @@ def compile_formula(formula: Formula) -> Program:
     signals, parts = SignalTable(), _Parts()
     reports: list[Row] = []
     operand_ids: list[int] = []
-    asked = set[int]()
+    # the parts of past operators, and whether these are their operand at the first sample
+    asked = dict[int, bool]()
     for node, operands in _nodes_with_operands(formula):
         ends = (len(operand_ids), len(operand_ids) + len(operands))
         operand_ids.extend(operands)
@@ -103,8 +105,11 @@ def compile_formula(formula: Formula) -> Program:
                 number = parts.add_node(node, signals)
                 reports.append((codes.REPORT_PART, number, _now_rule(node), *ends))
                 if node.operator not in FUTURE_OPERATORS:
-                    asked.add(number)
+                    asked[number] = node.operator != "Y" and (node.bound is None or node.bound.lower == 0)
     node_rows, part_rows, most_rows = parts.finished(asked)
+    for n, (code, number, *rest) in enumerate(reports):
+        if code == codes.REPORT_PART and part_rows[number][codes.PART_NUMBERS] == codes.LAST_NUMBERS:
+            reports[n] = codes.REPORT_PAST, number, *rest
     return Program(
         leaves=tuple(signals.leaves),
         signals=signals.array(parts.literals),
@@ -139,6 +144,7 @@ class _Parts:
         self._node_rows: list[Row] = []
         self._rows: list[tuple[Row, ...]] = []
         self._limits: list[int] = []
+        self._root_ends: list[tuple[int, int]] = []
 
     def add_node(self, node: Temporal, signals: SignalTable) -> int:
         """Add the part of a node that looks ahead, and return its number."""
@@ -158,6 +164,7 @@ class _Parts:
             )
             self._rows.append(())
             self._limits.append(NOTHING)
+            self._root_ends.append(_NEVER)
         return self._built[own]
 
     def add(self, part: PartRows, signals: SignalTable) -> int:
@@ -191,6 +198,7 @@ class _Parts:
         self._rows.append(rows)
         limit = NOTHING if part.is_flat or part.is_nested else _limit(rows, signals)
         self._limits.append(limit)
+        self._root_ends.append(_NEVER if part.is_flat else _root_end(rows, signals))
         self.literals |= {limit} - {NOTHING}
         for number, row in enumerate(rows):
             is_timed = row[codes.NODE_CODE] in codes.AHEAD_OF and row[codes.NODE_UNIT] != codes.SAMPLES
@@ -204,24 +212,27 @@ class _Parts:
         self.keeps_history |= not part.is_flat
         return self._built[key]
 
-    def finished(self, asked: set[int]) -> tuple[list[Row], list[Row], int]:
+    def finished(self, asked: Mapping[int, bool]) -> tuple[list[Row], list[Row], int]:
         """Return the rows of all nodes, those of all parts, and how many nodes of a part need rows at once.
 
         Args:
-            asked: the parts of which it is asked what they are at the last sample.
+            asked: the parts of which it is asked what they are at the last sample, and whether that is all
+                there is to ask, if another part says so.
         """
         last_in = self._nodes_at_last(asked)
         hosts = {number for number, _ in last_in.values()}
+        beside = {number for number, (host, _) in last_in.items() if asked[number] and host != number}
         parts = [
             (
                 *row[: codes.PART_IS_REMEMBERING],
                 int(number in hosts),
                 *row[codes.PART_IS_REMEMBERING + 1 :],
                 *last_in.get(number, (NOTHING, NOTHING)),
-                _known_bounds(self._rows[number]),
+                _known_bounds(self._rows[number], is_bounded=self._root_ends[number] != _NEVER),
                 self._limits[number],
                 codes.BY_NOTHING if row[codes.PART_IS_NESTED] else _outdone_by(self._rows[number]),
-                codes.ALL_NUMBERS,
+                *self._root_ends[number],
+                codes.LAST_NUMBERS if number in beside else codes.ALL_NUMBERS,
             )
             for number, row in enumerate(self._part_rows)
         ]
@@ -231,7 +242,7 @@ class _Parts:
         nodes = [(*row, place) for row, place in zip(self._node_rows, places, strict=True)]
         return nodes, parts, 1 + max(places, default=NOTHING)
 
-    def _nodes_at_last(self, asked: set[int]) -> dict[int, tuple[int, int]]:
+    def _nodes_at_last(self, asked: Collection[int]) -> dict[int, tuple[int, int]]:
         """Return for parts that are asked for at the last sample the part, and the node of it, that say so.
 
         Below an operator that never ends, a past one is run at every position anyway.
@@ -249,6 +260,10 @@ class _Parts:
             if never_ends or found.get(number, (NOTHING,))[0] == number:
                 known = {tree: (number, node) for node, tree in enumerate(trees)} | known
         return found
+
+
+_NEVER = codes.SAMPLES, NOTHING
+"""The end of a root that has none."""
 
 
 class _Direction(NamedTuple):
@@ -298,12 +313,24 @@ def _never_ends(rows: tuple[Row, ...]) -> bool:
     return rows[-1][codes.NODE_A] == NOTHING and rows[-1][codes.NODE_HIGH] <= 0
 
 
-def _known_bounds(rows: tuple[Row, ...]) -> int:
+def _root_end(rows: tuple[Row, ...], signals: SignalTable) -> tuple[int, int]:
+    """Return how far from the first sample on a root joins what its operand is, and in which unit."""
+    _, left, _, _, unit, _, high, *_ = rows[-1]
+    if left == NOTHING:
+        return (unit, high) if high > 0 else _NEVER
+    code, signal, *_ = rows[left]
+    return (signals.elapsed_at(signal) or _NEVER) if code == codes.LITERAL else _NEVER
+
+
+def _known_bounds(rows: tuple[Row, ...], *, is_bounded: bool) -> int:
     """Return which bounds follow from a part's table, whatever is open, a bit for each.
 
     What comes may always violate `G x`, so that its lower bound is as small as can be. Its upper one is as
     great as can be wherever x is: where it is `F y`, which what comes may always satisfy, or `F y or z`, say.
     The table then says what follows from what has closed, if the same holds for all of its variables.
+
+    Args:
+        is_bounded: whether the root ends, until when it joins all that its operand is.
     """
     way = _direction_of(rows)
     if way is None:
@@ -320,11 +347,10 @@ def _known_bounds(rows: tuple[Row, ...]) -> int:
         else:
             outdone.append(code == way.release and outdone[b])
     variables = [node for node, row in enumerate(rows) if row[codes.NODE_VARIABLE] != NOTHING]
-    is_known = {
-        way.worst: rows[-1][codes.NODE_A] == NOTHING,
-        way.best: all(outdone[node] for node in variables),
-    }
-    return sum(1 << bound for bound, known in is_known.items() if known)
+    known = 1 << way.worst if is_bounded or rows[-1][codes.NODE_A] == NOTHING else 0
+    if all(outdone[node] for node in variables):
+        known |= (1 | codes.EVEN_IF_OVER) << way.best
+    return known
 
 
 def _limit(rows: tuple[Row, ...], signals: SignalTable) -> int:

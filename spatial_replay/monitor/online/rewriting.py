@@ -47,7 +47,7 @@ def from_first(node: Temporal) -> Temporal:
 def simplified(node: Temporal) -> Temporal | Boolean:
     """Return an operator that looks ahead in the form that costs least, of the same value at every sample."""
     around = _around(recurring(node))
-    return around if isinstance(around, Boolean) else _divided(_merged(around))
+    return around if isinstance(around, Boolean) else _divided(merged(around))
 
 
 def from_all(node: Temporal) -> Temporal:
@@ -68,9 +68,9 @@ def at_last(node: Temporal) -> Formula | None:
     `O x` and `H x`, else, it is `F x` and `G x`. None if there is none, or if the operator is another one at
     the first.
     """
-    around = _around(node)
-    if isinstance(around, Boolean) and not looks_ahead(around.operands[0]):
-        return around.operands[0]
+    behind, _ = _sides(node)
+    if len(behind) == 1 and not looks_ahead(behind[0]):
+        return behind[0]
     if node.operator not in "OH" or node.bound is not None:
         return None
     return Temporal("F" if node.operator == "O" else "G", node.operands)
@@ -95,27 +95,56 @@ def recurring(node: Temporal) -> Temporal:
 
 
 def _around(node: Temporal) -> Temporal | Boolean:
-    """Return `O F x`, over windows that begin at once, as `O x or F x`; `H G x` as `H x and G x`.
+    """Return `O F x`, over windows that begin at once, as `O x or F x`; `H G x` as `H x and G x`."""
+    behind, ahead = _sides(node)
+    return Boolean("and" if node.operator == "H" else "or", (*behind, *ahead)) if ahead else node
 
-    What a sample before looks at is up to now, or ahead of now as far as now itself looks at most. So
-    `a S F x` is `a S x or F x`: of all samples at which `F x` may look at a later one, a has to last for the
-    shortest time from that one itself on, or not at all.
+
+def _sides(node: Temporal) -> tuple[list[Formula], list[Formula]]:
+    """Return what a past operator over windows ahead that begin at once looks at behind, and what ahead.
+
+    What a sample before looks at is up to now, or ahead of now as far as now itself looks at most. In
+    `a S F x`, a has to last for the shortest time from the very sample on that `F x` looks at, or not at all
+    if that one is later than now. The same holds for each of several windows in one alternative, as in
+    `O (x or F y)`, and below `H` for `G`, joined by `and`.
+
+    Returns:
+        both empty for any other operator.
     """
-    inner, is_negated = _below(node)
-    if node.operator not in "OHS" or not isinstance(inner, Temporal) or inner.operator not in _OPPOSITE:
-        return node
-    ahead: TemporalOperator = "F" if (inner.operator == "F") != is_negated else "G"
-    if (ahead == "G") != (node.operator == "H") or not _is_at_once(node.bound, inner.bound):
-        return node
-    *left, _ = node.operands
-    operand = _negated(inner.operands[0]) if is_negated else inner.operands[0]
-    if left and any(map(looks_ahead, (*left, operand))):
-        return node  # both would be computed at all open positions
-    sides = Temporal(node.operator, (*left, operand), node.bound), Temporal(ahead, (operand,), inner.bound)
-    return Boolean("or" if ahead == "F" else "and", sides)
+    if node.operator not in "OHS":
+        return [], []
+    joint: BooleanOperator = "and" if node.operator == "H" else "or"
+    kind: TemporalOperator = "G" if node.operator == "H" else "F"
+    *left, body = node.operands
+    ahead, known, rest = list[Formula](), list[Formula](), list[Formula]()
+    for each in _joined_by(joint, body, is_negated=False):
+        inner, is_negated = _peeled(each)
+        is_window = isinstance(inner, Temporal) and (
+            inner.operator == (_OPPOSITE[kind] if is_negated else kind)
+            and _is_at_once(node.bound, inner.bound)
+            and not (left and any(map(looks_ahead, (*left, *inner.operands))))
+        )
+        if is_window and isinstance(inner, Temporal):
+            operand = _negated(inner.operands[0]) if is_negated else inner.operands[0]
+            ahead.append(Temporal(kind, (operand,), inner.bound))
+            each = operand
+        (rest if looks_ahead(each) else known).append(each)
+    if not ahead:
+        return [], []
+    joined = [each[0] if len(each) == 1 else Boolean(joint, tuple(each)) for each in (known, rest) if each]
+    return [Temporal(node.operator, (*left, each), node.bound) for each in joined], ahead
 
 
-def _merged(node: Temporal) -> Temporal:
+def _joined_by(joint: BooleanOperator, formula: Formula, *, is_negated: bool) -> list[Formula]:
+    """Return what a formula, or its negation, joins by `and` or `or`."""
+    inner, is_inside = _peeled(formula)
+    is_negated = is_negated != is_inside
+    if isinstance(inner, Boolean) and inner.operator == (_DUAL[joint] if is_negated else joint):
+        return [part for each in inner.operands for part in _joined_by(joint, each, is_negated=is_negated)]
+    return [_negated(inner) if is_negated else inner]
+
+
+def merged(node: Temporal) -> Temporal:
     """Return `F[a,b] F[c,d] x` as `F[a+c,b+d] x`, and `G` likewise; in samples, of which none is left out."""
     inner, is_negated = _below(node)
     operator, low, high = _as_window(node, is_negated=False)
@@ -124,7 +153,7 @@ def _merged(node: Temporal) -> Temporal:
         return node
     operand = _negated(inner.operands[0]) if is_negated else inner.operands[0]
     kind: TemporalOperator = "F" if operator == "F" else "G"
-    return _merged(Temporal(kind, (operand,), Bound(low + more_low, high + more_high, "samples")))
+    return merged(Temporal(kind, (operand,), Bound(low + more_low, high + more_high, "samples")))
 
 
 def _divided(node: Temporal) -> Temporal | Boolean:
@@ -135,16 +164,22 @@ def _divided(node: Temporal) -> Temporal | Boolean:
         return node
     operands = map(_negated, inner.operands) if is_negated else inner.operands
     apart = [Temporal(node.operator, (operand,), node.bound) for operand in operands]
-    merged = [_merged(each) for each in apart]
-    return node if all(map(is_, apart, merged)) else Boolean(joint, tuple(merged))
+    joined = [merged(each) for each in apart]
+    return node if all(map(is_, apart, joined)) else Boolean(joint, tuple(joined))
 
 
 _OPPOSITE: Mapping[str, str] = MappingProxyType({"F": "G", "G": "F"})
+_DUAL: Mapping[str, str] = MappingProxyType({"and": "or", "or": "and"})
 
 
 def _below(node: Temporal) -> tuple[Formula, bool]:
-    """Return what stands below an operator, last, and below `not`, and whether these negate it."""
-    other, is_negated = expand(node.operands[-1]), False
+    """Return what stands below an operator and below `not`, and whether these negate it."""
+    return _peeled(node.operands[0])
+
+
+def _peeled(formula: Formula) -> tuple[Formula, bool]:
+    """Return what stands below `not`, and whether that negates it."""
+    other, is_negated = expand(formula), False
     while isinstance(other, Boolean) and other.operator == "not":
         other, is_negated = expand(other.operands[0]), not is_negated
     return other, is_negated

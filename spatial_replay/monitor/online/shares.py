@@ -304,7 +304,7 @@ def _programs_of(program: Program, numbers: Integers) -> tuple[Program, Program]
 
     The second one computes none of the tree.
     """
-    numbers = numbers & ~codes.LAST_NUMBERS
+    numbers = numbers & program.parts[:, codes.PART_NUMBERS] & ~codes.LAST_NUMBERS
     for number, host in enumerate(program.parts[:, codes.PART_LAST_IN].tolist()):
         # what a part is at the last sample comes with the value of the one that says so
         if host >= 0:

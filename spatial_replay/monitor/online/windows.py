@@ -107,7 +107,7 @@ def _value_at_first(
     look, at, root = look_of(which, channels), columns_number(which), nodes[part[codes.PART_END] - 1]
     base, variables = memory.cells[part[codes.PART_CELL_START]], part[codes.PART_VARIABLES]
     tables = memory.tables[look.channel, part[codes.PART_TABLE_START] : tables_end(part)]
-    if is_known(which, part, root, memory, last):
+    if is_known(which, part, memory, last):
         return known_number(which, part, memory, look.channel)
     if is_plain(part):
         has_more = not has_ended(part, root, memory, last)
@@ -187,7 +187,8 @@ def run_windows(table_at: int, channels: int, count: int) -> int:
     """
     tables, _, _, _ = arrays_at(table_at)
     for number in range(len(tables.parts)):
-        if tables.parts[number, codes.PART_KIND] == codes.WINDOWED:
+        part = tables.parts[number]
+        if part[codes.PART_KIND] == codes.WINDOWED and part[codes.PART_NUMBERS] & ~codes.LAST_NUMBERS:
             run_part(table_at, number, channels, 0, count, count)
     return 0
 

@@ -230,7 +230,7 @@ def set_first(table_at: int, number: int, which: int, channels: int, at: int) ->
     numbers = scratch.parts[number, which, at : at + count]
     place = root[codes.NODE_B] if is_plain(part) else end - part[codes.PART_FIRST]
     operand = operand_of(nodes, part, place, columns, memory.history[look.channel], scratch)
-    if is_known(which, part, root, memory, block.since):
+    if is_known(which, part, memory, block.since):
         fill(numbers, known_number(which, part, memory, look.channel))
         return 0
     if not is_plain(part) and base > 0:
@@ -333,7 +333,7 @@ def run_block(
     lowest = find_begins(table_at, number, 0, channels, 0, 0, since, last)
     if last + 1 - lowest > most:
         return 0
-    if is_over(root, memory, last) and not is_over(root, memory, since):
+    if is_over(part, memory, last) and not is_over(part, memory, since):
         return 0  # the samples of a block are all of one kind
     is_wide = last + 1 - lowest > WIDE
     narrows = 1 if is_wide and is_whole else 0

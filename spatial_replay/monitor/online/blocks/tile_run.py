@@ -43,7 +43,7 @@ def _samples_together(table_at: int, number: int, channels: int, since: int, mos
         most: so many at most.
     """
     tables, memory, _, _ = arrays_at(table_at)
-    root = tables.nodes[tables.parts[number, codes.PART_END] - 1]
+    part = tables.parts[number]
     count = since - find_begins(table_at, number, 0, channels, 0, 0, since, since)
     together = 0
     if count > SPANNED:
@@ -52,7 +52,7 @@ def _samples_together(table_at: int, number: int, channels: int, since: int, mos
             together *= 2
     together = min(together, most)
     # they are all of one kind
-    while together > 1 and is_over(root, memory, since + together - 1) and not is_over(root, memory, since):
+    while together > 1 and is_over(part, memory, since + together - 1) and not is_over(part, memory, since):
         together -= 1
     return together
 

@@ -80,7 +80,7 @@ def _set_first_of_spans(
     nodes, part, block = tables.nodes, tables.parts[number], block_of(memory, scratch)
     first, end = part[codes.PART_FIRST], part[codes.PART_END] - 1
     look, root = look_of(which, channels), nodes[end]
-    if runs_root(part, root) or is_known(which, part, root, memory, block.since):
+    if runs_root(part, root) or is_known(which, part, memory, block.since):
         return int(set_first(table_at, number, which, channels, at))
     table = memory.tables[look.channel, part[codes.PART_TABLE_START] : tables_end(part)]
     mode = codes.OPEN_END if has_ended(part, root, memory, block.since) else look.mode
@@ -137,14 +137,14 @@ def run_wide(table_at: int, number: int, looks: int, channels: int, at: int, cou
     """
     tables, memory, scratch, _ = arrays_at(table_at)
     nodes, part, numbers = tables.nodes, tables.parts[number], scratch.parts[number]
-    root, block, offset = nodes[part[codes.PART_END] - 1], scratch.block, memory.clock[OFFSET]
+    block, offset = scratch.block, memory.clock[OFFSET]
     since = memory.clock[POSITION] + at
     last = since + count - 1
     if since <= offset:
         return 0
     if is_beside_one(nodes, part, memory.stamps, offset, since):
         return 0  # sample by sample, the width of one window alone costs next to nothing
-    if is_over(root, memory, last) and not is_over(root, memory, since):
+    if is_over(part, memory, last) and not is_over(part, memory, since):
         return 0  # the samples are all of one kind
     # as long as not looked at what the samples are, this is the same for all numbers
     _find_next_begins(table_at, number, channels, last)
