@@ -123,6 +123,35 @@ alternative_windows = responses(
     )
 )
 """Windows beside windows, of which some say the same as one, and below past operators."""
+_at_once = st.one_of(
+    st.builds(Bound, st.just(0), st.one_of(st.integers(0, 6), st.none()), st.just("samples")),
+    st.builds(Bound, st.just(0), st.sampled_from([0, 100, 250, 600]), st.just("ns")),
+)
+_begun = st.one_of(_ahead, st.builds(Temporal, st.sampled_from(["F", "G"]), st.tuples(_literals), _at_once))
+_negated = st.one_of(_begun, st.builds(Boolean, st.just("not"), st.tuples(_begun)))
+_alternatives = st.one_of(
+    _negated,
+    st.builds(Boolean, st.sampled_from(["and", "or", "->"]), st.tuples(_literals, _negated)),
+    st.builds(Boolean, st.sampled_from(["and", "or"]), st.tuples(_negated, _literals, _negated)),
+    st.builds(Temporal, st.just("F"), st.tuples(_begun), _at_once),
+)
+_since = st.one_of(
+    st.builds(Temporal, st.sampled_from(["O", "H"]), st.tuples(_alternatives), st.one_of(_at_once, bounds)),
+    st.builds(
+        Temporal,
+        st.just("S"),
+        st.tuples(st.one_of(_literals, _literals, _begun), _alternatives),
+        st.one_of(_at_once, bounds),
+    ),
+)
+past_over_windows = st.one_of(
+    _since,
+    responses(_since),
+    st.builds(Boolean, st.just("not"), st.tuples(_since)),
+    st.builds(Temporal, st.sampled_from(["F", "G", "X", "WX", "Y"]), st.tuples(_since)),
+    st.builds(Temporal, st.sampled_from(["F", "G"]), st.tuples(_since), _at_once),
+)
+"""Past operators over windows ahead, most of which begin at once."""
 _lasting = st.one_of(responses(windows_of(_literals, bounds)), windows_of(_literals, bounds))
 _from_later = st.one_of(
     st.builds(Bound, st.integers(1, 3), st.none(), st.just("samples")),

@@ -26,6 +26,7 @@ from laws.strategies_monitor import (
     lasting_windows,
     leaf_runs,
     nested_windows,
+    past_over_windows,
     recordings,
     responses,
     specifications,
@@ -118,6 +119,12 @@ def test_windows_below_windows_equal_the_definitions(data, formula, run, room):
 @settings(max_examples=120)
 @given(data=st.data(), formula=alternative_windows, run=leaf_runs(max_size=30), room=st.integers(2, 64))
 def test_windows_beside_windows_equal_the_definitions(data, formula, run, room):
+    assert_as_defined(data, formula, run, room)
+
+
+@settings(max_examples=200)
+@given(data=st.data(), formula=past_over_windows, run=leaf_runs(max_size=30), room=st.integers(2, 64))
+def test_past_operators_over_windows_equal_the_definitions(data, formula, run, room):
     assert_as_defined(data, formula, run, room)
 
 

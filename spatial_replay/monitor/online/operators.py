@@ -208,10 +208,11 @@ def part_of(signals: SignalTable, node: Temporal) -> WindowedPart:
         UsageError: more than `MAX_VARIABLES` unbounded future operators.
     """
     bounded = node.operator in FUTURE_OPERATORS and (node.bound is not None or node.operator in ("X", "WX"))
-    part = WindowedPart(signals, node if bounded else from_all(node), anchored=bounded)
+    node = merged(node) if bounded else from_all(node)
+    part = WindowedPart(signals, node, anchored=bounded)
     if bounded and not part.is_flat:
         # at the first sample, what looks back is another formula
-        asked = node if part.looks_back else from_first(merged(node))
+        asked = node if part.looks_back else from_first(node)
         part = WindowedPart(signals, asked, anchored=False, ends=True)
     if part.variables > MAX_VARIABLES:
         raise UsageError(
