@@ -36,6 +36,9 @@ FLAT = (
     "G ({a} -> {b} U[0.5s,2s] {c})",
     "G ({a} -> (F[0s,2s] {b}) or (F[0s,3s] {c}))",
     "G ({a} -> G[0,600] F[0,600] {b})",
+    "G ({a} S[0,60] F[0,60] {b})",
+    "G ({b} S F[0,600] {c})",
+    "G ({a} S[0,600] F[0,600] {b})",
 )
 """Further formulas of which a change costs the same however wide their windows are."""
 OPEN = (
@@ -49,7 +52,6 @@ OPEN = (
 DEEP = (
     "G ({a} -> F[0,600] G[0,600] {b})",
     "G ({a} -> F[0s,10s] ({b} and F[0s,10s] {c}))",
-    "G ({a} S[0,60] F[0,60] {b})",
     "G ({a} -> F[0,30] ({b} and F[0,30] ({c} and F[0,30] ({a} and G[0,10] {b}))))",
 )
 """The longest of these."""
@@ -60,13 +62,22 @@ WIDE = (
     "G ({a} -> F[0,100] ({b} and F[0,100] ({c} and G[0,100] {a})))",
     "G ({a} -> F[0,600] ({b} and F[0,600] ({c} and G[0,600] {a})))",
     "G ({a} -> F ({b} and F[0,600] {c}))",
-    "G ({b} S F[0,600] {c})",
-    "G ({a} S[0,600] F[0,600] {b})",
     "G ({a} -> {b} U[0,600] ({c} and F[0,600] {a}))",
+    "G ({a} -> X F[0,600] ({b} and X F[0,600] {c}))",
+    "G ({a} -> H[0,60] F[0,60] {b})",
+    "G ({a} S ({b} and F[0,60] {c}))",
 )
 """Longer ones."""
-FALLING = (OPEN[0], DEEP[1], WIDE[1], WIDE[3], WIDE[4], WIDE[8])
-"""Of these, over a run that is worse with every sample, so that all that is open matters: no limit holds."""
+LONGEST = (
+    "G ({a} -> F[0,6000] ({b} and F[0,6000] ({c} and F[0,6000] {a})))",
+    "G ({a} -> F[600,1200] ({b} and F[0,600] {c}))",
+    "G ({a} S[0,600] ({b} and F[0,600] {c}))",
+    "G ({a} -> {b} U ({c} and F[0,600] {a}))",
+    "(G ({a} -> F[0,600] {b})) U (F[0,600] {c})",
+)
+"""What costs more, without a limit."""
+FALLING = (OPEN[0], DEEP[1], WIDE[1], WIDE[3], WIDE[4], WIDE[6])
+"""Of all these, over a run that is worse with every sample, so that all that is open matters: no limit."""
 CHANGES = 9
 PATIENCE_S = 60.0
 
@@ -173,6 +184,15 @@ def bench_what_if(bench: Any) -> None:
     cases += [(text.format_map(_NAMES), _spec(text), 250.0) for text in WIDE]
     for name, text, most in cases:
         _measure_changes(bench, name, trace, text, most)
+
+
+def bench_what_if_longest(bench: Any) -> None:
+    """The same of wide windows of which much is open."""
+    data = _data()
+    if data.is_dir():
+        trace = _trace(data)
+        for text in LONGEST:
+            _measure_changes(bench, text.format_map(_NAMES), trace, _spec(text), None)
 
 
 def bench_what_if_falling(bench: Any) -> None:

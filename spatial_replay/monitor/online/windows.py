@@ -220,7 +220,7 @@ def run_part(table_at: int, number: int, channels: int, begin: int, end: int, co
             if which in (2, 3) or (which >= 6 and k < count - 1) or not (own >> which) & 1:
                 continue
             if which == 1 and channels == 1:
-                numbers[1, k], numbers[3, k] = numbers[0, k], numbers[2, k]
+                numbers[1, k] = numbers[0, k]
             elif which >= 6 and channels < 4:
                 numbers[which, k] = numbers[which - 6, k]
             else:

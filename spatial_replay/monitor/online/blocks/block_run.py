@@ -222,17 +222,18 @@ def set_first(table_at: int, number: int, which: int, channels: int, at: int) ->
     tables, memory, scratch, _ = arrays_at(table_at)
     nodes, part, block = tables.nodes, tables.parts[number], block_of(memory, scratch)
     look, end, root = look_of(which, channels), part[codes.PART_END] - 1, nodes[part[codes.PART_END] - 1]
+    count = block.last + 1 - block.since
+    numbers = scratch.parts[number, which, at : at + count]
+    if is_known(which, part, memory, block.since):
+        fill(numbers, known_number(which, part, memory, look.channel))
+        return 0
     base, is_cut = memory.cells[part[codes.PART_CELL_START]], is_cut_short(which, part, root, channels)
     columns = memory.columns[look.channel if is_cut else columns_number(which)]
     table = memory.tables[look.channel, part[codes.PART_TABLE_START] : tables_end(part)]
     mode = codes.OPEN_END if has_ended(part, root, memory, block.since) else look.mode
-    missing, count = beyond(mode, root[codes.NODE_WEAK]), block.last + 1 - block.since
-    numbers = scratch.parts[number, which, at : at + count]
+    missing = beyond(mode, root[codes.NODE_WEAK])
     place = root[codes.NODE_B] if is_plain(part) else end - part[codes.PART_FIRST]
     operand = operand_of(nodes, part, place, columns, memory.history[look.channel], scratch)
-    if is_known(which, part, memory, block.since):
-        fill(numbers, known_number(which, part, memory, look.channel))
-        return 0
     if not is_plain(part) and base > 0:
         variables, points = part[codes.PART_VARIABLES], scratch.points
         _read_points(variables, table[: 1 << variables], count, points, scratch.point, scratch.order, numbers)
@@ -384,7 +385,7 @@ def run_block(
                 set_first(table_at, number, bound, channels, at)
     for k in range(at, at + count if channels < 4 else at):
         if channels == 1:
-            numbers[1, k], numbers[3, k] = numbers[0, k], numbers[2, k]
+            numbers[1, k] = numbers[0, k]
         numbers[6, k], numbers[7, k] = numbers[0, k], numbers[1, k]
     absorb(table_at, number, channels, last, outdone)
     return PARTIAL if block[IS_FOLLOWED] else WHOLE

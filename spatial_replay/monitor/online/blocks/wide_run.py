@@ -186,7 +186,7 @@ def run_wide(table_at: int, number: int, looks: int, channels: int, at: int, cou
         memory.unjoined[number, columns_number(which)] = 0
     for k in range(at, at + count if channels < 4 else at):
         if channels == 1:
-            numbers[1, k], numbers[3, k] = numbers[0, k], numbers[2, k]
+            numbers[1, k] = numbers[0, k]
         numbers[6, k], numbers[7, k] = numbers[0, k], numbers[1, k]
     absorb(table_at, number, channels, last, outdone)
     return PARTIAL
