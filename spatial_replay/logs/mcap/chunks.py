@@ -52,12 +52,14 @@ _TOGETHER, _TOGETHER_BYTES = 32, 2**22
 """Chunks, and their bytes, that a thread takes at once: with fewer, it waits for the interpreter
 more often."""
 _LARGEST_OF_OURS = 2**20
-"""Bytes, uncompressed, of a chunk that is read together with others."""
+"""Bytes, uncompressed, of the largest chunk that is read together with others."""
 _CACHED_BYTES = 2**21
 """So many are decompressed before they are split: they stay in the cache."""
 _AHEAD, _AHEAD_BYTES = 24, 2**24
-"""How many times as many are read ahead, at most, and their bytes: more than a block of samples has. However
-large they are, each thread has one."""
+"""So many times a thread takes some, and so many bytes, are read ahead at most: more than a block of samples
+has."""
+_LEAST_AHEAD = 8
+"""So many times at most, as long as each thread has some, they are read ahead however large they are."""
 _MOST_SPREAD = 1.5
 """Times their own bytes that chunks and what lies between them may have, to be read at once."""
 
@@ -200,7 +202,7 @@ def iter_records(
             waiting.append((size, Work(partial(reader.read, group), waits=is_planned(stream))))
             waiting[-1][1].hand_out()
             ahead += size
-            if len(waiting) > _AHEAD or (ahead > _AHEAD_BYTES and len(waiting) > cores()):
+            if len(waiting) > _AHEAD or (ahead > _AHEAD_BYTES and len(waiting) > min(cores(), _LEAST_AHEAD)):
                 found = first_result(work for _, work in waiting)
                 size, _ = waiting.popleft()
                 ahead -= size

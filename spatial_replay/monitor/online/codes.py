@@ -83,17 +83,18 @@ PART_ENDING, PART_LOWER, PART_UPPER, PART_IS_MINIMUM, PART_BESIDE = 10, 11, 12, 
 PART_IS_CUT = 15
 # the part, itself or another, and its node that is what this one is at the last sample; -1 if not asked for
 PART_LAST_IN, PART_LAST_NODE = 16, 17
-# which bounds follow from its table alone until its root has ended, a bit for each, and even then, a bit
-# higher up: what may still come outdoes all that is open
+# which bounds follow from its table alone until its root has ended, a bit for each, and eight bits higher up
+# which do even then: what may still come outdoes all that is open
 PART_KNOWN = 18
 EVEN_IF_OVER = 1 << 8
 # the signal that what a root joins by the minimum is at least, by the maximum at most; -1 for none
 PART_LIMIT = 19
 # what says that what a root joins by the minimum falls no more, by the maximum rises no more, while windows
-# are open: nothing; the worst that may come, where spans are found (see `blocks.spans`); or its value
+# are open, the more the greater: nothing; the worst that may come, where spans are found (see
+# `blocks.spans`); or its value
 PART_OUTDONE_BY = 20
 BY_NOTHING, BY_WORST, BY_VALUE = 0, 1, 2
-# how far from the first sample on the root joins what its operand is, and the unit; -1 if it never ends
+# the unit, and how far from the first sample on the root joins what its operand is; -1 if it never ends
 PART_END_UNIT, PART_ENDS_AT = 21, 22
 # which of its numbers a run computes, a bit for each: all but what a past operator is at first, where that is
 # its operand, and but where two runs share them (see `shares`)

@@ -261,13 +261,13 @@ def report(
             _set_now(rule, rows, numbers[operands[start]], numbers[operands[stop - 1]], count)
         elif code == codes.REPORT_PAST:
             _copy_numbers(numbers[operands[stop - 1]], rows, count)
-            of_first = 2 if rule == codes.NOW_OF_PART else 0
+            row = 2 if rule == codes.NOW_OF_PART else 0
             for end in range(2):
                 for k in range(count):
                     if rule == codes.NOW_OF_SIGNAL:
                         rows[2 + end, k] = memory.history[end * nominal_high, index, begin + k]
                     else:
-                        rows[2 + end, k] = scratch.parts[index, of_first + end, k]
+                        rows[2 + end, k] = scratch.parts[index, row + end, k]
         elif code == codes.REPORT_NOT:
             child = numbers[operands[start]]
             for pair in range(0, NUMBERS, 2):

@@ -147,7 +147,10 @@ def is_over(part: Integers, memory: Memory, last: int) -> bool:
 
 @inlined
 def has_ended(part: Integers, root: Integers, memory: Memory, last: int) -> bool:
-    """Return whether the window of a part's root is over, where that is all that depends on a variable."""
+    """Return whether the window of a part's root is over, where that is all that depends on a variable.
+
+    A root whose left operand says when its window ends joins nothing that comes later anyway.
+    """
     return is_plain(part) and root[codes.NODE_HIGH] > 0 and is_over(part, memory, last)
 
 

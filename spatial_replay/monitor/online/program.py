@@ -13,7 +13,7 @@ A formula becomes three tables, each with operands first:
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -85,8 +85,8 @@ def compile_formula(formula: Formula) -> Program:
     signals, parts = SignalTable(), _Parts()
     reports: list[Row] = []
     operand_ids: list[int] = []
-    # the parts of past operators, and whether these are their operand at the first sample
-    asked = dict[int, bool]()
+    # the parts of past operators, and whether these are their operand at the first sample; the other parts
+    asked, others = dict[int, bool](), set[int]()
     for node, operands in _nodes_with_operands(formula):
         ends = (len(operand_ids), len(operand_ids) + len(operands))
         operand_ids.extend(operands)
@@ -98,18 +98,25 @@ def compile_formula(formula: Formula) -> Program:
             last = None if node.operator in FUTURE_OPERATORS else at_last(node)
             if isinstance(last, Temporal) and looks_ahead(last):
                 number = parts.add_node(last, signals)
+                others.add(number)
                 reports.append((codes.REPORT_PAST, number, codes.NOW_OF_VALUE, *ends))
             elif last is not None:
                 reports.append((codes.REPORT_PAST, signals.add(last), codes.NOW_OF_SIGNAL, *ends))
             else:
                 number = parts.add_node(node, signals)
                 reports.append((codes.REPORT_PART, number, _now_rule(node), *ends))
-                if node.operator not in FUTURE_OPERATORS:
-                    asked[number] = node.operator != "Y" and (node.bound is None or node.bound.lower == 0)
-    node_rows, part_rows, most_rows = parts.finished(asked)
-    for n, (code, number, *rest) in enumerate(reports):
-        if code == codes.REPORT_PART and part_rows[number][codes.PART_NUMBERS] == codes.LAST_NUMBERS:
-            reports[n] = codes.REPORT_PAST, number, *rest
+                if node.operator in FUTURE_OPERATORS:
+                    others.add(number)
+                else:
+                    is_operand = node.operator != "Y" and (node.bound is None or node.bound.lower == 0)
+                    asked[number] = is_operand and asked.get(number, True)
+    node_rows, part_rows, most_rows = parts.finished(
+        {number: is_operand and number not in others for number, is_operand in asked.items()}
+    )
+    reports = [
+        (codes.REPORT_PAST, *rest) if _is_said_at_last_only(code, rest, part_rows) else (code, *rest)
+        for code, *rest in reports
+    ]
     return Program(
         leaves=tuple(signals.leaves),
         signals=signals.array(parts.literals),
@@ -124,6 +131,13 @@ def compile_formula(formula: Formula) -> Program:
         rows=most_rows,
         keeps_history=signals.keeps_history or parts.keeps_history,
     )
+
+
+def _is_said_at_last_only(code: int, rest: Sequence[int], part_rows: Sequence[Row]) -> bool:
+    """Return whether a report is of a part that a run says nothing of but what it is at the last sample."""
+    number, rule, *_ = rest
+    is_last = code == codes.REPORT_PART and rule == codes.NOW_OF_PART
+    return is_last and part_rows[number][codes.PART_NUMBERS] == codes.LAST_NUMBERS
 
 
 class _Parts:
@@ -329,8 +343,11 @@ def _known_bounds(rows: tuple[Row, ...], *, is_bounded: bool) -> int:
     great as can be wherever x is: where it is `F y`, which what comes may always satisfy, or `F y or z`, say.
     The table then says what follows from what has closed, if the same holds for all of its variables.
 
+    Once a root with a window is over, what comes does not violate it any more, but may still satisfy what
+    never ends below it.
+
     Args:
-        is_bounded: whether the root ends, until when it joins all that its operand is.
+        is_bounded: whether the root has a window, within which it joins all that its operand is.
     """
     way = _direction_of(rows)
     if way is None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from operator import is_
 from types import MappingProxyType
 
@@ -64,9 +64,9 @@ def from_all(node: Temporal) -> Temporal:
 def at_last(node: Temporal) -> Formula | None:
     """Return what, at the first sample, is what a past operator over a future one is at the last one.
 
-    That is a formula without future operators for `O F x` and `a S F x`, of which now is what was so far; for
-    `O x` and `H x`, else, it is `F x` and `G x`. None if there is none, or if the operator is another one at
-    the first.
+    That is a formula without future operators for `O F x`, `a S F x` and `O (x or F y)`, of which now is what
+    was so far; for `O x` and `H x`, else, it is `F x` and `G x`. None if there is none, or if the operator is
+    another one at the first.
     """
     behind, _ = _sides(node)
     if len(behind) == 1 and not looks_ahead(behind[0]):
@@ -95,7 +95,7 @@ def recurring(node: Temporal) -> Temporal:
 
 
 def _around(node: Temporal) -> Temporal | Boolean:
-    """Return `O F x`, over windows that begin at once, as `O x or F x`; `H G x` as `H x and G x`."""
+    """Return `O F x`, over windows that begin at once, as `O x or F x`, and others alike (see `_sides`)."""
     behind, ahead = _sides(node)
     return Boolean("and" if node.operator == "H" else "or", (*behind, *ahead)) if ahead else node
 
@@ -116,23 +116,26 @@ def _sides(node: Temporal) -> tuple[list[Formula], list[Formula]]:
     joint: BooleanOperator = "and" if node.operator == "H" else "or"
     kind: TemporalOperator = "G" if node.operator == "H" else "F"
     *left, body = node.operands
-    ahead, known, rest = list[Formula](), list[Formula](), list[Formula]()
+    ahead, signals, others = list[Formula](), list[Formula](), list[Formula]()
     for each in _joined_by(joint, body, is_negated=False):
         inner, is_negated = _peeled(each)
-        is_window = isinstance(inner, Temporal) and (
-            inner.operator == (_OPPOSITE[kind] if is_negated else kind)
-            and _is_at_once(node.bound, inner.bound)
-            and not (left and any(map(looks_ahead, (*left, *inner.operands))))
-        )
-        if is_window and isinstance(inner, Temporal):
-            operand = _negated(inner.operands[0]) if is_negated else inner.operands[0]
-            ahead.append(Temporal(kind, (operand,), inner.bound))
-            each = operand
-        (rest if looks_ahead(each) else known).append(each)
+        side = each
+        if isinstance(inner, Temporal) and inner.operator == (_OPPOSITE[kind] if is_negated else kind):
+            (below,) = inner.operands
+            # what looks ahead on the left would be computed at all open positions twice
+            is_alone = not left or not any(map(looks_ahead, (*left, below)))
+            if is_alone and _is_at_once(node.bound, inner.bound):
+                side = _negated(below) if is_negated else below
+                ahead.append(Temporal(kind, (side,), inner.bound))
+        (others if looks_ahead(side) else signals).append(side)
     if not ahead:
         return [], []
-    joined = [each[0] if len(each) == 1 else Boolean(joint, tuple(each)) for each in (known, rest) if each]
+    joined = [_joined(joint, sides) for sides in (signals, others) if sides]
     return [Temporal(node.operator, (*left, each), node.bound) for each in joined], ahead
+
+
+def _joined(joint: BooleanOperator, formulas: Sequence[Formula]) -> Formula:
+    return Boolean(joint, tuple(formulas)) if len(formulas) > 1 else formulas[0]
 
 
 def _joined_by(joint: BooleanOperator, formula: Formula, *, is_negated: bool) -> list[Formula]:

@@ -98,6 +98,8 @@ def open_share(program: Program, memory: Memory, left: int) -> float:
         nodes = program.nodes[part[codes.PART_FIRST] : part[codes.PART_END]]
         if part[codes.PART_KIND] != codes.WINDOWED or cast(Any, is_settled).interpreted()(part, memory):
             continue
+        if not part[codes.PART_NUMBERS] & ~codes.LAST_NUMBERS:
+            continue  # said by another part
         if part[codes.PART_VARIABLES] == 0 and part[codes.PART_LAST_IN] != number:
             continue  # soon over
         samples, time_ns = _horizon(nodes)

@@ -436,8 +436,8 @@ def join_body_spans(
     """Fill the running row with what the root of a part joins, and a number (see `_join_body`).
 
     Args:
-        base, after: where the first span begins that it joins, or an earlier position that has a number; and
-            where the last one ends.
+        base, after: the first position that the root joins, and what comes after the last one: spans begin
+            and end there (see `find_spans`), or there are numbers.
     """
     root = part[codes.PART_END] - 1
     is_until = nodes[root, codes.NODE_CODE] == codes.UNTIL
