@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
@@ -32,6 +31,14 @@ from spatial_replay.monitor.online.operators import (
     part_of,
 )
 from spatial_replay.monitor.online.rewriting import at_last, looks_ahead
+from spatial_replay.monitor.online.root_bounds import (
+    NEVER,
+    cutting_windows,
+    known_bounds,
+    limit_of,
+    outdone_by,
+    root_end,
+)
 from spatial_replay.spec.formula import (
     FUTURE_OPERATORS,
     Atom,
@@ -178,7 +185,7 @@ class _Parts:
             )
             self._rows.append(())
             self._limits.append(NOTHING)
-            self._root_ends.append(_NEVER)
+            self._root_ends.append(NEVER)
         return self._built[own]
 
     def add(self, part: PartRows, signals: SignalTable) -> int:
@@ -192,7 +199,7 @@ class _Parts:
         if key in self._built:
             return self._built[key]
         self._built[key] = len(self._part_rows)
-        first, cutting = len(self._node_rows), _cutting(rows)
+        first, cutting = len(self._node_rows), cutting_windows(rows)
         self._part_rows.append(
             (
                 first,
@@ -210,9 +217,9 @@ class _Parts:
             )
         )
         self._rows.append(rows)
-        limit = NOTHING if part.is_flat or part.is_nested else _limit(rows, signals)
+        limit = NOTHING if part.is_flat or part.is_nested else limit_of(rows, signals)
         self._limits.append(limit)
-        self._root_ends.append(_NEVER if part.is_flat else _root_end(rows, signals))
+        self._root_ends.append(NEVER if part.is_flat else root_end(rows, signals))
         self.literals |= {limit} - {NOTHING}
         for number, row in enumerate(rows):
             is_timed = row[codes.NODE_CODE] in codes.AHEAD_OF and row[codes.NODE_UNIT] != codes.SAMPLES
@@ -242,9 +249,9 @@ class _Parts:
                 int(number in hosts),
                 *row[codes.PART_IS_REMEMBERING + 1 :],
                 *last_in.get(number, (NOTHING, NOTHING)),
-                _known_bounds(self._rows[number], is_bounded=self._root_ends[number] != _NEVER),
+                known_bounds(self._rows[number], is_bounded=self._root_ends[number] != NEVER),
                 self._limits[number],
-                codes.BY_NOTHING if row[codes.PART_IS_NESTED] else _outdone_by(self._rows[number]),
+                codes.BY_NOTHING if row[codes.PART_IS_NESTED] else outdone_by(self._rows[number]),
                 *self._root_ends[number],
                 codes.LAST_NUMBERS if number in beside else codes.ALL_NUMBERS,
             )
@@ -274,154 +281,6 @@ class _Parts:
             if never_ends or found.get(number, (NOTHING,))[0] == number:
                 known = {tree: (number, node) for node, tree in enumerate(trees)} | known
         return found
-
-
-_NEVER = codes.SAMPLES, NOTHING
-"""The end of a root that has none."""
-
-
-class _Direction(NamedTuple):
-    """What a root that joins by the minimum meets below it; by the maximum, all of it the other way round.
-
-    Attributes:
-        either, both: the nodes that are as great as the greater, and as the smaller one of their operands.
-        signal_either, signal_both: the same for signals.
-        window, past_window, until: those that are great once their operand is.
-        release: those that are great as long as it is.
-        worst, best: the bounds of the smallest, and of the greatest continuation.
-        weak: what `NODE_WEAK` is where what is still to come counts as small.
-    """
-
-    either: int
-    both: int
-    signal_either: int
-    signal_both: int
-    window: int
-    past_window: int
-    until: int
-    release: int
-    worst: int
-    best: int
-    weak: int
-
-
-_BY_MINIMUM = _Direction(
-    codes.PART_OR, codes.PART_AND, codes.OR, codes.AND, codes.PART_WINDOW_MAX, codes.PAST_WINDOW_MAX,
-    codes.UNTIL, codes.RELEASE, codes.LOWER, codes.UPPER, 0,
-)  # fmt: skip
-_BY_MAXIMUM = _Direction(
-    codes.PART_AND, codes.PART_OR, codes.AND, codes.OR, codes.PART_WINDOW_MIN, codes.PAST_WINDOW_MIN,
-    codes.RELEASE, codes.UNTIL, codes.UPPER, codes.LOWER, 1,
-)  # fmt: skip
-
-
-def _direction_of(rows: tuple[Row, ...]) -> _Direction | None:
-    """Return what a part's root is in, if it is a variable: one that never ends, or not before its window."""
-    if not rows or rows[-1][codes.NODE_VARIABLE] == NOTHING:
-        return None
-    return {codes.RELEASE: _BY_MINIMUM, codes.UNTIL: _BY_MAXIMUM}.get(rows[-1][codes.NODE_CODE])
-
-
-def _never_ends(rows: tuple[Row, ...]) -> bool:
-    """Return whether a root joins all that its operand is from some position on."""
-    return rows[-1][codes.NODE_A] == NOTHING and rows[-1][codes.NODE_HIGH] <= 0
-
-
-def _root_end(rows: tuple[Row, ...], signals: SignalTable) -> tuple[int, int]:
-    """Return how far from the first sample on a root joins what its operand is, and in which unit."""
-    _, left, _, _, unit, _, high, *_ = rows[-1]
-    if left == NOTHING:
-        return (unit, high) if high > 0 else _NEVER
-    code, signal, *_ = rows[left]
-    return (signals.elapsed_at(signal) or _NEVER) if code == codes.LITERAL else _NEVER
-
-
-def _known_bounds(rows: tuple[Row, ...], *, is_bounded: bool) -> int:
-    """Return which bounds follow from a part's table, whatever is open, a bit for each.
-
-    What comes may always violate `G x`, so that its lower bound is as small as can be. Its upper one is as
-    great as can be wherever x is: where it is `F y`, which what comes may always satisfy, or `F y or z`, say.
-    The table then says what follows from what has closed, if the same holds for all of its variables.
-
-    Once a root with a window is over, what comes does not violate it any more, but may still satisfy what
-    never ends below it.
-
-    Args:
-        is_bounded: whether the root has a window, within which it joins all that its operand is.
-    """
-    way = _direction_of(rows)
-    if way is None:
-        return 0
-    # whether a node is as great as can be in the best continuation
-    outdone: list[bool] = []
-    for code, a, b, *_ in rows:
-        if code == way.either:
-            outdone.append(outdone[a] or outdone[b])
-        elif code == way.both:
-            outdone.append(outdone[a] and outdone[b])
-        elif code == way.until:
-            outdone.append(a == NOTHING or outdone[a] or outdone[b])
-        else:
-            outdone.append(code == way.release and outdone[b])
-    variables = [node for node, row in enumerate(rows) if row[codes.NODE_VARIABLE] != NOTHING]
-    known = 1 << way.worst if is_bounded or rows[-1][codes.NODE_A] == NOTHING else 0
-    if all(outdone[node] for node in variables):
-        known |= (1 | codes.EVEN_IF_OVER) << way.best
-    return known
-
-
-def _limit(rows: tuple[Row, ...], signals: SignalTable) -> int:
-    """Return the signal that what a root joins never passes, whatever comes; -1 for none.
-
-    `F[0,9] x` is at least what x is there, `x or y` at least what x is, though y looks ahead, and so on. What
-    `G` joins matters no more once it is known to be at least what `G` cannot exceed any more.
-
-    Args:
-        signals: extended.
-    """
-    way = _direction_of(rows)
-    if way is None or not _never_ends(rows):
-        return NOTHING
-    limits: list[int] = []
-    for code, a, b, _, _, low, *_ in rows[: rows[-1][codes.NODE_B] + 1]:
-        limit = NOTHING
-        if code == codes.LITERAL:
-            limit = a
-        elif code in (way.window, way.past_window) and low == 0:
-            limit = limits[a]
-        elif code == way.until:
-            limit = limits[b]
-        elif code in (way.either, way.both) and NOTHING not in (limits[a], limits[b]):
-            join = way.signal_either if code == way.either else way.signal_both
-            limit = signals.row(join, limits[a], limits[b])
-        elif code == way.either:
-            # one is known, or none
-            limit = limits[b] if limits[a] == NOTHING else limits[a]
-        limits.append(limit)
-    return limits[-1]
-
-
-def _outdone_by(rows: tuple[Row, ...]) -> int:
-    """Return what says that what a root joins by the minimum falls no more, or the other way round.
-
-    What `F` finds remains, and what is still to come can only add to it, so that its value says so. Of `G`
-    only what has closed does: where it is open, the worst may still come.
-    """
-    way = _direction_of(rows)
-    if way is None or not _never_ends(rows):
-        return codes.BY_NOTHING
-    free = (codes.LITERAL, codes.PART_AND, codes.PART_OR, codes.PAST_DELAY, *codes.PAST_WINDOWS)
-    ahead = (way.window, way.until, codes.SHIFT)
-    found = codes.BY_VALUE
-    for row in rows[:-1]:
-        code, low = row[codes.NODE_CODE], row[codes.NODE_LOW]
-        if code in free or (code in ahead and row[codes.NODE_WEAK] == way.weak):
-            continue
-        # one that has not begun would be as good as can be
-        if code not in (codes.PART_WINDOW_MAX, codes.PART_WINDOW_MIN) or low > 0:
-            return codes.BY_NOTHING
-        found = codes.BY_WORST
-    return found
 
 
 def _trees(rows: tuple[Row, ...], known: dict[Row, int]) -> list[int]:
@@ -473,37 +332,6 @@ def _places_of_rows(rows: tuple[Row, ...], kept: set[int]) -> list[int]:
         places.append(ended[0])
         free += ended[1:]
     return places
-
-
-def _cutting(rows: tuple[Row, ...]) -> set[int] | None:
-    """Return the windows that are the greatest while they are open, of a root that joins by the minimum.
-
-    Where one is open, what it stands in is no bound; anywhere else, the best that may come is what counts for
-    the value, too. The same upside down. None where other nodes make a difference between the two.
-    """
-    code, left, body, *_ = rows[-1]
-    if code not in (codes.UNTIL, codes.RELEASE) or left != NOTHING:
-        return None
-    is_weak = code == codes.RELEASE
-    window = codes.PART_WINDOW_MAX if is_weak else codes.PART_WINDOW_MIN
-    either, both = (codes.PART_OR, codes.PART_AND) if is_weak else (codes.PART_AND, codes.PART_OR)
-    differs: list[bool] = []
-    for own, a, b, weak, *_ in rows[: body + 1]:
-        operands = {codes.LITERAL: (), either: (a, b), both: (a, b)}.get(own, (a,))
-        is_free = own in (codes.LITERAL, either, both, *codes.AHEAD_OF)
-        is_open = own == window or (own == codes.SHIFT and bool(weak) != is_weak)
-        differs.append(not is_free or is_open or any(differs[each] for each in operands))
-    found, waiting = set[int](), [body]
-    while waiting:
-        row = waiting.pop()
-        own, a, b, *_ = rows[row]
-        if own == either:
-            waiting += (a, b)
-        elif own == window and not differs[a]:
-            found.add(row)
-        elif differs[row]:
-            return None
-    return found
 
 
 def _nodes_with_operands(formula: Formula) -> list[tuple[Formula, list[int]]]:
