@@ -1,7 +1,7 @@
 """What a part's root says of its bounds, and of positions that matter no more, by its rows alone.
 
-A root that joins by the minimum, as `G` does, cannot exceed any more what has closed of what it joins, and what
-comes may always be worse; by the maximum, as `F` does, all of it is the other way round.
+A root that joins by the minimum, as `G` does, cannot exceed any more what has closed of what it joins, and
+what comes may always be worse; by the maximum, as `F` does, all of it is the other way round.
 """
 
 from __future__ import annotations
