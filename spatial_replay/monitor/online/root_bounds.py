@@ -6,6 +6,8 @@ what comes may always be worse; by the maximum, as `F` does, all of it is the ot
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 from spatial_replay.monitor.online import codes
@@ -48,13 +50,16 @@ _BY_MAXIMUM = _Direction(
     codes.PART_AND, codes.PART_OR, codes.AND, codes.OR, codes.PART_WINDOW_MIN, codes.PAST_WINDOW_MIN,
     codes.RELEASE, codes.UNTIL, codes.UPPER, codes.LOWER, 1,
 )  # fmt: skip
+_DIRECTIONS: Mapping[int, _Direction] = MappingProxyType(
+    {codes.RELEASE: _BY_MINIMUM, codes.UNTIL: _BY_MAXIMUM}
+)
 
 
 def _direction_of(rows: tuple[Row, ...]) -> _Direction | None:
     """Return what a part's root is in, if it is a variable: one that never ends, or not before its window."""
     if not rows or rows[-1][codes.NODE_VARIABLE] == NOTHING:
         return None
-    return {codes.RELEASE: _BY_MINIMUM, codes.UNTIL: _BY_MAXIMUM}.get(rows[-1][codes.NODE_CODE])
+    return _DIRECTIONS.get(rows[-1][codes.NODE_CODE])
 
 
 def _never_ends(rows: tuple[Row, ...]) -> bool:
@@ -166,24 +171,22 @@ def cutting_windows(rows: tuple[Row, ...]) -> set[int] | None:
     the value, too. The same upside down. None where other nodes make a difference between the two.
     """
     code, left, body, *_ = rows[-1]
-    if code not in (codes.UNTIL, codes.RELEASE) or left != NOTHING:
+    way = _DIRECTIONS.get(code)
+    if way is None or left != NOTHING:
         return None
-    is_weak = code == codes.RELEASE
-    window = codes.PART_WINDOW_MAX if is_weak else codes.PART_WINDOW_MIN
-    either, both = (codes.PART_OR, codes.PART_AND) if is_weak else (codes.PART_AND, codes.PART_OR)
     differs: list[bool] = []
     for own, a, b, weak, *_ in rows[: body + 1]:
-        operands = {codes.LITERAL: (), either: (a, b), both: (a, b)}.get(own, (a,))
-        is_free = own in (codes.LITERAL, either, both, *codes.AHEAD_OF)
-        is_open = own == window or (own == codes.SHIFT and bool(weak) != is_weak)
+        operands = {codes.LITERAL: (), way.either: (a, b), way.both: (a, b)}.get(own, (a,))
+        is_free = own in (codes.LITERAL, way.either, way.both, *codes.AHEAD_OF)
+        is_open = own == way.window or (own == codes.SHIFT and weak == way.weak)
         differs.append(not is_free or is_open or any(differs[each] for each in operands))
     found, waiting = set[int](), [body]
     while waiting:
         row = waiting.pop()
         own, a, b, *_ = rows[row]
-        if own == either:
+        if own == way.either:
             waiting += (a, b)
-        elif own == window and not differs[a]:
+        elif own == way.window and not differs[a]:
             found.add(row)
         elif differs[row]:
             return None
