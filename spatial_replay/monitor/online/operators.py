@@ -6,7 +6,7 @@ negation normal form over signals, so that its value is monotone in all its oper
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial, reduce
 from itertools import islice
 
@@ -48,6 +48,14 @@ def array_of_rows(rows: Sequence[Row], width: int) -> Integers:
     return np.array(rows, np.int64).reshape(len(rows), width)
 
 
+def _operands_of_row(row: Row) -> tuple[int, ...]:
+    """Return the rows of a `SignalTable` that one of them is computed from."""
+    code, a, b, *_ = row
+    if code in (codes.LEAF, codes.CONSTANT, codes.ELAPSED):
+        return ()
+    return (a, b) if code in (codes.AND, codes.OR, codes.SINCE, *codes.BEGUN, *codes.CLOSED) else (a,)
+
+
 class SignalTable:
     """Collects rows; equal subformulas share one, and operands come before what they are operands of.
 
@@ -79,21 +87,30 @@ class SignalTable:
         """Whether any row looks at more than the newest sample."""
         return any(row[0] in codes.RINGS or row[0] in codes.DELAYED for row in self._rows)
 
-    def array(self, kept: Iterable[int]) -> Integers:
+    def array(self, kept: Iterable[int], asked: Mapping[int, set[int]]) -> Integers:
         """Return the table (S, SIGNAL_WIDTH), with its rings numbered: first those with numbers beside.
 
         Args:
             kept: the rows that parts look at behind the newest sample.
+            asked: for rows, who looks at them: cells that say whether these still do, -1 for who always does.
         """
         rings = [row for row in self._rows if row[0] in codes.RINGS]
         rings.sort(key=lambda row: row[0] not in codes.BEGUN)
         numbers = {row: number for number, row in enumerate(rings)}
-        looked_at = set(kept)
-        for code, a, b, *_ in self._rows:
-            if code in codes.DELAYED or code in codes.RINGS:
-                looked_at.update((a, b) if code in (*codes.BEGUN, *codes.CLOSED) else (a,))
+        looked_at, cells = set(kept), {number: set(asked.get(number, ())) for number in range(len(self))}
+        for number, row in reversed([*enumerate(self._rows)]):
+            operands = _operands_of_row(row)
+            if row[0] in codes.DELAYED or row[0] in codes.RINGS:
+                looked_at.update(operands)
+            for operand in operands:
+                cells[operand] |= cells[number]
         rows = [
-            (*row, numbers.get(row, NOTHING), int(number in looked_at))
+            (
+                *row,
+                numbers.get(row, NOTHING),
+                int(number in looked_at),
+                min(cells[number]) if len(cells[number]) == 1 else NOTHING,
+            )
             for number, row in enumerate(self._rows)
         ]
         return array_of_rows(rows, codes.SIGNAL_WIDTH)

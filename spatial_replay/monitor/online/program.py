@@ -126,7 +126,7 @@ def compile_formula(formula: Formula) -> Program:
     ]
     return Program(
         leaves=tuple(signals.leaves),
-        signals=signals.array(parts.literals),
+        signals=signals.array(parts.literals, _asked_signals(reports, node_rows, part_rows)),
         nodes=array_of_rows(node_rows, codes.NODE_WIDTH),
         parts=array_of_rows(part_rows, codes.PART_WIDTH),
         reports=array_of_rows(reports, codes.REPORT_WIDTH),
@@ -145,6 +145,26 @@ def _is_said_at_last_only(code: int, rest: Sequence[int], part_rows: Sequence[Ro
     number, rule, *_ = rest
     is_last = code == codes.REPORT_PART and rule == codes.NOW_OF_PART
     return is_last and part_rows[number][codes.PART_NUMBERS] == codes.LAST_NUMBERS
+
+
+def _asked_signals(
+    reports: Sequence[Row], node_rows: Sequence[Row], part_rows: Sequence[Row]
+) -> dict[int, set[int]]:
+    """Return for signals who looks at them: the cells of parts made of signals, -1 for anything else."""
+    always = {
+        index
+        for code, index, rule, *_ in reports
+        if code == codes.REPORT_SIGNAL or (code == codes.REPORT_PAST and rule == codes.NOW_OF_SIGNAL)
+    }
+    always |= {row[codes.NODE_A] for row in node_rows if row[codes.NODE_CODE] == codes.LITERAL}
+    asked = dict[int, set[int]]()
+    for part in part_rows:
+        always.add(part[codes.PART_LIMIT])
+        for column in (codes.PART_ENDING, codes.PART_LOWER, codes.PART_UPPER):
+            asked.setdefault(part[column], set()).add(part[codes.PART_CELL_START])
+    for signal in always:
+        asked.setdefault(signal, set()).add(NOTHING)
+    return asked
 
 
 class _Parts:
@@ -186,6 +206,7 @@ class _Parts:
             self._rows.append(())
             self._limits.append(NOTHING)
             self._root_ends.append(NEVER)
+            self.cells += 1
         return self._built[own]
 
     def add(self, part: PartRows, signals: SignalTable) -> int:

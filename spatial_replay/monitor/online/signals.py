@@ -15,6 +15,13 @@ from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.state import START_NS, Memory, behind, is_closed, past_value
 
 
+@inlined
+def matters_no_more(signal: Integers, memory: Memory) -> bool:
+    """Return whether a signal is run no more, since all that looked at it has settled."""
+    cell = signal[codes.SIGNAL_SETTLED]
+    return bool(cell >= 0 and memory.cells[cell])
+
+
 @uncounted
 def step_signals(
     signals: Integers, leaves: Floats, t: int, count: int, position: int, begin: int, memory: Memory
@@ -28,6 +35,8 @@ def step_signals(
     history, stamps, running, wedge_next = memory.history, memory.stamps, memory.running, memory.wedge_next
     channels = leaves.shape[0]
     for s in range(signals.shape[0]):
+        if matters_no_more(signals[s], memory):
+            continue
         code, a, b = signals[s, 0], signals[s, 1], signals[s, 2]
         for channel in range(channels):
             mirror = channel ^ 1 if channels > 1 else channel

@@ -139,6 +139,10 @@ def _step_channel(
     ends, lows, highs = scratch.series[0], scratch.series[1], scratch.series[2]
     if position == 0:
         _start(nodes, part, table, values)
+    elif table[0] == table[corners - 1]:
+        for k in range(count):
+            ends[k] = lows[k] = highs[k] = table[0]
+        return
     _fill_columns(nodes, part, channel, mirror, memory.history, begin, count, columns)
     anchored = (
         _is_anchored(nodes[end - 1, codes.NODE_CODE]) or nodes[end - 1, codes.NODE_CODE] == codes.PART_OR
@@ -218,19 +222,31 @@ def _read_clauses(
     nominal_high = 1 if channels > 1 else 0
     wide_low = 2 if channels > 2 else 0
     beside, is_minimum = part[codes.PART_BESIDE], part[codes.PART_IS_MINIMUM]
+    settled = part[codes.PART_CELL_START]
     for number in (0, 1, 4, 5, 6, 7):
         signal = part[codes.PART_ENDING]
         if number in (4, 5):
             signal = part[codes.PART_LOWER] if number == 4 else part[codes.PART_UPPER]
         channel = (0 if number < 2 else wide_low) + (nominal_high if number % 2 else 0)
         source, target = memory.history[channel, signal, begin : begin + count], numbers[number]
-        if beside < 0:
+        if memory.cells[settled]:
+            for k in range(count):
+                target[k] = memory.running[channel, signal]
+        else:
             for k in range(count):
                 target[k] = source[k]
+        if beside < 0:
             continue
         other = scratch.parts[beside, number]
         for k in range(count):
-            target[k] = min(source[k], other[k]) if is_minimum else max(source[k], other[k])
+            target[k] = min(target[k], other[k]) if is_minimum else max(target[k], other[k])
+    # what it is at least and at most only ever come closer
+    is_settled = True
+    for channel in range(channels):
+        least, most = part[codes.PART_LOWER], part[codes.PART_UPPER]
+        is_settled = is_settled and memory.running[channel, least] == memory.running[channel, most]
+    if is_settled:
+        memory.cells[settled] = 1
 
 
 @uncounted

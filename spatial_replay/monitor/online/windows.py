@@ -7,7 +7,8 @@ columns of numbers (see `open_windows`), which are read into the table. A past o
 operator below it carries a table of its own from base to base.
 
 A part's cells hold: the base, as the next position to absorb; for each variable, its position in the table;
-for each table of a past operator, the position it belongs to (-1: before the first).
+for each table of a past operator, the position it belongs to (-1: before the first). That of a part made of
+signals is 1 once these matter no more.
 """
 
 from __future__ import annotations
@@ -44,6 +45,7 @@ from spatial_replay.monitor.online.open_windows import (
     runs_root,
 )
 from spatial_replay.monitor.online.run_arrays import arrays_at
+from spatial_replay.monitor.online.signals import matters_no_more
 from spatial_replay.monitor.online.sliding import (
     beyond,
     copy,
@@ -246,6 +248,8 @@ def _kept_from(table_at: int, last: int) -> int:
     signals, parts, offset, keep = tables.signals, tables.parts, memory.clock[OFFSET], last
     for s in range(signals.shape[0]):
         code, unit = signals[s, codes.SIGNAL_CODE], signals[s, codes.SIGNAL_UNIT]
+        if matters_no_more(signals[s], memory):
+            continue
         if code in codes.DELAYED:
             keep = min(keep, behind(memory.stamps, offset, last, unit, signals[s, codes.SIGNAL_LOW]))
         elif code in codes.RINGS:

@@ -119,7 +119,11 @@ def _run_node(table_at: int, number: int, d: int, which: int, channels: int) -> 
     else:
         find_ends(node, recent, begin, block.last + 1, block.offset, block.last, block.starts, block.afters)
         if code in (codes.SHIFT, codes.PAST_DELAY):
-            shift_rows(block, code == codes.SHIFT, one, target, begin, block.last + 1, value)
+            end, is_ahead = block.last + 1, code == codes.SHIFT
+            is_in_place = nodes[first + a, codes.NODE_ROWS] == node[codes.NODE_ROWS]
+            if is_ahead and is_in_place and node[codes.NODE_LOW] == 0:
+                end = min(max(one.begin, begin), end)  # from there on, its rows are the operand's
+            shift_rows(block, is_ahead, one, target, begin, end, value)
         else:
             closed = block.last + 1
             if code in codes.AHEAD_OF and is_decided(node, look.mode):
