@@ -23,6 +23,7 @@ from spatial_replay.monitor.online.open_windows import (
     bring_columns_up,
     find_lows,
     has_ended,
+    is_over,
     reach,
     root_window,
 )
@@ -181,10 +182,11 @@ def is_outdone(part: Integers, root: Integers, memory: Memory, channel: int, val
 
 
 @inlined
-def looks_for_outdone(part: Integers, memory: Memory, channels: int, by: int) -> bool:
+def looks_for_outdone(part: Integers, memory: Memory, channels: int, by: int, last: int) -> bool:
     """Return whether anything, `by` at least, says what is outdone of what a root joins."""
     is_said = part[codes.PART_OUTDONE_BY] >= by and part[codes.PART_NUMBERS] & 1 and channels <= 2
-    return bool(is_said and memory.cells[part[codes.PART_CELL_START]] > 0)
+    is_begun = memory.cells[part[codes.PART_CELL_START]] > 0
+    return bool(is_said and is_begun and not is_over(part, memory, last))
 
 
 @uncounted
@@ -198,7 +200,7 @@ def _absorb_outdone(
     """
     base, boundary, _ = cells_of(part)
     limit, position = part[codes.PART_LIMIT], memory.cells[base]
-    if position == 0:
+    if position == 0 or is_over(part, memory, last):
         return
     begin = max(position, outdone)
     stop, is_first = begin, True

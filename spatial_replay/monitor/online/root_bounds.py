@@ -62,9 +62,9 @@ def _direction_of(rows: tuple[Row, ...]) -> _Direction | None:
     return _DIRECTIONS.get(rows[-1][codes.NODE_CODE])
 
 
-def _never_ends(rows: tuple[Row, ...]) -> bool:
-    """Return whether a root joins all that its operand is from some position on."""
-    return rows[-1][codes.NODE_A] == NOTHING and rows[-1][codes.NODE_HIGH] <= 0
+def _joins_all(rows: tuple[Row, ...]) -> bool:
+    """Return whether a root joins all that its operand is, until its window is over if it has one."""
+    return rows[-1][codes.NODE_A] == NOTHING
 
 
 def root_end(rows: tuple[Row, ...], signals: SignalTable) -> tuple[int, int]:
@@ -120,7 +120,7 @@ def limit_of(rows: tuple[Row, ...], signals: SignalTable) -> int:
         signals: extended.
     """
     way = _direction_of(rows)
-    if way is None or not _never_ends(rows):
+    if way is None or not _joins_all(rows):
         return NOTHING
     limits: list[int] = []
     for code, a, b, _, _, low, *_ in rows[: rows[-1][codes.NODE_B] + 1]:
@@ -148,7 +148,7 @@ def outdone_by(rows: tuple[Row, ...]) -> int:
     only what has closed does: where it is open, the worst may still come.
     """
     way = _direction_of(rows)
-    if way is None or not _never_ends(rows):
+    if way is None or not _joins_all(rows):
         return codes.BY_NOTHING
     free = (codes.LITERAL, codes.PART_AND, codes.PART_OR, codes.PAST_DELAY, *codes.PAST_WINDOWS)
     ahead = (way.window, way.until, codes.SHIFT)

@@ -235,7 +235,7 @@ def run_part(table_at: int, number: int, channels: int, begin: int, end: int, co
                     )
         if last % CLOSING == CLOSING - 1:
             outdone = 0
-            if looks_for_outdone(part, memory, channels, codes.BY_VALUE):
+            if looks_for_outdone(part, memory, channels, codes.BY_VALUE, last):
                 outdone = _outdone_up_to(tables.nodes, part, channels, memory, offset, last)
             absorb(table_at, number, channels, last, outdone)
     return 0

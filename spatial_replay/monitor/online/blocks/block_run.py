@@ -377,7 +377,7 @@ def run_block(
         set_first(table_at, number, which, channels, at)
         if which > 1:
             continue
-        if looks_for_outdone(part, memory, channels, codes.BY_VALUE):
+        if looks_for_outdone(part, memory, channels, codes.BY_VALUE, last):
             found = _outdone_in_rows(table_at, number, which)
             outdone = found if which == 0 else min(outdone, found)
         if part[codes.PART_IS_REMEMBERING]:

@@ -179,7 +179,7 @@ def run_wide(table_at: int, number: int, looks: int, channels: int, at: int, cou
                 is_beside = bound - 4 == which if channels == 4 else look_of(bound, channels).channel == which
                 if is_beside and ((part[codes.PART_NUMBERS] & ~looks) >> bound) & 1:
                     _set_first_of_spans(table_at, number, bound, channels, k, columns_number(which))
-        if which < 2 and looks_for_outdone(part, memory, channels, codes.BY_WORST):
+        if which < 2 and looks_for_outdone(part, memory, channels, codes.BY_WORST, last):
             found = outdone_in_spans(table_at, number, which)
             outdone = found if which == 0 else min(outdone, found)
         memory.known[number, columns_number(which)] = memory.closed[number, columns_number(which)] = last
