@@ -129,9 +129,9 @@ def is_plain(part: Integers) -> bool:
 
 
 @inlined
-def runs_root(part: Integers, root: Integers) -> bool:
+def runs_root(root: Integers) -> bool:
     """Return whether the root has a column, which what joins everything from some position on needs not."""
-    return not is_plain(part) or root[codes.NODE_A] >= 0
+    return root[codes.NODE_A] >= 0 or root[codes.NODE_VARIABLE] < 0
 
 
 @inlined
@@ -236,7 +236,8 @@ def bring_columns_up(table_at: int, number: int, looks: int, channels: int, last
             find_lows(table_at, number, last)
         since = max(memory.known[number, at] + 1, offset)
         memory.known[number, at] = last
-        for d in range(first, after if runs_root(part, nodes[after - 1]) else after - 1):
+        has_root = runs_root(nodes[after - 1])
+        for d in range(first, after if has_root else after - 1):
             code = nodes[d, codes.NODE_CODE]
             if code == codes.LITERAL:
                 begin = max(since, memory.lows[d])
@@ -251,6 +252,6 @@ def bring_columns_up(table_at: int, number: int, looks: int, channels: int, last
             else:
                 begin = run_behind(table_at, number, d, which, channels, since, last)
             changed[d - first] = begin
-        if is_plain(part):
+        if not has_root:
             memory.unjoined[number, at] = min(memory.unjoined[number, at], changed[body])
     return 0

@@ -111,26 +111,28 @@ def _value_at_first(
     tables = memory.tables[look.channel, part[codes.PART_TABLE_START] : tables_end(part)]
     if is_known(which, part, memory, last):
         return known_number(which, part, memory, look.channel)
-    if is_plain(part):
-        has_more = not has_ended(part, root, memory, last)
-        value = beyond(look.mode if has_more else codes.OPEN_END, root[codes.NODE_WEAK])
-        if root[codes.NODE_A] >= 0:
-            value = memory.columns[at, part[codes.PART_END] - 1, base - offset] if base <= last else value
-        else:
-            begin, end = root_window(root, memory, last)
-            if is_cut_short(which, part, root, channels):
-                at = look.channel
-                end = min(end, _cut_at(nodes, part, memory, scratch, offset, last))
-            d = part[codes.PART_FIRST] + root[codes.NODE_B]
-            signal, is_until = signal_of(nodes, d), root[codes.NODE_CODE] == codes.UNTIL
-            body = memory.columns[at, d] if signal < 0 else memory.history[look.channel, signal]
-            begin, count = max(begin, base) - offset, last + 1 - offset
-            value = _joined(number, at, is_until, body, value, begin, end - offset, memory, count)
-        return value if base == 0 else max(tables[0], min(value, tables[1]))
+    has_more = not has_ended(part, root, memory, last)
+    value = beyond(look.mode if has_more else codes.OPEN_END, root[codes.NODE_WEAK])
+    if runs_root(root):
+        value = memory.columns[at, part[codes.PART_END] - 1, base - offset] if base <= last else value
+    else:
+        begin, end = root_window(root, memory, last)
+        if is_cut_short(which, part, root, channels):
+            at = look.channel
+            end = min(end, _cut_at(nodes, part, memory, scratch, offset, last))
+        d = part[codes.PART_FIRST] + root[codes.NODE_B]
+        signal, is_until = signal_of(nodes, d), root[codes.NODE_CODE] == codes.UNTIL
+        body = memory.columns[at, d] if signal < 0 else memory.history[look.channel, signal]
+        begin, count = max(begin, base) - offset, last + 1 - offset
+        value = _joined(number, at, is_until, body, value, begin, end - offset, memory, count)
     if base == 0:
-        return float(memory.columns[at, part[codes.PART_END] - 1, 0 - offset])
-    for d in range(part[codes.PART_FIRST], part[codes.PART_END]):
+        return float(value)
+    if is_plain(part):
+        return float(max(tables[0], min(value, tables[1])))
+    for d in range(part[codes.PART_FIRST], part[codes.PART_END] - 1):
         set_point(nodes[d], part, memory.columns[at, d], memory.cells, look.mode, offset, last, scratch.point)
+    if root[codes.NODE_VARIABLE] >= 0:
+        scratch.point[root[codes.NODE_VARIABLE]] = value
     return read_table(tables[: 1 << variables], variables, scratch.point, scratch.order)
 
 
@@ -140,7 +142,7 @@ def _value_at_last(
 ) -> float:
     """Return what a node of a part is at the last sample, once the part's columns are brought up."""
     root = nodes[part[codes.PART_END] - 1]
-    if d < part[codes.PART_END] - 1 or runs_root(part, root):
+    if d < part[codes.PART_END] - 1 or runs_root(root):
         return float(memory.columns[which, d, last - offset])
     d = part[codes.PART_FIRST] + root[codes.NODE_B]
     signal = signal_of(nodes, d)

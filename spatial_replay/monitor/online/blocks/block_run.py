@@ -210,14 +210,24 @@ def _join_body(
 
 
 @uncounted
-def _read_points(
-    variables: int, table: Floats, count: int, points: Floats, point: Floats, order: Integers, numbers: Floats
-) -> None:
-    """Read a part's table at the point of each sample."""
-    for k in range(count):
-        for variable in range(variables):
-            point[variable] = points[variable, k]
-        numbers[k] = read_table(table, variables, point, order)
+def enter_numbers(
+    part: Integers, root: Integers, table: Floats, base: int, block: SampleBlock, scratch: Scratch,
+    numbers: Floats,
+) -> None:  # fmt: skip
+    """Enter what a part's table says, given what the root is from the base on, which the running row holds."""
+    if base == 0:
+        copy(block.running, numbers)
+    elif is_plain(part):
+        for k in range(len(numbers)):
+            numbers[k] = max(table[0], min(block.running[k], table[1]))
+    else:
+        variables, points, point = part[codes.PART_VARIABLES], scratch.points, scratch.point
+        for k in range(len(numbers)):
+            for variable in range(variables):
+                point[variable] = points[variable, k]
+            if root[codes.NODE_VARIABLE] >= 0:
+                point[root[codes.NODE_VARIABLE]] = block.running[k]
+            numbers[k] = read_table(table[: 1 << variables], variables, point, scratch.order)
 
 
 @apart
@@ -236,25 +246,18 @@ def set_first(table_at: int, number: int, which: int, channels: int, at: int) ->
     table = memory.tables[look.channel, part[codes.PART_TABLE_START] : tables_end(part)]
     mode = codes.OPEN_END if has_ended(part, root, memory, block.since) else look.mode
     missing = beyond(mode, root[codes.NODE_WEAK])
-    place = root[codes.NODE_B] if is_plain(part) else end - part[codes.PART_FIRST]
+    place = end - part[codes.PART_FIRST] if runs_root(root) else root[codes.NODE_B]
     operand = operand_of(nodes, part, place, columns, memory.history[look.channel], scratch)
-    if not is_plain(part) and base > 0:
-        variables, points = part[codes.PART_VARIABLES], scratch.points
-        _read_points(variables, table[: 1 << variables], count, points, scratch.point, scratch.order, numbers)
-    elif not is_plain(part):
+    if runs_root(root) and root[codes.NODE_VARIABLE] >= 0:
+        copy(scratch.points[root[codes.NODE_VARIABLE]], block.running)
+    elif runs_root(root):
         take_row(block, operand, 0, missing, block.running)
-        copy(block.running, numbers)
-    elif root[codes.NODE_A] >= 0:
-        copy(scratch.points[root[codes.NODE_VARIABLE]], numbers)
     else:
         recent, closing = recent_of(memory, scratch), scratch.closing
         begin, after = root_window(root, memory, block.last)
         begin = max(begin, base)
         _join_body(nodes, part, block, operand, begin, after, missing, is_cut, recent, closing)
-        copy(block.running, numbers)
-    if is_plain(part) and base > 0:
-        for k in range(count):
-            numbers[k] = max(table[0], min(numbers[k], table[1]))
+    enter_numbers(part, root, table, base, block, scratch, numbers)
     return 0
 
 
@@ -270,7 +273,7 @@ def set_last(table_at: int, number: int, which: int, channels: int, at: int) -> 
         if tables.parts[other, codes.PART_LAST_IN] != number:
             continue
         place = tables.parts[other, codes.PART_LAST_NODE]
-        is_joined = place == end - part[codes.PART_FIRST] and not runs_root(part, root)
+        is_joined = place == end - part[codes.PART_FIRST] and not runs_root(root)
         place = root[codes.NODE_B] if is_joined else place
         operand = operand_of(nodes, part, place, memory.columns[which], history, scratch)
         for k in range(block.last + 1 - block.since):
@@ -366,11 +369,11 @@ def run_block(
             continue
         if narrows:
             block[BLOCK_LOWEST] = find_begins(table_at, number, which, channels, narrows, 0, since, last)
-        for d in range(first, end if runs_root(part, root) else end - 1):
+        for d in range(first, end if runs_root(root) else end - 1):
             if nodes[d, codes.NODE_CODE] != codes.LITERAL:
                 _run_node(table_at, number, d, which, channels)
         memory.known[number, columns_number(which)] = last
-        if is_plain(part):
+        if not runs_root(root):
             unjoined = memory.unjoined[number]
             begin = min(scratch.begins[root[codes.NODE_B]], since)
             unjoined[columns_number(which)] = min(unjoined[columns_number(which)], begin)

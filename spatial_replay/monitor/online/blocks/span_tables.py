@@ -63,19 +63,26 @@ def _slide(
 
 
 @uncounted
-def _run_left(is_strong: bool, left: Floats, right: Floats, start: float, target: Floats) -> None:
-    """Run an operator with a left operand back from what it is after the last position, two at a time."""
-    value, whole = start, len(target) % 2
-    for k in range(len(target) - 2, whole - 1, -2):
+def _run_left(
+    is_strong: bool, left: Floats, right: Floats, least: float, most: float, worst: Floats, best: Floats
+) -> None:
+    """Run an operator with a left operand back from the least and the most that it is after the last position.
+
+    Both at once, and two positions at a time.
+    """
+    whole = len(worst) % 2
+    for k in range(len(worst) - 2, whole - 1, -2):
         # what two positions are together waits once for those after them
         both = either(is_strong, right[k], either(not is_strong, left[k], right[k + 1]))
         held = either(not is_strong, left[k], left[k + 1])
-        target[k + 1] = either(is_strong, right[k + 1], either(not is_strong, left[k + 1], value))
-        value = either(is_strong, both, either(not is_strong, held, value))
-        target[k] = value
+        worst[k + 1] = either(is_strong, right[k + 1], either(not is_strong, left[k + 1], least))
+        best[k + 1] = either(is_strong, right[k + 1], either(not is_strong, left[k + 1], most))
+        least = either(is_strong, both, either(not is_strong, held, least))
+        most = either(is_strong, both, either(not is_strong, held, most))
+        worst[k], best[k] = least, most
     for k in range(whole - 1, -1, -1):
-        value = either(is_strong, right[k], either(not is_strong, left[k], value))
-        target[k] = value
+        worst[k] = either(is_strong, right[k], either(not is_strong, left[k], least))
+        best[k] = either(is_strong, right[k], either(not is_strong, left[k], most))
 
 
 @uncounted
@@ -138,22 +145,27 @@ def _source_of(
 
 
 @uncounted
-def _run_corner(
-    is_strong: bool, is_ahead: bool, has_left: bool, left: Floats, right: Floats, start: float, row: Floats,
-    target: Floats,
+def _run_corners(
+    is_strong: bool, is_ahead: bool, has_left: bool, left: Floats, right: Floats, row: Floats, worst: Floats,
+    best: Floats,
 ) -> None:  # fmt: skip
-    """Run an operator without a window from one end of a span to the other."""
-    if not has_left and is_ahead:
-        extrema_from(is_strong, right, start, row, target)
-    elif not has_left:
-        extrema_up_to(is_strong, right, start, row, target)
+    """Run an operator without a window from one end of a span to the other, at the corners of its own row."""
+    if not has_left:
+        # where it begins with as much, or as little, as can be, it goes on with that
+        nothing, found, outdone = (-np.inf, worst, best) if is_strong else (np.inf, best, worst)
+        fill(outdone, -nothing)
+        if is_ahead:
+            extrema_from(is_strong, right, nothing, row, found)
+        else:
+            extrema_up_to(is_strong, right, nothing, row, found)
     elif is_ahead:
-        _run_left(is_strong, left, right, start, target)
+        _run_left(is_strong, left, right, -np.inf, np.inf, worst, best)
     else:
-        value = start
-        for k in range(len(target)):
-            value = either(is_strong, right[k], either(not is_strong, left[k], value))
-            target[k] = value
+        least, most = -np.inf, np.inf
+        for k in range(len(worst)):
+            least = either(is_strong, right[k], either(not is_strong, left[k], least))
+            most = either(is_strong, right[k], either(not is_strong, left[k], most))
+            worst[k], best[k] = least, most
 
 
 @uncounted
@@ -167,7 +179,7 @@ def fill_tables(table_at: int, number: int, which: int, channels: int, last: int
     """Compute what all nodes of a part are at the corners, in spans with tables, and over these spans."""
     tables, _, scratch, _ = arrays_at(table_at)
     part, nodes, first = tables.parts[number], tables.nodes, tables.parts[number, codes.PART_FIRST]
-    has_root = runs_root(part, nodes[part[codes.PART_END] - 1])
+    has_root = runs_root(nodes[part[codes.PART_END] - 1])
     for d in range(first, part[codes.PART_END]):
         code, place = nodes[d, codes.NODE_CODE], d - first
         if code in codes.BINARY_NODES and (has_root or d < part[codes.PART_END] - 1):
@@ -193,7 +205,9 @@ def _fill_joined(table_at: int, number: int, d: int, k: int, which: int, channel
     of_two = columns[first + b] if other < 0 else history[other]
     begin, end, has_left = span[BEGIN], span[END], node[codes.NODE_A] >= 0
     is_strong = code in (codes.PART_OR, codes.UNTIL, codes.PAST_SINCE)
-    for corner in range(corners_of(span)):
+    is_joined = code in (codes.PART_AND, codes.PART_OR)
+    # neighbouring corners of what has a row of its own differ in that alone
+    for corner in range(0, corners_of(span), 1 if is_joined else 2):
         two, base = _source_of(
             scratch.corner_columns[b], scratch.spans[b], span[RIGHT], span, corner, of_two, offset, lowest
         )
@@ -204,12 +218,12 @@ def _fill_joined(table_at: int, number: int, d: int, k: int, which: int, channel
             )
             left = one[begin - base : end - base]
         target = scratch.corner_columns[d - first, corner, begin - lowest : end - lowest]
-        if code in (codes.PART_AND, codes.PART_OR):
+        if is_joined:
             join(is_strong, left, right, target)
-        else:
-            start = np.inf if corner & 1 else -np.inf
-            is_ahead = code in (codes.UNTIL, codes.RELEASE)
-            _run_corner(is_strong, is_ahead, has_left, left, right, start, scratch.running, target)
+            continue
+        is_ahead = code in (codes.UNTIL, codes.RELEASE)
+        best = scratch.corner_columns[d - first, corner + 1, begin - lowest : end - lowest]
+        _run_corners(is_strong, is_ahead, has_left, left, right, scratch.running, target, best)
     return 0
 
 
@@ -223,7 +237,7 @@ def _fill_window(table_at: int, number: int, d: int, which: int, channels: int, 
     lowest, starts, afters = scratch.block[BLOCK_LOWEST], scratch.ends[0], scratch.ends[1]
     row, spare = scratch.running, scratch.extrema[0]
     place, node, root = d - first, nodes[d], part[codes.PART_END] - 1
-    is_root = d == root and not runs_root(part, nodes[root])
+    is_root = d == root and not runs_root(nodes[root])
     code, a = node[codes.NODE_CODE], node[codes.NODE_B] if is_root else node[codes.NODE_A]
     is_greatest = code in (codes.PART_WINDOW_MAX, codes.PAST_WINDOW_MAX, codes.UNTIL)
     signal, one, below = signal_of(nodes, first + a), scratch.spans[a], scratch.corner_columns[a]

@@ -6,7 +6,14 @@ from spatial_replay.compiled import apart, uncounted
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.blocks.block_ends import find_begins, is_beside_one
-from spatial_replay.monitor.online.blocks.block_run import PARTIAL, WHOLE, operand_of, set_first, set_last
+from spatial_replay.monitor.online.blocks.block_run import (
+    PARTIAL,
+    WHOLE,
+    enter_numbers,
+    operand_of,
+    set_first,
+    set_last,
+)
 from spatial_replay.monitor.online.blocks.span_rows import (
     block_of,
     join_body_spans,
@@ -26,7 +33,7 @@ from spatial_replay.monitor.online.open_windows import (
     runs_root,
 )
 from spatial_replay.monitor.online.run_arrays import arrays_at
-from spatial_replay.monitor.online.sliding import beyond, copy, enter_samples, recent_of
+from spatial_replay.monitor.online.sliding import beyond, enter_samples, recent_of
 from spatial_replay.monitor.online.state import (
     BLOCK,
     BLOCK_LAST,
@@ -53,7 +60,7 @@ def _takes_spans(nodes: Integers, part: Integers, memory: Memory, begins: Intege
     """Return whether spans can be found for a part, given where the rows of its nodes begin."""
     first, cells, tables_from = part[codes.PART_FIRST], memory.cells, cells_of(part)[2]
     root = nodes[part[codes.PART_END] - 1]
-    if part[codes.PART_VARIABLES] == 0 or (runs_root(part, root) and cells[part[codes.PART_CELL_START]] == 0):
+    if part[codes.PART_VARIABLES] == 0 or (runs_root(root) and cells[part[codes.PART_CELL_START]] == 0):
         return False
     takes = True
     for d in range(first, part[codes.PART_END]):
@@ -80,7 +87,7 @@ def _set_first_of_spans(
     nodes, part, block = tables.nodes, tables.parts[number], block_of(memory, scratch)
     first, end = part[codes.PART_FIRST], part[codes.PART_END] - 1
     look, root = look_of(which, channels), nodes[end]
-    if runs_root(part, root) or is_known(which, part, memory, block.since):
+    if runs_root(root) or is_known(which, part, memory, block.since):
         return int(set_first(table_at, number, which, channels, at))
     table = memory.tables[look.channel, part[codes.PART_TABLE_START] : tables_end(part)]
     mode = codes.OPEN_END if has_ended(part, root, memory, block.since) else look.mode
@@ -94,10 +101,7 @@ def _set_first_of_spans(
         scratch.block[BLOCK_NEWEST], scratch.spans[body], scratch.span_counts[body],
         scratch.wholes[end - first], scratch.closing,
     )  # fmt: skip
-    copy(block.running, numbers)
-    if base > 0:
-        for k in range(count):
-            numbers[k] = max(table[0], min(numbers[k], table[1]))
+    enter_numbers(part, root, table, base, block, scratch, numbers)
     return 0
 
 
