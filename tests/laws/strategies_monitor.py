@@ -152,6 +152,26 @@ past_over_windows = st.one_of(
     st.builds(Temporal, st.sampled_from(["F", "G"]), st.tuples(_since), _at_once),
 )
 """Past operators over windows ahead, most of which begin at once."""
+_alike = st.one_of(
+    st.builds(Bound, st.integers(0, 2), st.integers(2, 9), st.just("samples")),
+    st.builds(Bound, st.sampled_from([0, 0, 100, 250]), st.sampled_from([250, 600, 1100]), st.just("ns")),
+)
+
+
+def _two_of(bound):
+    window = st.builds(Temporal, st.sampled_from(["F", "G"]), st.tuples(_literals), st.just(bound))
+    joined = st.builds(Boolean, st.sampled_from(["and", "or", "->", "xor", "<->"]), st.tuples(window, window))
+    more = st.builds(Boolean, st.sampled_from(["and", "or"]), st.tuples(joined, st.one_of(window, _literals)))
+    return st.one_of(*[joined] * 4, more)
+
+
+_two = _alike.flatmap(_two_of)
+alike_windows = st.one_of(
+    *[st.builds(Temporal, st.sampled_from(["F", "G"]), st.tuples(_two))] * 4,
+    st.builds(Temporal, st.sampled_from(["F", "G"]), st.tuples(_two), _short),
+    responses(_two),
+)
+"""Windows that begin and end alike, of the same kind or of both."""
 _lasting = st.one_of(responses(windows_of(_literals, bounds)), windows_of(_literals, bounds))
 _from_later = st.one_of(
     st.builds(Bound, st.integers(1, 3), st.none(), st.just("samples")),

@@ -19,6 +19,7 @@ from laws.strategies_monitor import (
     NAMES,
     WORDS,
     Recording,
+    alike_windows,
     alternative_windows,
     bounds,
     cuts,
@@ -119,6 +120,12 @@ def test_windows_below_windows_equal_the_definitions(data, formula, run, room):
 @settings(max_examples=120)
 @given(data=st.data(), formula=alternative_windows, run=leaf_runs(max_size=30), room=st.integers(2, 64))
 def test_windows_beside_windows_equal_the_definitions(data, formula, run, room):
+    assert_as_defined(data, formula, run, room)
+
+
+@settings(max_examples=200)
+@given(data=st.data(), formula=alike_windows, run=leaf_runs(max_size=40), room=st.integers(2, 64))
+def test_windows_that_begin_and_end_alike_equal_the_definitions(data, formula, run, room):
     assert_as_defined(data, formula, run, room)
 
 

@@ -12,8 +12,16 @@ may be taken in any order: G (x and y) is G x and G y. So consider one clause, `
 With a left operand, `a R (…)`, p counts as the greater of p and every a before, and before the next sample,
 where what is open begins, that is all. Where `G` joins a window from the first sample on, p counts as
 infinite at positions outside, and what is open is the least that it can be until the window has closed. `F`
-and `U` are the same upside down. Two windows of different kinds in a clause, or one of the other kind over a
-window, are none of this: they stay with `windows`.
+and `U` are the same upside down.
+
+- *Both kinds and nothing else*, `G[l,h] b or F[l,h] c`: of the windows that are open, the later one begins, the
+  more is the least of b in it, and the less the greatest of c. So the least of all is where the two cross,
+  which only moves forward.
+- *The same kind twice and nothing else*, `G[0,h] b or G[0,h] c`: the least over all windows is that over any two
+  samples that one of them holds, max(b_j, c_k) or max(c_j, b_k), with k up to h behind j.
+
+Others with several windows, or with one of the other kind over a window, are none of this: they stay with
+`windows`.
 """
 
 from __future__ import annotations
@@ -143,6 +151,10 @@ class _Builder:
             return self._add_window(condition, rows[others[0]])
         if {rows[each][0] for each in others} == {self._other}:
             return self._add_windows(condition, [rows[each] for each in others])
+        windows = sorted((rows[each] for each in others), key=lambda row: row[0] != self._same)
+        if [row[0] for row in windows] in ([self._same, self._other], [self._same, self._same]):
+            is_whole = not literals and beside == NOTHING and self._left == NOTHING and self._ends is None
+            return is_whole and self._add_two(*windows)
         if all(self._unbounded(each) is not None for each in others):
             self._tabled.append((clause, NOTHING if beside == NOTHING else condition))
             return True
@@ -232,6 +244,33 @@ class _Builder:
             near = high
         self._ending += ending
         self._open += ending
+        return True
+
+    def _add_two(self, falling: Row, other: Row) -> bool:
+        """Add a clause of two windows and nothing else that begin and end alike, the first of the same kind.
+
+        While they are open, the first can only fall, and another kind only rise (below a strong root, the
+        other way round). Two of the same kind are as little as any two numbers in one window are.
+        """
+        unit, low, high = falling[4:7]
+        operands = {self._rows[window[1]][0] for window in (falling, other)}
+        if falling[4:7] != other[4:7] or operands != {codes.LITERAL}:
+            return False
+        if other[0] == self._same and low > 0:
+            return False  # between two samples there may be none that a window of both begins from
+        row, (first, second) = self._signals.row, (self._literal(each[1]) for each in (falling, other))
+        if other[0] == self._same:
+            behind = [row(self._window, each, 0, unit, 0, high) for each in (first, second)]
+            pairs = [row(self._either, *pair) for pair in zip((second, first), behind, strict=True)]
+            self._add_same(row(self._running, self._joined(pairs)))
+            return True
+        each = codes.CLOSED_EACH_MIN if self._is_weak else codes.CLOSED_EACH_MAX
+        found = row(each, row(codes.CONSTANT, low=1 if self._is_weak else -1), first, unit, low, high)
+        kind = codes.CLOSED_MIN_OF_MAX if self._is_weak else codes.CLOSED_MAX_OF_MIN
+        closed = row(kind, found, second, unit, low, high)
+        crossing = codes.CROSSING_MIN if self._is_weak else codes.CROSSING_MAX
+        self._settled.append(closed)
+        self._ending += [closed, row(crossing, first, second, unit, low, high)]
         return True
 
     def _add_later(self, condition: int, row: int) -> bool:

@@ -34,6 +34,9 @@ BEGUN_MIN, BEGUN_MAX = 13, 14  # min of max(a, max of b); max of min(a, min of b
 CLOSED_MIN_OF_MAX, CLOSED_MIN_OF_MIN, CLOSED_MAX_OF_MAX, CLOSED_MAX_OF_MIN = 17, 18, 19, 20
 # of each position whose window has closed, at that position: max(a, max of b); min(a, min of b)
 CLOSED_EACH_MAX, CLOSED_EACH_MIN = 29, 30
+# over the positions whose window [low, high] ahead has begun and is open, of extrema over what has come of it:
+# min of max(min of a, max of b), max of min(max of a, min of b)
+CROSSING_MIN, CROSSING_MAX = 32, 33
 # of a, over the positions that have come to be low back with the sample; infinite if there are none
 ARRIVED_MIN, ARRIVED_MAX = 21, 22
 # high times infinity once the first sample is at least low behind, the negative of that before
@@ -42,7 +45,8 @@ DELAYED = (DELAY, ARRIVED_MIN, ARRIVED_MAX)
 BEGUN = (BEGUN_MIN, BEGUN_MAX)
 CLOSED_EACH = (CLOSED_EACH_MAX, CLOSED_EACH_MIN)
 CLOSED = (CLOSED_MIN_OF_MAX, CLOSED_MIN_OF_MIN, CLOSED_MAX_OF_MAX, CLOSED_MAX_OF_MIN, *CLOSED_EACH)
-RINGS = (WINDOW_MAX, WINDOW_MIN, *BEGUN, *CLOSED)  # keep positions in a ring
+CROSSING = (CROSSING_MIN, CROSSING_MAX)  # keep positions in two rings
+RINGS = (WINDOW_MAX, WINDOW_MIN, *BEGUN, *CLOSED, *CROSSING)  # keep positions in a ring
 AHEAD = 16  # added to a code from ONCE on: its mirror image in time (see `finished`)
 
 # columns of parts' nodes

@@ -131,7 +131,7 @@ def is_plain(part: Integers) -> bool:
 @inlined
 def runs_root(root: Integers) -> bool:
     """Return whether the root has a column, which what joins everything from some position on needs not."""
-    return root[codes.NODE_A] >= 0 or root[codes.NODE_VARIABLE] < 0
+    return bool(root[codes.NODE_A] >= 0 or root[codes.NODE_VARIABLE] < 0)
 
 
 @inlined

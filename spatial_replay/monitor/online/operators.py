@@ -53,7 +53,8 @@ def _operands_of_row(row: Row) -> tuple[int, ...]:
     code, a, b, *_ = row
     if code in (codes.LEAF, codes.CONSTANT, codes.ELAPSED):
         return ()
-    return (a, b) if code in (codes.AND, codes.OR, codes.SINCE, *codes.BEGUN, *codes.CLOSED) else (a,)
+    binary = codes.AND, codes.OR, codes.SINCE, *codes.BEGUN, *codes.CLOSED, *codes.CROSSING
+    return (a, b) if code in binary else (a,)
 
 
 class SignalTable:
@@ -79,8 +80,8 @@ class SignalTable:
 
     @property
     def windows(self) -> int:
-        """How many rows keep a ring of positions."""
-        return sum(row[0] in codes.RINGS for row in self._rows)
+        """How many rings of positions the rows keep."""
+        return sum((row[0] in codes.RINGS) + (row[0] in codes.CROSSING) for row in self._rows)
 
     @property
     def keeps_history(self) -> bool:
@@ -95,8 +96,9 @@ class SignalTable:
             asked: for rows, who looks at them: cells that say whether these still do, -1 for who always does.
         """
         rings = [row for row in self._rows if row[0] in codes.RINGS]
-        rings.sort(key=lambda row: row[0] not in codes.BEGUN)
-        numbers = {row: number for number, row in enumerate(rings)}
+        rings.sort(key=lambda row: (row[0] not in codes.BEGUN, row[0] in codes.CROSSING))
+        single = sum(row[0] not in codes.CROSSING for row in rings)
+        numbers = {row: number + max(number - single, 0) for number, row in enumerate(rings)}
         looked_at, cells = set(kept), {number: set(asked.get(number, ())) for number in range(len(self))}
         for number, row in reversed([*enumerate(self._rows)]):
             operands = _operands_of_row(row)

@@ -92,6 +92,13 @@ def step_signals(
                     stamps, memory.wedges[ring, channel], memory.wedge_ends[ring, channel],
                     running[channel, s], history[channel, s],
                 )  # fmt: skip
+            elif code in codes.CROSSING:
+                ring = signals[s, 6]
+                _find_crossing(
+                    signals[s], history[channel, a], history[channel, b], target, position, offset, count,
+                    stamps, memory.wedges[ring, channel], memory.wedge_ends[ring, channel],
+                    memory.wedges[ring + 1, channel], memory.wedge_ends[ring + 1, channel],
+                )  # fmt: skip
             else:
                 _slide(
                     signals[s], history[channel, a], target, position, offset, count, stamps,
@@ -274,3 +281,72 @@ def _gather_begun(
             bottom += 1
         target[k] = heights[2, (top - 1) % size] if top > bottom else sign * np.inf
     state[0], state[1], state[2] = bottom, top, asking
+
+
+@inlined
+def _entry_from(
+    wedge: Integers, head: int, tail: int, at: int, unit: int, near: int, stamps: Integers, offset: int
+) -> int:
+    """Return the first entry of a wedge, from its head on, that the window ahead of a position holds."""
+    size = wedge.shape[0]
+    while head < tail and (
+        wedge[head % size] < at or _apart(stamps, offset, unit, at, wedge[head % size]) < near
+    ):
+        head += 1
+    return head
+
+
+@inlined
+def _entered(
+    wedge: Integers, head: int, tail: int, sign: float, source: Floats, offset: int, last: int
+) -> int:
+    """Have a sample enter a wedge of the greatest numbers, or of the least for -1; return the wedge's end."""
+    size, number = wedge.shape[0], sign * source[last - offset]
+    while tail > head and sign * source[wedge[(tail - 1) % size] - offset] <= number:
+        tail -= 1
+    wedge[tail % size] = last
+    return tail + 1
+
+
+@uncounted
+def _find_crossing(
+    signal: Integers, falling: Floats, rising: Floats, target: Floats, position: int, offset: int, count: int,
+    stamps: Integers, least: Integers, state: Integers, greatest: Integers, beside: Integers,
+) -> None:  # fmt: skip
+    """Compute the extremum, over open windows, of the greater of what falls and what rises with each sample.
+
+    For `CROSSING_MIN`, that is the least of a window's `falling` and the greatest of its `rising` so far. The
+    later a window begins, the greater is the one and the smaller the other. So the least of all is where they
+    cross: with the last window of those where `rising` is greater, or with the first of the others. Samples
+    only ever move windows from the others to those, and so the crossing forward. `CROSSING_MAX` mirrors it.
+    """
+    unit, near, far = signal[3], signal[4], signal[5]
+    sign = 1.0 if signal[0] == codes.CROSSING_MIN else -1.0
+    head, tail, at, opened = state[0], state[1], state[2], state[3]
+    other_head, other_tail = beside[0], beside[1]
+    size = least.shape[0]
+    for k in range(count):
+        last = position + k
+        tail = _entered(least, head, tail, -sign, falling, offset, last)
+        other_tail = _entered(greatest, other_head, other_tail, sign, rising, offset, last)
+        while opened <= last and is_closed(stamps, offset, last, opened, unit, far):
+            opened += 1
+        at = max(at, opened)
+        value = sign * np.inf
+        while at <= last and _apart(stamps, offset, unit, at, last) >= near:
+            head = _entry_from(least, head, tail, at, unit, near, stamps, offset)
+            entry = _entry_from(greatest, other_head, other_tail, at, unit, near, stamps, offset)
+            number = falling[least[head % size] - offset]
+            if sign * number >= sign * rising[greatest[entry % size] - offset]:
+                value = number
+                break
+            other_head = entry
+            at += 1
+        if at > opened:
+            # where the last of those before begins
+            other_head = _entry_from(greatest, other_head, other_tail, at - 1, unit, near, stamps, offset)
+            number = rising[greatest[other_head % size] - offset]
+            value = min(value, number) if sign > 0 else max(value, number)
+        target[k] = value
+    state[0], state[1], state[2], state[3] = head, tail, at, opened
+    beside[0], beside[1] = other_head, other_tail

@@ -214,7 +214,7 @@ def enter_numbers(
     part: Integers, root: Integers, table: Floats, base: int, block: SampleBlock, scratch: Scratch,
     numbers: Floats,
 ) -> None:  # fmt: skip
-    """Enter what a part's table says, given what the root is from the base on, which the running row holds."""
+    """Enter what a part says, by its table and by what the root is from the base on: the running row."""
     if base == 0:
         copy(block.running, numbers)
     elif is_plain(part):

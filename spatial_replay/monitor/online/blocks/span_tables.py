@@ -66,7 +66,7 @@ def _slide(
 def _run_left(
     is_strong: bool, left: Floats, right: Floats, least: float, most: float, worst: Floats, best: Floats
 ) -> None:
-    """Run an operator with a left operand back from the least and the most that it is after the last position.
+    """Run an operator with a left operand back from two numbers that it may be after the last position.
 
     Both at once, and two positions at a time.
     """
