@@ -14,11 +14,11 @@ where what is open begins, that is all. Where `G` joins a window from the first 
 infinite at positions outside, and what is open is the least that it can be until the window has closed. `F`
 and `U` are the same upside down.
 
-- *Both kinds and nothing else*, `G[l,h] b or F[l,h] c`: of the windows that are open, the later one begins, the
-  more is the least of b in it, and the less the greatest of c. So the least of all is where the two cross,
-  which only moves forward.
-- *The same kind twice and nothing else*, `G[0,h] b or G[0,h] c`: the least over all windows is that over any two
-  samples that one of them holds, max(b_j, c_k) or max(c_j, b_k), with k up to h behind j.
+- *Both kinds and nothing else*, `G[l,h] b or F[l,h] c`: the later a window that is open begins, the more is
+  the least of b in it, and the less the greatest of c. So the least of all is where the two cross, which
+  only moves forward.
+- *The same kind twice and nothing else*, `G[0,h] b or G[0,h] c`: the least over all windows is that over any
+  two samples that one of them holds, max(b_j, c_k) or max(c_j, b_k), with k up to h behind j.
 
 Others with several windows, or with one of the other kind over a window, are none of this: they stay with
 `windows`.

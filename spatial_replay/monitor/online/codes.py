@@ -34,8 +34,8 @@ BEGUN_MIN, BEGUN_MAX = 13, 14  # min of max(a, max of b); max of min(a, min of b
 CLOSED_MIN_OF_MAX, CLOSED_MIN_OF_MIN, CLOSED_MAX_OF_MAX, CLOSED_MAX_OF_MIN = 17, 18, 19, 20
 # of each position whose window has closed, at that position: max(a, max of b); min(a, min of b)
 CLOSED_EACH_MAX, CLOSED_EACH_MIN = 29, 30
-# over the positions whose window [low, high] ahead has begun and is open, of extrema over what has come of it:
-# min of max(min of a, max of b), max of min(max of a, min of b)
+# over the positions whose window [low, high] ahead has begun and is open, of extrema over what has come of
+# it: min of max(min of a, max of b), max of min(max of a, min of b)
 CROSSING_MIN, CROSSING_MAX = 32, 33
 # of a, over the positions that have come to be low back with the sample; infinite if there are none
 ARRIVED_MIN, ARRIVED_MAX = 21, 22
@@ -107,6 +107,7 @@ PART_NUMBERS = 23
 PART_WIDTH = 24
 ALL_NUMBERS = (1 << 8) - 1
 LAST_NUMBERS = 1 << 2 | 1 << 3  # what a part is at the last sample
+FIRST_NUMBERS = ALL_NUMBERS ^ LAST_NUMBERS  # what it is at the first one
 LOWER, UPPER = 4, 5  # its bounds, with uncertainty
 # kinds of parts
 TABLE, WINDOWED, CLAUSES = 0, 1, 2  # see `tables`, `windows`, `clauses`

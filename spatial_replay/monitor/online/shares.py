@@ -98,7 +98,7 @@ def open_share(program: Program, memory: Memory, left: int) -> float:
         nodes = program.nodes[part[codes.PART_FIRST] : part[codes.PART_END]]
         if part[codes.PART_KIND] != codes.WINDOWED or cast(Any, is_settled).interpreted()(part, memory):
             continue
-        if not part[codes.PART_NUMBERS] & ~codes.LAST_NUMBERS:
+        if not part[codes.PART_NUMBERS] & codes.FIRST_NUMBERS:
             continue  # said by another part
         if part[codes.PART_VARIABLES] == 0 and part[codes.PART_LAST_IN] != number:
             continue  # soon over
@@ -267,7 +267,7 @@ def bound_memory(program: Program, late: Memory, tables: Floats, channels: int) 
 
 
 def _parts_run(program: Program) -> Integers:
-    parts: Integers = program.parts[program.parts[:, codes.PART_NUMBERS] & ~codes.LAST_NUMBERS != 0]
+    parts: Integers = program.parts[program.parts[:, codes.PART_NUMBERS] & codes.FIRST_NUMBERS != 0]
     return parts
 
 
@@ -306,7 +306,7 @@ def _programs_of(program: Program, numbers: Integers) -> tuple[Program, Program]
 
     The second one computes none of the tree.
     """
-    numbers = numbers & program.parts[:, codes.PART_NUMBERS] & ~codes.LAST_NUMBERS
+    numbers = numbers & program.parts[:, codes.PART_NUMBERS] & codes.FIRST_NUMBERS
     for number, host in enumerate(program.parts[:, codes.PART_LAST_IN].tolist()):
         # what a part is at the last sample comes with the value of the one that says so
         if host >= 0:

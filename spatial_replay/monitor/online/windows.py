@@ -192,7 +192,7 @@ def run_windows(table_at: int, channels: int, count: int) -> int:
     tables, _, _, _ = arrays_at(table_at)
     for number in range(len(tables.parts)):
         part = tables.parts[number]
-        if part[codes.PART_KIND] == codes.WINDOWED and part[codes.PART_NUMBERS] & ~codes.LAST_NUMBERS:
+        if part[codes.PART_KIND] == codes.WINDOWED and part[codes.PART_NUMBERS] & codes.FIRST_NUMBERS:
             run_part(table_at, number, channels, 0, count, count)
     return 0
 
@@ -209,7 +209,7 @@ def run_part(table_at: int, number: int, channels: int, begin: int, end: int, co
         if is_settled(part, memory):
             for which in range(NUMBERS):
                 # what is now goes on, and is said by another part
-                if (own & ~codes.LAST_NUMBERS) >> which & 1:
+                if (own & codes.FIRST_NUMBERS) >> which & 1:
                     channel = look_of(which, channels).channel
                     numbers[which, k] = memory.tables[channel, part[codes.PART_TABLE_START]]
             continue
@@ -259,7 +259,7 @@ def _kept_from(table_at: int, last: int) -> int:
     for p in range(parts.shape[0]):
         part = parts[p]
         is_open = part[codes.PART_KIND] == codes.WINDOWED and not is_settled(part, memory)
-        if is_open and part[codes.PART_NUMBERS] & ~codes.LAST_NUMBERS:
+        if is_open and part[codes.PART_NUMBERS] & codes.FIRST_NUMBERS:
             base = min(memory.cells[part[codes.PART_CELL_START]], last)
             reach(table_at, p, base, last, last)
             for d in range(part[codes.PART_END] - part[codes.PART_FIRST]):

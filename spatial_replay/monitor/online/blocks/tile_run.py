@@ -65,7 +65,7 @@ def run_in_blocks(table_at: int, channels: int, count: int) -> int:
     position, stop = memory.clock[POSITION], count - 1 if channels == 4 else count
     for number in range(len(tables.parts)):
         part, k, state = tables.parts[number], 0, WHOLE
-        if part[codes.PART_KIND] != codes.WINDOWED or not part[codes.PART_NUMBERS] & ~codes.LAST_NUMBERS:
+        if part[codes.PART_KIND] != codes.WINDOWED or not part[codes.PART_NUMBERS] & codes.FIRST_NUMBERS:
             continue
         while k < count:
             if is_settled(part, memory):
