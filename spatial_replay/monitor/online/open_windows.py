@@ -129,9 +129,13 @@ def is_plain(part: Integers) -> bool:
 
 
 @inlined
-def runs_root(root: Integers) -> bool:
-    """Return whether the root has a column, which what joins everything from some position on needs not."""
-    return bool(root[codes.NODE_A] >= 0 or root[codes.NODE_VARIABLE] < 0)
+def runs_root(part: Integers, root: Integers) -> bool:
+    """Return whether the root has a column, which what joins everything from some position on needs not.
+
+    Nor does one whose left operand only says when its window is over: what it joins after that is neutral.
+    """
+    has_left = root[codes.NODE_A] >= 0 and part[codes.PART_ENDS_AT] < 0
+    return bool(has_left or root[codes.NODE_VARIABLE] < 0)
 
 
 @inlined
@@ -147,11 +151,8 @@ def is_over(part: Integers, memory: Memory, last: int) -> bool:
 
 @inlined
 def has_ended(part: Integers, root: Integers, memory: Memory, last: int) -> bool:
-    """Return whether the window of a part's root is over, where that is all that depends on a variable.
-
-    A root whose left operand says when its window ends joins nothing that comes later anyway.
-    """
-    return is_plain(part) and root[codes.NODE_HIGH] > 0 and is_over(part, memory, last)
+    """Return whether the window of a root that has no column is over, so that it joins nothing more."""
+    return not runs_root(part, root) and is_over(part, memory, last)
 
 
 @inlined
@@ -236,7 +237,7 @@ def bring_columns_up(table_at: int, number: int, looks: int, channels: int, last
             find_lows(table_at, number, last)
         since = max(memory.known[number, at] + 1, offset)
         memory.known[number, at] = last
-        has_root = runs_root(nodes[after - 1])
+        has_root = runs_root(part, nodes[after - 1])
         for d in range(first, after if has_root else after - 1):
             code = nodes[d, codes.NODE_CODE]
             if code == codes.LITERAL:

@@ -113,7 +113,7 @@ def _value_at_first(
         return known_number(which, part, memory, look.channel)
     has_more = not has_ended(part, root, memory, last)
     value = beyond(look.mode if has_more else codes.OPEN_END, root[codes.NODE_WEAK])
-    if runs_root(root):
+    if runs_root(part, root):
         value = memory.columns[at, part[codes.PART_END] - 1, base - offset] if base <= last else value
     else:
         begin, end = root_window(root, memory, last)
@@ -142,7 +142,7 @@ def _value_at_last(
 ) -> float:
     """Return what a node of a part is at the last sample, once the part's columns are brought up."""
     root = nodes[part[codes.PART_END] - 1]
-    if d < part[codes.PART_END] - 1 or runs_root(root):
+    if d < part[codes.PART_END] - 1 or runs_root(part, root):
         return float(memory.columns[which, d, last - offset])
     d = part[codes.PART_FIRST] + root[codes.NODE_B]
     signal = signal_of(nodes, d)

@@ -246,11 +246,11 @@ def set_first(table_at: int, number: int, which: int, channels: int, at: int) ->
     table = memory.tables[look.channel, part[codes.PART_TABLE_START] : tables_end(part)]
     mode = codes.OPEN_END if has_ended(part, root, memory, block.since) else look.mode
     missing = beyond(mode, root[codes.NODE_WEAK])
-    place = end - part[codes.PART_FIRST] if runs_root(root) else root[codes.NODE_B]
+    place = end - part[codes.PART_FIRST] if runs_root(part, root) else root[codes.NODE_B]
     operand = operand_of(nodes, part, place, columns, memory.history[look.channel], scratch)
-    if runs_root(root) and root[codes.NODE_VARIABLE] >= 0:
+    if runs_root(part, root) and root[codes.NODE_VARIABLE] >= 0:
         copy(scratch.points[root[codes.NODE_VARIABLE]], block.running)
-    elif runs_root(root):
+    elif runs_root(part, root):
         take_row(block, operand, 0, missing, block.running)
     else:
         recent, closing = recent_of(memory, scratch), scratch.closing
@@ -273,7 +273,7 @@ def set_last(table_at: int, number: int, which: int, channels: int, at: int) -> 
         if tables.parts[other, codes.PART_LAST_IN] != number:
             continue
         place = tables.parts[other, codes.PART_LAST_NODE]
-        is_joined = place == end - part[codes.PART_FIRST] and not runs_root(root)
+        is_joined = place == end - part[codes.PART_FIRST] and not runs_root(part, root)
         place = root[codes.NODE_B] if is_joined else place
         operand = operand_of(nodes, part, place, memory.columns[which], history, scratch)
         for k in range(block.last + 1 - block.since):
@@ -369,11 +369,11 @@ def run_block(
             continue
         if narrows:
             block[BLOCK_LOWEST] = find_begins(table_at, number, which, channels, narrows, 0, since, last)
-        for d in range(first, end if runs_root(root) else end - 1):
+        for d in range(first, end if runs_root(part, root) else end - 1):
             if nodes[d, codes.NODE_CODE] != codes.LITERAL:
                 _run_node(table_at, number, d, which, channels)
         memory.known[number, columns_number(which)] = last
-        if not runs_root(root):
+        if not runs_root(part, root):
             unjoined = memory.unjoined[number]
             begin = min(scratch.begins[root[codes.NODE_B]], since)
             unjoined[columns_number(which)] = min(unjoined[columns_number(which)], begin)

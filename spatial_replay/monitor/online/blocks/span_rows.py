@@ -231,7 +231,7 @@ def run_spans(table_at: int, number: int, which: int, channels: int, is_end: int
     nodes, part, block = tables.nodes, tables.parts[number], block_of(memory, scratch)
     columns = memory.columns[columns_number(which)]
     first, root = part[codes.PART_FIRST], part[codes.PART_END] - 1
-    has_root = runs_root(nodes[root])
+    has_root = runs_root(part, nodes[root])
     for d in range(first, part[codes.PART_END]):
         code, place = nodes[d, codes.NODE_CODE], d - first
         if code == codes.LITERAL:
@@ -319,7 +319,7 @@ def _run_window(table_at: int, number: int, d: int, which: int, channels: int) -
     nodes, part, look = tables.nodes, tables.parts[number], look_of(which, channels)
     columns, history = memory.columns[columns_number(which)], memory.history[look.channel]
     root = part[codes.PART_END] - 1
-    is_root = d == root and not runs_root(nodes[root])
+    is_root = d == root and not runs_root(part, nodes[root])
     recent, block, first = recent_of(memory, scratch), block_of(memory, scratch), part[codes.PART_FIRST]
     newest, joints, spare = scratch.block[BLOCK_NEWEST], scratch.joints, scratch.spare
     node, place, value = nodes[d], d - first, beyond(look.mode, nodes[d, codes.NODE_WEAK])

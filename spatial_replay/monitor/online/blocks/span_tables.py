@@ -179,7 +179,7 @@ def fill_tables(table_at: int, number: int, which: int, channels: int, last: int
     """Compute what all nodes of a part are at the corners, in spans with tables, and over these spans."""
     tables, _, scratch, _ = arrays_at(table_at)
     part, nodes, first = tables.parts[number], tables.nodes, tables.parts[number, codes.PART_FIRST]
-    has_root = runs_root(nodes[part[codes.PART_END] - 1])
+    has_root = runs_root(part, nodes[part[codes.PART_END] - 1])
     for d in range(first, part[codes.PART_END]):
         code, place = nodes[d, codes.NODE_CODE], d - first
         if code in codes.BINARY_NODES and (has_root or d < part[codes.PART_END] - 1):
@@ -237,7 +237,7 @@ def _fill_window(table_at: int, number: int, d: int, which: int, channels: int, 
     lowest, starts, afters = scratch.block[BLOCK_LOWEST], scratch.ends[0], scratch.ends[1]
     row, spare = scratch.running, scratch.extrema[0]
     place, node, root = d - first, nodes[d], part[codes.PART_END] - 1
-    is_root = d == root and not runs_root(nodes[root])
+    is_root = d == root and not runs_root(part, nodes[root])
     code, a = node[codes.NODE_CODE], node[codes.NODE_B] if is_root else node[codes.NODE_A]
     is_greatest = code in (codes.PART_WINDOW_MAX, codes.PAST_WINDOW_MAX, codes.UNTIL)
     signal, one, below = signal_of(nodes, first + a), scratch.spans[a], scratch.corner_columns[a]

@@ -312,7 +312,7 @@ def find_spans(table_at: int, number: int, which: int, channels: int, since: int
     nodes, part, mode = tables.nodes, tables.parts[number], look_of(which, channels).mode
     stamps, offset = memory.stamps, memory.clock[OFFSET]
     first, end = part[codes.PART_FIRST], part[codes.PART_END]
-    for d in range(first, end if runs_root(nodes[end - 1]) else end - 1):
+    for d in range(first, end if runs_root(part, nodes[end - 1]) else end - 1):
         place, node, spans = d - first, nodes[d], scratch.spans[d - first]
         code, begin = node[codes.NODE_CODE], scratch.begins[place]
         if code == codes.LITERAL:
@@ -338,7 +338,7 @@ def find_spans(table_at: int, number: int, which: int, channels: int, since: int
         if count < 0:
             return 0
         scratch.span_counts[place] = count
-    if runs_root(nodes[end - 1]):
+    if runs_root(part, nodes[end - 1]):
         return 1
     # the root joins whole spans, and none outside its window or before its base
     body, base = nodes[end - 1, codes.NODE_B], memory.cells[part[codes.PART_CELL_START]]

@@ -60,7 +60,7 @@ def _takes_spans(nodes: Integers, part: Integers, memory: Memory, begins: Intege
     """Return whether spans can be found for a part, given where the rows of its nodes begin."""
     first, cells, tables_from = part[codes.PART_FIRST], memory.cells, cells_of(part)[2]
     root = nodes[part[codes.PART_END] - 1]
-    if part[codes.PART_VARIABLES] == 0 or (runs_root(root) and cells[part[codes.PART_CELL_START]] == 0):
+    if part[codes.PART_VARIABLES] == 0 or (runs_root(part, root) and cells[part[codes.PART_CELL_START]] == 0):
         return False
     takes = True
     for d in range(first, part[codes.PART_END]):
@@ -87,7 +87,7 @@ def _set_first_of_spans(
     nodes, part, block = tables.nodes, tables.parts[number], block_of(memory, scratch)
     first, end = part[codes.PART_FIRST], part[codes.PART_END] - 1
     look, root = look_of(which, channels), nodes[end]
-    if runs_root(root) or is_known(which, part, memory, block.since):
+    if runs_root(part, root) or is_known(which, part, memory, block.since):
         return int(set_first(table_at, number, which, channels, at))
     table = memory.tables[look.channel, part[codes.PART_TABLE_START] : tables_end(part)]
     mode = codes.OPEN_END if has_ended(part, root, memory, block.since) else look.mode
