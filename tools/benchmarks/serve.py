@@ -39,6 +39,9 @@ FLAT = (
     "G ({a} S[0,60] F[0,60] {b})",
     "G ({b} S F[0,600] {c})",
     "G ({a} S[0,600] F[0,600] {b})",
+    "G ((F[0,600] {a}) <-> (F[0,600] {b}))",
+    "G ((F[0,600] {a}) -> (F[0,600] {b}))",
+    "G ((F[0,6000] {a}) xor {b})",
 )
 """Further formulas of which a change costs the same however wide their windows are."""
 OPEN = (
@@ -46,7 +49,6 @@ OPEN = (
     "G ({a} -> F ({b} and G[0,60] {c}))",
     "G[0,50000] ({a} -> F ({b} and F[0,60] {c}))",
     "G ({a} -> O[0,60] ({b} and F[0,60] {c}))",
-    "G ((F[0,60] {a}) <-> (F[0,60] {b}))",
 )
 """Formulas of which more is kept at each position that is open."""
 DEEP = (
@@ -66,6 +68,9 @@ WIDE = (
     "G ({a} -> X F[0,600] ({b} and X F[0,600] {c}))",
     "G ({a} -> H[0,60] F[0,60] {b})",
     "G ({a} S ({b} and F[0,60] {c}))",
+    "G ({a} -> F[0,600] ({b} U[0,600] {c}))",
+    "G ({a} -> {b} U[0,600] G[0,600] {c})",
+    "G[0,50000] ({a} -> F[0,6000] ({b} and F[0,6000] {c}))",
 )
 """Longer ones."""
 LONGEST = (
@@ -74,6 +79,8 @@ LONGEST = (
     "G ({a} S[0,600] ({b} and F[0,600] {c}))",
     "G ({a} -> {b} U ({c} and F[0,600] {a}))",
     "(G ({a} -> F[0,600] {b})) U (F[0,600] {c})",
+    "G[0,50000] ({a} -> F ({b} and F[0,600] {c}))",
+    "G ({a} -> O[0,6000] ({b} and F[0,6000] {c}))",
 )
 """What costs more, without a limit."""
 FALLING = (OPEN[0], DEEP[1], WIDE[1], WIDE[3], WIDE[4], WIDE[6])
