@@ -240,6 +240,23 @@ def leaf_runs(draw, max_size=14):
 
 
 @st.composite
+def ramps(draw, max_size=90):
+    """Runs whose leaves go one way for long, but for leaps, and whose samples come more often later on."""
+    size = draw(st.integers(20, max_size))
+    slow, pace = draw(st.integers(1, size)), draw(st.sampled_from([5, 20, 100]))
+    times = np.cumsum([0] + [100 if index < slow else pace for index in range(1, size)]).tolist()
+    exact = {}
+    for leaf in LEAVES:
+        level, slope = draw(st.sampled_from([-200.0, 0.0, 200.0])), draw(st.sampled_from([-1.0, 0.0, 1.0]))
+        leaps = draw(
+            st.dictionaries(st.integers(0, size - 1), st.sampled_from([-500.0, 500.0, -3.0]), max_size=3)
+        )
+        values = [leaps.get(index, level + slope * index) for index in range(size)]
+        exact[leaf.text] = tuple(Interval(value, value) for value in values)
+    return LeafRun(tuple(times), exact, exact, 1)
+
+
+@st.composite
 def _cells(draw, channels):
     value = float(draw(st.integers(-9, 9)))
     if channels > 1 and draw(st.integers(0, 6)) == 0:

@@ -18,6 +18,7 @@ from laws.strategies_monitor import (
     LEAVES,
     NAMES,
     WORDS,
+    LeafRun,
     Recording,
     alike_windows,
     alternative_windows,
@@ -28,6 +29,7 @@ from laws.strategies_monitor import (
     leaf_runs,
     nested_windows,
     past_over_windows,
+    ramps,
     recordings,
     responses,
     specifications,
@@ -127,6 +129,32 @@ def test_windows_beside_windows_equal_the_definitions(data, formula, run, room):
 @given(data=st.data(), formula=alike_windows, run=leaf_runs(max_size=40), room=st.integers(2, 64))
 def test_windows_that_begin_and_end_alike_equal_the_definitions(data, formula, run, room):
     assert_as_defined(data, formula, run, room)
+
+
+@settings(max_examples=60)
+@given(data=st.data(), formula=alike_windows, run=ramps(), room=st.integers(2, 16))
+def test_windows_alike_over_signals_that_go_one_way_equal_the_definitions(data, formula, run, room):
+    assert_as_defined(data, formula, run, room)
+
+
+@pytest.mark.parametrize("room", [8, 16])
+@pytest.mark.parametrize("outer", ["G", "F"])
+def test_windows_alike_equal_the_definitions_where_they_do_not_cross_for_long(outer, room):
+    """What is before all that is open is forgotten by then, and then there is room for more."""
+    early, size, sign = 3 * room, 7 * room, 1.0 if outer == "G" else -1.0
+    times = np.cumsum([0] + [250 if index <= early else 450 // room for index in range(1, size)])
+    falling = [sign * (-1e4 if index == early else 1e4) for index in range(size)]
+    rising = [-sign * index for index in range(size)]
+    numbers = {
+        leaf.text: tuple(Interval(value, value) for value in values)
+        for leaf, values in zip(LEAVES, (falling, rising, rising), strict=True)
+    }
+    run = LeafRun(tuple(times.tolist()), numbers, numbers, 1)
+    inner, bound = "F" if outer == "G" else "G", Bound(0, 1000, "ns")
+    windows = Temporal(outer, LEAVES[:1], bound), Temporal(inner, LEAVES[1:2], bound)
+    formula = Temporal(outer, (either(*windows) if outer == "G" else both(*windows),))
+    expected = numbers_of(formula, run.times_ns, run.nominal_leaf, run.nominal_leaf)
+    assert_same(run_of(formula, run, room=room), (expected.series, expected.final))
 
 
 @settings(max_examples=200)

@@ -9,19 +9,20 @@ may be taken in any order: G (x and y) is G x and G y. So consider one clause, `
 - *A window of the other kind*, `p or F[l,h] b`: what closed windows hold is settled, and b_j counts for all
   windows that have begun and are open, so those over which it is the greatest so far form a single segment.
 
+Of a clause of two windows that begin and end alike, and nothing else:
+
+- *One of each kind*, `G[l,h] b or F[l,h] c`: the later a window that is open begins, the more is the least of
+  b in it, and the less the greatest of c. So the least of all is where they cross, which only moves forward.
+- *Both of the same kind*, `G[0,h] b or G[0,h] c`: the least over all windows is that over any two samples
+  that one of them holds, max(b_j, c_k) or max(c_j, b_k), with k up to h behind j.
+
 With a left operand, `a R (…)`, p counts as the greater of p and every a before, and before the next sample,
 where what is open begins, that is all. Where `G` joins a window from the first sample on, p counts as
 infinite at positions outside, and what is open is the least that it can be until the window has closed. `F`
-and `U` are the same upside down.
+and `U` are the same upside down. Two windows alike have neither a left operand nor such a window.
 
-- *Both kinds and nothing else*, `G[l,h] b or F[l,h] c`: the later a window that is open begins, the more is
-  the least of b in it, and the less the greatest of c. So the least of all is where the two cross, which
-  only moves forward.
-- *The same kind twice and nothing else*, `G[0,h] b or G[0,h] c`: the least over all windows is that over any
-  two samples that one of them holds, max(b_j, c_k) or max(c_j, b_k), with k up to h behind j.
-
-Others with several windows, or with one of the other kind over a window, are none of this: they stay with
-`windows`.
+Other clauses with windows of both kinds, or with one of the other kind over a window, are none of this: they
+stay with `windows`.
 """
 
 from __future__ import annotations

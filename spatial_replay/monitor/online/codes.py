@@ -17,7 +17,7 @@ SAMPLES, NANOSECONDS = 0, 1
 # columns of signals
 SIGNAL_CODE, SIGNAL_A, SIGNAL_B, SIGNAL_UNIT, SIGNAL_LOW, SIGNAL_HIGH, SIGNAL_WINDOW = range(7)
 SIGNAL_IS_KEPT = 7  # whether it is looked at behind the newest sample, too
-SIGNAL_SETTLED = 8  # the cell that says whether it matters no more, -1 if it always does
+SIGNAL_SETTLED = 8  # the cell that says whether it matters no more, -1 if it always matters
 SIGNAL_WIDTH = 9
 OFFLINE_TARGET = 6  # of finished stretches: the column that a row writes, in place of the window
 OFFLINE_WIDTH = 7

@@ -130,7 +130,7 @@ def is_plain(part: Integers) -> bool:
 
 @inlined
 def runs_root(part: Integers, root: Integers) -> bool:
-    """Return whether the root has a column, which what joins everything from some position on needs not.
+    """Return whether the root has a column. One that joins all its operand from some position on needs none.
 
     Nor does one whose left operand only says when its window is over: what it joins after that is neutral.
     """
@@ -157,7 +157,7 @@ def has_ended(part: Integers, root: Integers, memory: Memory, last: int) -> bool
 
 @inlined
 def root_window(root: Integers, memory: Memory, last: int) -> tuple[int, int]:
-    """Return the first of the recent positions that a plain root joins, and what comes after the last one."""
+    """Return the first of the recent positions that a root joins, and what comes after the last one."""
     unit, near, far = root[codes.NODE_UNIT], root[codes.NODE_LOW], root[codes.NODE_HIGH]
     offset, start_ns = memory.clock[OFFSET], memory.clock[START_NS]
     begin, after = offset, last + 1

@@ -61,7 +61,7 @@ class Program:
         parts: (P, PART_WIDTH).
         reports: (N, REPORT_WIDTH), in the order of node ids.
         operands: ids of the nodes below each node of the tree, node after node.
-        windows: how many signals keep a ring of positions.
+        windows: how many rings of positions the signals keep.
         table_size: how many numbers the parts' tables hold for one channel.
         cells: how many rows of bookkeeping the parts need.
         timed: how many windows in seconds parts run over what is open.

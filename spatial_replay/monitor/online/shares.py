@@ -346,7 +346,7 @@ def joined_memory(programs: tuple[Program, Program], memories: tuple[Memory, Mem
     kept = int(memories[0].clock[OFFSET] > memories[1].clock[OFFSET])
     memory, other = memories[kept], memories[1 - kept]
     for part in programs[1 - kept].parts.tolist():
-        # what is made of signals is run by both
+        # signals are run by both, and whether they matter is said by the memory that they are in
         if part[codes.PART_NUMBERS] & 1 and part[codes.PART_KIND] != codes.CLAUSES:
             cell, table = part[codes.PART_CELL_START], part[codes.PART_TABLE_START]
             variables, tables = part[codes.PART_VARIABLES], part[codes.PART_TABLES]

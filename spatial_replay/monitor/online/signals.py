@@ -284,23 +284,27 @@ def _gather_begun(
 
 
 @inlined
-def _entry_from(
-    wedge: Integers, head: int, tail: int, at: int, unit: int, near: int, stamps: Integers, offset: int
-) -> int:
-    """Return the first entry of a wedge, from its head on, that the window ahead of a position holds."""
-    size = wedge.shape[0]
-    while head < tail and (
-        wedge[head % size] < at or _apart(stamps, offset, unit, at, wedge[head % size]) < near
-    ):
+def _first_from(wedge: Integers, head: int, tail: int, position: int) -> int:
+    """Return the first entry of a wedge that is not before a position."""
+    while head < tail and wedge[head % wedge.shape[0]] < position:
         head += 1
     return head
 
 
 @inlined
-def _entered(
-    wedge: Integers, head: int, tail: int, sign: float, source: Floats, offset: int, last: int
+def _first_within(
+    wedge: Integers, head: int, tail: int, at: int, unit: int, near: int, stamps: Integers, offset: int
 ) -> int:
-    """Have a sample enter a wedge of the greatest numbers, or of the least for -1; return the wedge's end."""
+    """Return the first entry of a wedge in the window ahead of a position, which is still open."""
+    size, head = wedge.shape[0], _first_from(wedge, head, tail, at)
+    while head < tail and _apart(stamps, offset, unit, at, wedge[head % size]) < near:
+        head += 1
+    return head
+
+
+@inlined
+def _push(wedge: Integers, head: int, tail: int, sign: float, source: Floats, offset: int, last: int) -> int:
+    """Push a sample onto a wedge of the greatest numbers, or for -1 of the least; return its new end."""
     size, number = wedge.shape[0], sign * source[last - offset]
     while tail > head and sign * source[wedge[(tail - 1) % size] - offset] <= number:
         tail -= 1
@@ -311,42 +315,47 @@ def _entered(
 @uncounted
 def _find_crossing(
     signal: Integers, falling: Floats, rising: Floats, target: Floats, position: int, offset: int, count: int,
-    stamps: Integers, least: Integers, state: Integers, greatest: Integers, beside: Integers,
+    stamps: Integers, of_falling: Integers, falling_ends: Integers, of_rising: Integers,
+    rising_ends: Integers,
 ) -> None:  # fmt: skip
     """Compute the extremum, over open windows, of the greater of what falls and what rises with each sample.
 
-    For `CROSSING_MIN`, that is the least of a window's `falling` and the greatest of its `rising` so far. The
-    later a window begins, the greater is the one and the smaller the other. So the least of all is where they
-    cross: with the last window of those where `rising` is greater, or with the first of the others. Samples
-    only ever move windows from the others to those, and so the crossing forward. `CROSSING_MAX` mirrors it.
+    For `CROSSING_MIN`, that is the least of a window's `falling` and the greatest of its `rising` so far.
+    The later a window begins, the greater is the one and the smaller the other. So the least of all is where
+    they cross: with the first window in which `falling` is as great, or with the one before. Samples only
+    ever move the crossing forward. `CROSSING_MAX` mirrors it.
+
+    Each has a wedge of its own, without entries before the first open window, which may be forgotten.
     """
     unit, near, far = signal[3], signal[4], signal[5]
-    sign = 1.0 if signal[0] == codes.CROSSING_MIN else -1.0
-    head, tail, at, opened = state[0], state[1], state[2], state[3]
-    other_head, other_tail = beside[0], beside[1]
-    size = least.shape[0]
+    sign, size = 1.0 if signal[0] == codes.CROSSING_MIN else -1.0, of_falling.shape[0]
+    fell, fell_end, crossing, opened = falling_ends[0], falling_ends[1], falling_ends[2], falling_ends[3]
+    rose, rose_end = rising_ends[0], rising_ends[1]
     for k in range(count):
         last = position + k
-        tail = _entered(least, head, tail, -sign, falling, offset, last)
-        other_tail = _entered(greatest, other_head, other_tail, sign, rising, offset, last)
         while opened <= last and is_closed(stamps, offset, last, opened, unit, far):
             opened += 1
-        at = max(at, opened)
+        crossing = max(crossing, opened)
+        fell = _first_from(of_falling, fell, fell_end, opened)
+        rose = _first_from(of_rising, rose, rose_end, opened)
+        fell_end = _push(of_falling, fell, fell_end, -sign, falling, offset, last)
+        rose_end = _push(of_rising, rose, rose_end, sign, rising, offset, last)
         value = sign * np.inf
-        while at <= last and _apart(stamps, offset, unit, at, last) >= near:
-            head = _entry_from(least, head, tail, at, unit, near, stamps, offset)
-            entry = _entry_from(greatest, other_head, other_tail, at, unit, near, stamps, offset)
-            number = falling[least[head % size] - offset]
-            if sign * number >= sign * rising[greatest[entry % size] - offset]:
+        while crossing <= last and _apart(stamps, offset, unit, crossing, last) >= near:
+            fell = _first_within(of_falling, fell, fell_end, crossing, unit, near, stamps, offset)
+            entry = _first_within(of_rising, rose, rose_end, crossing, unit, near, stamps, offset)
+            if crossing == opened:
+                rose = entry  # no window before is open
+            number = falling[of_falling[fell % size] - offset]
+            if sign * number >= sign * rising[of_rising[entry % size] - offset]:
                 value = number
                 break
-            other_head = entry
-            at += 1
-        if at > opened:
-            # where the last of those before begins
-            other_head = _entry_from(greatest, other_head, other_tail, at - 1, unit, near, stamps, offset)
-            number = rising[greatest[other_head % size] - offset]
+            rose = entry
+            crossing += 1
+        if crossing > opened:
+            rose = _first_within(of_rising, rose, rose_end, crossing - 1, unit, near, stamps, offset)
+            number = rising[of_rising[rose % size] - offset]
             value = min(value, number) if sign > 0 else max(value, number)
         target[k] = value
-    state[0], state[1], state[2], state[3] = head, tail, at, opened
-    beside[0], beside[1] = other_head, other_tail
+    falling_ends[0], falling_ends[1], falling_ends[2], falling_ends[3] = fell, fell_end, crossing, opened
+    rising_ends[0], rising_ends[1] = rose, rose_end

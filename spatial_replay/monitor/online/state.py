@@ -75,8 +75,8 @@ class Memory(NamedTuple):
         stamps: (room,), their times in ns.
         running: (CHANNELS, S), every signal at the last sample.
         firsts: (CHANNELS, S), every signal at the first sample.
-        wedges: (W, CHANNELS, room), for each signal with a ring its positions.
-        wedge_ends: (W, CHANNELS, 4), how many positions ever left and entered it, and the next ones to come.
+        wedges: (W, CHANNELS, room), the positions in each ring of a signal.
+        wedge_ends: (W, CHANNELS, 4), how many ever left and entered it, and where its signal goes on.
         wedge_next: (W,), the next position to enter a sliding window.
         heights: (B, CHANNELS, 3, room), numbers beside the positions of the first rings.
         tables: (CHANNELS, ...), the parts' tables (see `tables`).
@@ -296,7 +296,7 @@ def with_room(memory: Memory, room: int, channels: int, signals: Integers) -> Me
 
     Args:
         room: that of the memory, doubled any number of times.
-        signals: (S, 8), those of the program; of some, only the newest sample is looked at.
+        signals: (S, SIGNAL_WIDTH), those of the program; of some, only the newest sample is looked at.
     """
     old = len(memory.stamps)
     history = np.empty((*memory.history.shape[:2], room))

@@ -140,6 +140,7 @@ def _step_channel(
     if position == 0:
         _start(nodes, part, table, values)
     elif table[0] == table[corners - 1]:
+        # it says the same whatever comes
         for k in range(count):
             ends[k] = lows[k] = highs[k] = table[0]
         return

@@ -7,8 +7,8 @@ columns of numbers (see `open_windows`), which are read into the table. A past o
 operator below it carries a table of its own from base to base.
 
 A part's cells hold: the base, as the next position to absorb; for each variable, its position in the table;
-for each table of a past operator, the position it belongs to (-1: before the first). That of a part made of
-signals is 1 once these matter no more.
+for each table of a past operator, the position it belongs to (-1: before the first). A part made of signals
+has one cell, which is 1 once these matter no more.
 """
 
 from __future__ import annotations

@@ -151,13 +151,13 @@ def _run_corners(
 ) -> None:  # fmt: skip
     """Run an operator without a window from one end of a span to the other, at the corners of its own row."""
     if not has_left:
-        # where it begins with as much, or as little, as can be, it goes on with that
-        nothing, found, outdone = (-np.inf, worst, best) if is_strong else (np.inf, best, worst)
-        fill(outdone, -nothing)
+        # at one corner, it begins with as much, or as little, as can be, and goes on with that
+        neutral, joined, constant = (-np.inf, worst, best) if is_strong else (np.inf, best, worst)
+        fill(constant, -neutral)
         if is_ahead:
-            extrema_from(is_strong, right, nothing, row, found)
+            extrema_from(is_strong, right, neutral, row, joined)
         else:
-            extrema_up_to(is_strong, right, nothing, row, found)
+            extrema_up_to(is_strong, right, neutral, row, joined)
     elif is_ahead:
         _run_left(is_strong, left, right, -np.inf, np.inf, worst, best)
     else:
