@@ -148,11 +148,7 @@ def _slide(
     for k in range(count):
         here = position + k
         while entering <= here and _apart(stamps, offset, unit, entering, here) >= near:
-            value = sign * source[entering - offset]
-            while tail > head and sign * source[wedge[(tail - 1) % size] - offset] <= value:
-                tail -= 1
-            wedge[tail % size] = entering
-            tail += 1
+            tail = _push(wedge, head, tail, sign, source, offset, entering)
             entering += 1
         # what is forgotten is farther than any window reaches
         while tail > head and (
@@ -167,6 +163,37 @@ def _slide(
 def _apart(stamps: Integers, offset: int, unit: int, position: int, later: int) -> int:
     """Return how far a position is ahead of another, in the unit of a window."""
     return later - position if unit == codes.SAMPLES else stamps[later - offset] - stamps[position - offset]
+
+
+@inlined
+def _first_from(wedge: Integers, head: int, tail: int, position: int) -> int:
+    """Return the first entry of a wedge that is not before a position."""
+    while head < tail and wedge[head % wedge.shape[0]] < position:
+        head += 1
+    return head
+
+
+@inlined
+def _first_within(
+    wedge: Integers, head: int, tail: int, at: int, unit: int, near: int, stamps: Integers, offset: int
+) -> int:
+    """Return the first entry of a wedge in the window ahead of a position, which is still open."""
+    size, head = wedge.shape[0], _first_from(wedge, head, tail, at)
+    while head < tail and _apart(stamps, offset, unit, at, wedge[head % size]) < near:
+        head += 1
+    return head
+
+
+@inlined
+def _push(
+    wedge: Integers, head: int, tail: int, sign: float, source: Floats, offset: int, position: int
+) -> int:
+    """Push a position onto a wedge of the greatest numbers, or for -1 of the least; return its new end."""
+    size, number = wedge.shape[0], sign * source[position - offset]
+    while tail > head and sign * source[wedge[(tail - 1) % size] - offset] <= number:
+        tail -= 1
+    wedge[tail % size] = position
+    return tail + 1
 
 
 @uncounted
@@ -212,17 +239,10 @@ def _gather_closed(
         last = position + k
         while asking <= last and is_closed(stamps, offset, last, asking, unit, far):
             # what lies before `asking` may be forgotten already
-            while tail > head and (
-                wedge[head % size] < asking or _apart(stamps, offset, unit, asking, wedge[head % size]) < near
-            ):
-                head += 1
+            head = _first_within(wedge, head, tail, asking, unit, near, stamps, offset)
             while entering <= last and _apart(stamps, offset, unit, asking, entering) <= far:
                 if _apart(stamps, offset, unit, asking, entering) >= near:
-                    number = sign * source[entering - offset]
-                    while tail > head and sign * source[wedge[(tail - 1) % size] - offset] <= number:
-                        tail -= 1
-                    wedge[tail % size] = entering
-                    tail += 1
+                    tail = _push(wedge, head, tail, sign, source, offset, entering)
                 entering += 1
             found = source[wedge[head % size] - offset] if tail > head else -sign * np.inf
             condition = conditions[asking - offset]
@@ -281,35 +301,6 @@ def _gather_begun(
             bottom += 1
         target[k] = heights[2, (top - 1) % size] if top > bottom else sign * np.inf
     state[0], state[1], state[2] = bottom, top, asking
-
-
-@inlined
-def _first_from(wedge: Integers, head: int, tail: int, position: int) -> int:
-    """Return the first entry of a wedge that is not before a position."""
-    while head < tail and wedge[head % wedge.shape[0]] < position:
-        head += 1
-    return head
-
-
-@inlined
-def _first_within(
-    wedge: Integers, head: int, tail: int, at: int, unit: int, near: int, stamps: Integers, offset: int
-) -> int:
-    """Return the first entry of a wedge in the window ahead of a position, which is still open."""
-    size, head = wedge.shape[0], _first_from(wedge, head, tail, at)
-    while head < tail and _apart(stamps, offset, unit, at, wedge[head % size]) < near:
-        head += 1
-    return head
-
-
-@inlined
-def _push(wedge: Integers, head: int, tail: int, sign: float, source: Floats, offset: int, last: int) -> int:
-    """Push a sample onto a wedge of the greatest numbers, or for -1 of the least; return its new end."""
-    size, number = wedge.shape[0], sign * source[last - offset]
-    while tail > head and sign * source[wedge[(tail - 1) % size] - offset] <= number:
-        tail -= 1
-    wedge[tail % size] = last
-    return tail + 1
 
 
 @uncounted

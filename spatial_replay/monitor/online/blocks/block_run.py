@@ -246,11 +246,12 @@ def set_first(table_at: int, number: int, which: int, channels: int, at: int) ->
     table = memory.tables[look.channel, part[codes.PART_TABLE_START] : tables_end(part)]
     mode = codes.OPEN_END if has_ended(part, root, memory, block.since) else look.mode
     missing = beyond(mode, root[codes.NODE_WEAK])
-    place = end - part[codes.PART_FIRST] if runs_root(part, root) else root[codes.NODE_B]
+    has_root = runs_root(part, root)
+    place = end - part[codes.PART_FIRST] if has_root else root[codes.NODE_B]
     operand = operand_of(nodes, part, place, columns, memory.history[look.channel], scratch)
-    if runs_root(part, root) and root[codes.NODE_VARIABLE] >= 0:
+    if has_root and root[codes.NODE_VARIABLE] >= 0:
         copy(scratch.points[root[codes.NODE_VARIABLE]], block.running)
-    elif runs_root(part, root):
+    elif has_root:
         take_row(block, operand, 0, missing, block.running)
     else:
         recent, closing = recent_of(memory, scratch), scratch.closing
