@@ -2,7 +2,7 @@
 
 Extrema over windows are computed by doubling: over 1, 2, 4, … numbers from each on, of which any two cover a
 window. Each of these passes is a plain loop over neighbouring numbers, which the compiler turns into vector
-instructions. Extrema from each number on, or up to each, are found by doubling within rows of numbers.
+instructions.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from spatial_replay.compiled import inlined, row_fold, row_loop, uncounted
+from spatial_replay.compiled import inlined, row_fold, uncounted
 from spatial_replay.compiler import ROW, Lanes
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
@@ -21,8 +21,6 @@ NEAR = 16
 """So far behind the last sample, what a window in seconds begins with is found by walking back."""
 STRIDE = 16
 """So many numbers are filled with one at a time, at first."""
-_APART = tuple(1 << doubled for doubled in range(ROW.bit_length() - 1))
-"""So many places apart, one after the other, numbers of a row are joined until each has all from it on."""
 
 
 class Recent(NamedTuple):
@@ -116,111 +114,6 @@ def extremum(is_greatest: bool, source: Floats, start: float) -> float:
         for k in range(whole, count):
             value = min(value, source[k])
     return value
-
-
-def _greatest_back(lanes: Lanes, row: Any, numbers: Any) -> Any:
-    for by in _APART:
-        numbers = lanes.greater(numbers, lanes.moved(numbers, by))
-    found = lanes.greater(row, numbers)
-    return lanes.spread(found, 0), found
-
-
-def _least_back(lanes: Lanes, row: Any, numbers: Any) -> Any:
-    for by in _APART:
-        numbers = lanes.lesser(numbers, lanes.moved(numbers, by))
-    found = lanes.lesser(row, numbers)
-    return lanes.spread(found, 0), found
-
-
-def _greatest_on(lanes: Lanes, row: Any, numbers: Any) -> Any:
-    for by in _APART:
-        numbers = lanes.greater(numbers, lanes.moved(numbers, -by))
-    found = lanes.greater(row, numbers)
-    return lanes.spread(found, ROW - 1), found
-
-
-def _least_on(lanes: Lanes, row: Any, numbers: Any) -> Any:
-    for by in _APART:
-        numbers = lanes.lesser(numbers, lanes.moved(numbers, -by))
-    found = lanes.lesser(row, numbers)
-    return lanes.spread(found, ROW - 1), found
-
-
-def _greatest_on_beside(lanes: Lanes, row: Any, numbers: Any, before: Any) -> Any:
-    row, found = _greatest_on(lanes, row, numbers)
-    return row, lanes.greater(before, found)
-
-
-def _least_on_beside(lanes: Lanes, row: Any, numbers: Any, before: Any) -> Any:
-    row, found = _least_on(lanes, row, numbers)
-    return row, lanes.lesser(before, found)
-
-
-_run_greatest_back = row_loop(backwards=True)(_greatest_back)
-_run_least_back = row_loop(backwards=True)(_least_back)
-_run_greatest_on, _run_least_on = row_loop()(_greatest_on), row_loop()(_least_on)
-_join_greatest_on, _join_least_on = row_loop()(_greatest_on_beside), row_loop()(_least_on_beside)
-
-
-@uncounted
-def extrema_from(is_greatest: bool, source: Floats, start: float, row: Floats, target: Floats) -> None:
-    """Enter the extremum of a number and of all numbers from each on.
-
-    Args:
-        row: (ROW,), room to work in.
-    """
-    count, value = len(target), start
-    rest = count % ROW
-    if count >= ROW:
-        row[:] = start
-        shape = count // ROW, ROW
-        numbers, rows = source[rest:count].reshape(shape), target[rest:].reshape(shape)
-        if is_greatest:
-            _run_greatest_back(row, numbers, rows)
-        else:
-            _run_least_back(row, numbers, rows)
-        value = row[0]
-    for k in range(1, rest + 1):
-        value = either(is_greatest, value, source[rest - k])
-        target[rest - k] = value
-
-
-@uncounted
-def extrema_up_to(is_greatest: bool, source: Floats, start: float, row: Floats, target: Floats) -> None:
-    """Enter the extremum of a number and of all numbers up to each (see `extrema_from`)."""
-    count, value = len(target), start
-    whole = count - count % ROW
-    if count >= ROW:
-        row[:] = start
-        shape = count // ROW, ROW
-        numbers, rows = source[:whole].reshape(shape), target[:whole].reshape(shape)
-        if is_greatest:
-            _run_greatest_on(row, numbers, rows)
-        else:
-            _run_least_on(row, numbers, rows)
-        value = row[0]
-    for k in range(whole, count):
-        value = either(is_greatest, value, source[k])
-        target[k] = value
-
-
-@uncounted
-def join_extrema_up_to(is_greatest: bool, source: Floats, start: float, row: Floats, target: Floats) -> None:
-    """Join numbers with what `extrema_up_to` enters."""
-    count, value = len(target), start
-    whole = count - count % ROW
-    if count >= ROW:
-        row[:] = start
-        shape = count // ROW, ROW
-        numbers, rows = source[:whole].reshape(shape), target[:whole].reshape(shape)
-        if is_greatest:
-            _join_greatest_on(row, numbers, rows, rows)
-        else:
-            _join_least_on(row, numbers, rows, rows)
-        value = row[0]
-    for k in range(whole, count):
-        value = either(is_greatest, value, source[k])
-        target[k] = either(is_greatest, target[k], value)
 
 
 @uncounted

@@ -17,6 +17,7 @@ import numpy as np
 
 from spatial_replay.compiled import inlined, uncounted
 from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.monitor.online.blocks.column_scans import extrema_from
 from spatial_replay.monitor.online.blocks.row_loops import (
     extend,
     extend_from,
@@ -34,7 +35,7 @@ from spatial_replay.monitor.online.blocks.row_loops import (
     run_on,
     run_unbounded,
 )
-from spatial_replay.monitor.online.sliding import extrema_from, extremum
+from spatial_replay.monitor.online.sliding import extremum
 
 
 class SampleBlock(NamedTuple):

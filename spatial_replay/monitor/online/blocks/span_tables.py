@@ -12,6 +12,12 @@ from spatial_replay.compiled import apart, inlined, uncounted
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.blocks.block_ends import find_ends
+from spatial_replay.monitor.online.blocks.column_scans import (
+    extrema_from,
+    extrema_up_to,
+    found_along,
+    join_extrema_up_to,
+)
 from spatial_replay.monitor.online.blocks.spans import (
     BEGIN,
     END,
@@ -28,17 +34,7 @@ from spatial_replay.monitor.online.blocks.spans import (
 from spatial_replay.monitor.online.node_columns import columns_number, look_of, signal_of
 from spatial_replay.monitor.online.open_windows import runs_root
 from spatial_replay.monitor.online.run_arrays import arrays_at
-from spatial_replay.monitor.online.sliding import (
-    beyond,
-    either,
-    extrema_from,
-    extrema_up_to,
-    extremum,
-    fill,
-    join,
-    join_extrema_up_to,
-    recent_of,
-)
+from spatial_replay.monitor.online.sliding import beyond, either, extremum, fill, join, recent_of
 from spatial_replay.monitor.online.state import (
     BLOCK_LOWEST,
     OFFSET,
@@ -60,29 +56,6 @@ def _slide(
         _join_left(is_greatest, source, base, some, False, middle, row, spare, target[first:until])
         _join_right(is_greatest, source, base, middle, others, False, row, spare, target[first:until])
         first = until
-
-
-@uncounted
-def _run_left(
-    is_strong: bool, left: Floats, right: Floats, least: float, most: float, worst: Floats, best: Floats
-) -> None:
-    """Run an operator with a left operand back from two numbers that it may be after the last position.
-
-    Both at once, and two positions at a time.
-    """
-    whole = len(worst) % 2
-    for k in range(len(worst) - 2, whole - 1, -2):
-        # what two positions are together waits once for those after them
-        both = either(is_strong, right[k], either(not is_strong, left[k], right[k + 1]))
-        held = either(not is_strong, left[k], left[k + 1])
-        worst[k + 1] = either(is_strong, right[k + 1], either(not is_strong, left[k + 1], least))
-        best[k + 1] = either(is_strong, right[k + 1], either(not is_strong, left[k + 1], most))
-        least = either(is_strong, both, either(not is_strong, held, least))
-        most = either(is_strong, both, either(not is_strong, held, most))
-        worst[k], best[k] = least, most
-    for k in range(whole - 1, -1, -1):
-        worst[k] = either(is_strong, right[k], either(not is_strong, left[k], least))
-        best[k] = either(is_strong, right[k], either(not is_strong, left[k], most))
 
 
 @uncounted
@@ -149,23 +122,25 @@ def _run_corners(
     is_strong: bool, is_ahead: bool, has_left: bool, left: Floats, right: Floats, row: Floats, worst: Floats,
     best: Floats,
 ) -> None:  # fmt: skip
-    """Run an operator without a window from one end of a span to the other, at the corners of its own row."""
+    """Run an operator without a window from one end of a span to the other, at the corners of its own row.
+
+    At one of these, nothing comes to what is found on the way; at the other, as much, or as little, as the
+    left operand has let through up to there.
+    """
+    neutral, found, passed = (-np.inf, worst, best) if is_strong else (np.inf, best, worst)
     if not has_left:
-        # at one corner, it begins with as much, or as little, as can be, and goes on with that
-        neutral, joined, constant = (-np.inf, worst, best) if is_strong else (np.inf, best, worst)
-        fill(constant, -neutral)
+        fill(passed, -neutral)
         if is_ahead:
-            extrema_from(is_strong, right, neutral, row, joined)
+            extrema_from(is_strong, right, neutral, row, found)
         else:
-            extrema_up_to(is_strong, right, neutral, row, joined)
-    elif is_ahead:
-        _run_left(is_strong, left, right, -np.inf, np.inf, worst, best)
+            extrema_up_to(is_strong, right, neutral, row, found)
+        return
+    found_along(is_strong, is_ahead, left, right, row, found)
+    if is_ahead:
+        extrema_from(not is_strong, left, -neutral, row, passed)
     else:
-        least, most = -np.inf, np.inf
-        for k in range(len(worst)):
-            least = either(is_strong, right[k], either(not is_strong, left[k], least))
-            most = either(is_strong, right[k], either(not is_strong, left[k], most))
-            worst[k], best[k] = least, most
+        extrema_up_to(not is_strong, left, -neutral, row, passed)
+    join(is_strong, found, passed, passed)
 
 
 @uncounted
