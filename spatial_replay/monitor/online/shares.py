@@ -85,8 +85,8 @@ def open_share(program: Program, memory: Memory, left: int) -> float:
     """Return how much of what windows span is open in a run, infinity if never less than all of it.
 
     Where what a root joins is outdone by what it is already, positions matter no more long before their
-    windows close (see `closing`), so that one thread is as fast as several. 0 if windows close for the first
-    time soon.
+    windows close (see `closing`), so that one thread is as fast as several. All of them matter to what a past
+    operator is at the last sample, though. 0 if windows close for the first time soon.
 
     Args:
         left: the samples that are to be run.
@@ -107,7 +107,8 @@ def open_share(program: Program, memory: Memory, left: int) -> float:
         far, is_counted = nodes[-1, codes.NODE_HIGH], nodes[-1, codes.NODE_UNIT] == codes.SAMPLES
         if far > 0 and far * (1 if is_counted else per_ns) + width - position <= left * _SOON:
             continue
-        if part[codes.PART_LIMIT] < 0 and part[codes.PART_OUTDONE_BY] == codes.BY_NOTHING:
+        is_outdone = part[codes.PART_LIMIT] >= 0 or part[codes.PART_OUTDONE_BY] != codes.BY_NOTHING
+        if part[codes.PART_IS_REMEMBERING] or not is_outdone:
             return np.inf
         if base > 0:
             # what closes within a block is absorbed with it
