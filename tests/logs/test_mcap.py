@@ -350,7 +350,7 @@ def test_what_is_read_and_written_does_not_depend_on_the_number_of_cores(log, tm
 
 
 def test_blocks_may_end_within_chunks_of_samples_that_others_overlap(tmp_path):
-    trace, path = moving_cup(1_300, 10**7), tmp_path / "run.mcap"
+    trace, path = moving_cup(2_600, 10**7), tmp_path / "run.mcap"
     camera = messages(Channel("/camera", "json", None), trace.times_ns + 1, [b"0" * 9_000] * len(trace))
     with path.open("wb") as stream, LogWriter(stream) as writer:
         for begin in range(0, len(trace), 10):

@@ -11,6 +11,7 @@ import tempfile
 import time
 import zlib
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -125,6 +126,11 @@ def bench_reading(measure: Any) -> None:
                 with _on_one_core():
                     one = measure("reading with one core", lambda _: read("0"), **per_sample)
                 measure.ratio(f"{cores()} cores, time of one", first.median_s / one.median_s, 1 / 1.7)
+                shared = measure(
+                    "bare pass on all cores", lambda _: _decompressed_by_all(records), **per_sample
+                )
+                share = shared.median_s / bare.median_s
+                measure.remark(f"the bare pass on {cores()} cores takes {share:.2f} of its time on one")
         finally:
             for name, value in kept.items():
                 if value is None:
@@ -148,6 +154,13 @@ def _chunk_records(log: Path) -> list[tuple[bytes, int]]:
 def _decompressed(records: list[tuple[bytes, int]]) -> int:
     decompressor = zstandard.ZstdDecompressor()
     return sum(zlib.crc32(decompressor.decompress(data, max_output_size=size)) for data, size in records)
+
+
+def _decompressed_by_all(records: list[tuple[bytes, int]]) -> int:
+    """Do the same on all cores, which have nothing but the memory in common."""
+    shares = [records[begin :: cores()] for begin in range(cores())]
+    with ThreadPoolExecutor(cores()) as threads:
+        return sum(threads.map(_decompressed, shares))
 
 
 def bench_annotating(measure: Any) -> None:

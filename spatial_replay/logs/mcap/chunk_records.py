@@ -360,6 +360,7 @@ class Splitter:
         self._heads = np.empty(0, np.uint8)
         self._starts = np.zeros(1, np.int64)
         self._known: dict[tuple[int, int], list[tuple[bytes, Declaration]]] = {}
+        self._known_blocks: dict[int, list[tuple[bytes, list[Declaration]]]] = {}
         self._begin(0)
 
     def _begin(self, size: int) -> None:
@@ -403,10 +404,30 @@ class Splitter:
 
     def _declared(self, content: bytes | memoryview, places: Integers) -> Integers:
         """Take in the declarations among records; return the records before one that cannot be read."""
-        for index in np.flatnonzero(places[0] != _MESSAGE).tolist():
-            opcode, begin, end = places[:, index].tolist()
+        others = np.flatnonzero(places[0] != _MESSAGE).tolist()
+        while others:
+            first = others[0]
+            count = next((k for k, other in enumerate(others) if other != first + k), len(others))
+            begin, end = int(places[1, first]) - _RECORD_HEAD, int(places[2, first + count - 1])
+            # many chunks begin with the same ones; comparing is quicker than a hash of a long schema
+            block = bytes(content[begin:end])
+            alike = self._known_blocks.setdefault(len(block), [])
+            found = next((each for known_block, each in alike if known_block == block), None)
+            if found is None:
+                found = self._decoded(content, places[:, first : first + count])
+                if len(found) < count:
+                    self._declarations += found
+                    return places[:, : first + len(found)]
+                alike.append((block, found))
+            self._declarations += found
+            del others[:count]
+        return places
+
+    def _decoded(self, content: bytes | memoryview, places: Integers) -> list[Declaration]:
+        """Return declarations, up to one that cannot be read."""
+        found: list[Declaration] = []
+        for opcode, begin, end in places.T.tolist():
             body = bytes(content[begin:end])
-            # many chunks declare the same; comparing is quicker than a hash of a long schema
             alike = self._known.setdefault((opcode, len(body)), [])
             known = next((each for known_body, each in alike if known_body == body), None)
             if known is None:
@@ -415,10 +436,10 @@ class Splitter:
                     known = decoded(read, body)
                 except DamageError as error:
                     self._damage = str(error)
-                    return places[:, :index]
+                    break
                 alike.append((body, known))
-            self._declarations.append(known)
-        return places
+            found.append(known)
+        return found
 
     def _make_room(self, count: int, size: int) -> None:
         """Make room for some records more, of which the payloads are those of the walk."""

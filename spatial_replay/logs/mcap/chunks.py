@@ -48,7 +48,7 @@ _ZSTD = 4 | int.from_bytes(b"zstd", "little") << 32
 """The compression of our own chunks in their heads: a length, and a name."""
 _OUR_HEAD = _FIXED_HEAD + 4 + 8
 """How long these heads are."""
-_TOGETHER, _TOGETHER_BYTES = 32, 2**22
+_TOGETHER, _TOGETHER_BYTES = 64, 2**22
 """Chunks, and their bytes, that a thread takes at once: with fewer, it waits for the interpreter
 more often."""
 _LARGEST_OF_OURS = 2**20
