@@ -188,6 +188,34 @@ lasting_windows = st.one_of(
     st.builds(Temporal, st.sampled_from(["U", "R", "W"]), st.tuples(_literals, _lasting), _from_later),
 )
 """Windows below what holds from some time on, or again and again."""
+_unbounded = st.one_of(st.none(), _from_later)
+_never_falling = st.one_of(
+    st.builds(Temporal, st.just("G"), st.tuples(_lasting), _unbounded),
+    st.builds(
+        Boolean, st.just("not"), st.tuples(st.builds(Temporal, st.just("F"), st.tuples(_lasting), _unbounded))
+    ),
+    st.builds(Temporal, st.just("O"), st.tuples(_ahead), _unbounded),
+)
+_held = st.one_of(
+    _never_falling,
+    st.builds(Boolean, st.sampled_from(["and", "or", "->"]), st.tuples(_never_falling, _never_falling)),
+    # these may fall
+    st.builds(Temporal, st.sampled_from(["G", "F", "O", "H"]), st.tuples(_lasting), bounds),
+)
+_until_held = st.builds(
+    Temporal,
+    st.sampled_from(["U", "U", "U", "R", "W"]),
+    st.tuples(_held, st.one_of(_literals, _ahead, _lasting)),
+    st.one_of(bounds, _from_later),
+)
+untils_of_lasting = st.one_of(
+    _until_held,
+    _until_held,
+    st.builds(Boolean, st.sampled_from(["not", "spec"]), st.tuples(_until_held)),
+    st.builds(Boolean, st.sampled_from(["and", "->"]), st.tuples(_until_held, _literals)),
+    st.builds(Temporal, st.sampled_from(["G", "F", "H", "O", "X", "Y"]), st.tuples(_until_held)),
+)
+"""Untils whose left operands mostly never fall."""
 formulas_of_leaves = st.one_of(_responses, _nested(1), _nested(2), _nested(3), _nested(4), _windows_within)
 
 

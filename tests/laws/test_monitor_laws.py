@@ -35,6 +35,7 @@ from laws.strategies_monitor import (
     specifications,
     time_bounds,
     tracked_objects,
+    untils_of_lasting,
     widened,
     windows_of,
 )
@@ -128,6 +129,12 @@ def test_windows_beside_windows_equal_the_definitions(data, formula, run, room):
 @settings(max_examples=200)
 @given(data=st.data(), formula=alike_windows, run=leaf_runs(max_size=40), room=st.integers(2, 64))
 def test_windows_that_begin_and_end_alike_equal_the_definitions(data, formula, run, room):
+    assert_as_defined(data, formula, run, room)
+
+
+@settings(max_examples=150)
+@given(data=st.data(), formula=untils_of_lasting, run=leaf_runs(max_size=24), room=st.integers(2, 32))
+def test_untils_whose_left_operand_never_falls_equal_the_definitions(data, formula, run, room):
     assert_as_defined(data, formula, run, room)
 
 

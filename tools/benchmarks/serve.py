@@ -42,6 +42,7 @@ FLAT = (
     "G ((F[0,600] {a}) <-> (F[0,600] {b}))",
     "G ((F[0,600] {a}) -> (F[0,600] {b}))",
     "G ((F[0,6000] {a}) xor {b})",
+    "(G ({a} -> F[0,600] {b})) U (F[0,600] {c})",
 )
 """Further formulas of which a change costs the same however wide their windows are."""
 OPEN = (
@@ -71,6 +72,7 @@ WIDE = (
     "G ({a} -> F[0,600] ({b} U[0,600] {c}))",
     "G ({a} -> {b} U[0,600] G[0,600] {c})",
     "G[0,50000] ({a} -> F[0,6000] ({b} and F[0,6000] {c}))",
+    "G ({a} -> O[0,6000] ({b} and F[0,6000] {c}))",
 )
 """Longer ones."""
 LONGEST = (
@@ -78,9 +80,7 @@ LONGEST = (
     "G ({a} -> F[600,1200] ({b} and F[0,600] {c}))",
     "G ({a} S[0,600] ({b} and F[0,600] {c}))",
     "G ({a} -> {b} U ({c} and F[0,600] {a}))",
-    "(G ({a} -> F[0,600] {b})) U (F[0,600] {c})",
     "G[0,50000] ({a} -> F ({b} and F[0,600] {c}))",
-    "G ({a} -> O[0,6000] ({b} and F[0,6000] {c}))",
 )
 """What costs more, without a limit."""
 FALLING = (OPEN[0], DEEP[1], WIDE[1], WIDE[3], WIDE[4], WIDE[6])

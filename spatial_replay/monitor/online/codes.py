@@ -121,6 +121,8 @@ REPORT_SIGNAL, REPORT_PART = 0, 1
 # a past operator that is, at the first sample, its operand; now it is a signal, or what a part is at first or
 # at last
 REPORT_PAST = 9
+# an until whose left operand never falls, by what it waits for, which is a part (see `after_lasting`)
+REPORT_LASTING = 10
 REPORT_NOT, REPORT_AND, REPORT_OR, REPORT_XOR, REPORT_IMPLIES, REPORT_IFF, REPORT_SPEC = 2, 3, 4, 5, 6, 7, 8
 REPORT_OF_BOOLEAN = MappingProxyType(
     {

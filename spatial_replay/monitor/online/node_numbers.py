@@ -192,6 +192,18 @@ def _report_known(
                 _combine_known(codes.REPORT_OR, now, first, first, last, last)
             else:
                 _fill_known(np.inf if rule == codes.NOW_TRUE else -np.inf, now)
+        elif code == codes.REPORT_LASTING:
+            left, right = operands[start], operands[stop - 1]
+            for which, row in ((0, 0), (2, 4), (3, 5)):
+                into, of = series[n, which, t:end], series[left, which, t:end]
+                awaited, at_once = scratch.parts[index, row, :count], series[right, which, t:end]
+                _combine_known(codes.REPORT_AND, into, awaited, awaited, of, of)
+                if rule == codes.NOW_LAST_OPERAND:
+                    _combine_known(codes.REPORT_OR, into, into, into, at_once, at_once)
+            if rule == codes.NOW_LAST_OPERAND:
+                _copy_known(series[right, 1, t:end], now)
+            else:
+                _fill_known(-np.inf, now)
         elif code == codes.REPORT_PAST:
             of = operands[stop - 1]
             for which in (0, 2, 3):
@@ -258,6 +270,12 @@ def report(
                 rows[6, k], rows[7, k] = rows[4, k], rows[5, k]
         elif code == codes.REPORT_PART:
             _copy_numbers(scratch.parts[index], rows, count)
+            _set_now(rule, rows, numbers[operands[start]], numbers[operands[stop - 1]], count)
+        elif code == codes.REPORT_LASTING:
+            _copy_numbers(scratch.parts[index], rows, count)
+            _combine(codes.REPORT_AND, rows, numbers[operands[start]], count)
+            if rule == codes.NOW_LAST_OPERAND:
+                _combine(codes.REPORT_OR, rows, numbers[operands[stop - 1]], count)
             _set_now(rule, rows, numbers[operands[start]], numbers[operands[stop - 1]], count)
         elif code == codes.REPORT_PAST:
             _copy_numbers(numbers[operands[stop - 1]], rows, count)

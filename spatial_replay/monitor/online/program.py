@@ -30,7 +30,7 @@ from spatial_replay.monitor.online.operators import (
     operand_rows,
     part_of,
 )
-from spatial_replay.monitor.online.rewriting import at_last, looks_ahead
+from spatial_replay.monitor.online.rewriting import after_lasting, at_last, looks_ahead
 from spatial_replay.monitor.online.root_bounds import (
     NEVER,
     cutting_windows,
@@ -101,6 +101,10 @@ def compile_formula(formula: Formula) -> Program:
             reports.append((codes.REPORT_SIGNAL, signals.add(node), 0, *ends))
         elif isinstance(node, Boolean):
             reports.append((codes.REPORT_OF_BOOLEAN[node.operator], 0, 0, *ends))
+        elif isinstance(node, Temporal) and (awaited := after_lasting(node)) is not None:
+            number = parts.add_node(awaited, signals)
+            others.add(number)
+            reports.append((codes.REPORT_LASTING, number, _now_rule(node), *ends))
         elif isinstance(node, Temporal):
             last = None if node.operator in FUTURE_OPERATORS else at_last(node)
             if isinstance(last, Temporal) and looks_ahead(last):

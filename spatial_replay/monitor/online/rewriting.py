@@ -76,6 +76,27 @@ def at_last(node: Temporal) -> Formula | None:
     return Temporal("F" if node.operator == "O" else "G", node.operands)
 
 
+def after_lasting(node: Temporal) -> Temporal | None:
+    """Return `F[a,b] y` for `x U[a,b] y`, as of `(G z) U y`, whose left operand never falls; else None.
+
+    Until y, x is least at once. So the node is `x and F[a,b] y`, or y itself where that may be at once.
+    """
+    if node.operator != "U" or not looks_ahead(node.operands[0]) or not _never_falls(node.operands[0]):
+        return None
+    return Temporal("F", node.operands[1:], node.bound)
+
+
+def _never_falls(formula: Formula, *, is_negated: bool = False) -> bool:
+    """Return whether a formula, or its negation, is at least as much at each sample as at those before."""
+    formula, is_inside = _peeled(formula)
+    is_negated = is_negated != is_inside
+    if isinstance(formula, Boolean):
+        return all(_never_falls(operand, is_negated=is_negated) for operand in formula.operands)
+    if not isinstance(formula, Temporal) or (formula.bound is not None and formula.bound.upper is not None):
+        return False
+    return formula.operator in ("FH" if is_negated else "GO")
+
+
 def recurring(node: Temporal) -> Temporal:
     """Return `F G x` and `G F x` with, in place of x, what that is at the last sample if nothing follows.
 
