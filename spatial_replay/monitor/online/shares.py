@@ -40,6 +40,9 @@ _TWICE = 1.2
 _MOST_OF_WORK = 0.8
 """So much of the work at least is done in sections, or none."""
 
+NARROW = 0.3
+"""So much at most of what windows span is open where one thread is as fast as several."""
+
 _SOON = 0.25
 """Windows that close within so much of a stretch are waited for before it is shared; within a fourth of that,
 where a signal alone may outdo what is open."""
@@ -110,9 +113,12 @@ def open_share(program: Program, memory: Memory, left: int) -> float:
         is_outdone = part[codes.PART_LIMIT] >= 0 or part[codes.PART_OUTDONE_BY] != codes.BY_NOTHING
         if part[codes.PART_IS_REMEMBERING] or not is_outdone:
             return np.inf
+        early, early_ns = _horizon(nodes, codes.NODE_LOW)
         if base > 0:
             # what closes within a block is absorbed with it
             widest = max(widest, (position - base) / (width + BLOCK))
+        elif early + early_ns * per_ns > NARROW * width:
+            return np.inf  # nothing is found before windows begin
         elif width > left * (_SOON if part[codes.PART_OUTDONE_BY] == codes.BY_VALUE else _SOON / 4):
             return np.inf
     return widest
@@ -156,8 +162,12 @@ def _is_bounded(part: Integers, nodes: Integers) -> bool:
     return bool(np.isin(nodes[:-1, codes.NODE_CODE], _BOUNDED).all())
 
 
-def _horizon(nodes: Integers) -> tuple[int, int]:
-    """Return how far ahead a part's body looks at most: in samples, and in ns besides."""
+def _horizon(nodes: Integers, end: int = codes.NODE_HIGH) -> tuple[int, int]:
+    """Return how far ahead a part's body looks at most: in samples, and in ns besides.
+
+    Args:
+        end: the column for the end of windows that counts.
+    """
     horizons = list[tuple[int, int]]()
     for node in nodes[:-1].tolist():
         operands = [horizons[d] for d in (node[codes.NODE_A], node[codes.NODE_B]) if 0 <= d < len(horizons)]
@@ -167,7 +177,7 @@ def _horizon(nodes: Integers) -> tuple[int, int]:
             (max(ends, default=0) for ends in zip(*operands, strict=True)) if operands else (0, 0)
         )
         if node[codes.NODE_CODE] in codes.AHEAD_OF:
-            far = max(node[codes.NODE_LOW], node[codes.NODE_HIGH])
+            far = max(node[codes.NODE_LOW], node[end])
             is_counted = node[codes.NODE_UNIT] == codes.SAMPLES
             samples, time_ns = samples + far * is_counted, time_ns + far * (not is_counted)
         horizons.append((samples, time_ns))

@@ -24,6 +24,7 @@ from spatial_replay.monitor.online.node_numbers import Results, report
 from spatial_replay.monitor.online.program import Program
 from spatial_replay.monitor.online.run_arrays import RunArrays, Tables, arrays_at, table_of
 from spatial_replay.monitor.online.shares import (
+    NARROW,
     RunAhead,
     SectionStart,
     begin_late,
@@ -141,9 +142,6 @@ _MOST_THREADS = 8
 _MOST_IN_SECTIONS = 1 << 18
 """So many samples at most are run in sections at once: numbers of later ones wait for those of the first."""
 
-_NARROW = 0.3
-"""So much at most of what windows span is open where one thread is as fast as several."""
-
 _TILES_ALONE = 8
 """So many tiles are run before it is looked again whether several threads are worth it."""
 
@@ -238,9 +236,9 @@ class OnlineRun:
             # after a tile, the kernel is there, and what settles soon has
             if may_share and alone <= done < len(times_ns) and self._is_compiled:
                 share = open_share(self._program, self._memory, len(times_ns) - done)
-                if share <= _NARROW or (share <= 1 and was_narrow):
+                if share <= NARROW or (share <= 1 and was_narrow):
                     # one position may have waited longer than usual
-                    alone, was_narrow = done + _TILES_ALONE * self._tile, share <= _NARROW
+                    alone, was_narrow = done + _TILES_ALONE * self._tile, share <= NARROW
                     continue
                 before, done = done, self._run_in_sections(stretch, done)
                 if done == before:
