@@ -89,9 +89,10 @@ PART_IS_CUT = 15
 # the part, itself or another, and its node that is what this one is at the last sample; -1 if not asked for
 PART_LAST_IN, PART_LAST_NODE = 16, 17
 # which bounds follow from its table alone until its root has ended, a bit for each, and eight bits higher up
-# which do even then: what may still come outdoes all that is open
+# which do even then: what may still come outdoes all that is open; eight bits higher, which are the value
+# then
 PART_KNOWN = 18
-EVEN_IF_OVER = 1 << 8
+EVEN_IF_OVER, SAME_IF_OVER = 1 << 8, 1 << 16
 # the signal that what a root joins by the minimum is at least, by the maximum at most; -1 for none
 PART_LIMIT = 19
 # what says that what a root joins by the minimum falls no more, by the maximum rises no more, while windows

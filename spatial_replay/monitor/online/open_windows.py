@@ -179,6 +179,13 @@ def is_known(which: int, part: Integers, memory: Memory, last: int) -> bool:
 
 
 @inlined
+def is_same(which: int, part: Integers, memory: Memory, channels: int, last: int) -> bool:
+    """Return whether a bound is the value: the root is over, and all that is open counts alike for both."""
+    is_alike = (part[codes.PART_KNOWN] >> which) & codes.SAME_IF_OVER > 0
+    return bool(is_alike and channels < 4 and is_over(part, memory, last))
+
+
+@inlined
 def known_number(which: int, part: Integers, memory: Memory, channel: int) -> float:
     """Return a bound that is known: what comes outdoes all that is open, whatever that is."""
     if memory.cells[part[codes.PART_CELL_START]] == 0:
@@ -207,7 +214,7 @@ def looks_of(
         return int(looks & own)  # its numbers at the first sample stand in its table
     for which in (4, 5):
         is_other = is_known(which, part, memory, position) or is_cut_short(which, part, root, channels)
-        if not is_other:
+        if not is_other and not is_same(which, part, memory, channels, position):
             looks |= 1 << which
     if is_last and channels == 4:
         looks |= 1 << 6 | 1 << 7

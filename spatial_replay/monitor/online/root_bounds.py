@@ -17,6 +17,10 @@ NEVER = codes.SAMPLES, NOTHING
 """The end of a root that has none."""
 
 
+_OPEN = (codes.UNTIL, codes.RELEASE, *codes.AHEAD_OF)
+"""Nodes whose number may depend on what is still to come."""
+
+
 class _Direction(NamedTuple):
     """What a root that joins by the minimum meets below it; by the maximum, all of it the other way round.
 
@@ -84,7 +88,8 @@ def known_bounds(rows: tuple[Row, ...], *, is_bounded: bool) -> int:
     The table then says what follows from what has closed, if the same holds for all of its variables.
 
     Once a root with a window is over, what comes does not violate it any more, but may still satisfy what
-    never ends below it.
+    never ends below it. Where all that is open below it counts as violated until something comes, the value
+    is the lower bound; where all of it counts as satisfied, the upper one.
 
     Args:
         is_bounded: whether the root has a window, within which it joins all that its operand is.
@@ -105,6 +110,9 @@ def known_bounds(rows: tuple[Row, ...], *, is_bounded: bool) -> int:
             outdone.append(code == way.release and outdone[b])
     variables = [node for node, row in enumerate(rows) if row[codes.NODE_VARIABLE] != NOTHING]
     known = 1 << way.worst if is_bounded or rows[-1][codes.NODE_A] == NOTHING else 0
+    open_weak = {row[codes.NODE_WEAK] for row in rows[:-1] if row[codes.NODE_CODE] in _OPEN}
+    if is_bounded and len(open_weak) == 1:
+        known |= codes.SAME_IF_OVER << (codes.UPPER if 1 in open_weak else codes.LOWER)
     if all(outdone[node] for node in variables):
         known |= (1 | codes.EVEN_IF_OVER) << way.best
     return known

@@ -38,6 +38,7 @@ from spatial_replay.monitor.online.open_windows import (
     is_cut_short,
     is_known,
     is_plain,
+    is_same,
     known_number,
     looks_of,
     reach,
@@ -227,6 +228,8 @@ def run_part(table_at: int, number: int, channels: int, begin: int, end: int, co
                 numbers[1, k] = numbers[0, k]
             elif which >= 6 and channels < 4:
                 numbers[which, k] = numbers[which - 6, k]
+            elif is_same(which, part, memory, channels, last):
+                numbers[which, k] = numbers[look_of(which, channels).channel, k]
             else:
                 numbers[which, k] = _value_at_first(
                     tables.nodes, part, number, which, channels, memory, scratch, offset, last

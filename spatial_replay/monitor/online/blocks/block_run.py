@@ -46,6 +46,7 @@ from spatial_replay.monitor.online.open_windows import (
     is_known,
     is_over,
     is_plain,
+    is_same,
     known_number,
     root_window,
     runs_root,
@@ -240,6 +241,9 @@ def set_first(table_at: int, number: int, which: int, channels: int, at: int) ->
     numbers = scratch.parts[number, which, at : at + count]
     if is_known(which, part, memory, block.since):
         fill(numbers, known_number(which, part, memory, look.channel))
+        return 0
+    if is_same(which, part, memory, channels, block.since):
+        copy(scratch.parts[number, look.channel, at : at + count], numbers)
         return 0
     base, is_cut = memory.cells[part[codes.PART_CELL_START]], is_cut_short(which, part, root, channels)
     columns = memory.columns[look.channel if is_cut else columns_number(which)]

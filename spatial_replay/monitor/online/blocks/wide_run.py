@@ -29,6 +29,7 @@ from spatial_replay.monitor.online.open_windows import (
     is_cut_short,
     is_known,
     is_over,
+    is_same,
     root_window,
     runs_root,
 )
@@ -87,7 +88,10 @@ def _set_first_of_spans(
     nodes, part, block = tables.nodes, tables.parts[number], block_of(memory, scratch)
     first, end = part[codes.PART_FIRST], part[codes.PART_END] - 1
     look, root = look_of(which, channels), nodes[end]
-    if runs_root(part, root) or is_known(which, part, memory, block.since):
+    is_said = is_known(which, part, memory, block.since) or is_same(
+        which, part, memory, channels, block.since
+    )
+    if runs_root(part, root) or is_said:
         return int(set_first(table_at, number, which, channels, at))
     table = memory.tables[look.channel, part[codes.PART_TABLE_START] : tables_end(part)]
     mode = codes.OPEN_END if has_ended(part, root, memory, block.since) else look.mode
