@@ -72,7 +72,7 @@ WIDE = (
     "G ({a} -> F[0,600] ({b} U[0,600] {c}))",
     "G ({a} -> {b} U[0,600] G[0,600] {c})",
     "G[0,50000] ({a} -> F[0,6000] ({b} and F[0,6000] {c}))",
-    "G ({a} -> O[0,6000] ({b} and F[0,6000] {c}))",
+    "G ({a} -> O[0,600] ({b} and F[0,600] {c}))",
 )
 """Longer ones."""
 LONGEST = (
@@ -81,6 +81,7 @@ LONGEST = (
     "G ({a} S[0,600] ({b} and F[0,600] {c}))",
     "G ({a} -> {b} U ({c} and F[0,600] {a}))",
     "G[0,50000] ({a} -> F ({b} and F[0,600] {c}))",
+    "G ({a} -> O[0,6000] ({b} and F[0,6000] {c}))",
 )
 """What costs more, without a limit."""
 FALLING = (OPEN[0], DEEP[1], WIDE[1], WIDE[3], WIDE[4], WIDE[6])
