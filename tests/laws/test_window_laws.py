@@ -122,6 +122,28 @@ wide_windows = st.one_of(
 )
 """Windows of some hundred samples over each other, and operators that never end above and below them."""
 
+
+def _of_one_kind(depth, operators):
+    """Formulas of which all that is open counts alike, over each other up to so often."""
+    if depth == 0:
+        return _literals
+    below = _of_one_kind(depth - 1, operators)
+    single, pair = operators
+    return st.one_of(
+        st.builds(Temporal, st.just(single), st.tuples(below), _bounds),
+        st.builds(Temporal, st.just(pair), st.tuples(_literals, below), _bounds),
+        st.builds(Boolean, st.sampled_from(["and", "or"]), st.tuples(below, _literals)),
+    )
+
+
+ending_kinds = st.builds(
+    Temporal,
+    st.sampled_from(["F", "G"]),
+    st.sampled_from(["FU", "GR"]).flatmap(lambda kind: st.tuples(_of_one_kind(2, kind))),
+    st.builds(Bound, st.just(0), st.integers(60, 250), st.just("samples")),
+)
+"""Roots with a window that ends well within a run, over one kind of operators."""
+
 _near = st.one_of(
     st.builds(
         lambda low, more: Bound(low, low + more, "samples"),
@@ -443,6 +465,16 @@ def test_two_runs_that_share_several_roots_say_what_one_does(data, formula, run,
     ends = sorted({0, size // 2, *(end for end in ends if end > size // 2)})
     with only("compiled"), wide_open():
         options = {"room": tile, "tile": tile, "least_shared": 60, "threads": 2}
+        assert_same_bits(*both_ways(program_of(formula), run, ends, **options))
+
+
+@settings(max_examples=250)
+@given(formula=ending_kinds, run=long_runs(280, 420), tile=st.sampled_from([16, 40]))
+def test_two_runs_that_share_a_root_say_what_one_does_once_it_is_over(formula, run, tile):
+    """Its bounds may be the value then, which only one of them computes."""
+    ends = [0, tile, len(run)]
+    with only("compiled"), wide_open():
+        options = {"room": tile, "tile": tile, "least_shared": 40, "threads": 2}
         assert_same_bits(*both_ways(program_of(formula), run, ends, **options))
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Collection, Sequence
+from collections import deque
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from itertools import accumulate
@@ -66,6 +67,8 @@ _MESSAGE_BYTES = _MESSAGE_FIELDS.itemsize
 _LAST_OF_LOG_TIME = 13
 """Where the highest byte of its log time is in a message."""
 _SCHEMA, _CHANNEL, _MESSAGE = 3, 4, 5
+_MOST_RECENT = 8
+"""So many runs of declarations are remembered, which the next chunks may begin with, too."""
 
 
 class RecordHeads(NamedTuple):
@@ -360,7 +363,7 @@ class Splitter:
         self._heads = np.empty(0, np.uint8)
         self._starts = np.zeros(1, np.int64)
         self._known: dict[tuple[int, int], list[tuple[bytes, Declaration]]] = {}
-        self._known_blocks: dict[int, list[tuple[bytes, list[Declaration]]]] = {}
+        self._recent = deque[tuple[bytes, list[Declaration]]](maxlen=_MOST_RECENT)
         self._begin(0)
 
     def _begin(self, size: int) -> None:
@@ -404,29 +407,34 @@ class Splitter:
 
     def _declared(self, content: bytes | memoryview, places: Integers) -> Integers:
         """Take in the declarations among records; return the records before one that cannot be read."""
-        others = np.flatnonzero(places[0] != _MESSAGE).tolist()
-        while others:
-            first = others[0]
-            count = next((k for k, other in enumerate(others) if other != first + k), len(others))
-            begin, end = int(places[1, first]) - _RECORD_HEAD, int(places[2, first + count - 1])
+        others = np.flatnonzero(places[0] != _MESSAGE)
+        opcodes, begins, ends = places[:, others].tolist()
+        k, count = 0, len(opcodes)
+        while k < count:
+            after = k + 1
+            while after < count and begins[after] - _RECORD_HEAD == ends[after - 1]:
+                after += 1
             # many chunks begin with the same ones; comparing is quicker than a hash of a long schema
-            block = bytes(content[begin:end])
-            alike = self._known_blocks.setdefault(len(block), [])
-            found = next((each for known_block, each in alike if known_block == block), None)
+            block = bytes(content[begins[k] - _RECORD_HEAD : ends[after - 1]])
+            found = next((each for known, each in self._recent if known == block), None)
             if found is None:
-                found = self._decoded(content, places[:, first : first + count])
-                if len(found) < count:
+                found = self._decoded(
+                    content, zip(*(each[k:after] for each in (opcodes, begins, ends)), strict=True)
+                )
+                if len(found) < after - k:
                     self._declarations += found
-                    return places[:, : first + len(found)]
-                alike.append((block, found))
+                    return places[:, : others[k + len(found)]]
+                self._recent.append((block, found))
             self._declarations += found
-            del others[:count]
+            k = after
         return places
 
-    def _decoded(self, content: bytes | memoryview, places: Integers) -> list[Declaration]:
-        """Return declarations, up to one that cannot be read."""
+    def _decoded(
+        self, content: bytes | memoryview, places: Iterable[tuple[int, int, int]]
+    ) -> list[Declaration]:
+        """Return the declarations in some places, up to one that cannot be read."""
         found: list[Declaration] = []
-        for opcode, begin, end in places.T.tolist():
+        for opcode, begin, end in places:
             body = bytes(content[begin:end])
             alike = self._known.setdefault((opcode, len(body)), [])
             known = next((each for known_body, each in alike if known_body == body), None)

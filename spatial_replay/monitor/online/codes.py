@@ -88,9 +88,9 @@ PART_ENDING, PART_LOWER, PART_UPPER, PART_IS_MINIMUM, PART_BESIDE = 10, 11, 12, 
 PART_IS_CUT = 15
 # the part, itself or another, and its node that is what this one is at the last sample; -1 if not asked for
 PART_LAST_IN, PART_LAST_NODE = 16, 17
-# which bounds follow from its table alone until its root has ended, a bit for each, and eight bits higher up
-# which do even then: what may still come outdoes all that is open; eight bits higher, which are the value
-# then
+# a bit for each bound: which follow from its table alone until its root has ended, since what may still come
+# outdoes all that is open; eight bits higher up, which do even once it has; again eight bits higher up, which
+# are the value once it has
 PART_KNOWN = 18
 EVEN_IF_OVER, SAME_IF_OVER = 1 << 8, 1 << 16
 # the signal that what a root joins by the minimum is at least, by the maximum at most; -1 for none
@@ -122,7 +122,8 @@ REPORT_SIGNAL, REPORT_PART = 0, 1
 # a past operator that is, at the first sample, its operand; now it is a signal, or what a part is at first or
 # at last
 REPORT_PAST = 9
-# an until whose left operand never falls, by what it waits for, which is a part (see `after_lasting`)
+# an until whose left operand never falls, by what it waits for, which is a part (see `after_lasting`); where
+# its rule is `NOW_LAST_OPERAND`, its right operand is an alternative
 REPORT_LASTING = 10
 REPORT_NOT, REPORT_AND, REPORT_OR, REPORT_XOR, REPORT_IMPLIES, REPORT_IFF, REPORT_SPEC = 2, 3, 4, 5, 6, 7, 8
 REPORT_OF_BOOLEAN = MappingProxyType(

@@ -16,6 +16,7 @@ from spatial_replay.monitor.online.node_columns import (
     cells_of,
     columns_number,
     join_operands,
+    look_of,
     run_behind,
     run_since,
     run_until,
@@ -180,9 +181,13 @@ def is_known(which: int, part: Integers, memory: Memory, last: int) -> bool:
 
 @inlined
 def is_same(which: int, part: Integers, memory: Memory, channels: int, last: int) -> bool:
-    """Return whether a bound is the value: the root is over, and all that is open counts alike for both."""
-    is_alike = (part[codes.PART_KNOWN] >> which) & codes.SAME_IF_OVER > 0
-    return bool(is_alike and channels < 4 and is_over(part, memory, last))
+    """Return whether a bound is the value: the root is over, and all that is open counts alike for both.
+
+    Not in a run that leaves the value to another one (see `shares`): the value is computed first, and copied.
+    """
+    is_alike = (part[codes.PART_KNOWN] >> which) & codes.SAME_IF_OVER > 0 and channels < 4
+    has_value = (part[codes.PART_NUMBERS] >> look_of(which, channels).channel) & 1 == 1
+    return bool(is_alike and has_value and is_over(part, memory, last))
 
 
 @inlined

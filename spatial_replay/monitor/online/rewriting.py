@@ -79,7 +79,8 @@ def at_last(node: Temporal) -> Formula | None:
 def after_lasting(node: Temporal) -> Temporal | None:
     """Return `F[a,b] y` for `x U[a,b] y`, as of `(G z) U y`, whose left operand never falls; else None.
 
-    Until y, x is least at once. So the node is `x and F[a,b] y`, or y itself where that may be at once.
+    Until y, x is least at once. So the node is `x and F[a,b] y`, or y itself where that may be at once: where
+    the window begins with the sample, and what the node is now is what y is.
     """
     if node.operator != "U" or not looks_ahead(node.operands[0]) or not _never_falls(node.operands[0]):
         return None
@@ -94,7 +95,7 @@ def _never_falls(formula: Formula, *, is_negated: bool = False) -> bool:
         return all(_never_falls(operand, is_negated=is_negated) for operand in formula.operands)
     if not isinstance(formula, Temporal) or (formula.bound is not None and formula.bound.upper is not None):
         return False
-    return formula.operator in ("FH" if is_negated else "GO")
+    return formula.operator in ({"F", "H"} if is_negated else {"G", "O"})
 
 
 def recurring(node: Temporal) -> Temporal:

@@ -15,9 +15,7 @@ from spatial_replay.monitor.online.operators import NOTHING, Row, SignalTable
 
 NEVER = codes.SAMPLES, NOTHING
 """The end of a root that has none."""
-
-
-_OPEN = (codes.UNTIL, codes.RELEASE, *codes.AHEAD_OF)
+_LOOKING_AHEAD = (codes.UNTIL, codes.RELEASE, *codes.AHEAD_OF)
 """Nodes whose number may depend on what is still to come."""
 
 
@@ -110,7 +108,7 @@ def known_bounds(rows: tuple[Row, ...], *, is_bounded: bool) -> int:
             outdone.append(code == way.release and outdone[b])
     variables = [node for node, row in enumerate(rows) if row[codes.NODE_VARIABLE] != NOTHING]
     known = 1 << way.worst if is_bounded or rows[-1][codes.NODE_A] == NOTHING else 0
-    open_weak = {row[codes.NODE_WEAK] for row in rows[:-1] if row[codes.NODE_CODE] in _OPEN}
+    open_weak = {row[codes.NODE_WEAK] for row in rows[:-1] if row[codes.NODE_CODE] in _LOOKING_AHEAD}
     if is_bounded and len(open_weak) == 1:
         known |= codes.SAME_IF_OVER << (codes.UPPER if 1 in open_weak else codes.LOWER)
     if all(outdone[node] for node in variables):

@@ -113,11 +113,10 @@ def open_share(program: Program, memory: Memory, left: int) -> float:
         is_outdone = part[codes.PART_LIMIT] >= 0 or part[codes.PART_OUTDONE_BY] != codes.BY_NOTHING
         if part[codes.PART_IS_REMEMBERING] or not is_outdone:
             return np.inf
-        early, early_ns = _horizon(nodes, codes.NODE_LOW)
         if base > 0:
             # what closes within a block is absorbed with it
             widest = max(widest, (position - base) / (width + BLOCK))
-        elif early + early_ns * per_ns > NARROW * width:
+        elif _begin_of(nodes, per_ns) > NARROW * width:
             return np.inf  # nothing is found before windows begin
         elif width > left * (_SOON if part[codes.PART_OUTDONE_BY] == codes.BY_VALUE else _SOON / 4):
             return np.inf
@@ -162,12 +161,28 @@ def _is_bounded(part: Integers, nodes: Integers) -> bool:
     return bool(np.isin(nodes[:-1, codes.NODE_CODE], _BOUNDED).all())
 
 
-def _horizon(nodes: Integers, end: int = codes.NODE_HIGH) -> tuple[int, int]:
-    """Return how far ahead a part's body looks at most: in samples, and in ns besides.
+def _begin_of(nodes: Integers, per_ns: float) -> float:
+    """Return how far ahead, in samples, the first windows of a part's body begin: of several, the earliest.
 
     Args:
-        end: the column for the end of windows that counts.
+        per_ns: samples.
     """
+    begins = list[float | None]()
+    for node in nodes[:-1].tolist():
+        operands = [begins[d] for d in (node[codes.NODE_A], node[codes.NODE_B]) if 0 <= d < len(begins)]
+        known = (
+            [] if node[codes.NODE_CODE] == codes.LITERAL else [each for each in operands if each is not None]
+        )
+        begin = min(known, default=None)
+        if node[codes.NODE_CODE] in codes.AHEAD_OF:
+            is_counted = node[codes.NODE_UNIT] == codes.SAMPLES
+            begin = (begin or 0.0) + node[codes.NODE_LOW] * (1.0 if is_counted else per_ns)
+        begins.append(begin)
+    return begins[-1] or 0.0 if begins else 0.0
+
+
+def _horizon(nodes: Integers) -> tuple[int, int]:
+    """Return how far ahead a part's body looks at most: in samples, and in ns besides."""
     horizons = list[tuple[int, int]]()
     for node in nodes[:-1].tolist():
         operands = [horizons[d] for d in (node[codes.NODE_A], node[codes.NODE_B]) if 0 <= d < len(horizons)]
@@ -177,7 +192,7 @@ def _horizon(nodes: Integers, end: int = codes.NODE_HIGH) -> tuple[int, int]:
             (max(ends, default=0) for ends in zip(*operands, strict=True)) if operands else (0, 0)
         )
         if node[codes.NODE_CODE] in codes.AHEAD_OF:
-            far = max(node[codes.NODE_LOW], node[end])
+            far = max(node[codes.NODE_LOW], node[codes.NODE_HIGH])
             is_counted = node[codes.NODE_UNIT] == codes.SAMPLES
             samples, time_ns = samples + far * is_counted, time_ns + far * (not is_counted)
         horizons.append((samples, time_ns))

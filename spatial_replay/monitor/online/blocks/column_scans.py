@@ -157,7 +157,7 @@ _run_since_on, _run_trigger_on = row_loop()(_since_on), row_loop()(_trigger_on)
 def found_along(
     is_strong: bool, is_ahead: bool, left: Floats, right: Floats, row: Floats, target: Floats
 ) -> None:
-    """Enter what an operator with a left operand finds from each number on, or up to each.
+    """Enter what an operator with a left operand finds from each number on, or up to each, and no further.
 
     Args:
         is_strong: whether it is an until or a since, or else a release or a trigger.
