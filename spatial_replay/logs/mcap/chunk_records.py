@@ -411,6 +411,7 @@ class Splitter:
         opcodes, begins, ends = places[:, others].tolist()
         k, count = 0, len(opcodes)
         while k < count:
+            # side by side, so that no message between them is kept with them
             after = k + 1
             while after < count and begins[after] - _RECORD_HEAD == ends[after - 1]:
                 after += 1
