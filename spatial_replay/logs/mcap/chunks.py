@@ -309,15 +309,35 @@ def _records_together(
             return None
         for first, last in _batches(sizes):
             content = own.content.of(sum(sizes[first:last])).data
-            reader = own.decompressor.stream_reader(view[ends[first] : ends[last]], read_across_frames=True)
-            if reader.readinto(content) != len(content):  # type: ignore[attr-defined, unused-ignore]
+            if not _decompress_frames(
+                view[ends[first] : ends[last]], content, own, is_long=len(sizes) == _TOGETHER
+            ):
                 return None
             checksum = crc32(content, checksum)
             if not own.splitter.add(content, sizes[first:last]):
                 return None
-    except zstandard.ZstdError:
+    except (zstandard.ZstdError, RuntimeError, ValueError):
         return None
     return own.splitter.records() if checksum == joined_checksum(checksums, sizes) else None
+
+
+def _decompress_frames(frames: memoryview, content: memoryview, own: _Buffers, *, is_long: bool) -> bool:
+    """Decompress several frames into as many bytes as they hold; return whether they hold these.
+
+    Args:
+        is_long: whether the log has so many chunks that it pays to load what decompresses all in one step.
+            Else each frame hands the interpreter to another thread, and waits for it.
+
+    Raises:
+        ZstdError, RuntimeError, ValueError: they are damaged.
+    """
+    if is_long:
+        from numcodecs import zstd
+
+        zstd.decompress(frames, content)
+        return True
+    reader = own.decompressor.stream_reader(frames, read_across_frames=True)
+    return bool(reader.readinto(content) == len(content))  # type: ignore[attr-defined, unused-ignore]
 
 
 def _batches(sizes: Sequence[int]) -> Iterator[tuple[int, int]]:
