@@ -66,6 +66,7 @@ class CameraView:
         self.seen: Counter[int] = Counter()
         self.twice: Counter[int] = Counter()
         self.frames = self.moved = 0
+        self._parallax = 0.0
         self._detector = TagDetector(tags.family)
         self._plane: Plane | None = None
         self._size: tuple[int, int] | None = None
@@ -130,7 +131,8 @@ class CameraView:
             self._plane = None
             return
         try:
-            self.fit = plane_from_references(self.tags, {n: mean for n, (mean, _) in self._averages.items()})
+            means = {number: mean for number, (mean, _) in self._averages.items()}
+            self.fit = plane_from_references(self.tags, means, self._size or (0, 0))
             self._plane = self.fit.plane
         except UsageError:
             # what fitted before does not while the camera or a tag moves
@@ -154,6 +156,7 @@ class CameraView:
                 pose = pose_in_space(plane, corners[number], tag, sigmas) if found.is_lifted else None
                 if pose is not None:
                     poses[number] = pose
+        self._parallax = max(self._parallax, *(pose.parallax for pose in poses.values()), 0.0)
         return poses
 
     def remarks(self) -> list[str]:
@@ -176,6 +179,14 @@ class CameraView:
         for number, count in sorted(self.twice.items()):
             lines.append(
                 f"tag {number} is in {counted(count, 'frame')}{of_it} more than once, and left out there"
+            )
+        if self._parallax:
+            above = max((tag.z for _, tag in self.tags.by_id.values() if tag.id in self.seen), key=abs)
+            lines.append(
+                f"tags on objects are up to {1e3 * abs(above):.3g} mm {'above' if above > 0 else 'below'} the"
+                f" reference tags, and no camera{of_it} is calibrated: outlines are up to"
+                f" {1e3 * self._parallax:.3g} mm less certain; calibrate the camera (tags calibrate), or fix"
+                " the reference tags as high as the others and give their height (plane: height: …)"
             )
         if self.moved:
             who = self.name or "the camera"

@@ -15,7 +15,7 @@ import numpy as np
 
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.perception.camera_pose import rotations
-from spatial_replay.perception.plane import CameraPlane, Plane
+from spatial_replay.perception.plane import CameraPlane, HomographyPlane, Plane
 from spatial_replay.perception.tags_file import MountedTag
 
 _STEP: Final = 1e-3
@@ -39,6 +39,7 @@ class ObjectPose(NamedTuple):
         yaw: radians.
         spread: (4, 4), the covariance of x, y, z, yaw that comes from the corners.
         shared: (2, 2), the covariance of x, y that comes from the plane; all objects near have the same.
+        parallax: how far the place may be off since the height of its tag cannot be resolved.
         doubt: why the pose cannot be right; None if nothing speaks against it.
     """
 
@@ -46,6 +47,7 @@ class ObjectPose(NamedTuple):
     yaw: float
     spread: Floats
     shared: Floats
+    parallax: float = 0.0
     doubt: str | None = None
 
 
@@ -89,6 +91,12 @@ def poses_on_plane(
     variance = plane.corner_error**2
     spread = variance * np.einsum("nki,nkj->nij", derivative, derivative)
     shared = plane.covariance(corners.mean(axis=1), z)
+    parallax, larger = np.zeros(len(tags)), np.zeros(len(tags))
+    lifted = "its object is lifted or has tipped over"
+    if isinstance(plane, HomographyPlane):
+        bounds = plane.parallax(corners.reshape(-1, 2), np.repeat(z, 4))
+        parallax, larger = (each.reshape(-1, 4).max(axis=1) for each in bounds)
+        lifted += ", or the tag is higher above the reference tags than the file says"
     poses = []
     for index, tag in enumerate(tags):
         of_pose = np.zeros((4, 4))
@@ -102,13 +110,15 @@ def poses_on_plane(
             ratio = edge[index, 0] / size[index] - 1
             square = along[index, 0] / 4
             off = _out_of_square(places[index, 0], centre[index, 0], square) / size[index]
-            if abs(ratio) > _SIZE_TOLERANCE + noise or off > 2 * _SIZE_TOLERANCE + 2 * noise:
+            beyond = abs(ratio) - (larger[index] if ratio * tag.z > 0 else 0.0)
+            if beyond > _SIZE_TOLERANCE + noise or off > 2 * _SIZE_TOLERANCE + 2 * noise:
                 doubt = (
                     f"tag {tag.id} appears {abs(ratio):.0%} {'larger' if ratio > 0 else 'smaller'} than it"
-                    " is, or leans: its object is lifted or has tipped over"
+                    f" is, or leans: {lifted}"
                 )
         place = np.array([*numbers[index, 0, :2], 0.0])
-        poses.append(ObjectPose(place, float(numbers[index, 0, 2]), of_pose, shared[index], doubt))
+        yaw_of_object, off_by = float(numbers[index, 0, 2]), float(parallax[index])
+        poses.append(ObjectPose(place, yaw_of_object, of_pose, shared[index], off_by, doubt))
     return poses
 
 
@@ -166,7 +176,7 @@ def pose_in_space(plane: CameraPlane, corners: Floats, tag: MountedTag, sigmas: 
         doubt = f"tag {tag.id} does not look like an upright tag of its size: its object has tipped over"
     shared = plane.covariance(corners.mean(axis=0)[None], state[2:3])[0]
     return ObjectPose(
-        state[:3] - shift, float(yaw), lever @ spread[np.ix_(chosen, chosen)] @ lever.T, shared, doubt
+        state[:3] - shift, float(yaw), lever @ spread[np.ix_(chosen, chosen)] @ lever.T, shared, doubt=doubt
     )
 
 
@@ -197,7 +207,8 @@ def fused(poses: Sequence[ObjectPose]) -> ObjectPose:
     off = states - mean
     excess = sum(float(x @ w @ x) for w, x in zip(weights, off, strict=True)) / max(3 * (len(poses) - 1), 1)
     shared = np.max([each.shared for each in poses], axis=0)
-    return ObjectPose(mean[:3], float(mean[3]), spread * max(excess, 1.0), shared)
+    parallax = max(each.parallax for each in poses)
+    return ObjectPose(mean[:3], float(mean[3]), spread * max(excess, 1.0), shared, parallax)
 
 
 def radius(pose: ObjectPose, outline: Floats, sigmas: float) -> float:
@@ -205,7 +216,7 @@ def radius(pose: ObjectPose, outline: Floats, sigmas: float) -> float:
 
     For the point v of the outline, the error is that of the place and that of the yaw, by which v swings:
     with A = [I | e_z x R v] its covariance is A C A^T, and its largest standard deviation the root of the
-    largest eigenvalue. The radius is `sigmas` times that of the worst point.
+    largest eigenvalue. The radius is `sigmas` times that of the worst point, and the parallax.
 
     Args:
         outline: (K, 2), points of the footprint in its own frame.
@@ -219,4 +230,4 @@ def radius(pose: ObjectPose, outline: Floats, sigmas: float) -> float:
     lever[:, :2, 3] = swing.T
     spread = lever @ pose.spread @ lever.transpose(0, 2, 1)
     spread[:, :2, :2] += pose.shared
-    return sigmas * math.sqrt(max(float(np.linalg.eigvalsh(spread)[:, -1].max()), 0.0))
+    return pose.parallax + sigmas * math.sqrt(max(float(np.linalg.eigvalsh(spread)[:, -1].max()), 0.0))

@@ -33,6 +33,10 @@ _LEAST_SLANT: Final = math.sin(math.radians(8.0))
 """A plane that is seen at less than this, the sine of an angle, is seen edge-on; further down, no tags are
 found."""
 
+_WIDEST: Final = 1.0
+"""Half of the image's diagonal, in focal lengths, of a camera that is not calibrated: 90 degrees from corner
+to corner."""
+
 _STEP: Final = 1e-6
 
 
@@ -88,16 +92,18 @@ class ImagePlane:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HomographyPlane:
-    """A plane seen without a calibrated camera; everything in it has height 0.
+    """A plane seen without a calibrated camera: heights above it cannot be resolved.
 
     Attributes:
         pixel_from_plane: (3, 3), its last entry 1.
         spread: (8, 8), the covariance of its other entries.
+        size: (width, height) of the images in pixels; zeros where it is not known.
     """
 
     pixel_from_plane: Floats
     spread: Floats
     corner_error: float
+    size: tuple[int, int] = (0, 0)
 
     def places(self, pixels: Floats, z: Floats) -> Floats:
         """See `Plane`."""
@@ -120,6 +126,33 @@ class HomographyPlane:
     def pixels(self, places: Floats) -> Floats:
         """See `Plane`."""
         return _through(self.pixel_from_plane, places[..., :2])
+
+    def parallax(self, pixels: Floats, z: Floats) -> tuple[Floats, Floats]:
+        """Bound the error of reading pixels (N, 2) at heights (N,) as places in the plane.
+
+        A ray at the angle t to the plane's normal gains |z| tan t on its way from the height z to the plane.
+        The map from the plane to the image is A B: B, to the sphere around the camera, has the singular
+        values (1, cos t) / d at the distance d; A, from the sphere to the image, has f / cos p and f / cos² p
+        at the angle p to the optical axis. So cos t is at least cos p times the ratio of those of A B, and
+        d at least f divided by the greater one.
+
+        Returns:
+            How far places may be off, and by which share lengths may appear too large, (N,) each.
+        """
+        matrix, places = self.pixel_from_plane, self.places(pixels, z)
+        depth = places @ matrix[2, :2] + matrix[2, 2]
+        local = (matrix[:2, :2] - pixels[:, :, None] * matrix[2, :2]) / depth[:, None, None]
+        greater, lesser = np.linalg.svd(local, compute_uv=False).T
+        size = np.array(self.size, np.float64)
+        half = float(np.linalg.norm(size)) / 2
+        # detections without images: the image reaches at least as far as they do
+        focal = (half or float(np.linalg.norm(pixels, axis=1).max()) / 2) / _WIDEST
+        off_axis = np.linalg.norm(pixels - (size - 1) / 2, axis=1) / focal if half else _WIDEST
+        cosine = lesser / greater / np.sqrt(1 + np.square(off_axis))
+        above = focal / greater * cosine
+        with np.errstate(divide="ignore"):
+            larger = np.where(above > np.abs(z), np.abs(z) / (above - np.abs(z)), np.inf)
+        return np.abs(z) * np.sqrt(1 / np.square(cosine) - 1), np.asarray(larger)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -161,10 +194,11 @@ class CameraPlane:
         return self.camera.pixels(np.asarray(places @ self.rotation.T + self.pose[3:], np.float64))
 
 
-def plane_from_references(tags: TagsFile, corners: Mapping[int, Floats]) -> Fit:
+def plane_from_references(tags: TagsFile, corners: Mapping[int, Floats], size: tuple[int, int]) -> Fit:
     """Fit the plane to reference tags.
 
     Args:
+        size: (width, height) of the images in pixels; zeros where it is not known.
         corners: (4, 2) of each reference tag that was detected, at least `LEAST_REFERENCES`.
 
     Raises:
@@ -192,7 +226,7 @@ def plane_from_references(tags: TagsFile, corners: Mapping[int, Floats]) -> Fit:
     spread = np.asarray(variance * np.linalg.pinv(flat_derivative.T @ flat_derivative), np.float64)
     plane: Plane
     if tags.camera is None:
-        plane = HomographyPlane(found, spread, error)
+        plane = HomographyPlane(found, spread, error, size)
     else:
         plane = CameraPlane(tags.camera, found, spread, error)
     _refuse_edge_on(tags, seen, known)
@@ -265,6 +299,17 @@ def _refuse_misfit(
     limit = _WORST_RESIDUAL + 2 * tags.reference_error * _pixels_per_unit(seen, known)
     if off.max() <= limit:
         return
+    first = references[0]
+    for turns in (2, 1, 3):
+        # the corners of all tags, each counted from another one
+        turned = np.roll(known.reshape(-1, 4, 2), -turns, axis=1).reshape(-1, 2)
+        solved = _solved(turned, seen, tags.camera)
+        if solved is not None and _off_by_tag(turned, seen, solved, tags.camera).max() <= limit:
+            raise UsageError(
+                f"{tags.name}: the reference tags fit each other only if all are turned by {90 * turns}"
+                f" degrees, as other programs print them; write {first.id}: {{at: [{first.x:g}, {first.y:g}],"
+                f" yaw: {90 * turns}deg}}, the others alike, and the same yaw for tags on objects"
+            )
     alone = _off_alone(tags, seen, known)
     if alone is not None and alone[2] <= limit:
         place, away, _ = alone
@@ -288,8 +333,7 @@ def _off_alone(tags: TagsFile, seen: Floats, known: Floats) -> tuple[int, float,
         others = np.arange(len(known)) // 4 != place
         solved = _solved(known[others], seen[others], tags.camera)
         if solved is not None:
-            off = np.linalg.norm(_appearing(known, solved, tags.camera)[0] - seen, axis=1)
-            by_tag = off.reshape(-1, 4).mean(axis=1)
+            by_tag = _off_by_tag(known, seen, solved, tags.camera)
             found.append((float(np.delete(by_tag, place).max()), place, float(by_tag[place])))
     if not found:
         return None
@@ -308,6 +352,12 @@ def _solved(known: Floats, seen: Floats, camera: Camera | None) -> Floats | None
 def _appearing(known: Floats, found: Floats, camera: Camera | None) -> tuple[Floats, Floats]:
     """Return where places appear, and the derivative by what was found."""
     return _homography_jacobian(found, known) if camera is None else projection(_flat(known), found, camera)
+
+
+def _off_by_tag(known: Floats, seen: Floats, found: Floats, camera: Camera | None) -> Floats:
+    """Return by how many pixels the corners of each tag are off on average, (K,)."""
+    off = np.linalg.norm(_appearing(known, found, camera)[0] - seen, axis=1)
+    return np.asarray(off.reshape(-1, 4).mean(axis=1))
 
 
 def _flat(places: Floats) -> Floats:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib.resources import files
@@ -43,7 +43,7 @@ class MountedTag:
         size: edge of its black square, in footprint units.
         x, y: where its centre is.
         yaw: radians, counter-clockwise from the object's x axis to the tag's, which points to its right.
-        z: height of the tag above the plane, for objects that stay on it.
+        z: height of the tag above the reference tags, for objects that stay where they stand.
     """
 
     id: int
@@ -200,9 +200,9 @@ def parse_tags(text: str, name: str = "tags") -> TagsFile:
     camera = _camera(camera_value) if camera_value else None
     several: Mapping[str, Any] = value.get("cameras", {})
     try:
+        level = 0.0 if is_image else _length(plane.get("height", 0.0))
         objects = tuple(
-            _object(own_name, entry, size, value, has_camera=bool(camera or several))
-            for own_name, entry in value["objects"].items()
+            _object(own_name, entry, size, value, level) for own_name, entry in value["objects"].items()
         )
         references = () if is_image else tuple(_references(plane, size))
         pose = _pose(camera_value)
@@ -228,21 +228,21 @@ def parse_tags(text: str, name: str = "tags") -> TagsFile:
 
 
 def _object(
-    name: str, entry: Mapping[str, Any], size: Any, defaults: Mapping[str, Any], *, has_camera: bool
+    name: str, entry: Mapping[str, Any], size: Any, defaults: Mapping[str, Any], level: float
 ) -> TaggedObject:
+    """Return an object; `level` is the height of the reference tags."""
     height = entry.get("height")
     interval = None if height is None else (_length(height[0]), _length(height[1]))
-    # without a calibrated camera everything is in the plane of the reference tags
-    top = interval[1] if interval is not None and has_camera else 0.0
+    # in an image there are no heights; a tag without one is as high as the reference tags
+    top = level if interval is None or _is_image(defaults) else interval[1]
     mounted = entry["tags"] if "tags" in entry else [entry["tag"]]
     tags = []
     for each in mounted:
         tag = each if isinstance(each, dict) else {"id": each}
         x, y = (_length(number) for number in tag.get("at", (0.0, 0.0)))
         edge = _length(tag.get("size", 0.0 if size is None else size))
-        tags.append(
-            MountedTag(tag["id"], edge, x, y, _angle(tag.get("yaw", 0.0)), _length(tag.get("z", top)))
-        )
+        z = _length(tag.get("z", top)) - level
+        tags.append(MountedTag(tag["id"], edge, x, y, _angle(tag.get("yaw", 0.0)), z))
     return TaggedObject(
         name,
         _footprint(entry),
@@ -342,10 +342,23 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
     camera = value.get("camera") or value.get("cameras")
     if "camera" in value and "cameras" in value:
         faults.append((("cameras",), "give either camera, of one or of all, or cameras, one for each"))
+    plane = value.get("plane")
+    references = plane.get("tags") if isinstance(plane, dict) else None
+    reach = _reach(references)
     for name, entry in cast("dict[str, Any]", value["objects"]).items():
         if not isinstance(entry, dict):
             continue
         place: Place = ("objects", name)
+        for key in ("box", "disc", "polygon"):
+            number = max(_plain_numbers(entry.get(key)), default=0.0)
+            if number > reach:
+                faults.append(
+                    (
+                        (*place, key),
+                        f"{number:g} is {number:g} m, and the reference tags are within {reach:.3g} m; write"
+                        f" {number:g}mm, or {number:g}m if that is meant",
+                    )
+                )
         shapes = [key for key in ("box", "disc", "polygon") if key in entry]
         if len(shapes) != 1:
             faults.append(
@@ -359,8 +372,8 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
         for index, tag in enumerate(tags):
             own = (*place, "tags", index) if "tags" in entry else (*place, "tag")
             use(tag.get("id") if isinstance(tag, dict) else tag, own, f"on {name}")
-            if isinstance(tag, dict) and tag.get("z") and not camera:
-                faults.append((own, "z needs a calibrated camera; without one, all tags are in one plane"))
+            if isinstance(tag, dict) and tag.get("z") and _is_image(value):
+                faults.append((own, "an image has no heights; leave z out, or give reference tags"))
             has_size = "size" in value or (isinstance(tag, dict) and "size" in tag)
             if entry.get("lifted") and not has_size:
                 faults.append((own, "a lifted object is found by the size of its tags; give size"))
@@ -368,8 +381,6 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
             faults.append(
                 (place, "lifted needs a calibrated camera; add camera (tags calibrate measures one)")
             )
-    plane = value.get("plane")
-    references = plane.get("tags") if isinstance(plane, dict) else None
     if isinstance(plane, dict) and isinstance(references, dict):
         for key, entry in references.items():
             own = ("plane", "tags", key)
@@ -390,6 +401,25 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
             other = f"the pose of each camera; {lacking[0]} has none"
         faults.append((("plane",), f"the plane is not determined: give {least}, or {other}"))
     return faults
+
+
+def _reach(references: Any) -> float:
+    """Return the diagonal of the box around reference tags in metres; inf where it is not known."""
+    try:
+        entries = [each["at"] if isinstance(each, dict) else each for each in references.values()]
+        places = np.array([[_length(number) for number in entry] for entry in entries])
+        return float(np.linalg.norm(np.ptp(places, axis=0))) or math.inf
+    except (AttributeError, KeyError, TypeError, ValueError, UsageError):
+        return math.inf
+
+
+def _plain_numbers(value: Any) -> Iterator[float]:
+    """Yield the sizes of the numbers without a unit in a list, at any depth."""
+    if isinstance(value, list):
+        for each in value:
+            yield from _plain_numbers(each)
+    elif isinstance(value, int | float):
+        yield abs(float(value))
 
 
 def _outline_fault(corners: Any) -> str | None:

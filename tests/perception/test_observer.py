@@ -27,7 +27,7 @@ from spatial_replay.perception.rendering import Flaws, Plate, render
 
 pytest.importorskip("cv2")
 
-FLAT = f"{BLOCKS}\n{REFERENCES}\n"
+FLAT = f"{BLOCKS}\n{REFERENCES}\n".replace("plane: {", "plane: {height: 40mm, ")
 
 
 def true_corners(each: Plate) -> np.ndarray:
@@ -93,6 +93,51 @@ def test_the_truth_is_within_the_stated_uncertainty(text: str) -> None:
             stated.append(each.uncertainty)
     # and it says something: millimetres, where a pixel is 1.6 mm
     assert np.median(stated) < 0.004
+
+
+@pytest.mark.parametrize("top", [0.01, 0.04, -0.02])
+def test_tags_above_a_plane_that_no_camera_was_calibrated_for_are_as_uncertain_as_their_parallax(
+    top: float,
+) -> None:
+    heights = f"height: [{min(top, 0.0)}, {top}]"
+    tags = parse_tags(f"{BLOCKS}\n{REFERENCES}\n".replace("height: [0, 40mm]", heights))
+    drawn = np.random.default_rng(11)
+    off, stated = [], []
+    for seed in range(12):
+        # from all sides, and from steep to flat
+        around, slant = drawn.uniform(-math.pi, math.pi), drawn.uniform(0.6, 1.5)
+        level, table = math.cos(slant), np.array([0.48, 0.0, 0.0])
+        eye = table + 1.3 * np.array([level * math.cos(around), level * math.sin(around), math.sin(slant)])
+        pose = pose_looking_at(eye, table, np.array([0.0, 0.0, 1.0]))
+        places = {0: (*drawn.uniform([0.38, -0.08], [0.56, 0.08]), 0.3)}
+        observer = TagObserver(tags)
+        sample = observer.observe(Frame(0, picture(plates(tags, places, top), seed=seed, pose=pose))).sample
+        red = sample.objects["red"]
+        assert isinstance(red, TrackedObject)
+        off.append(np.hypot(*(place_of(red) - places[0][:2])))
+        stated.append(red.uncertainty)
+        (remark,) = [line for line in observer.remarks() if "calibrated" in line]
+        side = "above" if top > 0 else "below"
+        assert f"tags on objects are up to {1e3 * abs(top):.3g} mm {side} the reference tags" in remark
+    assert (np.array(off) <= stated).all()
+    # the bound says something, and would not hold without the parallax
+    assert (np.array(off) > 0.004).any()
+    assert np.median(np.array(stated) / off) < 6
+
+
+def test_reference_tags_that_are_as_high_as_those_on_objects_leave_no_parallax() -> None:
+    scene = plates(parse_tags(FLAT), {0: (0.45, 0.05, 0.0)}, 0.0)
+    observer = TagObserver(parse_tags(FLAT))
+    assert observer.observe(Frame(0, picture(scene))).sample.objects["red"].uncertainty < 0.004
+    assert not any("calibrated" in line for line in observer.remarks())
+
+
+@pytest.mark.parametrize("text", [TABLE, FLAT], ids=["camera", "homography"])
+def test_reference_tags_that_fit_if_all_are_turned_name_the_line_to_write(text: str) -> None:
+    tags = parse_tags(text, "tags.yaml")
+    turned = [plate(each.id, each.x, each.y, 0.0, math.pi) for each in tags.references]
+    with pytest.raises(UsageError, match=r"turned by 180 degrees.*10: \{at: \[0\.3, -0\.17\], yaw: 180deg\}"):
+        TagObserver(tags).observe(Frame(0, picture(turned)))
 
 
 def test_more_noise_and_smaller_tags_are_stated_as_more_uncertainty() -> None:

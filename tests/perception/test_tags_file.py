@@ -64,6 +64,14 @@ MISTAKES = {
         "objects.red.polygon: the polygon's boundary crosses or touches itself at (0.5, 0.5); list its"
         " corners in order around it, or split it",
     ),
+    "millimetres without a unit": (
+        TABLE.replace("box: [50mm, 50mm]", "box: [50, 50]", 1),
+        "objects.red.box: 50 is 50 m, and the reference tags are within 0.488 m; write 50mm, or 50m if",
+    ),
+    "a height in an image": (
+        "size: 40\nobjects: {red: {tags: [{id: 0, z: 3}], box: [40, 30]}}\nplane: image",
+        "an image has no heights",
+    ),
     "millimetres in an image": (f"{BLOCKS}\nplane: image", "lengths are pixels; write a number; got '48mm'"),
     "a size of nothing": (TABLE.replace("48mm", "0mm"), "above 0"),
 }
