@@ -31,7 +31,7 @@ from spatial_replay.mapping.reading_plan import ReadingPlan
 from spatial_replay.mapping.topic_reader import MISFITS, TopicReader
 from spatial_replay.mapping.tracker import Remarks, Tracker
 from spatial_replay.mapping.transforms import HISTORY_NS, FrameTree
-from spatial_replay.text import Instant, Sentence, times_apart
+from spatial_replay.text import Instant, Sentence, nearest_hint, times_apart
 from spatial_replay.trace.sample import FOREVER, LATEST_NS
 from spatial_replay.trace.trace import Trace
 
@@ -210,7 +210,7 @@ class Assembler:
         """End the log; return the remaining samples.
 
         Raises:
-            UsageError: the mapping fits no message of a topic.
+            UsageError: the mapping fits no message of a topic, or the log has no such fixed frame.
         """
         trace = self._settle(max(self._newest_ns, self._latest_ns))
         # of a system that runs, there is no log to cut
@@ -229,8 +229,26 @@ class Assembler:
                     f"{reader.name}: {reader.unstamped} {were} left out: they have no stamp for the clock"
                     " header"
                 )
+        self._check_fixed_frame()
         self._settled_ns = LATEST_NS
         return trace
+
+    def _check_fixed_frame(self) -> None:
+        """Raise UsageError if a whole log has frames, but not the fixed one."""
+        mapping = self._plan.mapping
+        is_whole = self._arrived is None and self._window_ns == (0, FOREVER) and self.jump is None
+        if mapping.fixed_frame is None or not is_whole or self._plan.lost:
+            return
+        extractors = (reader.extractor for reader in self._readers.values())
+        noted = (each.noted_frames for each in extractors if each is not None)
+        frames = sorted(self._tree.names.union(*noted) - {""})
+        if frames and mapping.fixed_frame not in frames:
+            hint = nearest_hint(mapping.fixed_frame, frames)
+            listed = ", ".join(frames[:20]) + (f" and {len(frames) - 20} more" if len(frames) > 20 else "")
+            raise UsageError(
+                f"{mapping.name}: fixed_frame: the log has no frame {mapping.fixed_frame!r};"
+                f" {f'{hint} ' if hint else ''}its frames are {listed}"
+            )
 
     def take_faults(self, *, last: bool = False) -> tuple[str, ...]:
         """Return what was lost since the last call, each with its place."""

@@ -214,6 +214,7 @@ class Extractor:
     def _frames(self, binding: Binding, messages: Sequence[object], objects: _Objects) -> list[str] | None:
         """Return the frame of each object; None if all are in the fixed frame."""
         if self._layout.frame_name is not None:
+            self.noted_frames.add(self._layout.frame_name)
             return [self._layout.frame_name] * len(objects.values) if self._needs_frame else None
         if binding.frame is None or not objects.values:
             return None
@@ -223,10 +224,9 @@ class Extractor:
             example = messages[objects.message[0]] if from_message else objects.values[0]
             self.noted_frames.add(str(get(example)))
             return None
-        if from_message:
-            of_message = [str(get(message)).removeprefix("/") for message in messages]
-            return [of_message[index] for index in objects.message]
-        return [str(get(each)).removeprefix("/") for each in objects.values]
+        frames = [str(get(each)).removeprefix("/") for each in (messages if from_message else objects.values)]
+        self.noted_frames.update(frames)
+        return [frames[index] for index in objects.message] if from_message else frames
 
     def _stamps(self, messages: Sequence[object], objects: _Objects) -> list[int] | None:
         if self._time is None or not self._needs_frame:

@@ -21,6 +21,7 @@ from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import log_file
 from spatial_replay.mapping.field_paths import FieldPath, NameTemplate
 from spatial_replay.mapping.model import (
+    NO_FRAME,
     NO_TOPIC,
     UNITS_NS,
     ClassMapping,
@@ -105,6 +106,8 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
     listed = value.get("shapes")
     shapes = list(listed) if isinstance(listed, dict) else []
     faults: list[tuple[Place, str]] = []
+    if value.get("fixed_frame", "") is None:
+        faults.append((("fixed_frame",), NO_FRAME))
     topics: Any = value["topics"]
     for topic, entry in topics.items():
         if not isinstance(entry, dict):

@@ -24,6 +24,8 @@ FOREVER_NS = 2**63 - 1
 
 NO_TOPIC = "no topic was chosen: name one with objects or signals"
 """What is wrong with a mapping without topics."""
+NO_FRAME = "no frame was chosen: name the one that coordinates are brought into"
+"""What is wrong with a mapping whose fixed frame is left open."""
 
 Measure: TypeAlias = float | str
 """A number, or the field path of one."""

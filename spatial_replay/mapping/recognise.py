@@ -12,6 +12,7 @@ from spatial_replay.mapping.field_paths import (
     field_names,
     get_field,
     is_list,
+    is_number,
     iter_elements,
     walk,
 )
@@ -53,6 +54,7 @@ class Guess:
         position: of a point, or of x and y.
         size: of length, width and maybe height; or of a radius.
         names: candidates for what distinguishes objects, the likeliest first.
+        is_in_pixels: whether coordinates look like pixels.
         others: of further lists whose elements look like objects.
     """
 
@@ -64,6 +66,7 @@ class Guess:
     size: tuple[str, ...] = ()
     names: tuple[str, ...] = ()
     class_name: str | None = None
+    is_in_pixels: bool = False
     others: tuple[str, ...] = ()
 
     @property
@@ -159,11 +162,15 @@ def _object_in(value: object) -> Guess | None:
     """Find the fields of one object in a message or an element of a list."""
     fields = dict(_iter_fields(value))
     polygon = next((path for path in _named(fields, _OUTLINES) if _is_outline(fields[path])), None)
-    position = _position_in(fields)
+    if polygon is not None and not is_list(fields[polygon]):
+        polygon = f"{polygon}.points"
+    position, turn = _pose_in(fields)
+    if polygon is not None and turn is not None and not _is_around(fields[polygon], fields, position):
+        # such as pixels beside a pose in metres
+        polygon = None
     if polygon is None and position is None:
         return None
     yaw = _first(fields, _YAWS, _is_number) if polygon is None else None
-    turn = next((path for path in _named(fields, _TURNS) if _has(fields[path], "xyzw")), None)
     return Guess(
         position=position if polygon is None else None,
         orientation=turn if polygon is None else None,
@@ -172,16 +179,69 @@ def _object_in(value: object) -> Guess | None:
         size=_size_in(fields) if polygon is None else (),
         names=_names_in(fields),
         class_name=_first(fields, _CLASSES, lambda each: isinstance(each, str)),
+        is_in_pixels=_is_in_pixels(fields, polygon, position),
     )
 
 
-def _position_in(fields: dict[str, object]) -> str | tuple[str, ...] | None:
-    for path in _named(fields, _POSITIONS):
-        if _has(fields[path], "xy"):
-            return path
-    if _is_number(fields.get("x")) and _is_number(fields.get("y")) and not _is_number(fields.get("w")):
-        return ("x", "y")
+def _pose_in(fields: dict[str, object]) -> tuple[str | tuple[str, ...] | None, str | None]:
+    """Return the paths of a position and an orientation, of one pose if there is one."""
+    turns = [path for path in _named(fields, _TURNS) if _has(fields[path], "xyzw")]
+    places = [
+        path
+        for path in _named(fields, _POSITIONS)
+        # the positions of joints stand beside a list of their names
+        if _point(fields[path]) is not None and not (is_list(fields[path]) and is_list(fields.get("name")))
+    ]
+    for place in places:
+        for turn in turns:
+            if place.rpartition(".")[0] == turn.rpartition(".")[0]:
+                return place, turn
+    position: str | tuple[str, ...] | None = places[0] if places else None
+    if position is None and all(_is_number(fields.get(name)) for name in "xy"):
+        position = None if _is_number(fields.get("w")) else ("x", "y")
+    return position, turns[0] if turns else None
+
+
+def _point(value: object) -> tuple[float, ...] | None:
+    """Return the coordinates of a point: of a message with x and y, or of a list of two or three numbers."""
+    if _has(value, "xy"):
+        known = field_names(value)
+        return tuple(float(get_field(value, name)) for name in "xyz" if name in known)  # type: ignore[arg-type]
+    if is_list(value) and len(value) in (2, 3) and all(map(is_number, value)) and None not in list(value):
+        return tuple(map(float, value))  # type: ignore[arg-type]
     return None
+
+
+def _corners(value: object) -> list[tuple[float, ...]]:
+    return [point for each in value if (point := _point(each)) is not None]  # type: ignore[attr-defined]
+
+
+def _is_around(outline: object, fields: dict[str, object], position: str | tuple[str, ...] | None) -> bool:
+    """Return whether an outline lies around a position; at most its own size apart."""
+    place = _point(fields[position]) if isinstance(position, str) else None
+    if place is None:
+        return True
+    corners = _corners(outline)
+    low, high = (tuple(pick(each[axis] for each in corners) for axis in (0, 1)) for pick in (min, max))
+    size = sum(high) - sum(low)
+    return all(low[axis] - size <= place[axis] <= high[axis] + size for axis in (0, 1))
+
+
+_PIXELS = 50
+"""Coordinates in pixels reach beyond this as a rule, and are not below 0."""
+_IMAGES = re.compile("pixel|image|bbox|xyxy|keypoint", re.IGNORECASE)
+
+
+def _is_in_pixels(
+    fields: dict[str, object], polygon: str | None, position: str | tuple[str, ...] | None
+) -> bool:
+    """Return whether an outline, or a position whose name speaks of an image, has coordinates like pixels."""
+    points = _corners(fields[polygon]) if polygon is not None else []
+    if polygon is None and isinstance(position, str) and _IMAGES.search(position):
+        points = [point for point in [_point(fields[position])] if point is not None]
+    flat = [number for x, y, *_ in points for number in (x, y)]
+    is_flat = not any(z for _, _, *rest in points for z in rest)
+    return bool(flat) and is_flat and min(flat) >= 0 and max(flat) >= _PIXELS
 
 
 def _size_in(fields: dict[str, object]) -> tuple[str, ...]:
@@ -230,7 +290,7 @@ def _first(fields: dict[str, object], names: tuple[str, ...], fits: Callable[[ob
 
 
 def _is_no_place(name: str) -> bool:
-    return not _NOT_PLACES.isdisjoint(_words(name))
+    return not _NOT_PLACES.isdisjoint(_words(name.removesuffix("_with_covariance")))
 
 
 def _is_time(name: str) -> bool:

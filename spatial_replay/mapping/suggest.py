@@ -14,26 +14,34 @@ from dataclasses import dataclass, replace
 from math import isfinite
 from operator import itemgetter
 from types import MappingProxyType
+from typing import Literal, TypeAlias
 
 from spatial_replay.bags.topic import Topic
 from spatial_replay.logs.topics import DERIVED
 from spatial_replay.mapping.field_paths import (
+    FieldError,
     FieldPath,
     field_names,
     get_field,
     getter,
+    iter_elements,
+    leads_somewhere,
     name_from_topic,
     style_of,
+    walk,
 )
 from spatial_replay.mapping.message_types import (
     BUILT_IN,
     GEODETIC,
     GEODETIC_TYPES,
     TRANSFORM_TYPES,
+    MessageLayout,
+    layout_of_topic,
     short_type,
 )
-from spatial_replay.mapping.model import NO_TOPIC
+from spatial_replay.mapping.model import NO_TOPIC, TopicMapping
 from spatial_replay.mapping.recognise import Guess, frame_of, guess_objects, numbers_in
+from spatial_replay.mapping.yaml_document import LARGEST_TEXT
 from spatial_replay.text import counted
 from spatial_replay.trace.sample import FOREVER
 
@@ -49,6 +57,24 @@ _MIDDLEWARE = frozenset({"rosout", "rosout_agg", "parameter_events", "clock", "d
 """Topics about programs rather than objects, by the last part of their names."""
 _SENSORS = re.compile("camera|optical|lidar|laser|velodyne|radar|imu|gps|gnss|sensor", re.IGNORECASE)
 """Names of frames that are mounted on an object."""
+_NORTH_EAST_DOWN = re.compile(r"(?<![a-z0-9])(px4|ned|fmu|vehicle_local_position)(?![a-z0-9])", re.IGNORECASE)
+"""Topics, types and frames whose x points north, y east and z down."""
+_MAVROS = re.compile(r"(?<![a-z0-9])mavros(?![a-z0-9])", re.IGNORECASE)
+
+_LARGEST_SUGGESTION = LARGEST_TEXT // 2
+"""Bytes of a suggestion, so that a reader's additions fit, too."""
+_LONGEST_KEY = 1_000
+"""Characters of a topic's name as a key; YAML allows 1024."""
+
+_Axes: TypeAlias = Literal["plane", "north", "image"]
+_AXES: Mapping[_Axes, str] = MappingProxyType(
+    {
+        "plane": "",
+        "north": "x north, y east",
+        "image": "in pixels",
+    }
+)
+"""Axes of coordinates, in words. One scene has one kind: the first of these that a log has is suggested."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +87,8 @@ class TopicSuggestion:
         remarks: what a reader should know or change.
         is_transforms: whether it carries transforms. They are suggested as objects only if there are no
             others.
-        frame: the frame of its coordinates.
+        frames: those of its coordinates, as the suggested entry reads them.
+        axes: those of its coordinates.
         numbers: paths of possible signals.
     """
 
@@ -70,7 +97,8 @@ class TopicSuggestion:
     name: str = ""
     remarks: tuple[str, ...] = ()
     is_transforms: bool = False
-    frame: str | None = None
+    frames: frozenset[str] = frozenset()
+    axes: _Axes = "plane"
     numbers: tuple[str, ...] = ()
 
     @property
@@ -104,7 +132,10 @@ def suggest_mapping(
     examples: Mapping[str, Sequence[object]],
     first_ns: Mapping[str, int] = _NOT_KNOWN,
 ) -> str:
-    """Return the text of a mapping file, with comments; it is valid if some topic holds objects.
+    """Return the text of a mapping file, with comments.
+
+    It is valid if some topic holds objects or signals, except where objects are in several frames that no
+    transforms join: then a reader has to choose one.
 
     Args:
         log: the log's name.
@@ -112,31 +143,54 @@ def suggest_mapping(
         first_ns: log time of the first message of each topic, by its name.
     """
     suggestions = suggest_topics(topics, examples)
-    mapped = [each for each in suggestions if each.entry and not each.is_transforms]
+    usable = [each for each in suggestions if each.entry and len(_text(each.topic.name)) <= _LONGEST_KEY]
+    mapped = [each for each in usable if not each.is_transforms]
     transforms = [each for each in suggestions if each.is_transforms]
-    active = _distinguished(mapped or [each for each in transforms if each.entry])
+    axes: _Axes = next((axes for axes in _AXES if any(each.axes == axes for each in mapped)), "plane")
+    mapped = [each for each in mapped if each.axes == axes]
+    active = _distinguished(mapped or [each for each in usable if each.is_transforms])
     signals = [] if active else [each for each in suggestions if each.signals]
-    chosen = {each.topic.name: each.entry for each in active} | {e.topic.name: e.signals for e in signals}
     lines = [f"# How messages of {_comment(log)} become objects: a start, made from the first of them."]
     if not active:
         lines.append(f"# Nothing looks like an object{': these are signals' if signals else ''}.")
     lines += [
         *_frame_lines(active, transforms, examples),
-        *_axes_lines(active),
+        *_axes_lines(axes if active else "plane"),
         *_origin_lines(active, examples),
         *_time_lines(active or signals, first_ns),
         "topics:",
     ]
-    if not chosen:
+    if not active and not signals:
         lines.append(f"  # {NO_TOPIC}, such as")
         lines.append("  # /robot/state: {name: robot, position: [x, y], yaw: theta, shape: {disc: 0.5}}")
-    for each in active or signals:
-        lines += [f"  # {_described(each.topic)}", *(f"  # {remark}" for remark in each.remarks)]
-        lines.append(f"  {_text(each.topic.name)}: {chosen[each.topic.name]}")
-    rest = [each for each in suggestions if each.topic.name not in chosen]
-    if rest:
-        lines += ["", "  # not used:", *(line for each in rest for line in _unused(each))]
+    entries = {each.topic.name: "\n".join(_entry_lines(each)) for each in active or signals}
+    kept = _bounded(list(entries.items()), _LARGEST_SUGGESTION - len("\n".join(lines)))
+    rest = [each for each in suggestions if each.topic.name not in dict(kept)]
+    unused = {each.topic.name: _unused(each, axes) for each in rest}
+    left = _LARGEST_SUGGESTION - len("\n".join([*lines, *dict(kept).values()]))
+    listed = _bounded(list(unused.items()), left)
+    lines += dict(kept).values()
+    if listed:
+        lines += ["", "  # not used:", *dict(listed).values()]
+    if len(listed) < len(unused):
+        lines.append(f"  # … and {counted(len(unused) - len(listed), 'topic')} more")
     return "\n".join(lines) + "\n"
+
+
+def _entry_lines(each: TopicSuggestion) -> Iterator[str]:
+    yield from (f"  # {text}" for text in (_described(each.topic), *each.remarks))
+    yield f"  {_text(each.topic.name)}: {each.entry or each.signals}"
+
+
+def _bounded(texts: Sequence[tuple[str, str]], most: int) -> list[tuple[str, str]]:
+    """Return the first texts, up to a number of bytes."""
+    kept: list[tuple[str, str]] = []
+    for name, text in texts:
+        most -= len(text.encode()) + 1
+        if most < 0:
+            break
+        kept.append((name, text))
+    return kept
 
 
 def _distinguished(active: Sequence[TopicSuggestion]) -> list[TopicSuggestion]:
@@ -168,10 +222,12 @@ def _origin_lines(
                     return
 
 
-def _axes_lines(active: Sequence[TopicSuggestion]) -> Iterator[str]:
-    """Yield the lines about axes, if all coordinates are those of an image."""
-    if active and all(short_type(each.topic.type) in _IN_IMAGES for each in active):
+def _axes_lines(axes: _Axes) -> Iterator[str]:
+    if axes == "image":
         yield "# rows of pixels are counted downwards; samples have y up, so that above means above"
+        yield "axes: {y: down}"
+    elif axes == "north":
+        yield "# x is north, y east, z down (NED); with y down, pictures are not mirrored, and north is right"
         yield "axes: {y: down}"
 
 
@@ -179,7 +235,6 @@ def _suggestion(topic: Topic, examples: Sequence[object]) -> TopicSuggestion:
     if topic.name in DERIVED or topic.name.rstrip("/").split("/")[-1] in _MIDDLEWARE:
         return TopicSuggestion(topic)
     kind = short_type(topic.type)
-    frame = next((name for each in examples if (name := frame_of(each)) is not None), None)
     if topic.unreadable is not None:
         return TopicSuggestion(topic, remarks=(f"cannot be read: {_comment(topic.unreadable)}",))
     if kind in TRANSFORM_TYPES:
@@ -188,14 +243,56 @@ def _suggestion(topic: Topic, examples: Sequence[object]) -> TopicSuggestion:
         reading = BUILT_IN[kind]
         has_outline = bool(reading.polygon or reading.sizes or reading.solids)
         name = reading.name.replace("{topic}", name_from_topic(topic.name))
-        return TopicSuggestion(
-            topic, {} if has_outline else _POINT, name, () if has_outline else _SIZELESS, frame=frame
-        )
+        fields = {} if has_outline else _POINT
+        return _placed(topic, reading, examples, fields, name, () if has_outline else _SIZELESS)
     guess = guess_objects(topic.name, topic.type, examples)
     if guess is None:
         return TopicSuggestion(topic, numbers=numbers_in(examples[0]) if examples else ())
     name = _name(topic, guess)
-    return TopicSuggestion(topic, _fields(name, guess), name, _remarks(guess), frame=frame)
+    layout = layout_of_topic(topic.type, TopicMapping(topic.name, objects=guess.objects))
+    made = _placed(topic, layout, examples, _fields(name, guess), name, _remarks(guess))
+    return replace(made, axes="image") if guess.is_in_pixels else made
+
+
+def _placed(
+    topic: Topic,
+    layout: MessageLayout,
+    examples: Sequence[object],
+    fields: Mapping[str, str],
+    name: str,
+    remarks: tuple[str, ...],
+) -> TopicSuggestion:
+    """Return a suggestion with the frames and axes of its coordinates, and how long they stay valid."""
+    frames = frozenset(_iter_frames(layout, examples))
+    kept = {**fields, "max_age": "forever"} if layout.stays or topic.latched else fields
+    axes: _Axes = "plane"
+    if short_type(topic.type) in _IN_IMAGES:
+        axes = "image"
+    elif any(map(_NORTH_EAST_DOWN.search, (topic.name, topic.type, *frames))):
+        axes = "north"
+    elif any(map(_MAVROS.search, (topic.name, topic.type))):
+        remarks = (*remarks, _OF_MAVROS)
+    return TopicSuggestion(topic, kept, name, remarks, frames=frames, axes=axes)
+
+
+def _iter_frames(layout: MessageLayout, examples: Sequence[object]) -> Iterator[str]:
+    """Yield the frame of each object, where the layout looks for it."""
+    alternatives = [FieldPath.of(path) for path in layout.frame]
+    for message, thing in _iter_objects(layout, examples):
+        roots = [(path, message if path.from_message else thing) for path in alternatives]
+        frame = next((walk(path, root) for path, root in roots if leads_somewhere(path, root)), None)
+        if isinstance(frame, str) and frame:
+            yield frame.removeprefix("/")
+
+
+def _iter_objects(layout: MessageLayout, examples: Sequence[object]) -> Iterator[tuple[object, object]]:
+    """Yield each message with each object in it."""
+    path = FieldPath.of(layout.objects) if layout.objects else None
+    for message in examples:
+        try:
+            yield from ((message, each) for each in (iter_elements(path, message) if path else (message,)))
+        except FieldError:
+            continue
 
 
 def _of_transforms(topic: Topic, examples: Sequence[object]) -> TopicSuggestion:
@@ -208,7 +305,15 @@ def _of_transforms(topic: Topic, examples: Sequence[object]) -> TopicSuggestion:
     left_out = (
         {"except": f"[{', '.join(map(_text, mounted))}]"} if mounted and len(mounted) < len(children) else {}
     )
-    return TopicSuggestion(topic, {**left_out, **_POINT}, "{child_frame_id}", _SIZELESS, is_transforms=True)
+    frames = frozenset(parent for message in examples for parent, _ in _edges(message))
+    return TopicSuggestion(
+        topic,
+        {**left_out, **_POINT},
+        "{child_frame_id}",
+        _SIZELESS,
+        is_transforms=True,
+        frames=frames,
+    )
 
 
 _IN_IMAGES = frozenset({"vision_msgs/Detection2DArray", "apriltag_msgs/AprilTagDetectionArray"})
@@ -217,6 +322,10 @@ _IN_IMAGES = frozenset({"vision_msgs/Detection2DArray", "apriltag_msgs/AprilTagD
 _SIZELESS = (f"messages have no size: {_RADIUS} is a guess, {{box: [length, width]}} is another shape",)
 
 
+_OF_MAVROS = (
+    "MAVROS turns local positions to x east, y north, z up; raw MAVLink messages are north, east, down: for"
+    " these, axes: {y: down}"
+)
 _POINT = MappingProxyType({"shape": f"{{disc: {_RADIUS}}}"})
 _INDEXED = "only the places in the list distinguish objects: objects swap where these change"
 
@@ -281,18 +390,27 @@ def _frame_lines(
     examples: Mapping[str, Sequence[object]],
 ) -> Iterator[str]:
     """Yield the lines about the fixed frame, which coordinates in more than one frame need."""
-    frames = sorted({each.frame for each in active if each.frame is not None})
+    frames = sorted(frozenset().union(*(each.frames for each in active)))
     messages = (message for each in transforms for message in examples.get(each.topic.name, ()))
-    edges = {edge for message in messages for edge in _edges(message)}
+    edges = sorted({edge for message in messages for edge in _edges(message)})
     roots = sorted({parent for parent, _ in edges} - {child for _, child in edges})
     if len(frames) > 1:
-        yield f"# coordinates are in the frames {_comment(', '.join(frames))}: bring them into one"
-        known = {name for edge in edges for name in edge}
-        fixed = next((root for root in roots if known.issuperset(frames)), None)
-        yield f"{'' if fixed else '# '}fixed_frame: {_text(fixed or frames[0])}"
+        yield f"# coordinates are in the frames {_comment(', '.join(frames))}"
+        fixed = next((root for root in roots if _below(root, edges).issuperset(frames)), None)
+        if fixed is None:
+            yield "# no transforms join these: choose one; leave out topics in others or give them a `frame`"
+        yield f"fixed_frame: {_text(fixed) if fixed else ''}".rstrip()
     elif edges:
         yield "# without a fixed frame, coordinates are taken as they are"
         yield f"# fixed_frame: {_text((roots or frames or ['map'])[0])}"
+
+
+def _below(root: str, edges: Sequence[tuple[str, str]]) -> set[str]:
+    """Return a frame and all those that transforms place in it."""
+    below = {root}
+    while more := {child for parent, child in edges if parent in below} - below:
+        below |= more
+    return below
 
 
 def _edges(message: object) -> Iterator[tuple[str, str]]:
@@ -329,15 +447,14 @@ def _sampled(active: Sequence[TopicSuggestion], first_ns: Mapping[str, int]) -> 
     return max(together, key=itemgetter(0))[1] if together else topics[0]
 
 
-def _unused(each: TopicSuggestion) -> Iterator[str]:
-    topic = _text(each.topic.name)
-    if each.entry:
-        yield f"  # {topic}: {each.entry}    # {_described(each.topic)}"
-    elif each.signals:
-        yield f"  # {topic}: {each.signals}    # {_described(each.topic)}"
-    else:
-        remark = "".join(f"; {remark}" for remark in each.remarks)
-        yield f"  # {topic}: {_described(each.topic)}{remark}"
+def _unused(each: TopicSuggestion, axes: _Axes) -> str:
+    topic, what = _text(each.topic.name), _described(each.topic)
+    if each.entry and each.axes != axes and not each.is_transforms:
+        apart = f"{_AXES[each.axes]}: for a mapping of its own with y down"
+        return f"  # {topic}: {each.entry}    # {what}; {apart}"
+    if each.entry or each.signals:
+        return f"  # {topic}: {each.entry or each.signals}    # {what}"
+    return "; ".join([f"  # {topic}: {what}", *each.remarks])
 
 
 def _described(topic: Topic) -> str:

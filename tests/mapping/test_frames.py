@@ -89,6 +89,7 @@ def test_transforms_farther_apart_than_ten_seconds_do_not_count() -> None:
 
 def test_objects_in_an_unknown_frame_are_unknown() -> None:
     feed = Feed().add("/p", 0, pose_stamped(1, 1, "camera")).add("/q", 1, pose_stamped(1, 1, ""))
+    feed.add("/tf", 1, tf(transform("map", "odom", (0, 0, 0))))
     made = make("fixed_frame: map\nsample: {topic: /q}\ntopics: {/p: {}, /q: {}}", feed)
     assert (made.states("p"), made.states("q")) == ("?", "?")
     assert "no transform to 'map' names the frame 'camera'" in made.remarks[0]
@@ -142,7 +143,7 @@ def test_a_frame_that_is_fixed_to_a_moving_one_moves_with_it() -> None:
 def test_frames_in_a_cycle_make_objects_unknown() -> None:
     feed = Feed(latched=frozenset({"/tf_static"}))
     feed.add("/tf_static", 0, tf(transform("a", "b", (1, 0, 0)), transform("b", "a", (1, 0, 0))))
-    feed.add("/p", 0, pose_stamped(0, 0, "a"))
+    feed.add("/tf_static", 0, tf(transform("map", "c", (1, 0, 0)))).add("/p", 0, pose_stamped(0, 0, "a"))
     assert make("fixed_frame: map\ntopics: {/p: {}}", feed).states("p") == "?"
 
 

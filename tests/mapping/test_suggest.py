@@ -11,7 +11,7 @@ from spatial_replay import UsageError, read_trace
 from spatial_replay.bags import Topic
 from spatial_replay.cli import run
 from spatial_replay.mapping import LogMapping, parse_mapping, suggest_mapping
-from spatial_replay.mapping.model import ShapeMapping
+from spatial_replay.mapping.model import FOREVER_NS, ShapeMapping
 from spatial_replay.sources import open_source
 
 POINT = {"x": 1.0, "y": 2.0, "z": 0.0}
@@ -119,7 +119,83 @@ def test_the_root_frame_is_suggested_for_several_frames() -> None:
     topics = [Topic(name, kind, "json") for name, kind in kinds.items()]
     assert parse_mapping(suggest_mapping("run", topics, examples)).fixed_frame == "map"
     # without the transforms the root is not known
-    assert parse_mapping(suggest_mapping("run", topics[:2], examples)).fixed_frame is None
+    text = suggest_mapping("run", topics[:2], examples)
+    assert "frames base, map" in text
+    with pytest.raises(UsageError, match="fixed_frame: no frame was chosen"):
+        parse_mapping(text)
+
+
+def test_frames_inside_lists_count_and_only_a_common_root_is_suggested() -> None:
+    odometry = {"header": {"frame_id": "odom"}, "pose": {"pose": {"position": POINT, "orientation": TURN}}}
+    markers = {"markers": [{"header": {"frame_id": "map"}, "ns": "a", "id": 1}]}
+    examples: dict[str, list[object]] = {"/odom": [odometry], "/markers": [markers]}
+    kinds = {
+        "/odom": "nav_msgs/msg/Odometry",
+        "/markers": "visualization_msgs/msg/MarkerArray",
+        "/tf": "tf2_msgs/msg/TFMessage",
+    }
+    topics = [Topic(name, kind, "json") for name, kind in kinds.items()]
+
+    def suggested_with(*edges: tuple[str, str]) -> str:
+        moved = [{"header": {"frame_id": one}, "child_frame_id": other} for one, other in edges]
+        return suggest_mapping("run", topics, {**examples, "/tf": [{"transforms": moved}]})
+
+    joined = parse_mapping(suggested_with(("map", "odom"), ("odom", "base")))
+    assert joined.fixed_frame == "map"
+    assert {each.topic: each.max_age_ns for each in joined.topics} == {"/odom": None, "/markers": FOREVER_NS}
+    assert parse_mapping(suggested_with(("world", "map"), ("map", "odom"))).fixed_frame == "world"
+    for apart in ([("map", "laser"), ("odom", "base")], []):
+        with pytest.raises(UsageError, match="no frame was chosen"):
+            parse_mapping(suggested_with(*apart))
+
+
+def test_transforms_as_objects_are_brought_into_their_root() -> None:
+    moved = [{"header": {"frame_id": a}, "child_frame_id": b} for a, b in (("map", "odom"), ("odom", "base"))]
+    tf = Topic("/tf", "tf2_msgs/msg/TFMessage", "json")
+    assert parse_mapping(suggest_mapping("run", [tf], {"/tf": [{"transforms": moved}]})).fixed_frame == "map"
+
+
+def test_pixels_and_metres_do_not_meet_in_one_suggestion() -> None:
+    corners = [{"x": x, "y": y, "z": 0.0} for x, y in ((300, 200), (340, 200), (340, 240), (300, 240))]
+    robot = {"pose": {"position": POINT, "orientation": TURN}}
+    text, mapping = suggested(robot=robot, tags={"tags": [{"id": 1, "corners": corners}]})
+    assert [each.topic for each in mapping.topics] == ["/robot"]
+    assert "# /tags: " in text
+    assert "in pixels" in text
+    # alone, they are the scene, with y down
+    _, mapping = suggested(tags={"tags": [{"id": 1, "corners": corners}]})
+    assert (mapping.topics[0].polygon, mapping.axes.y) == ("corners", "down")
+    # beside a pose that lies elsewhere, the pose counts
+    tag = {"id": 1, "center": {"x": 320.0, "y": 220.0}, "corners": corners, "pose": robot}
+    _, mapping = suggested(robot=robot, tags={"tags": [tag]})
+    assert {each.topic: each.position for each in mapping.topics} == {
+        "/robot": "pose.position",
+        "/tags": "pose.pose.position",
+    }
+
+
+def test_north_east_down_is_recognised_by_the_names_of_px4() -> None:
+    position = {"x": 0.0, "y": 2.0, "z": -5.0, "heading": 1.5}
+    topic = Topic("/fmu/out/vehicle_local_position", "px4_msgs/msg/VehicleLocalPosition", "json")
+    text = suggest_mapping("run", [topic], {topic.name: [position]})
+    assert parse_mapping(text).axes.y == "down"
+    assert "x is north, y east, z down" in text
+    # beside coordinates that are not, they are left out
+    robot = Topic("/robot", "geometry_msgs/msg/PoseStamped", "json")
+    mapping = parse_mapping(suggest_mapping("run", [topic, robot], {topic.name: [position]}))
+    assert ([each.topic for each in mapping.topics], mapping.axes.y) == (["/robot"], "up")
+    mavros = Topic("/mavros/local_position/pose", "geometry_msgs/msg/PoseStamped", "json")
+    assert "north, east, down" in suggest_mapping("run", [mavros], {})
+
+
+def test_a_suggestion_for_any_log_is_small_enough_to_be_read() -> None:
+    topics = [
+        Topic(f"/{number}/{'x' * 100}", "geometry_msgs/msg/PoseStamped", "cdr") for number in range(5000)
+    ]
+    topics.append(Topic("/" + "y" * 2000, "geometry_msgs/msg/PoseStamped", "cdr"))
+    text = suggest_mapping("run", topics, {})
+    assert 100 < len(parse_mapping(text).topics) < 5000
+    assert "more" in text.splitlines()[-1]
 
 
 def test_numbers_are_suggested_as_signals() -> None:

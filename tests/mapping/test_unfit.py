@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from mapping.feeding import SECOND, Feed, make, pose_stamped
+from mapping.feeding import SECOND, Feed, make, pose_stamped, tf, transform
 from spatial_replay import UsageError
 from spatial_replay.bags import Topic
 from spatial_replay.mapping import Assembler, ReadingPlan, parse_mapping
@@ -80,3 +80,17 @@ def test_a_fault_has_the_time_of_its_own_message() -> None:
         f"test.bag: /a at {number}.000" for number in (1, 3)
     ]
     assert made.trace.times_ns.tolist() == [0, 2 * SECOND]
+
+
+def test_a_fixed_frame_that_the_log_lacks_is_refused_with_the_frames_there_are() -> None:
+    feed = Feed().add("/tf", 0, tf(transform("map", "odom", (0, 0, 0))))
+    feed.add("/p", 1, pose_stamped(1, 0, "odom")).add("/p", 2, pose_stamped(1, 0, "odom"))
+    with pytest.raises(
+        UsageError, match=r"has no frame 'mapp'; did you mean 'map'\? its frames are map, odom"
+    ):
+        make("fixed_frame: mapp\ntopics: {/p: {}}", feed)
+    # a window may lack what the log has
+    assert make("fixed_frame: other\ntopics: {/p: {}}", feed, start_ns=1).states("p") == "??"
+    # the frame of the objects themselves needs no transform
+    alone = Feed().add("/p", 1, pose_stamped(1, 0, "odom"))
+    assert make("fixed_frame: odom\ntopics: {/p: {}}", alone).states("p") == "+"
