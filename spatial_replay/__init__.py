@@ -58,7 +58,7 @@ if TYPE_CHECKING:
     from spatial_replay.monitor.evaluate import Evaluation, evaluate
     from spatial_replay.monitor.monitor import Ending, Monitor, NodeUpdate, SpecUpdate, Update
     from spatial_replay.monitor.result import NodeResult, SpecResult
-    from spatial_replay.monitor.vacuity import Vacuous
+    from spatial_replay.monitor.vacuity import UntestedPart
     from spatial_replay.monitor.verdict import Verdict
     from spatial_replay.monitor.violation import Violation
     from spatial_replay.monitor.witness.atom import DecidingAtom, Measured
@@ -166,9 +166,9 @@ __all__ = [
     "Trigger",
     "TriggeredClip",
     "Tuning",
+    "UntestedPart",
     "Update",
     "UsageError",
-    "Vacuous",
     "Verdict",
     "Verified",
     "Violation",
@@ -235,7 +235,7 @@ __getattr__, __dir__ = loaded_when_used(
         "monitor.evaluate": ("Evaluation", "evaluate"),
         "monitor.monitor": ("Ending", "Monitor", "NodeUpdate", "SpecUpdate", "Update"),
         "monitor.result": ("NodeResult", "SpecResult"),
-        "monitor.vacuity": ("Vacuous",),
+        "monitor.vacuity": ("UntestedPart",),
         "monitor.verdict": ("Verdict",),
         "monitor.violation": ("Violation",),
         "monitor.witness.atom": ("DecidingAtom", "Measured"),

@@ -365,7 +365,7 @@ def evaluate_logs(
         jobs: how many processes evaluate; a program that gives more than 1 needs the guard
             `if __name__ == "__main__":`, as for every process pool.
         dask: the address of a Dask scheduler, whose workers evaluate instead.
-        fail_on: "vacuous", "unknown": results that fail as well.
+        fail_on: "vacuous", "cut", "unknown": results that fail as well.
         constants, each, semantics, strict_names, reading: as for `replay_log`.
 
     Returns:

@@ -86,12 +86,11 @@ class ReplayItem(pytest.Item):
 
     def _failure(self, row: ResultRow) -> str | None:
         """Return what is wrong with a result and what explains it; None if it passes."""
-        from spatial_replay.batch.rows import with_damage
         from spatial_replay.text import requirement_text
 
         failure = row.error
         if row.verdict is not None:
-            failure = with_damage(self._case.expectation.failure(row.verdict, row.robustness), row.faults)
+            failure = self._case.expectation.failure(row)
         if failure is None:
             return None
         title = row.spec if row.object is None else f"{row.spec}[{row.object}]"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from types import SimpleNamespace
 from typing import Unpack
 
 from spatial_replay.api import Evaluating, Log, Specifications, replay_log
@@ -15,6 +17,8 @@ def assert_satisfied(
     specifications: Specifications | None = None,
     *,
     at_least: float | None = None,
+    tolerance: float = 0.0,
+    allow: Iterable[str] = (),
     **options: Unpack[Evaluating],
 ) -> Replayed:
     """Evaluate specifications over a log, and fail unless every result is satisfied.
@@ -22,28 +26,44 @@ def assert_satisfied(
     Args:
         log: a file in any format, an address, or a trace.
         specifications: one or several, parsed or as files; None takes those that the log was written with.
-        at_least: the least robustness that passes, in the units of the formula.
+        at_least: the least robustness that passes, whatever the verdict, in the units of the formula.
+        tolerance: how much less passes, as an allowance for rounding.
+        allow: "vacuous" and "dropped": results that were tested by nothing, and logs that lack samples which
+            their recorder dropped.
         options: how to evaluate and read the log, as for `replay_log`.
 
     Returns:
         What `replay_log` returns, for further assertions.
 
     Raises:
-        AssertionError: a result is violated, unknown, or less robust; its text is what `explain` says.
+        AssertionError: a result is violated, unknown, less robust, or tested by nothing; its text is what
+            `explain` says.
         UsageError, SpecificationError, LogError: it cannot be evaluated.
     """
     __tracebackhide__ = True
     replayed = replay_log(log, specifications, **options)
-    expectation = Expectation(at_least=at_least)
+    expectation = Expectation(at_least=at_least, tolerance=tolerance, allow=frozenset(allow))
     reasons = []
     for result in replayed.results:
-        failure = expectation.failure(result.verdict, result.robustness)
+        failure = expectation.failure(
+            SimpleNamespace(
+                verdict=result.verdict,
+                lower=result.lower,
+                tested=result.tested,
+                untested=[each.message for each in result.untested],
+                vacuous=result.vacuous,
+                dropped=replayed.dropped.text,
+                faults=(),
+            )
+        )
         if failure is not None:
             title = result.name if result.object is None else f"{result.name}[{result.object}]"
             explanation = result.sentences(replayed.first_ns) if result.can_explain else ()
             about = requirement_text(result.spec.id, result.spec.title)
             lines = [f"{replayed.log}: {title}: {failure}", about, *map(str, explanation)]
             reasons.append("\n".join(filter(None, lines)))
+    if "vacuous" not in expectation.allow:
+        reasons += [f"{replayed.log}: {each.message}" for each in replayed.vacuous]
     reasons += [f"{replayed.log} is damaged: {fault}" for fault in replayed.faults[:1]]
     if reasons:
         raise AssertionError("\n\n".join(reasons))

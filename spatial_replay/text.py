@@ -55,14 +55,14 @@ class Sentence(str):
         return made
 
 
-def counted_from(texts: Iterable[str], first_ns: int) -> tuple[str, ...]:
+def counted_from(texts: Iterable[str], first_ns: int) -> tuple[Sentence, ...]:
     """Return texts whose times, where they know them, count from `first_ns`."""
     return tuple(
         Sentence(
             *(Instant(part.time_ns, first_ns) if isinstance(part, Instant) else part for part in text.parts)
         )
         if isinstance(text, Sentence)
-        else text
+        else Sentence(text)
         for text in texts
     )
 

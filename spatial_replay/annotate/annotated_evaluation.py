@@ -18,9 +18,9 @@ from spatial_replay.geometry.arrays import Empty, Floats
 from spatial_replay.logs.messages import Attachment, Channel, Messages, merge
 from spatial_replay.logs.topics import AUTOMATON, DERIVED, SCENE
 from spatial_replay.monitor.instances import Instance
+from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.stream import EvaluationStream, SeriesBlock
-from spatial_replay.monitor.vacuity import Vacuous
 from spatial_replay.spec.formula import Specification
 from spatial_replay.text import nearest_hint
 from spatial_replay.trace.axes import OUR_AXES, Axes
@@ -116,14 +116,14 @@ class AnnotatedEvaluation:
         """For each of `trees` (N, 2), lower and upper end of each node's value if the log ends here."""
         return [stream.final for stream in self.streams]
 
-    def end(self, time_ns: int, vacuous: Sequence[Sequence[Vacuous]] = ()) -> Messages:
+    def end(self, time_ns: int, results: Sequence[SpecResult] = ()) -> Messages:
         """Return what to write after everything else of a log.
 
         Args:
             time_ns: that of its last sample or message, whichever is later.
-            vacuous: for each of `trees`, the parts that decided nothing, if that is known.
+            results: for each of `trees` its result, if there is one: they know what they were tested by.
         """
-        return merge(self._annotator.end(time_ns, self.finals, vacuous))
+        return merge(self._annotator.end(time_ns, self.finals, results))
 
     @property
     def worst_first(self) -> Sequence[int]:

@@ -47,10 +47,9 @@ from spatial_replay.logs.topics import (
     protobuf_channel,
 )
 from spatial_replay.monitor.instances import Instance
+from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.stream import SeriesBlock
-from spatial_replay.monitor.vacuity import Vacuous
-from spatial_replay.monitor.verdict import final_verdict
 from spatial_replay.spec.formula import Outline, Specification, iter_nodes
 from spatial_replay.trace.sample import LATEST_NS
 from spatial_replay.trace.trace import Trace
@@ -193,7 +192,7 @@ class Annotator:
         return self._events(self._changes(trace, blocks))
 
     def end(
-        self, time_ns: int, finals: Sequence[Floats], vacuous: Sequence[Sequence[Vacuous]] = ()
+        self, time_ns: int, finals: Sequence[Floats], results: Sequence[SpecResult] = ()
     ) -> list[Messages]:
         """Return what to write after the last sample: events of what was still pending, warnings, and how all
         results stand, in numbers and in the scene.
@@ -201,15 +200,15 @@ class Annotator:
         Args:
             time_ns: when the log ends, the last sample's time or later.
             finals: for each tree, (N, 2), lower and upper end of each node's value over the finished log.
-            vacuous: for each tree, the parts that decided nothing, if that is known.
+            results: for each tree its result, if there is one: they know what they were tested by.
         """
         events = [
             each
             for reporter, final in zip(self._reporters, finals, strict=True)
             for each in reporter.end(time_ns, final)
         ]
-        for reporter, final, parts in zip(self._reporters, finals, vacuous, strict=False):
-            events += reporter.vacuous(time_ns, parts, final_verdict(*final[0].tolist()))
+        for reporter, result in zip(self._reporters, results, strict=False):
+            events += reporter.untested(time_ns, result)
         return [*self._events(events), *self._finals(time_ns, finals)]
 
     def _finals(self, time_ns: int, finals: Sequence[Floats]) -> list[Messages]:

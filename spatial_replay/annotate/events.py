@@ -39,10 +39,10 @@ from spatial_replay.geometry.arrays import Floats
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.online.codes import low_and_high
 from spatial_replay.monitor.online.rewriting import looks_ahead
+from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.sentences import amount_text, uncertain_text
 from spatial_replay.monitor.stream import SeriesBlock
-from spatial_replay.monitor.vacuity import Vacuous
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Formula, Quantified, Specification, iter_nodes, operator_of
@@ -198,15 +198,14 @@ class EventReporter:
             return []
         return [self._final_event(node, time_ns, self._last_ns, final) for node in self._states.pending]
 
-    def vacuous(self, time_ns: int, parts: Sequence[Vacuous], verdict: Verdict) -> list[EncodedEvent]:
-        """Return one warning for each part of the result that decided nothing.
+    def untested(self, time_ns: int, result: SpecResult) -> list[EncodedEvent]:
+        """Return one warning for each part of the result that was not tested, or not wholly.
 
         Args:
             time_ns: when the log ends.
-            verdict: of the result.
         """
         root = self._reported[0]
-        facts = self._facts(root) | {"verdict": str(verdict)}
+        facts = self._facts(root) | {"verdict": str(result.verdict), "tested": result.tested}
         return [
             self._message(
                 root,
@@ -216,7 +215,7 @@ class EventReporter:
                 facts | {"node": str(each.node or 0), "vacuous": each.reason, "part": each.text},
                 each.message,
             )
-            for each in parts
+            for each in dict.fromkeys((*result.vacuous, *result.untested))
         ]
 
     def _deciding_leaf(self, node: int, period: Period, block: SeriesBlock) -> LeafValue | None:

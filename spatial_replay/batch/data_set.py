@@ -34,7 +34,7 @@ from spatial_replay.errors import LogError, MissingFileError, UsageError, import
 if TYPE_CHECKING:
     import pyarrow as pa
 
-FORMAT: Final = 1
+FORMAT: Final = 2
 """The version of the layout; rows of another version are never read."""
 LAST_RUN: Final = "last_run.parquet"
 IDENTITIES: Final = "identities.jsonl"
@@ -70,7 +70,10 @@ def columns() -> pa.Schema:
             ("atom_objects", texts),
             ("reason", text),
             ("explanation", texts),
+            ("tested", text),
+            ("untested", texts),
             ("vacuous", texts),
+            ("dropped", text),
             ("samples", pa.int64()),
             ("start_ns", time),
             ("duration_ns", time),

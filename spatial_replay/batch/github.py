@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
 from spatial_replay.batch.run_table import (
+    counts_of,
     damage_word,
     requirement_of,
     result_name,
@@ -100,21 +101,23 @@ def write_summary(table: pa.Table, environment: Mapping[str, str] = os.environ) 
 
 def markdown(table: pa.Table) -> str:
     """Return the totals and the worst rows as Markdown."""
+    rows = totals(table)
+    columns = counts_of(rows)
     lines = [
         "### spatial-replay\n",
         f"{summary_text(table)}\n",
-        "| case | spec | requirement | satisfied | violated | unknown | errors | failed | least robustness |",
-        "|---|---|---|--:|--:|--:|--:|--:|--:|",
+        f"| case | spec | requirement | {' | '.join(columns)} | least robustness |",
+        f"|---|---|---|{'--:|' * (len(columns) + 1)}",
     ]
-    for each in totals(table):
+    for place, each in enumerate(rows):
         names = [
             each.group["case"],
             each.group["spec"] or each.group["file"],
             each.about,
         ]
-        numbers = [each.satisfied, each.violated, each.unknown, each.errors, each.failures]
+        numbers = [f"{own[place]:,}" for own in columns.values()]
         least = "" if each.least is None else f"{each.least:.6g}"
-        lines.append(_line([*names, *(f"{number:,}" for number in numbers), least]))
+        lines.append(_line([*names, *numbers, least]))
     failing = [row for row in worst_rows(table, _WORST) if row["failure"] is not None]
     if failing:
         count = len(table) - table.column("failure").null_count

@@ -63,7 +63,7 @@ def _lines(
 ) -> Iterator[str]:
     suites: dict[tuple[str, ...], list[Values]] = {}
     wanted = ("case", "file", "spec", "requirement", "title", "log", "object", "failure", "error")
-    texts = ("explanation", "vacuous", "seconds", "error_kind", "verdict", "line", "faults")
+    texts = ("explanation", "vacuous", "seconds", "error_kind", "verdict", "line", "faults", "untested")
     for row in table.select([*wanted, *texts]).to_pylist():
         suites.setdefault((row["case"], row["file"], row["spec"]), []).append(row)
     failures, errors = _counts(row for rows in suites.values() for row in rows)
@@ -112,6 +112,9 @@ def _case(
         yield f"<{tag} type={_quoted(kind)} message={_quoted(message)}>{_text(text)}</{tag}>\n"
         if (row["case"], row["log"]) in reports:
             yield f"<system-out>[[ATTACHMENT|{_text(reports[row['case'], row['log']])}]]</system-out>\n"
+    elif row["untested"] and limit is None:
+        own = _text("\n".join(row["untested"]))
+        yield f"<system-out>{own}</system-out>\n"
     yield "</testcase>\n"
 
 

@@ -15,6 +15,7 @@ from spatial_replay.batch.baseline import BASELINE_ROBUSTNESS
 from spatial_replay.batch.run_table import (
     Total,
     Values,
+    counts_of,
     damage_word,
     requirement_of,
     result_name,
@@ -103,14 +104,14 @@ def _panel(title: str, *content: Html) -> Html:
 
 def _totals(by_spec: Sequence[Total]) -> Html:
     names = ("case", "spec", "requirement")
-    numbers = ("satisfied", "violated", "unknown", "errors", "failed", "least robustness")
+    columns = counts_of(by_spec)
+    numbers = (*columns, "least robustness")
     head = [*(element("th", each) for each in names), *(_number("th", each) for each in numbers)]
     rows = []
-    for each in by_spec:
+    for place, each in enumerate(by_spec):
         group = each.group
         cells = [group["case"], group["spec"] or group["file"], each.about]
-        numbers_shown = (each.satisfied, each.violated, each.unknown, each.errors, each.failures)
-        counts = [f"{count:,}" for count in numbers_shown]
+        counts = [f"{own[place]:,}" for own in columns.values()]
         least = "" if each.least is None else f"{each.least:.6g}"
         rows.append(
             element(
@@ -247,10 +248,11 @@ def _cell(row: Values | None) -> Html:
         return element(
             "td", f"{verdict}{before}", title=row["failure"], **{"class": kind, "data-value": "-1e400"}
         )
-    shown = verdict if math.isnan(number) else f"{number:.4g}"
+    shown = verdict if math.isnan(number) or verdict == "untested" else f"{number:.4g}"
     value = "0" if math.isnan(number) else f"{max(-1e300, min(1e300, number)):.17g}"
     why = f": {row['failure']}" if fails else ""
     tip = f"{result_name(row['spec'], row['object'])} is {verdict}{damage_word(row)}{why}. {row['reason']}"
+    tip = " ".join([tip, *(row["untested"] or ())])
     shown = f"{shown}{damage_word(row)}{before}"
     return element("td", shown, title=tip, **{"class": kind, "data-value": value})
 

@@ -25,7 +25,7 @@ from spatial_replay.logs.remote import log_file
 from spatial_replay.logs.source import Source
 from spatial_replay.logs.topics import MAPPED
 from spatial_replay.monitor.result import SpecResult
-from spatial_replay.monitor.vacuity import no_instances
+from spatial_replay.monitor.vacuity import Tested, UntestedPart
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.replay.engine import Replay, Replayed
 from spatial_replay.replay.selection import ReplayOptions, Window, first_sample_ns
@@ -33,7 +33,7 @@ from spatial_replay.sources.open_log import open_source
 from spatial_replay.spec.diagnostics import SourceText
 from spatial_replay.spec.formula import NamedSpec, Specification
 from spatial_replay.spec.overrides import SpecificationText, load_specifications
-from spatial_replay.text import printable
+from spatial_replay.text import counted_from, printable
 from spatial_replay.trace.time_points import time_point_from_text
 
 ErrorKind: TypeAlias = Literal["usage", "log", "machine"]
@@ -81,7 +81,10 @@ class ResultRow:
         reason: what decided and, if that is not what the number is of, what gave it; "" under the paper's
             semantics.
         explanation: what `explain` says, in sentences, but for since when a satisfied spec has held.
+        tested: what the verdict was tested by, see `SpecResult.tested`; None if there is an error.
+        untested: sentences on the parts for which that is not "full".
         vacuous: sentences on the parts that decided nothing.
+        dropped: what the recorder of the log dropped, in words; None for nothing.
         samples: how many were evaluated.
         start_ns: time of the first of them.
         duration_ns: from the first to the last.
@@ -109,7 +112,10 @@ class ResultRow:
     atom_objects: tuple[str, ...] = ()
     reason: str = ""
     explanation: tuple[str, ...] = ()
+    tested: Tested | None = None
+    untested: tuple[str, ...] = ()
     vacuous: tuple[str, ...] = ()
+    dropped: str | None = None
     samples: int = 0
     start_ns: int | None = None
     duration_ns: int | None = None
@@ -182,12 +188,6 @@ def parsed_specifications(
     return tuple(load_specifications(specs, profile=conditions.profile, constants=dict(conditions.constants)))
 
 
-def with_damage(failure: str | None, faults: Sequence[str]) -> str | None:
-    """Return why a result does not pass: what a log has lost adds to that; None if nothing does."""
-    damage = f"the log is damaged: {faults[0]}" if faults else None
-    return "; ".join(filter(None, (failure, damage))) or None
-
-
 def error_from_exception(error: Exception) -> tuple[str, ErrorKind]:
     """Return what an error says, and whose it is."""
     kind: ErrorKind = "machine"
@@ -243,10 +243,11 @@ def _rows_of_file(
     pairs = zip(replay.trees, replayed.results, strict=True)
     # a name that another file has, too, is that of the file's own text here
     results = [replace(result, name=result.spec.name) for tree, result in pairs if tree.file == index]
+    parts = {part.text: part for part in replayed.vacuous}
     rows = [_row(log, result, replayed.first_ns, lines[result.name]) for result in results]
     evaluated = {result.name for result in results}
     idle = [spec for spec in file.results if spec.name not in evaluated and spec.parameter is not None]
-    rows += [_idle_row(log, spec, lines[spec.name]) for spec in idle]
+    rows += [_idle_row(log, spec, lines[spec.name], parts[f"{spec.name}({spec.parameter})"]) for spec in idle]
     return tuple(rows)
 
 
@@ -264,6 +265,7 @@ def _row_of_log(replayed: Replayed) -> ResultRow:
         faults=_some(replayed.faults),
         remarks=_some(replayed.remarks),
         missing=_some([each.message for each in replayed.missing]),
+        dropped=replayed.dropped.text or None,
     )
 
 
@@ -289,13 +291,15 @@ def _row(log: ResultRow, result: SpecResult, first_ns: int, line: int) -> Result
         atom_objects=() if deciding is None else tuple(deciding.objects),
         reason=_cut(result.reason(first_ns)),
         explanation=_some(result.sentences(first_ns)),
-        vacuous=_some([part.message for part in result.vacuous]),
+        tested=result.tested,
+        untested=_some(counted_from((part.message for part in result.untested), first_ns)),
+        vacuous=_some(counted_from((part.message for part in result.vacuous), first_ns)),
     )
 
 
-def _idle_row(log: ResultRow, spec: NamedSpec, line: int) -> ResultRow:
+def _idle_row(log: ResultRow, spec: NamedSpec, line: int, part: UntestedPart) -> ResultRow:
     """Return the row of a template that no object of the log fits: nothing violates it."""
-    message = no_instances(spec.name, spec.parameter or "").message
+    message = _cut(part.message)
     endless = float("inf")
     return replace(
         log,
@@ -308,6 +312,8 @@ def _idle_row(log: ResultRow, spec: NamedSpec, line: int) -> ResultRow:
         lower=endless,
         upper=endless,
         explanation=(message,),
+        tested="nothing",
+        untested=(message,),
         vacuous=(message,),
     )
 

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from os import PathLike
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from spatial_replay import __version__
@@ -22,10 +23,9 @@ from spatial_replay.batch.rows import (
     Task,
     error_rows,
     rows_from_task,
-    with_damage,
 )
 from spatial_replay.batch.spec_files import HASH_DIGITS, SpecFile
-from spatial_replay.batch.suite import Case, Conditions
+from spatial_replay.batch.suite import Case, Conditions, Expectation
 from spatial_replay.batch.workers import (
     DaskCluster,
     LocalProcesses,
@@ -37,7 +37,6 @@ from spatial_replay.batch.workers import (
 )
 from spatial_replay.logs.remote import log_file
 from spatial_replay.mapping.mapping_file import load_mapping
-from spatial_replay.monitor.verdict import Verdict
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -114,7 +113,7 @@ def run_batch(
 
     Args:
         results: the folder of results or its address, made if need be.
-        fail_on: "vacuous" and "unknown": what fails although the case allows it.
+        fail_on: "vacuous", "cut" and "unknown": what fails although the case allows it.
         progress: shows how many logs have been hashed, and evaluated.
 
     Raises:
@@ -285,8 +284,7 @@ def _judged(rows: pa.Table, asked: Sequence[Wanted], fail_on: frozenset[str]) ->
 
     names = rows.column("spec").to_pylist()
     columns = {name: rows.column(name) for name in rows.column_names}
-    judged = ("verdict", "robustness", "vacuous", "faults", "error")
-    values = zip(*(columns[name].to_pylist() for name in judged), asked, strict=True)
+    judged = rows.select(_JUDGED).to_pylist()
     lines = {id(each.file): dict(each.file.lines) for each in asked}
     requirements = zip(columns["requirement"].to_pylist(), asked, strict=True)
     columns |= {
@@ -294,7 +292,9 @@ def _judged(rows: pa.Table, asked: Sequence[Wanted], fail_on: frozenset[str]) ->
         "log": [each.log.name for each in asked],
         "file": [each.file.name for each in asked],
         "expected": [each.case.expectation.text for each in asked],
-        "failure": [_failure(*each, fail_on=fail_on) for each in values],
+        "failure": [
+            _failure(row, each.case.expectation, fail_on) for row, each in zip(judged, asked, strict=True)
+        ],
         "line": [lines[id(each.file)].get(name, 1) for each, name in zip(asked, names, strict=True)],
         "requirement": [own or ", ".join(each.case.requirements) or None for own, each in requirements],
     }
@@ -302,22 +302,9 @@ def _judged(rows: pa.Table, asked: Sequence[Wanted], fail_on: frozenset[str]) ->
     return pa.table({field.name: columns[field.name] for field in schema}, schema=schema)
 
 
-def _failure(
-    verdict: str | None,
-    robustness: float,
-    vacuous: Sequence[str],
-    faults: Sequence[str],
-    error: str | None,
-    wanted: Wanted,
-    *,
-    fail_on: frozenset[str],
-) -> str | None:
+_JUDGED = ["verdict", "lower", "tested", "untested", "vacuous", "dropped", "faults", "error"]
+
+
+def _failure(row: Mapping[str, Any], expectation: Expectation, fail_on: frozenset[str]) -> str | None:
     """Return why a row does not pass, in a few words; None if it does."""
-    if error is not None or verdict is None:
-        return error
-    failure = wanted.case.expectation.failure(Verdict(verdict), robustness)
-    if failure is None and "unknown" in fail_on and verdict == Verdict.UNKNOWN:
-        failure = "unknown"
-    elif failure is None and "vacuous" in fail_on and vacuous:
-        failure = f"vacuous: {vacuous[0]}"
-    return with_damage(failure, faults)
+    return row["error"] if row["verdict"] is None else expectation.failure(SimpleNamespace(**row), fail_on)

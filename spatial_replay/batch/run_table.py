@@ -5,11 +5,12 @@ from __future__ import annotations
 import ast
 import operator
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, cast
 
+from spatial_replay.batch.suite import UNTESTED
 from spatial_replay.errors import UsageError
 from spatial_replay.text import counted, nearest_hint, requirement_text
 
@@ -20,7 +21,8 @@ By: TypeAlias = Literal["spec", "log"]
 Values: TypeAlias = dict[str, Any]
 """A row of a table: values by column."""
 
-VERDICTS: Final = ("satisfied", "violated", "unknown")
+VERDICTS: Final = ("satisfied", "violated", "unknown", "untested")
+"""Verdicts, and the one in their place of what was tested by nothing and fails for that."""
 WORSE: Final = "worse_than_baseline"
 """A column of a table that was compared with a baseline: whether a result is worse than there, or gone."""
 _GROUPS: Final[Mapping[By, tuple[str, ...]]] = MappingProxyType(
@@ -39,7 +41,7 @@ class Total:
 
     Attributes:
         group: what they have in common, by column.
-        satisfied, violated, unknown: how many results.
+        satisfied, violated, unknown, untested: how many results; see `VERDICTS`.
         errors: how many have an error in place of a verdict.
         failures: how many do not pass.
         least: the least robustness among them; None if none is determined.
@@ -51,6 +53,7 @@ class Total:
     satisfied: int
     violated: int
     unknown: int
+    untested: int
     errors: int
     failures: int
     least: float | None
@@ -75,7 +78,9 @@ def requirement_of(row: Values) -> str:
 
 
 def verdict_word(row: Values) -> str:
-    """Return the verdict of a row; "error" or "gone" in place of one."""
+    """Return the verdict of a row, see `VERDICTS`; "error" or "gone" in place of one."""
+    if (row["failure"] or "").startswith(UNTESTED):
+        return "untested"
     return row["verdict"] or ("gone" if row["error"] is None else "error")
 
 
@@ -96,9 +101,9 @@ def summary_text(table: pa.Table) -> str:
         damaged += bool(damage_word(row))
     parts = [
         _expected(f"{total[name]:,} {name}", total[name], passed[name])
-        if name != "satisfied"
-        else f"{total[name]:,} satisfied"
-        + (f" ({bad:,} failed)" if (bad := total[name] - passed[name]) else "")
+        if name not in ("satisfied", "untested")
+        else f"{total[name]:,} {'satisfied' if name == 'satisfied' else UNTESTED}"
+        + (f" ({bad:,} failed)" if name == "satisfied" and (bad := total[name] - passed[name]) else "")
         for name in VERDICTS
         if total[name]
     ]
@@ -122,6 +127,8 @@ def totals(table: pa.Table, by: By = "spec") -> list[Total]:
 
     verdict, number = table.column("verdict"), table.column("robustness")
     columns = {name: table.column(name) for name in _GROUPS[by]}
+    untested = pc.fill_null(pc.starts_with(table.column("failure"), UNTESTED), False)
+    verdict = pc.if_else(untested, "untested", verdict)
     counted = {name: pc.equal(verdict, name) for name in VERDICTS}
     counted |= {
         "errors": pc.is_valid(table.column("error")),
@@ -147,6 +154,13 @@ def totals(table: pa.Table, by: By = "spec") -> list[Total]:
         )
         for row in grouped.aggregate([*sums, ("least", "min")]).to_pylist()
     ]
+
+
+def counts_of(rows: Sequence[Total]) -> dict[str, list[int]]:
+    """Return the columns of counts of a table of totals; "untested" only where some are."""
+    names = {**{name: name for name in VERDICTS}, "errors": "errors", "failed": "failures"}
+    counts = {head: [getattr(row, name) for row in rows] for head, name in names.items()}
+    return {head: own for head, own in counts.items() if head != "untested" or any(own)}
 
 
 def worst_rows(table: pa.Table, count: int) -> list[Values]:

@@ -9,12 +9,12 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
 from os import PathLike
 from pathlib import Path
-from typing import Any, Final, TypeAlias, TypeVar, cast
+from typing import Any, Final, Protocol, TypeAlias, TypeVar, cast
 
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import is_address
@@ -69,38 +69,89 @@ class Conditions:
 DEFAULT_CONDITIONS: Final = Conditions()
 
 
+class Outcome(Protocol):
+    """What of a result decides whether it passes; see `ResultRow`."""
+
+    @property
+    def verdict(self) -> Verdict | str | None: ...
+    @property
+    def lower(self) -> float: ...
+    @property
+    def tested(self) -> str | None: ...
+    @property
+    def untested(self) -> Sequence[str]: ...
+    @property
+    def vacuous(self) -> Sequence[str]: ...
+    @property
+    def dropped(self) -> str | None: ...
+    @property
+    def faults(self) -> Sequence[str]: ...
+
+
+UNTESTED: Final = "tested by nothing"
+DROPPED: Final = "the recorder dropped"
+DAMAGED: Final = "the log is damaged"
+"""Beginnings of failures that are no violations."""
+
+
 @dataclass(frozen=True, slots=True)
 class Expectation:
     """What a case expects of every result.
 
     Attributes:
         verdict: the verdict that passes.
-        at_least: the least robustness that passes, or None.
+        at_least: the least robustness that passes, whatever the verdict, or None.
+        tolerance: how much less passes, as an allowance for rounding.
         allow_unknown: whether an unknown verdict passes, too.
+        allow: "vacuous" and "dropped": what passes although it shows nothing.
     """
 
     verdict: Verdict = Verdict.SATISFIED
     at_least: float | None = None
+    tolerance: float = 0.0
     allow_unknown: bool = False
+    allow: frozenset[str] = frozenset()
 
     @property
     def text(self) -> str:
         """What is expected, in words."""
-        least = "" if self.at_least is None else f" by at least {self.at_least:.6g}"
-        return f"{self.verdict}{least}{' or unknown' if self.allow_unknown else ''}"
+        unknown = " or unknown" if self.allow_unknown else ""
+        if self.at_least is not None:
+            return f"robustness of at least {self.at_least:.6g}{unknown}"
+        return f"{self.verdict}{unknown}"
 
-    def failure(self, verdict: Verdict, robustness: float) -> str | None:
-        """Return why a result does not pass, in a few words; None if it does.
+    def failure(self, outcome: Outcome, fail_on: AbstractSet[str] = frozenset()) -> str | None:
+        """Return why a result with a verdict does not pass, in a few words; None if it does.
 
         Args:
-            robustness: NaN if it is not determined, which no least robustness accepts.
+            fail_on: "vacuous", "cut" and "unknown": what fails although the case allows it.
         """
-        if verdict is Verdict.UNKNOWN and self.allow_unknown:
+        failure = self._unexpected(outcome)
+        if failure is None and "unknown" in fail_on and outcome.verdict == Verdict.UNKNOWN:
+            failure = "unknown"
+        elif failure is None and "vacuous" in fail_on and outcome.vacuous:
+            failure = f"vacuous: {outcome.vacuous[0]}"
+        elif failure is None and "cut" in fail_on and outcome.tested == "cut":
+            failure = f"cut: {outcome.untested[0]}"
+        elif failure is None and "vacuous" not in self.allow and outcome.tested == "nothing":
+            failure = f"{UNTESTED}: {outcome.untested[0]}"
+        elif failure is None and "dropped" not in self.allow and outcome.dropped:
+            failure = outcome.dropped
+        damage = f"{DAMAGED}: {outcome.faults[0]}" if outcome.faults else None
+        return "; ".join(filter(None, (failure, damage))) or None
+
+    def _unexpected(self, outcome: Outcome) -> str | None:
+        """Return how a verdict or a robustness differs from what is expected."""
+        if outcome.verdict == Verdict.UNKNOWN and self.allow_unknown:
             return None
-        if verdict is not self.verdict:
-            return f"{verdict}, expected {self.verdict}"
-        if self.at_least is not None and not robustness >= self.at_least:
-            return f"robustness {robustness:.6g}, expected at least {self.at_least:.6g}"
+        if self.verdict is Verdict.SATISFIED and (self.at_least is not None or self.tolerance):
+            # known to be at least that: the lower end is the robustness where nothing is unknown
+            if outcome.lower >= (self.at_least or 0.0) - self.tolerance:
+                return None
+            if self.at_least is not None:
+                return f"robustness {outcome.lower:.6g}, expected at least {self.at_least:.6g}"
+        if outcome.verdict != self.verdict:
+            return f"{outcome.verdict}, expected {self.verdict}"
         return None
 
 
@@ -165,6 +216,14 @@ class Suite:
     cases: tuple[Case, ...]
     path: Path | None = None
     faults: tuple[tuple[int, str], ...] = ()
+
+    def allowing(self, kinds: AbstractSet[str]) -> Suite:
+        """Return the suite with what passes in every case, too."""
+        cases = [
+            replace(each, expectation=replace(each.expectation, allow=each.expectation.allow | kinds))
+            for each in self.cases
+        ]
+        return replace(self, cases=tuple(cases))
 
     @classmethod
     def of_logs(
@@ -263,7 +322,9 @@ def _case(
         expectation=Expectation(
             Verdict(entry.get("expect", "satisfied")),
             entry.get("at_least"),
+            entry.get("tolerance", 0.0),
             entry.get("allow_unknown", False),
+            frozenset(_listed(entry.get("allow"))),
         ),
         requirements=tuple(_listed(entry.get("requirements"))),
         places=tuple(lines.items()),
@@ -289,7 +350,7 @@ def _contradictions(value: Any, folder: Path) -> Iterator[tuple[Place, str]]:
             yield ("cases", number), "it has no specs; give it some, or the whole suite"
         both = {**value, **entry}
         if both.get("expect", "satisfied") != "satisfied" and "at_least" in both:
-            what = f"at_least applies to satisfied results, and {both['expect']} ones are expected"
+            what = f"at_least is a least robustness, and {both['expect']} results are expected; remove one"
             yield ("cases", number, "at_least"), what
 
 

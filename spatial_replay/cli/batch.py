@@ -20,6 +20,7 @@ from spatial_replay.cli.batch_output import (
 from spatial_replay.cli.options import (
     ConditionArguments,
     add_options,
+    allow_option,
     condition_options,
     fail_on_option,
     gather,
@@ -97,6 +98,7 @@ _OUTPUTS = (
 )
 @click.option("--dask", metavar="ADDRESS", help="Scheduler of a Dask cluster that evaluates the logs.")
 @fail_on_option
+@allow_option
 def batch(
     logs: tuple[str, ...],
     conditions: ConditionArguments,
@@ -105,6 +107,7 @@ def batch(
     jobs: int | None,
     dask: str | None,
     fail_on: frozenset[str],
+    allow: frozenset[str],
 ) -> int:
     """Evaluate many logs and show what fails: a suite file, or logs with specifications.
 
@@ -112,7 +115,8 @@ def batch(
     folder; another run evaluates only what is new. A log that cannot be read is a result, too: its error.
 
     Exits as replay does over all logs: 0 if everything is as expected, 1 if anything fails, 4 if results are
-    unknown, 3 if logs are damaged, 2 if some do not fit, 70 if the machine failed.
+    unknown, tested by nothing, or of logs whose recorder dropped samples, 3 if logs are damaged, 2 if some do
+    not fit, 70 if the machine failed.
 
     \b
     Examples:
@@ -131,7 +135,7 @@ def batch(
 
     if dask is not None and jobs is not None:
         raise UsageError("--jobs is for this machine, and a cluster has its own; remove --jobs or --dask")
-    suite = _suite(logs, conditions, semantics)
+    suite = _suite(logs, conditions, semantics).allowing(allow)
     cases = prepare(suite, progress)
     folder = outputs.output
     if folder is None:
@@ -301,6 +305,9 @@ def _print(result: BatchResult, found: BatchResult, folder: str) -> None:
     news = f"{news}, {gone:,} gone" if gone else news
     show(f"{counted(result.logs + gone, 'log')}, {summary_text(result.table)} ({news})")
     print_totals(result.table, "spec")
+    cut = pc.sum(pc.equal(result.table["tested"], "cut")).as_py()
+    if cut:
+        show(f"{counted(cut, 'result')} decided by a window that the end of the log cut: see --fail-on cut")
     failures = len(result.failures)
     if failures:
         shown = f"{failures:,} failed"

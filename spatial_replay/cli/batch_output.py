@@ -9,6 +9,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
+from spatial_replay.batch.suite import DAMAGED, DROPPED, UNTESTED
 from spatial_replay.cli.application import ExitCode, most_severe
 from spatial_replay.cli.output import VERDICT_COLOURS
 from spatial_replay.cli.terminal import Coloured, show, show_file
@@ -20,7 +21,11 @@ if TYPE_CHECKING:
     from spatial_replay.batch.run_table import By, Total
 
 _COLOURS: Final = MappingProxyType(
-    {**VERDICT_COLOURS, **dict.fromkeys(("error", "errors", "failures", "worse", "gone"), "red")}
+    {
+        **VERDICT_COLOURS,
+        "untested": "yellow",
+        **dict.fromkeys(("error", "errors", "failed", "worse", "gone"), "red"),
+    }
 )
 _KIND_CODES: Final = {"usage": ExitCode.USAGE, "log": ExitCode.DAMAGED, "machine": ExitCode.INTERNAL}
 _BATCH: Final = 10_000
@@ -33,20 +38,19 @@ def print_totals(table: pa.Table, by: By) -> None:
     Of a table that was compared with a baseline, also how many are worse than there, or gone.
     """
     # imported here so that --help stays fast
-    from spatial_replay.batch.run_table import WORSE, totals
+    from spatial_replay.batch.run_table import WORSE, counts_of, totals
 
     rows = totals(table, by)
     titles = [_title(each, by, len({each.group["case"] for each in rows}) > 1) for each in rows]
-    names = ["satisfied", "violated", "unknown", "errors", "failures"]
-    heads = [*names[:-1], "failed"]
+    columns = counts_of(rows)
     if WORSE in table.column_names:
-        names, heads = [*names, "worse"], [*heads, "worse"]
+        columns["worse"] = [each.worse or 0 for each in rows]
     width = max([len(by), *map(len, titles)])
-    show(f"  {by:<{width}}  {'  '.join(f'{head:>9}' for head in heads)}  least robustness")
-    for title, each in zip(titles, rows, strict=True):
+    show(f"  {by:<{width}}  {'  '.join(f'{head:>9}' for head in columns)}  least robustness")
+    for place, (title, each) in enumerate(zip(titles, rows, strict=True)):
         line: list[str | Coloured] = [f"  {title:<{width}}"]
-        for name in names:
-            count = getattr(each, name)
+        for name, counts in columns.items():
+            count = counts[place]
             # of verdicts that all were expected, none is bad
             colour = _COLOURS.get(name) if each.failures or name == "satisfied" else None
             shown = f"{count:>9,}" if count else f"{'-':>9}"
@@ -110,11 +114,11 @@ def exit_code_from_table(table: pa.Table, fail_on: frozenset[str]) -> ExitCode:
     for failure, kind, verdict, faults in zip(*(table.column(n).to_pylist() for n in names), strict=True):
         if faults:
             codes.add(ExitCode.DAMAGED)
-        if failure is None or (faults and failure.startswith("the log is damaged")):
+        if failure is None or (faults and failure.startswith(DAMAGED)):
             continue
         if kind is not None:
             codes.add(_KIND_CODES[kind])
-        elif verdict == "unknown" and "unknown" not in fail_on:
+        elif (verdict == "unknown" and "unknown" not in fail_on) or failure.startswith((UNTESTED, DROPPED)):
             codes.add(ExitCode.UNKNOWN)
         else:
             codes.add(ExitCode.VIOLATED)

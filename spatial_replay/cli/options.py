@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass, replace
-from functools import wraps
+from functools import partial, wraps
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypedDict, TypeVar
@@ -144,23 +144,35 @@ semantics_option = click.option(
     help="Robustness over finite traces, or Def. 16 of the paper to the letter.",
 )
 
-_KINDS = ("vacuous", "unknown")
+_FAILURES = ("vacuous", "cut", "unknown")
+_ALLOWED = ("vacuous", "dropped")
 
 
-def _read_kinds(context: click.Context, parameter: click.Parameter, text: str) -> frozenset[str]:
+def _read_kinds(
+    known: Sequence[str], context: click.Context, parameter: click.Parameter, text: str
+) -> frozenset[str]:
     kinds = frozenset(kind.strip() for kind in text.split(",") if kind.strip())
-    for kind in kinds - {*_KINDS}:
-        hint = nearest_hint(kind, _KINDS) or f"the kinds are {' and '.join(_KINDS)}"
-        raise UsageError(f"--fail-on: {kind!r} is not a kind of failure; {hint}")
+    for kind in sorted(kinds - {*known}):
+        hint = nearest_hint(kind, known) or f"the kinds are {', '.join(known)}"
+        raise UsageError(f"{parameter.opts[0]}: {kind!r} is not a kind of result; {hint}")
     return kinds
 
 
 fail_on_option = click.option(
     "--fail-on",
     metavar="KINDS",
-    callback=_read_kinds,
+    callback=partial(_read_kinds, _FAILURES),
     default="",
-    help="Exit with 1 on these as well: vacuous, unknown, or both with a comma between.",
+    help="Exit with 1 on these as well: vacuous, cut, unknown, or several with commas between.",
+)
+
+allow_option = click.option(
+    "--allow",
+    metavar="KINDS",
+    callback=partial(_read_kinds, _ALLOWED),
+    default="",
+    help="Let these pass instead of exit code 4: vacuous (tested by nothing), dropped (samples that the "
+    "recorder lost), or both with a comma between.",
 )
 
 profile_option = click.option(

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 from spatial_replay.cli.terminal import Coloured, Line, show, show_json
 from spatial_replay.text import (
     counted,
+    counted_from,
     escaped,
     requirement_text,
     time_text,
@@ -69,6 +70,7 @@ def print_verdicts(replayed: Replayed, output: Path | None, window_ns: int | Non
     counts = (
         f": {counts_text(each.verdict for each in replayed.results)}" if len(replayed.results) > MANY else ""
     )
+    damaged += f"; {replayed.dropped.text}" if replayed.dropped.count else ""
     show(f"{replayed.log}: {counted(replayed.samples, 'sample')} over {span}{damaged}{counts}")
     results, others = worst_of(replayed.results)
     # escaped here, so that what is printed is as wide as what is measured
@@ -145,7 +147,8 @@ def _titled(result: SpecResult) -> str:
 
 def _numbers(result: SpecResult, first_ns: int) -> str:
     robustness, lower, upper = result.robustness, result.lower, result.upper
-    parts = [f"robustness {_shown(robustness, result.unit)}"]
+    parts = ["tested by nothing"] if result.tested == "nothing" else []
+    parts.append(f"robustness {_shown(robustness, result.unit)}")
     if not (lower == upper == robustness or math.isnan(lower)):
         parts.append(f"between {_shown(lower, result.unit)} and {_shown(upper, result.unit)}")
     if robustness == 0.0:
@@ -179,8 +182,10 @@ def _below(result: SpecResult, first_ns: int) -> Iterator[str]:
             yield f"{label}{reason_sentence(cause.witness, first_ns=first_ns)}"
         elif label:
             yield f"{label}{cause.verdict}, robustness {_shown(cause.robustness)}"
-    for part in result.vacuous:
-        yield f"vacuous: {part.message}"
+    cut = result.untested if result.tested == "cut" else ()
+    for label, parts in (("vacuous", result.vacuous), ("cut", cut)):
+        for message in counted_from((part.message for part in parts), first_ns):
+            yield f"{label}: {message}"
 
 
 def _over_window(result: SpecResult, first_ns: int, window_ns: int) -> str:

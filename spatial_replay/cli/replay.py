@@ -13,6 +13,7 @@ import click
 from spatial_replay.cli.application import exit_code_from_verdicts
 from spatial_replay.cli.options import (
     EvaluationArguments,
+    allow_option,
     evaluation_options,
     fail_on_option,
     keep_option,
@@ -64,6 +65,7 @@ if TYPE_CHECKING:
     help="Also evaluate a sliding window, such as 10s, at every sample.",
 )
 @fail_on_option
+@allow_option
 @watch_option
 @semantics_option
 def replay(
@@ -77,6 +79,7 @@ def replay(
     signal: bool,
     width: str | None,
     fail_on: frozenset[str],
+    allow: frozenset[str],
     watch: bool,
     semantics: Semantics,
 ) -> int:
@@ -85,9 +88,11 @@ def replay(
     T is 12.5s or 1500ms after the first sample, 5250000000ns on the log's clock, or 2026-01-31T12:00:00Z.
 
     Exits with 0 if all results are satisfied, 1 if any is violated, 4 if none is violated and any is unknown,
-    3 if the log is damaged and the verdicts cover only what could be read. With --fail-on vacuous also
-    with 1 if a part of a specification decided nothing: an empty window, an antecedent that never held, a
-    group without members, a template without objects.
+    3 if the log is damaged and the verdicts cover only what could be read. The code is also 4 if nothing
+    tested a result, or if the recorder dropped samples; --allow lets these pass. With --fail-on vacuous it is
+    1 if a part of a specification decided nothing: an empty window, an antecedent that never held, a group
+    without members, a template without objects. With --fail-on cut it is 1 if a window decides that the end
+    of the log cut short.
 
     With --watch the log stays in memory, and is evaluated again whenever a specification file is saved; the
     key w writes the values given with --const into the files, and Ctrl-C ends it, with exit code 130.
@@ -123,7 +128,13 @@ def replay(
         option = "--signal" if signal else "--window"
         raise UsageError(f"{option} is not defined under --semantics {semantics}; remove one of them")
     if watch:
-        others = {"-o": output, "--json": json_file, "--window": width, "--fail-on": fail_on}
+        others = {
+            "-o": output,
+            "--json": json_file,
+            "--window": width,
+            "--fail-on": fail_on,
+            "--allow": allow,
+        }
         for option, value in others.items():
             if value:
                 raise UsageError(f"--watch prints verdicts only; remove {option}")
@@ -152,15 +163,23 @@ def replay(
     if "violated" in verdicts and json_file != "-" and semantics == "ltlf" and sys.stderr.isatty():
         hint = "`spatial-replay explain` with the same log and specifications says what would have helped"
         show_message("note", hint, "cyan")
-    return exit_code_from_verdicts([*verdicts, *_failures(replayed, fail_on)], damaged=bool(replayed.faults))
+    failures = _failures(replayed, fail_on, allow)
+    return exit_code_from_verdicts([*verdicts, *failures], damaged=bool(replayed.faults))
 
 
-def _failures(replayed: Replayed, kinds: frozenset[str]) -> Iterator[str]:
-    """Yield "violated" for each thing that the user counts as a failure."""
-    if "unknown" in kinds and any(result.verdict == "unknown" for result in replayed.results):
+def _failures(replayed: Replayed, kinds: frozenset[str], allow: frozenset[str]) -> Iterator[str]:
+    """Yield "violated" for what the user counts as a failure, "unknown" for what shows nothing."""
+    results = replayed.results
+    if "unknown" in kinds and any(result.verdict == "unknown" for result in results):
         yield "violated"
-    if "vacuous" in kinds and (replayed.vacuous or any(result.vacuous for result in replayed.results)):
+    if "vacuous" in kinds and (replayed.vacuous or any(result.vacuous for result in results)):
         yield "violated"
+    if "cut" in kinds and any(result.tested == "cut" for result in results):
+        yield "violated"
+    if "vacuous" not in allow and (replayed.vacuous or any(each.tested == "nothing" for each in results)):
+        yield "unknown"
+    if "dropped" not in allow and replayed.dropped.count:
+        yield "unknown"
 
 
 def _width_ns(text: str) -> int:

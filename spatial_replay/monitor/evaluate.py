@@ -14,7 +14,7 @@ from spatial_replay.monitor.instances import find_instances
 from spatial_replay.monitor.result import NodeResult, SpecResult, no_such_node
 from spatial_replay.monitor.semantics import Semantics, checked_semantics
 from spatial_replay.monitor.stream import EvaluationStream
-from spatial_replay.monitor.vacuity import Vacuous, no_instances
+from spatial_replay.monitor.vacuity import UntestedPart, no_instances
 from spatial_replay.monitor.verdict import Verdict, worst_verdict
 from spatial_replay.monitor.witness.evidence import Evidence
 from spatial_replay.monitor.witness.witness import Witness
@@ -59,14 +59,14 @@ class Evaluation(Displayed):
         return tuple(replace(remark, severity="warning") for remark in found)
 
     @cached_property
-    def vacuous(self) -> tuple[Vacuous, ...]:
+    def vacuous(self) -> tuple[UntestedPart, ...]:
         """The templates without instances: no object fits them, so they decided nothing.
 
         What decided nothing within a result is in its own `vacuous`.
         """
         evaluated = {result.name for result in self.results}
         return tuple(
-            no_instances(spec.name, spec.parameter)
+            no_instances(spec.name, spec.parameter, self.each.get(spec.parameter, ""), self.classes)
             for spec in self.specification.results
             if spec.parameter is not None and spec.name not in evaluated
         )

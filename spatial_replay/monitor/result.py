@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -22,7 +22,13 @@ from spatial_replay.monitor.sentences import (
     verdict_sentence,
 )
 from spatial_replay.monitor.stream import NEVER, InstanceStream, SeriesBlock
-from spatial_replay.monitor.vacuity import Vacuous, find_vacuous
+from spatial_replay.monitor.vacuity import (
+    Tested,
+    UntestedPart,
+    find_cut_window,
+    find_vacuous,
+    is_tested_by_nothing,
+)
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.monitor.witness.evidence import Evidence, Gap
 from spatial_replay.monitor.witness.path import End, deciding_path
@@ -31,8 +37,10 @@ from spatial_replay.spec.diagnostics import nearest_hint
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Formula, NamedSpec, iter_nodes, operator_of
 from spatial_replay.spec.units import declared_unit
-from spatial_replay.text import Instant, Sentence, shortened_formula, with_unit
+from spatial_replay.text import Instant, Sentence, counted_from, shortened_formula, with_unit
 from spatial_replay.trace.sample import LATEST_NS
+
+_UNTESTED: Final = Sentence("Nothing tested the verdict.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,19 +300,57 @@ class SpecResult(Displayed):
         return causes[0].witness if causes else self._settled_witness(node, self.certain_ns(node))
 
     @cached_property
-    def vacuous(self) -> tuple[Vacuous, ...]:
-        """The parts that decided nothing, by node; none under the paper's semantics.
+    def vacuous(self) -> tuple[UntestedPart, ...]:
+        """The parts that decided nothing, by node.
 
         Where the leaves were not stored, the log is read again.
         """
-        if self.semantics != "ltlf":
-            return ()
-        leaves, times_ns = self.leaves, self.times_ns
-        if leaves is None:
-            leaves = self.evidence.columns(self.evidence.instance.program.leaves)
-            times_ns = self.evidence.times_ns()
-        is_infinite = bool(self.final[0, 0] == np.inf)
-        return find_vacuous(self.evidence, leaves, times_ns, is_infinite=is_infinite)
+        return find_vacuous(self.evidence, *self._stored, is_infinite=bool(self.final[0, 0] == np.inf))
+
+    @property
+    def tested(self) -> Tested:
+        """What the verdict was tested by; an unknown one is "full", since it claims nothing.
+
+        "nothing": it is the same whatever the atoms are, where the antecedents of a satisfied formula stay as
+        they are. "cut": it could be another one if windows beyond the end of the log were whole. Else "full".
+        """
+        if self._is_untested:
+            return "nothing"
+        return "full" if self._cut_window is None else "cut"
+
+    @property
+    def untested(self) -> tuple[UntestedPart, ...]:
+        """The parts for which `tested` is not "full"."""
+        if self._is_untested:
+            return self.vacuous
+        return () if self._cut_window is None else (self._cut_window,)
+
+    @property
+    def remarks(self) -> tuple[Sentence, ...]:
+        """Sentences on the parts that decided nothing, and on the window that the end of the log cut."""
+        parts = [*self.vacuous, *(() if self._is_untested else self.untested)]
+        own = [_UNTESTED] if self._is_untested else []
+        return (*own, *(each.message for each in parts))
+
+    @cached_property
+    def _is_untested(self) -> bool:
+        if self.verdict is Verdict.UNKNOWN or not self.vacuous:
+            return False
+        return is_tested_by_nothing(self.evidence, *self._stored, self.verdict)
+
+    @cached_property
+    def _cut_window(self) -> UntestedPart | None:
+        if self.certain_ns() is not None:
+            # no sample that follows could have changed it
+            return None
+        return find_cut_window(self.evidence, *self._stored, self.verdict)
+
+    @property
+    def _stored(self) -> tuple[Floats, Integers]:
+        """The leaves of every sample and its times, read again where they were not stored."""
+        if self.leaves is not None:
+            return self.leaves, self.times_ns
+        return self.evidence.columns(self.evidence.instance.program.leaves), self.evidence.times_ns()
 
     @property
     def can_explain(self) -> bool:
@@ -393,7 +439,7 @@ class SpecResult(Displayed):
     def sentences(self, first_ns: int) -> tuple[Sentence, ...]:
         """Return the sentences of `explain`, which count time from `first_ns`."""
         found = self.sentences_about(0, self.causes, first_ns)
-        return (*found, *(each.message for each in self.vacuous))
+        return (*found, *counted_from(self.remarks, first_ns))
 
     def sentences_about(self, node: int, causes: Sequence[Cause], first_ns: int) -> tuple[Sentence, ...]:
         """Return the sentences on the verdict of a node, given why it failed, if it did."""

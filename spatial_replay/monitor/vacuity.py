@@ -1,19 +1,26 @@
-"""The parts of a result that decided nothing: empty windows, antecedents that never held, empty groups."""
+"""What a verdict was tested by: parts that decided nothing, windows that the end of the log cut short."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple, TypeAlias
+from typing import Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.monitor.offline import evaluate_offline
-from spatial_replay.monitor.online.codes import low_and_high
+from spatial_replay.monitor.offline import OfflineNodes, evaluate_offline
+from spatial_replay.monitor.online.codes import in_channels, low_and_high
+from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.monitor.witness.evidence import Evidence
-from spatial_replay.monitor.witness.path import End, deciding_path
+from spatial_replay.monitor.witness.path import End, PathNode, deciding_path
+from spatial_replay.monitor.witness.unfinished import (
+    UnfinishedNodes,
+    evaluate_untested,
+    evaluate_with_whole_windows,
+    is_cut,
+)
 from spatial_replay.spec.format import format_formula, format_term
 from spatial_replay.spec.formula import (
     FUTURE_OPERATORS,
@@ -24,50 +31,65 @@ from spatial_replay.spec.formula import (
     Formula,
     Group,
     Quantified,
+    Signal,
     Temporal,
     TrackedName,
     iter_nodes,
     operands_of,
 )
 from spatial_replay.spec.walks import iter_terms, without_enlargement
-from spatial_replay.text import Instant, Sentence
+from spatial_replay.text import Instant, Sentence, counted, nearest_hint, printable, time_text
 
+Tested: TypeAlias = Literal["full", "cut", "nothing"]
+"""By how much of the log a verdict was tested; see `SpecResult.tested`."""
 Reason: TypeAlias = Literal[
-    "empty window", "antecedent never held", "no members", "past the end", "no instances"
+    "empty window", "antecedent never held", "no members", "past the end", "no instances", "cut window"
 ]
 _Samples: TypeAlias = NDArray[np.bool_]
 _NEXT = {"X": "next sample", "WX": "next sample", "Y": "sample before"}
 
 
 @dataclass(frozen=True, slots=True)
-class Vacuous:
-    """A part of a formula that decided nothing, since what it is about never was.
+class UntestedPart:
+    """A part of a formula that was not tested, or not wholly.
 
     Attributes:
         node: its id; None for a template without instances.
         text: its canonical text.
         reason: "empty window": no sample ever lies in the window of an operator; "antecedent never held": of
             an implication; "no members": an open group is empty; "past the end": the result is infinite, for
-            what decides looks past an end of the log; "no instances": a template that no object fits.
+            what decides looks past an end of the log; "no instances": a template that no object fits; "cut
+            window": it decides at a sample whose window ends after the log.
         message: a sentence.
+        time_ns: the sample at which it decides; None where it decides at none.
     """
 
     node: int | None
     text: str
     reason: Reason
     message: Sentence
+    time_ns: int | None = None
 
 
-def no_instances(name: str, parameter: str) -> Vacuous:
-    """Return the entry of a template that no object fits."""
+def no_instances(name: str, parameter: str, chosen: str = "", classes: Iterable[str] = ()) -> UntestedPart:
+    """Return the entry of a template that no object fits.
+
+    Args:
+        chosen: its objects, such as "class:person".
+        classes: the classes of the log.
+    """
     text = f"{name}({parameter})"
     message = f"`{text}` was never evaluated: no object stands for {parameter}."
-    return Vacuous(None, text, "no instances", Sentence(message))
+    kind, _, wanted = chosen.partition(":")
+    if kind == "class":
+        hint = nearest_hint(wanted, classes)
+        message += f" The log never has the class {printable(wanted)!r}{f'; {hint}' if hint else '.'}"
+    return UntestedPart(None, text, "no instances", Sentence(message))
 
 
 def find_vacuous(
     evidence: Evidence, leaves: Floats, times_ns: Integers, *, is_infinite: bool
-) -> tuple[Vacuous, ...]:
+) -> tuple[UntestedPart, ...]:
     """Return the parts of an instance's formula that decided nothing, in the order of the text.
 
     Args:
@@ -92,18 +114,22 @@ def find_vacuous(
         if node not in {each.node for each in found}:
             found += _infinite(node, nodes[node], Instant(int(times_ns[sample]), evidence.first_ns()))
     return tuple(
-        Vacuous(each.node, text, each.reason, Sentence(f"`{text}` ", *each.what))
-        for each in sorted(found, key=lambda each: each.node)
-        for text in (format_formula(evidence.bound(nodes[each.node])),)
+        _part(each, nodes[each.node], evidence) for each in sorted(found, key=lambda each: each.node)
     )
 
 
 class _Idle(NamedTuple):
-    """A part that decided nothing, and the rest of the sentence that begins with its text."""
+    """A part that was not tested, and the rest of the sentence that begins with its text."""
 
     node: int
     reason: Reason
     what: tuple[str | Instant, ...]
+    time_ns: int | None = None
+
+
+def _part(idle: _Idle, node: Formula, evidence: Evidence) -> UntestedPart:
+    text = format_formula(evidence.bound(node))
+    return UntestedPart(idle.node, text, idle.reason, Sentence(f"`{text}` ", *idle.what), idle.time_ns)
 
 
 # ---------------------------------------------------------------------------------------------- scopes
@@ -239,14 +265,13 @@ def _implications(node: Quantified) -> Iterator[tuple[Boolean, Formula]]:
 def _empty_groups(
     nodes: Sequence[Formula], scopes: Sequence[_Samples], evidence: Evidence
 ) -> Iterator[_Idle]:
-    groups: dict[Group | Earlier, bool] = {}
     open_groups = {
         identifier: list(_open_groups(evidence.bound(node)))
         for identifier, (node, scope) in enumerate(zip(nodes, scopes, strict=True))
         if isinstance(node, Atom | Quantified) and scope.any()
     }
     wanted = list(dict.fromkeys(group for each in open_groups.values() for group in each))
-    groups = dict(zip(wanted, evidence.have_members(wanted), strict=True))
+    groups = {group: bool(own.any()) for group, own in zip(wanted, evidence.members(wanted), strict=True)}
     for identifier, own in open_groups.items():
         empty = [group for group in own if not groups[group]]
         if empty:
@@ -269,6 +294,141 @@ def _infinite(identifier: int, node: Formula, when: Instant) -> Iterator[_Idle]:
     """Yield why a result is infinite, from the node that its number is of."""
     if isinstance(node, Temporal):
         side = "past the end" if node.operator in FUTURE_OPERATORS else "before the start"
-        yield _Idle(identifier, "past the end", ("decides at ", when, f", where it looks {side} of the log."))
+        what = ("decides at ", when, f", where it looks {side} of the log.")
+        yield _Idle(identifier, "past the end", what, when.time_ns)
     elif isinstance(node, Atom | Quantified):
-        yield _Idle(identifier, "no members", ("decides at ", when, ", where no object is in its group."))
+        what = ("decides at ", when, ", where no object is in its group.")
+        yield _Idle(identifier, "no members", what, when.time_ns)
+
+
+# ------------------------------------------------------------------------------------- tested by nothing
+
+_UNKNOWN: Final = Atom("", "signal", Signal("\0"))
+"""An atom that is unknown in every log, since none has such a signal."""
+
+
+def is_tested_by_nothing(evidence: Evidence, leaves: Floats, times_ns: Integers, verdict: Verdict) -> bool:
+    """Return whether a verdict stays the same whatever the leaves are.
+
+    Leaves in antecedents keep their numbers where it is satisfied: if no antecedent held, nothing was tested.
+    Leaves over an open group keep them where the group is empty.
+
+    Args:
+        leaves: (C, A, T), the leaves of the instance's formula.
+    """
+    instance = evidence.instance
+    order = instance.program.leaves
+    unknown = _with_unknown_leaves(order, leaves, evidence)
+    known = leaves if verdict is Verdict.SATISFIED else unknown
+    low, high = evaluate_untested(instance.formula, order, known, unknown, times_ns)
+    return final_verdict(float(low[0]), float(high[0])) is verdict
+
+
+def _with_unknown_leaves(order: Sequence[Atom | Quantified], leaves: Floats, evidence: Evidence) -> Floats:
+    """Return leaves (2, A, T) that are unknown, but for antecedents in quantifiers and empty groups."""
+    low, high = low_and_high(len(leaves), wide=True)
+    result = np.empty((2, *leaves.shape[1:]))
+    result[0], result[1] = -np.inf, np.inf
+    for place, leaf in enumerate(order):
+        bound = evidence.bound(leaf)
+        groups = list(dict.fromkeys(_open_groups(bound)))
+        if isinstance(bound, Quantified):
+            column = evidence.columns([replace(bound, body=_without_tests(bound.body))])
+            result[:, place] = in_channels(column, 4)[2:, 0]
+        elif groups:
+            is_empty = ~evidence.members(groups).all(axis=0)
+            result[:, place, is_empty] = leaves[[low, high], place][:, is_empty]
+    return result
+
+
+def _without_tests(formula: Formula) -> Formula:
+    """Return the body of a quantifier with unknown atoms, but for those in antecedents."""
+    match formula:
+        case Atom():
+            return _UNKNOWN
+        case Quantified():
+            return replace(formula, body=_without_tests(formula.body))
+        case Boolean(operator="->", operands=(antecedent, consequent)):
+            return replace(formula, operands=(antecedent, _without_tests(consequent)))
+        case Boolean():
+            return replace(formula, operands=tuple(_without_tests(each) for each in formula.operands))
+        case _:
+            return formula
+
+
+# ------------------------------------------------------------------------------------------ cut windows
+
+
+def find_cut_window(
+    evidence: Evidence, leaves: Floats, times_ns: Integers, verdict: Verdict
+) -> UntestedPart | None:
+    """Return the operator whose window ends after the log and thereby decides a verdict; None if none does.
+
+    Samples beyond the end of the log may be anything there, within the windows of operators with an upper
+    bound and for X. All other operators end with the log.
+
+    Args:
+        leaves: (C, A, T), the leaves of the instance's formula.
+    """
+    instance = evidence.instance
+    nodes = [node for _, _, node in iter_nodes(instance.formula)]
+    if not any(isinstance(node, Temporal) and is_cut(node, times_ns)[-1] for node in nodes):
+        return None
+    order = instance.program.leaves
+    done = evaluate_offline(instance.formula, order, leaves, times_ns)
+    whole = evaluate_with_whole_windows(instance.formula, order, leaves, times_ns)
+    own, other = (final_verdict(*(float(end[0]) + 0.0 for end in each.ends(0))) for each in (done, whole))
+    if own is not verdict or other is verdict:
+        return None
+    ranks = _RankedNodes(done, whole, is_violated=verdict is Verdict.VIOLATED)
+    path = deciding_path(instance.formula, ranks, times_ns, 0, End.of(verdict))
+    cut = [step for step in path.steps if _is_cut_at(nodes[step.node], step.sample, times_ns)]
+    step = next((step for step in cut[::-1] if 1.0 in ranks.at(step)), path.steps[0])
+    return _part(_cut(step, nodes[step.node], times_ns, evidence), nodes[step.node], evidence)
+
+
+def _is_cut_at(node: Formula, sample: int, times_ns: Integers) -> bool:
+    return isinstance(node, Temporal) and bool(is_cut(node, times_ns)[sample])
+
+
+def _cut(step: PathNode, node: Formula, times_ns: Integers, evidence: Evidence) -> _Idle:
+    """Return that a window is cut at a sample, and how far it reaches beyond the log."""
+    identifier, sample = step.node, step.sample
+    when = Instant(int(times_ns[sample]), evidence.first_ns())
+    bound = node.bound if isinstance(node, Temporal) else None
+    if bound is None or bound.upper is None:
+        beyond = "the log has no next sample"
+    elif bound.unit == "samples":
+        left = sample + bound.upper - (len(times_ns) - 1)
+        beyond = f"its window ends {counted(left, 'sample')} after the log"
+    else:
+        left_ns = int(times_ns[sample]) + bound.upper - int(times_ns[-1])
+        beyond = f"its window ends {time_text(left_ns)} after the log"
+    return _Idle(
+        identifier,
+        "cut window",
+        ("decides at ", when, f", where {beyond}: a longer log may change the verdict."),
+        when.time_ns,
+    )
+
+
+class _RankedNodes:
+    """Nodes by verdict instead of by number: decided by whole windows, by cut ones, or not decided.
+
+    Ranks go through minima, maxima and negations as numbers do, so that a path by them leads to a cut window.
+    """
+
+    def __init__(self, done: OfflineNodes, whole: UnfinishedNodes, *, is_violated: bool) -> None:
+        self._both = (done, whole)
+        self._is_violated = is_violated
+
+    def ends(self, node: int) -> tuple[Floats, Floats]:
+        """Return the ranks (T,) of both ends of a node: 1 and -1 where a cut window decides."""
+        lows, highs = zip(*(each.ends(node) for each in self._both), strict=True)
+        holds = np.greater if self._is_violated else np.greater_equal
+        return sum(holds(low, 0.0) * 1.0 for low in lows), -sum(holds(-high, 0.0) * 1.0 for high in highs)
+
+    def at(self, step: PathNode) -> tuple[float, float]:
+        """Return how far from undecided both ends of a node are at a sample."""
+        low, high = self.ends(step.node)
+        return float(low[step.sample]), -float(high[step.sample])

@@ -84,8 +84,13 @@ def _results_table(results: Sequence[SpecResult]) -> Html:
     for each in results:
         robustness = _robustness_text(each.robustness, each.lower, each.upper, each.unit)
         name, verdict = element("b", _title_of(each)), verdict_mark(each.verdict)
-        rows.append((name, verdict, robustness, _first_satisfied(each)))
-    return table(["result", "verdict", "robustness", "first satisfied"], rows)
+        rows.append((name, verdict, robustness, _first_satisfied(each), _tested(each)))
+    return table(["result", "verdict", "robustness", "first satisfied", "tested"], rows)
+
+
+def _tested(result: SpecResult) -> Html:
+    """Return what a result was tested by, with the sentences on the parts that were not."""
+    return element("span", result.tested, title=" ".join(result.remarks))
 
 
 def _first_satisfied(result: SpecResult) -> str:

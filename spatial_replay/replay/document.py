@@ -11,14 +11,14 @@ from spatial_replay.geometry.arrays import Floats
 from spatial_replay.monitor.causes import Cause
 from spatial_replay.monitor.result import SpecResult, no_such_node
 from spatial_replay.monitor.sentences import sentences_of
-from spatial_replay.monitor.vacuity import Vacuous
+from spatial_replay.monitor.vacuity import UntestedPart
 from spatial_replay.monitor.verdict import Verdict, online_verdict
 from spatial_replay.monitor.witness.atom import Measured
 from spatial_replay.monitor.witness.witness import Witness
 from spatial_replay.replay.engine import Replayed
 from spatial_replay.spec.formula import iter_nodes
 from spatial_replay.spec.units import units_of, units_text
-from spatial_replay.text import Sentence, json_number, names_of
+from spatial_replay.text import Sentence, counted_from, json_number, names_of
 
 
 def document_from_replay(
@@ -43,6 +43,7 @@ def document_from_replay(
             "faults": list(replayed.faults),
             "remarks": list(replayed.remarks),
             "missing": [each.message for each in replayed.missing],
+            "dropped_samples": replayed.dropped.count,
             "unreadable_observations": replayed.unreadable,
         },
         "semantics": replayed.semantics,
@@ -50,7 +51,7 @@ def document_from_replay(
         "specifications": [
             _result(result, replayed.start_ns, signal, window_ns) for result in replayed.results
         ],
-        "vacuous": [_vacuous(each) for each in replayed.vacuous],
+        "vacuous": [_untested(each, replayed.first_ns) for each in replayed.vacuous],
     }
 
 
@@ -69,7 +70,9 @@ def _result(result: SpecResult, first_ns: int, signal: bool, window_ns: int | No
         "satisfied_at_ns": result.satisfied_at_ns,
         "worst": None,
         "causes": [_cause(each, first_ns) for each in result.causes],
-        "vacuous": [_vacuous(each) for each in result.vacuous],
+        "tested": result.tested,
+        "untested": [_untested(each, first_ns) for each in result.untested],
+        "vacuous": [_untested(each, first_ns) for each in result.vacuous],
         "nodes": [
             {
                 "id": node.id,
@@ -117,8 +120,15 @@ def _cause(cause: Cause, first_ns: int) -> dict[str, Any]:
     }
 
 
-def _vacuous(part: Vacuous) -> dict[str, Any]:
-    return {"node": part.node, "text": part.text, "reason": part.reason, "message": part.message}
+def _untested(part: UntestedPart, first_ns: int) -> dict[str, Any]:
+    (message,) = counted_from([part.message], first_ns)
+    return {
+        "node": part.node,
+        "text": part.text,
+        "reason": part.reason,
+        "time_ns": part.time_ns,
+        "message": message,
+    }
 
 
 def witness_document(witness: Witness, first_ns: int) -> dict[str, Any]:
@@ -193,14 +203,16 @@ def _numbers(rows: Floats) -> list[list[float | str | None]]:
     return [[json_number(number) for number in row] for row in rows.tolist()]
 
 
-def idle_document(template: Vacuous) -> dict[str, Any]:
+def idle_document(template: UntestedPart) -> dict[str, Any]:
     """Return a template without instances as JSON beside explanations: it has a reason, but no verdict."""
     return {
         "specification": template.text.partition("(")[0],
         "object": None,
         "node": None,
         "verdict": None,
-        "vacuous": [_vacuous(template)],
+        "tested": "nothing",
+        "untested": [_untested(template, 0)],
+        "vacuous": [_untested(template, 0)],
         "explanation": [template.message],
     }
 
@@ -299,8 +311,8 @@ def explain_node(result: SpecResult, node: int = 0, *, first_ns: int, goes_on: b
         worst = result.worst_of(node, causes)
         witness = result.witness(node) if worst is None else worst
         sentences = result.sentences_about(node, causes, first_ns)
-    vacuous = result.vacuous if node == 0 and not is_open else ()
-    sentences += tuple(each.message for each in vacuous)
+    is_whole = node == 0 and not is_open
+    sentences += counted_from(result.remarks, first_ns) if is_whole else ()
     formula = next(each for identifier, _, each in iter_nodes(result.formula) if identifier == node)
     if words := units_text(units_of(formula)):
         sentences += (Sentence(words),)
@@ -322,7 +334,9 @@ def explain_node(result: SpecResult, node: int = 0, *, first_ns: int, goes_on: b
         **{key: decided[key] for key in ("time_ns", "atom", "threshold", "obstacle", "missed", "missing")},
         "worst": decided,
         "causes": [] if is_open else [_cause(each, first_ns) for each in causes],
-        "vacuous": [_vacuous(each) for each in vacuous],
+        "tested": result.tested if is_whole else None,
+        "untested": [_untested(each, first_ns) for each in result.untested] if is_whole else [],
+        "vacuous": [_untested(each, first_ns) for each in result.vacuous] if is_whole else [],
         "explanation": list(sentences),
     }
     return Explanation(verdict, witness.time_ns, sentences, document)

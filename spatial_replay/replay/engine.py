@@ -18,11 +18,11 @@ from spatial_replay.annotate.specification import (
 )
 from spatial_replay.logs.messages import Attachment, Block, Messages, merge
 from spatial_replay.logs.source import Source, axes_of, read_ahead, units_of
-from spatial_replay.logs.topics import PLAN_METADATA, REPLAYED_PREFIX, image_topics
+from spatial_replay.logs.topics import ENDING, PLAN_METADATA, REPLAYED_PREFIX, image_topics
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.stream import SeriesBlock, join_blocks
-from spatial_replay.monitor.vacuity import Vacuous, no_instances
+from spatial_replay.monitor.vacuity import UntestedPart, no_instances
 from spatial_replay.monitor.verdict import Verdict, worst_verdict
 from spatial_replay.monitor.witness.evidence import Evidence
 from spatial_replay.replay.selection import (
@@ -34,15 +34,30 @@ from spatial_replay.replay.selection import (
 )
 from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.formula import Specification
-from spatial_replay.text import counted_from
+from spatial_replay.text import counted, counted_from
 from spatial_replay.trace.trace import Trace
 
 if TYPE_CHECKING:
     from spatial_replay.annotate.automaton_state import SpecAutomaton
     from spatial_replay.annotate.scene.scene_frames import SceneFrames
 
+_MOST_DIGITS = 18
+"""Of a count in the metadata of a log; more are no count."""
 _KEPT_BYTES, _MOST_KEPT_BYTES = 2**22, 2**26
 """Samples of up to so many bytes for each result, and in all, stay in memory: each is explained by itself."""
+
+
+@dataclass(frozen=True, slots=True)
+class Dropped:
+    """How many samples the recorder of a log had no time for, of how many."""
+
+    count: int
+    of: int
+
+    @property
+    def text(self) -> str:
+        """What is lost, in words; "" where nothing is."""
+        return f"the recorder dropped {self.count:,} of {counted(self.of, 'sample')}" if self.count else ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +72,7 @@ class Replayed:
         faults: what was lost while reading, each with its place.
         remarks: what the source reports about its samples where nothing was lost.
         missing: a warning for each name in the specifications that the log never has: it is unknown.
+        dropped: the samples that the recorder of the log had no time for.
         unreadable: how many observations have no usable value: a number is not finite, or too old.
         results: one per spec and object.
         vacuous: templates without instances; what decided nothing within a result is in its own `vacuous`.
@@ -72,9 +88,10 @@ class Replayed:
     faults: tuple[str, ...]
     remarks: tuple[str, ...]
     missing: tuple[Diagnostic, ...]
+    dropped: Dropped
     unreadable: int
     results: tuple[SpecResult, ...]
-    vacuous: tuple[Vacuous, ...]
+    vacuous: tuple[UntestedPart, ...]
     certificate: Mapping[str, str]
     semantics: Semantics = "ltlf"
 
@@ -169,7 +186,7 @@ class Replay:
             raise
         replayed = self._replayed()
         if write is not None:
-            write(self._evaluation.end(self._end_ns, [each.vacuous for each in replayed.results]))
+            write(self._evaluation.end(self._end_ns, replayed.results))
         return replayed
 
     def _pass(
@@ -244,6 +261,7 @@ class Replay:
         if not self._samples:
             raise self._selection.nothing_to_evaluate(self._faults)
         missing = self._selection.missing_names(self._names)
+        dropped = dropped_samples(self._source)
         options = self._selection.options
         first_ns = first_sample_ns(self._source) if options.window.start_ns else self._times[0]
         return Replayed(
@@ -253,8 +271,9 @@ class Replay:
             start_ns=self._times[0],
             end_ns=self._times[-1],
             faults=counted_from(self._faults, first_ns),
-            remarks=counted_from(self._remarks, first_ns),
+            remarks=(*counted_from(self._remarks, first_ns), *filter(None, [dropped.text])),
             missing=missing,
+            dropped=dropped,
             unreadable=self._unreadable,
             results=replayed_specs(
                 self._evaluation,
@@ -264,7 +283,7 @@ class Replay:
                 has_series=self._keep_series,
                 has_leaves=self._keep_leaves,
             ),
-            vacuous=idle_templates(self.files, self.trees),
+            vacuous=idle_templates(self.files, self.trees, options.each, self._names.classes),
             certificate={}
             if self._hashes is None
             else self._hashes.certificate(
@@ -296,15 +315,33 @@ class _KeptTraces:
         return self._selection.iter_traces() if self._traces is None else iter(self._traces)
 
 
-def idle_templates(files: Sequence[Specification], trees: Sequence[ReportedTree]) -> tuple[Vacuous, ...]:
+def dropped_samples(source: Source) -> Dropped:
+    """Return what the recorder of a log dropped, as the log says."""
+    ending = dict(source.metadata()).get(ENDING, {})
+    texts = [ending.get(name, "0") for name in ("samples", "dropped")]
+    kept, count = (
+        int(text) if text.isascii() and text.isdecimal() and len(text) <= _MOST_DIGITS else 0
+        for text in texts
+    )
+    return Dropped(count, kept + count)
+
+
+def idle_templates(
+    files: Sequence[Specification],
+    trees: Sequence[ReportedTree],
+    each: Mapping[str, str],
+    classes: Iterable[str],
+) -> tuple[UntestedPart, ...]:
     """Return the templates without instances.
 
     Args:
         trees: what was evaluated.
+        each: the objects that parameters stand for.
+        classes: of the log.
     """
     evaluated = {id(tree.formula) for tree in trees}
     return tuple(
-        no_instances(spec.name, spec.parameter)
+        no_instances(spec.name, spec.parameter, each.get(spec.parameter, ""), sorted(classes))
         for file in files
         for spec in file.results
         if spec.parameter is not None and id(spec.formula) not in evaluated

@@ -28,7 +28,7 @@ from spatial_replay.logs.source import MemorySource, Source, units_of
 from spatial_replay.monitor.result import SpecResult, worst_first
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.monitor.verdict import Verdict, worst_verdict
-from spatial_replay.replay.engine import Replayed, idle_templates, replayed_specs
+from spatial_replay.replay.engine import Replayed, dropped_samples, idle_templates, replayed_specs
 from spatial_replay.replay.kept_messages import KEEP_ALL
 from spatial_replay.replay.own_messages import OwnMessages
 from spatial_replay.replay.reused_memory import ReusedMemory
@@ -83,6 +83,7 @@ class LoadedLog:
         own: the messages of the log itself.
         faults, remarks: what was lost while reading, and what else the source reports.
         missing: a warning for each name in the specifications that the log never has.
+        dropped: the samples that its recorder had no time for.
     """
 
     def __init__(
@@ -128,6 +129,7 @@ class LoadedLog:
         if not len(self.inside):
             raise selection.nothing_to_evaluate(self.faults)
         self.missing = self._missing(selection)
+        self.dropped = dropped_samples(source)
         self.first_ns = first_sample_ns(source) if options.window.start_ns else int(self.trace.times_ns[0])
         self._places = _places(self._files)
         self.constants: Mapping[str, Constant] = self._constants(self._files)
@@ -291,13 +293,22 @@ class Evaluated:
             start_ns=int(times_ns[0]),
             end_ns=int(times_ns[-1]),
             faults=counted_from(loaded.faults, loaded.first_ns),
-            remarks=counted_from(loaded.remarks, loaded.first_ns),
+            remarks=(
+                *counted_from(loaded.remarks, loaded.first_ns),
+                *filter(None, [loaded.dropped.text]),
+            ),
             missing=loaded.missing,
+            dropped=loaded.dropped,
             unreadable=loaded.inside.unreadable_count,
             results=replayed_specs(
                 self.evaluation, self.edited.files, self.stretches, self.selection.iter_traces
             ),
-            vacuous=idle_templates(self.edited.files, self.evaluation.trees),
+            vacuous=idle_templates(
+                self.edited.files,
+                self.evaluation.trees,
+                loaded.options.each,
+                [each for each in loaded.inside.classes if each],
+            ),
             certificate=MappingProxyType({}),
             semantics=loaded.options.semantics,
         )

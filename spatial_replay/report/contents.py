@@ -11,7 +11,7 @@ from spatial_replay.automata.automaton import Automaton
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.monitor.result import NodeResult, SpecResult, worst_first
 from spatial_replay.monitor.semantics import Semantics
-from spatial_replay.monitor.vacuity import Vacuous
+from spatial_replay.monitor.vacuity import UntestedPart
 from spatial_replay.monitor.verdict import Verdict, worst_verdict
 from spatial_replay.report.automaton_panel import StatePath
 from spatial_replay.report.decision_panel import ReportedDecisions
@@ -143,7 +143,7 @@ class RunReport:
     certificate: Mapping[str, str]
     files: tuple[Specification, ...]
     results: tuple[ReportedResult, ...]
-    vacuous: tuple[Vacuous, ...]
+    vacuous: tuple[UntestedPart, ...]
     observed_ns: int | None
     scene: ReportedScene
     events: tuple[ReportedEvent, ...]

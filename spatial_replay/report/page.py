@@ -17,7 +17,7 @@ from typing import Final
 
 from spatial_replay import __version__
 from spatial_replay.monitor.causes import settled_time
-from spatial_replay.monitor.result import worst_first
+from spatial_replay.monitor.result import SpecResult, worst_first
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.notebook.figures import Html, element
 from spatial_replay.palette import NEGATIVE, NEUTRAL, POSITIVE, hexadecimal
@@ -148,7 +148,7 @@ def _verdicts(report: RunReport) -> Iterator[Html]:
     for number, each in enumerate(report.results[place] for place in worst):
         # which result the page shows when something in the verdict is chosen
         drawn = {"data-result": str(places[id(each)])} if id(each) in places else {}
-        is_reported = each.result.verdict == report.verdict or bool(each.result.vacuous)
+        is_reported = each.result.verdict == report.verdict or bool(each.result.remarks)
         is_unfolded = is_reported and not (are_many and number)
         unfolded = {"open": ""} if each.sentences and is_unfolded else {}
         attributes = {"class": "verdict", "data-verdict": str(each.result.verdict), **drawn, **unfolded}
@@ -176,8 +176,8 @@ def _summary(each: ReportedResult, first_ns: int) -> Html:
         numbers.append(f"satisfied since {Instant(result.satisfied_at_ns, first_ns)}")
     elif result.verdict is Verdict.SATISFIED and result.first_satisfied_ns is not None:
         numbers.append(f"first satisfied at {Instant(result.first_satisfied_ns, first_ns)}")
-    decided_nothing = "a part decided nothing" if len(result.vacuous) == 1 else "parts decided nothing"
-    marks = [element("span", decided_nothing, **{"class": "chip is-vacuous"})] if result.vacuous else []
+    mark = _mark(result)
+    marks = [element("span", mark, **{"class": "chip is-vacuous"})] if mark else []
     return element(
         "summary" if each.sentences else "div",
         chip(result.verdict),
@@ -186,6 +186,16 @@ def _summary(each: ReportedResult, first_ns: int) -> Html:
         element("span", text(", ".join(numbers)), **{"class": "numbers"}),
         **{"class": "summary"},
     )
+
+
+def _mark(result: SpecResult) -> str:
+    """Return what a verdict lacks; "" for nothing."""
+    if result.tested == "nothing":
+        return "tested by nothing"
+    marks = ["a part decided nothing" if len(result.vacuous) == 1 else "parts decided nothing"]
+    marks = marks if result.vacuous else []
+    marks += ["the end of the log cut a window"] if result.tested == "cut" else []
+    return ", ".join(marks)
 
 
 def _requirement(identifier: str | None, name: str, title: str | None) -> Iterator[Html]:

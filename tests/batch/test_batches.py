@@ -69,6 +69,95 @@ def test_only_what_is_new_is_evaluated(fleet: Path) -> None:
     ]  # fmt: skip
 
 
+def test_what_nothing_tested_passes_nowhere_unless_it_is_allowed(fleet: Path) -> None:
+    Path("late.spatial").write_text("spec late = G[60s, 90s] (cart dist person >= 0.3)")
+    outputs = ("--junit", "junit.xml", "--html", "pages")
+    done = batch("logs/run-0.jsonl", "--spec", "late.spatial", *outputs)
+    assert done.code == 4
+    failure = "tested by nothing: `G[60s, 90s] (cart dist person >= 0.3)` was never tested"
+    assert ("1 result: 1 tested by nothing" in done.out, f"      {failure}" in done.out) == (True, True)
+    (own,) = ElementTree.parse("junit.xml").getroot().iter("failure")
+    assert (own.get("type"), str(own.get("message")).startswith(failure)) == ("untested", True)
+    page = Path("pages/index.html").read_text()
+    assert ("number is-untested fails" in page, 'class="number is-satisfied' in page) == (True, False)
+    assert batch("logs/run-0.jsonl", "--spec", "late.spatial", "--fail-on", "vacuous").code == 1
+    assert batch("logs/run-0.jsonl", "--spec", "late.spatial", "--allow", "vacuous").code == 0
+    Path("suite.yaml").write_text(
+        "specs: late.spatial\nallow: vacuous\ncases: [{name: all, logs: logs/run-0.jsonl}]"
+    )
+    assert batch("suite.yaml").code == 0
+
+
+def test_a_misspelt_class_of_a_template_passes_nowhere_and_names_the_nearest(fleet: Path) -> None:
+    Path("clear.spatial").write_text("spec clear(ego) = G (ego dist cart >= 0)")
+    objects = [_box("cart", 0.0), {**_box("anna", 3.0), "class": "pedestrian"}]
+    Path("walk.jsonl").write_text(json.dumps({"time_ns": 0, "objects": objects}))
+    misspelt = ("walk.jsonl", "--spec", "clear.spatial", "--each", "ego=class:pedestrain")
+    done = batch(*misspelt, "--junit", "junit.xml")
+    assert (done.code, "did you mean 'pedestrian'?" in done.out) == (4, True)
+    assert ElementTree.parse("junit.xml").getroot().get("failures") == "1"
+
+
+def test_a_cut_window_is_said_and_can_fail(fleet: Path) -> None:
+    Path("hold.spatial").write_text("spec hold = F G[0s, 60s] (cart dist person >= 0.3)")
+    done = batch("logs/run-0.jsonl", "--spec", "hold.spatial", "--junit", "junit.xml")
+    assert (done.code, "1 result decided by a window that the end of the log cut" in done.out) == (0, True)
+    (said,) = ElementTree.parse("junit.xml").getroot().iter("system-out")
+    assert "`G[0s, 60s] (cart dist person >= 0.3)` decides at 0.000 s" in str(said.text)
+    assert batch("logs/run-0.jsonl", "--spec", "hold.spatial", "--fail-on", "cut").code == 1
+
+
+def test_a_least_robustness_is_a_floor_whatever_the_verdict_and_an_interval_counts_by_its_lower_end(
+    fleet: Path,
+) -> None:
+    suite = "specs: gate.spatial\ncases: [{name: all, logs: logs/run-3.jsonl, at_least: %s}]"
+    for least, code in ((-0.5, 0), (-0.2, 0), (-0.1, 1)):
+        Path("suite.yaml").write_text(suite % least)
+        assert batch("suite.yaml").code == code
+    # between 0.4 and 0.6
+    Path("blurred.spatial").write_text("spec apart = G (cart dist person >= 0.1)")
+    cart = sr.TrackedObject(sr.Footprint.box(0, 0, 1, 1), uncertainty=0.1)
+    near = sr.Sample(0, {"cart": cart, "person": sr.Footprint.box(1.6, 0, 2, 1)})
+    with sr.Recorder("blurred.mcap") as recorder:
+        recorder.write(near)
+    text = "specs: blurred.spatial\ncases: [{name: all, logs: blurred.mcap, at_least: %s}]"
+    for least, code in ((0.4, 0), (0.55, 1)):
+        Path("suite.yaml").write_text(text % least)
+        assert batch("suite.yaml").code == code
+
+
+def test_an_allowance_for_rounding_is_a_key_of_suites(fleet: Path) -> None:
+    Path("exact.spatial").write_text("spec apart = G (cart dist person >= 0.5000000001)")
+    suite = "specs: exact.spatial\ncases: [{name: all, logs: logs/run-0.jsonl%s}]"
+    for key, code in (("", 1), (", tolerance: 1e-9", 0), (", tolerance: 1e-12", 1)):
+        Path("suite.yaml").write_text(suite % key)
+        assert batch("suite.yaml").code == code
+
+
+def test_samples_that_a_recorder_dropped_are_said_and_do_not_pass(fleet: Path) -> None:
+    samples = [
+        sr.Sample(number, {"cart": sr.Footprint.box(0, 0, 1, 1), "person": sr.Footprint.box(2, 0, 3, 1)})
+        for number in range(5)
+    ]
+    with sr.Recorder("lossy.mcap") as recorder:
+        for sample in samples[:2]:
+            recorder.write(sample)
+        for sample in samples[2:]:
+            recorder.miss(sample)
+    lossy = ("lossy.mcap", "--spec", "gate.spatial")
+    said = "the recorder dropped 3 of 5 samples"
+    for run in ("replay", "batch"):
+        done = command(run, *lossy)
+        assert (done.code, said in done.out) == (4, True)
+        assert command(run, *lossy, "--allow", "dropped").code == 0
+    assert command("report", *lossy, "-o", "lossy.html").code == 0
+    assert said in Path("lossy.html").read_text()
+
+
+def _box(name: str, x: float) -> dict[str, object]:
+    return {"name": name, "polygon": [[x, 0], [x + 1, 0], [x + 1, 1], [x, 1]]}
+
+
 def test_a_log_that_cannot_be_read_is_a_row_until_it_can(fleet: Path) -> None:
     log = Path("logs/run-1.jsonl")
     whole = log.read_text()
@@ -226,7 +315,7 @@ def test_all_errors_of_a_suite_are_reported_at_once_with_their_lines(fleet: Path
         (8, "'soon' is not a time"),
         (9, "expected a whole number of at least 1"),
         (10, "the key 'name' is missing"),
-        (13, "at_least applies to satisfied"),
+        (13, "at_least is a least robustness, and violated results"),
         (14, "no file 'none.yaml'"),
         (15, "unknown key"),
         (17, "nightly/*.mcap: no log matches"),

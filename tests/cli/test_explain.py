@@ -210,7 +210,9 @@ def test_json_has_templates_without_objects_and_may_name_standard_output(
     assert (idle["specification"], idle["verdict"], idle["vacuous"][0]["reason"]) == (
         "near", None, "no instances",
     )  # fmt: skip
-    assert idle["explanation"] == ["`near(ego)` was never evaluated: no object stands for ego."]
+    assert idle["explanation"] == [
+        "`near(ego)` was never evaluated: no object stands for ego. The log never has the class 'bus'."
+    ]
 
 
 def luminance(number: int) -> float:

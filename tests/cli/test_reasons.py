@@ -204,7 +204,9 @@ def test_parts_that_decided_nothing_are_marked_and_can_fail_a_gate(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     code, document = _document(folder, "idle.spatial")
-    assert code == 0
+    assert code == 4
+    assert [each["tested"] for each in document["specifications"]] == ["nothing"] * 3
+    assert all(each["untested"] == each["vacuous"] for each in document["specifications"])
     reasons = {
         each["name"]: [part["reason"] for part in each["vacuous"]] for each in document["specifications"]
     }
@@ -213,7 +215,9 @@ def test_parts_that_decided_nothing_are_marked_and_can_fail_a_gate(
         "polite": ["antecedent never held"],
         "calm": ["no members"],
     }
-    assert capsys.readouterr().out.count("vacuous: `") == 3
+    shown = capsys.readouterr().out
+    assert (shown.count("vacuous: `"), shown.count("satisfied  tested by nothing, ")) == (3, 3)
+    assert _document(folder, "idle.spatial", "--allow", "vacuous")[0] == 0
     assert _document(folder, "idle.spatial", "--fail-on", "vacuous")[0] == 1
 
 
@@ -223,9 +227,43 @@ def test_a_template_without_objects_is_vacuous(folder: Path) -> None:
     )
     none = ("--each", "t=class:drink", "--to", "2s")
     code, document = _document(folder, "t.spatial", *none)
-    assert code == 0
+    assert code == 4
     assert [(each["reason"], each["text"]) for each in document["vacuous"]] == [("no instances", "near(t)")]
+    assert _document(folder, "t.spatial", *none, "--allow", "vacuous")[0] == 0
     assert _document(folder, "t.spatial", *none, "--fail-on", "vacuous")[0] == 1
+
+
+def test_a_window_that_the_end_of_the_log_cut_is_said_where_it_decides(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "hold.spatial").write_text(
+        "spec parked = F G[0s, 2s] (cup dist plate >= 0)\nspec near = F (cup dist plate >= 0)\n"
+    )
+    last = ("--from", "9s")
+    code, document = _document(folder, "hold.spatial", *last)
+    parked, near = document["specifications"]
+    assert (code, parked["tested"], near["tested"]) == (0, "cut", "full")
+    (part,) = parked["untested"]
+    assert (part["node"], part["reason"], part["text"]) == (
+        1,
+        "cut window",
+        "G[0s, 2s] (cup dist plate >= 0)",
+    )
+    assert part["time_ns"] >= document["log"]["start_ns"]
+    shown = capsys.readouterr().out
+    assert "  cut: `G[0s, 2s] (cup dist plate >= 0)` decides at 9" in shown
+    assert _document(folder, "hold.spatial", *last, "--fail-on", "cut")[0] == 1
+    assert _document(folder, "hold.spatial", "--to", "5s", "--fail-on", "cut")[0] == 0
+
+
+def test_an_antecedent_that_never_held_fails_a_gate_under_the_semantics_of_the_paper(folder: Path) -> None:
+    (folder / "polite.spatial").write_text("spec polite = G (cup ovlp plate -> fork ovlp plate)\n")
+    paper = ("--semantics", "paper")
+    code, document = _document(folder, "polite.spatial", *paper)
+    (polite,) = document["specifications"]
+    assert (code, polite["verdict"], polite["tested"]) == (4, "satisfied", "nothing")
+    assert _document(folder, "polite.spatial", *paper, "--fail-on", "vacuous")[0] == 1
+    assert _document(folder, "polite.spatial", *paper, "--allow", "vacuous")[0] == 0
 
 
 def test_an_unknown_verdict_can_fail_a_gate(folder: Path) -> None:
@@ -239,4 +277,4 @@ def test_a_kind_of_failure_that_there_is_not_is_refused(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run(["replay", str(LOG), "--spec", "idle.spatial", "--fail-on", "vacous"]) == 2
-    assert "--fail-on: 'vacous' is not a kind of failure; did you mean 'vacuous'?" in capsys.readouterr().err
+    assert "--fail-on: 'vacous' is not a kind of result; did you mean 'vacuous'?" in capsys.readouterr().err

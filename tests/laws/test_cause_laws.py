@@ -17,7 +17,17 @@ from spatial_replay.monitor.witness.path import End, deciding_path
 from spatial_replay.monitor.witness.unfinished import evaluate_unfinished
 from spatial_replay.spec.expressions import TrackedName
 from spatial_replay.spec.format import format_term
-from spatial_replay.spec.formula import Boolean, Formula, Quantified, Temporal, Truth, iter_nodes, operands_of
+from spatial_replay.spec.formula import (
+    FUTURE_OPERATORS,
+    Boolean,
+    Bound,
+    Formula,
+    Quantified,
+    Temporal,
+    Truth,
+    iter_nodes,
+    operands_of,
+)
 
 _NUMBERS = st.sampled_from([-9.0, -3.0, -1.5, 0.0, 0.25, 1.0, 2.5, 7.0])
 
@@ -130,6 +140,45 @@ def test_a_vacuous_part_can_be_replaced_by_true(formula, trace):
 
 def _with_true_operands(node: Temporal) -> Temporal:
     return replace(node, operands=tuple(Truth(True) for _ in node.operands))
+
+
+def without_end(formula: Formula) -> Formula:
+    """The formula with a window for each operator that would end with the log."""
+    if isinstance(formula, Temporal) and formula.operator in FUTURE_OPERATORS:
+        operands = tuple(without_end(each) for each in formula.operands)
+        if formula.operator in ("X", "WX"):
+            return Temporal("X", operands)
+        bound = formula.bound or Bound(0, None, "samples")
+        bound = replace(bound, upper=bound.lower + 2) if bound.upper is None else bound
+        return replace(formula, operands=operands, bound=bound)
+    if isinstance(formula, Boolean | Temporal):
+        return replace(formula, operands=tuple(without_end(each) for each in formula.operands))
+    return formula
+
+
+@settings(max_examples=300)
+@given(formula=formulas_of_leaves.map(without_end), trace=signal_runs(), later=signal_runs())
+def test_no_later_sample_changes_a_verdict_that_no_cut_window_decides(formula, trace, later):
+    result = evaluated(formula, trace)
+    assume(result.tested != "cut" and result.verdict is not sr.Verdict.UNKNOWN)
+    end = int(trace.times_ns[-1]) + 40
+    samples = [replace(each, time_ns=each.time_ns + end) for each in later.samples()]
+    longer = sr.Trace.from_samples([*trace.samples(), *samples])
+    if result.tested == "full":
+        assert evaluated(formula, longer).verdict is result.verdict
+
+
+@settings(max_examples=300)
+@given(formula=formulas_of_leaves, trace=signal_runs(), data=st.data())
+def test_no_value_changes_a_verdict_that_nothing_tested(formula, trace, data):
+    result = evaluated(formula, trace)
+    assert result.tested != "nothing" or result.untested
+    is_implied = any(
+        isinstance(each, Boolean) and each.operator == "->" for _, _, each in iter_nodes(formula)
+    )
+    assume(result.tested == "nothing" and not is_implied)
+    other = [replace(each, signals={name: data.draw(_NUMBERS) for name in "pqr"}) for each in trace.samples()]
+    assert evaluated(formula, sr.Trace.from_samples(other)).verdict is result.verdict
 
 
 @settings(max_examples=200)

@@ -472,7 +472,7 @@ def test_the_scene_says_where_y_points(task: Page) -> None:
 def test_a_result_that_decided_nothing_is_marked(tmp_path: Path) -> None:
     page = report_of_samples(tmp_path / "run.html", driving(3), "spec late = G[60s, 90s] robot ovlp vase")
     said = page.within("section#verdicts")
-    assert "a part decided nothing" in said
+    assert "tested by nothing" in said
     assert "no sample of the log lies in its window" in said
     assert [event["status"] for event in page.facts["events"]][-1] == "vacuous"
 

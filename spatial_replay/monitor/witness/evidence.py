@@ -137,17 +137,15 @@ class Evidence:
         found = zip(kinds, np.concatenate(parts, axis=1), strict=True)
         return tuple(_gap(shown, missing, times_ns) for (shown, _, _), missing in found if missing.any())
 
-    def have_members(self, groups: Sequence[Group | Earlier]) -> list[bool]:
-        """Return for each open group whether any of the samples has a member of it, or may have had one."""
-        found = [False] * len(groups)
+    def members(self, groups: Sequence[Group | Earlier]) -> NDArray[np.bool_]:
+        """Return (G, T), in which samples each open group has a member, or may have had one."""
+        parts: list[NDArray[np.bool_]] = []
         for scene in self._scenes() if groups else ():
             times_ns = scene.trace.times_ns[scene.skip :]
-            begin, end = window_of(times_ns, self.instance.start_ns, self.instance.end_ns)
-            for index, group in enumerate(groups):
-                if not found[index]:
-                    _, members, unknown = scene.members(group)
-                    found[index] = bool(members[begin:end].any() or unknown[begin:end].any())
-        return found
+            inside = slice(*window_of(times_ns, self.instance.start_ns, self.instance.end_ns))
+            found = [scene.members(group) for group in groups]
+            parts.append(np.stack([(members.any(axis=1) | before)[inside] for _, members, before in found]))
+        return np.concatenate(parts, axis=1) if parts else np.empty((0, 0), np.bool_)
 
     def _scenes(self) -> Iterator[TraceScene]:
         """Iterate over the samples in blocks, each with the earlier ones that it may look back at."""

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from itertools import pairwise
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -155,9 +155,17 @@ class DecidingPath:
     end: End
 
 
+class NodeEnds(Protocol):
+    """Every node at every sample."""
+
+    def ends(self, node: int) -> tuple[Floats, Floats]:
+        """Return the ends (T,) of a node's interval at each sample."""
+        ...
+
+
 def deciding_path(
     formula: Formula,
-    done: OfflineNodes | UnfinishedNodes,
+    done: NodeEnds,
     times_ns: Integers,
     node: int,
     end: End,
@@ -180,9 +188,7 @@ def deciding_path(
 class _Walk:
     """The tree of a formula with every node's numbers."""
 
-    def __init__(
-        self, formula: Formula, done: OfflineNodes | UnfinishedNodes, times_ns: Integers, *, goes_on: bool
-    ) -> None:
+    def __init__(self, formula: Formula, done: NodeEnds, times_ns: Integers, *, goes_on: bool) -> None:
         self._done = done
         self._times = times_ns
         self._goes_on = goes_on

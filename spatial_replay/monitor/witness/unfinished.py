@@ -8,7 +8,8 @@ monitor, and the path through them leads to what settled a verdict before the lo
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,9 +30,11 @@ from spatial_replay.spec.formula import (
     expand,
     iter_nodes,
     operands_of,
+    operator_of,
 )
 
 _Ends = tuple[Floats, Floats]
+_Samples: TypeAlias = NDArray[np.bool_]
 _STAND_INS = tuple(Atom(name, "signal", Signal(name)) for name in ("first", "second"))
 
 
@@ -57,12 +60,65 @@ def evaluate_unfinished(
         leaves: (C, A, T), their intervals (see `leaf_values`).
         times_ns: (T,), increasing; T at least 1.
     """
+    return UnfinishedNodes(formula, _Evaluator(_columns(order, leaves), times_ns, _is_open))
+
+
+def evaluate_with_whole_windows(
+    formula: Formula, order: Sequence[Atom | Quantified], leaves: Floats, times_ns: Integers
+) -> UnfinishedNodes:
+    """Evaluate the nodes of a formula over a finished log, but with windows that go on beyond its end.
+
+    What lies there is unknown, and only there (see `is_cut`). Arguments as of `evaluate_unfinished`.
+    """
+    return UnfinishedNodes(formula, _Evaluator(_columns(order, leaves), times_ns, is_cut))
+
+
+def evaluate_untested(
+    formula: Formula,
+    order: Sequence[Atom | Quantified],
+    antecedents: Floats,
+    leaves: Floats,
+    times_ns: Integers,
+) -> _Ends:
+    """Return the ends (T,) of a formula on a finished log, with other leaves in the antecedents of `->`.
+
+    Args:
+        antecedents: (C, A, T), the leaves there.
+        leaves: (C, A, T), the leaves elsewhere.
+    """
+    within = _Evaluator(_columns(order, antecedents), times_ns, _is_never_open)
+    return _Evaluator(_columns(order, leaves), times_ns, _is_never_open, within).ends(formula)
+
+
+def _columns(order: Sequence[Atom | Quantified], leaves: Floats) -> dict[tuple[object, ...], _Ends]:
     low, high = low_and_high(len(leaves), wide=True)
-    columns = {_key(leaf): (leaves[low, index], leaves[high, index]) for index, leaf in enumerate(order)}
-    return UnfinishedNodes(formula, _Evaluator(columns, times_ns))
+    return {_key(leaf): (leaves[low, index], leaves[high, index]) for index, leaf in enumerate(order)}
 
 
-def is_closed(bound: Bound | None, times_ns: Integers) -> NDArray[np.bool_]:
+def is_cut(formula: Temporal, times_ns: Integers) -> _Samples:
+    """Return (T,), at which samples the end of a log cuts the window of an operator short.
+
+    An operator without an upper bound ends with the log; WX says itself what holds at the last sample.
+    """
+    bound = formula.bound
+    is_bounded = formula.operator == "X" or (bound is not None and bound.upper is not None)
+    return _is_open(formula, times_ns) if is_bounded else _is_never_open(formula, times_ns)
+
+
+def _is_open(formula: Temporal, times_ns: Integers) -> _Samples:
+    """Return (T,), at which samples later ones can fall into the window of an operator."""
+    if formula.operator in ("X", "WX"):
+        return ~is_closed(Bound(1, 1, "samples"), times_ns)
+    if formula.operator in FUTURE_OPERATORS:
+        return ~is_closed(formula.bound, times_ns)
+    return _is_never_open(formula, times_ns)
+
+
+def _is_never_open(formula: Temporal, times_ns: Integers) -> _Samples:
+    return np.zeros(len(times_ns), np.bool_)
+
+
+def is_closed(bound: Bound | None, times_ns: Integers) -> _Samples:
     """Return (T,), whether no later sample can fall into the window of a future operator at each sample."""
     count = len(times_ns)
     if bound is None or bound.upper is None:
@@ -84,9 +140,23 @@ def _key(leaf: Formula) -> tuple[object, ...]:
 class _Evaluator:
     """The ends of formulas at each sample, each computed once."""
 
-    def __init__(self, leaves: dict[tuple[object, ...], _Ends], times_ns: Integers) -> None:
+    def __init__(
+        self,
+        leaves: dict[tuple[object, ...], _Ends],
+        times_ns: Integers,
+        is_open: Callable[[Temporal, Integers], _Samples],
+        antecedents: _Evaluator | None = None,
+    ) -> None:
+        """Begin without any number.
+
+        Args:
+            is_open: at which samples what is beyond the end, and anything, can fall into a window.
+            antecedents: computes the antecedents of `->`; None if this one does.
+        """
         self._leaves = leaves
         self._times = times_ns
+        self._is_open = is_open
+        self._antecedents = antecedents or self
         # the formulas stay alive, so that no other one takes the id of one
         self._done: dict[int, tuple[Formula, _Ends]] = {}
 
@@ -97,7 +167,11 @@ class _Evaluator:
         return self._done[id(formula)][1]
 
     def _computed(self, formula: Formula) -> _Ends:
-        expanded = expand(formula)
+        if isinstance(formula, Boolean) and formula.operator == "->":
+            antecedent, consequent = formula.operands
+            low, high = self._antecedents.ends(antecedent)
+            return _combined("or", [(-high, -low), self.ends(consequent)])
+        expanded = formula if operator_of(formula) == "WX" else expand(formula)
         if expanded is not formula:
             return self.ends(expanded)
         operands = [self.ends(operand) for operand in operands_of(formula)]
@@ -113,13 +187,10 @@ class _Evaluator:
 
     def _temporal(self, formula: Temporal, operands: Sequence[_Ends]) -> _Ends:
         low, high = self._finished(formula, operands)
-        if formula.operator not in FUTURE_OPERATORS:
-            return low, high
-        if formula.operator == "X":
-            low[-1], high[-1] = -np.inf, np.inf
-            return low, high
-        is_open = ~is_closed(formula.bound, self._times)
-        if formula.operator == "G":
+        is_open = self._is_open(formula, self._times)
+        if formula.operator in ("X", "WX"):
+            low[is_open], high[is_open] = -np.inf, np.inf
+        elif formula.operator == "G":
             low[is_open] = -np.inf
         elif formula.operator == "F":
             high[is_open] = np.inf
