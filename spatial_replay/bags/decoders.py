@@ -7,6 +7,15 @@ from collections.abc import Iterable
 from dataclasses import replace
 from functools import lru_cache
 
+from google.protobuf import (
+    any_pb2,
+    duration_pb2,
+    empty_pb2,
+    field_mask_pb2,
+    struct_pb2,
+    timestamp_pb2,
+    wrappers_pb2,
+)
 from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message import DecodeError, Message
@@ -20,6 +29,17 @@ from spatial_replay.logs.messages import Channel, Schema
 
 _MOST_FILES = 1_000
 """Files that one descriptor set may hold."""
+
+_WELL_KNOWN = (
+    any_pb2,
+    duration_pb2,
+    empty_pb2,
+    field_mask_pb2,
+    struct_pb2,
+    timestamp_pb2,
+    wrappers_pb2,
+)
+"""None of these imports another."""
 
 ENCODINGS = ("ros1", "cdr", "protobuf", "json")
 
@@ -94,13 +114,23 @@ def _message_class(type_name: str, schema: Schema | None) -> type[Message]:
         raise LogError(f"the definition of {type_name!r:.100} is {given}; protobuf needs a descriptor set")
     pool = DescriptorPool()
     try:
-        for file in _in_order(FileDescriptorSet.FromString(schema.data)):
+        for file in _in_order(_with_well_known(FileDescriptorSet.FromString(schema.data))):
             pool.AddSerializedFile(file.SerializeToString())
         return GetMessageClass(pool.FindMessageTypeByName(type_name))
     # descriptors that contradict themselves or each other end in TypeError, and names without one in KeyError
     except (DecodeError, TypeError, ValueError, KeyError, UnicodeError, RecursionError) as error:
         reason = f"{error!s:.200}" or type(error).__name__
         raise LogError(f"the definition of {type_name!r:.100} cannot be used: {reason}") from None
+
+
+def _with_well_known(described: FileDescriptorSet) -> FileDescriptorSet:
+    """Add the files of well-known types, such as timestamps, that a set imports without having them."""
+    own = {file.name for file in described.file}
+    imported = {name for file in described.file for name in file.dependency} - own
+    for module in _WELL_KNOWN:
+        if module.DESCRIPTOR.name in imported:
+            module.DESCRIPTOR.CopyToProto(described.file.add())
+    return described
 
 
 def _in_order(described: FileDescriptorSet) -> list[FileDescriptorProto]:

@@ -203,7 +203,11 @@ class BagFolder(MessageReader):
             with path.open("rb") as stream:
                 head = stream.read(len(SQLITE_MAGIC))
             if head.startswith(ZSTD_MAGIC):
-                return self._opened(unpack_file(path, self._unpacked_files))
+                damage = FaultList()
+                file = self._opened(unpack_file(path, self._unpacked_files, damage))
+                for fault in damage.take(last=True):
+                    self._faults.add(f"{self.name}: {fault}")
+                return file
         except OSError as error:
             raise MissingFileError.of(path, error) from None
         except LogError as error:

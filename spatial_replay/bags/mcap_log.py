@@ -23,7 +23,7 @@ from spatial_replay.logs.mcap.chunk_records import DamageError, walk_records
 from spatial_replay.logs.mcap.chunk_walk import ChunkWalk
 from spatial_replay.logs.mcap.chunks import ChunkPlace, plan_places, read_records
 from spatial_replay.logs.mcap.index import Directory, iter_attachments, iter_metadata, read_directory
-from spatial_replay.logs.mcap.reader import recovery_remarks
+from spatial_replay.logs.mcap.reader import directory_remarks
 from spatial_replay.logs.messages import Attachment, Channel
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.logs.remote import LogFile, open_file
@@ -75,7 +75,7 @@ class McapLog(MessageReader):
 
     def take_remarks(self) -> tuple[str, ...]:
         is_first, self._is_remarked = not self._is_remarked, True
-        return recovery_remarks(self.name, self.metadata()) if is_first else ()
+        return directory_remarks(self.name, self._contents[0], self.metadata()) if is_first else ()
 
     @property
     def channel_topics(self) -> frozenset[str]:

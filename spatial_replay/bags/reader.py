@@ -86,15 +86,17 @@ class MessageReader(ABC):
             raise LogError(f"{self.name} holds no topic: {reason}")
         return self._topics
 
-    def decoder(self, topic: str) -> Decoder:
-        """Return a decoder for the messages of a topic.
+    def decoder(self, topic: str | Topic) -> Decoder:
+        """Return a decoder for the messages of a topic, by its name or as given.
 
         The decoder raises LogError for a payload that does not fit, with the reason.
 
         Raises:
             LogError: the topic's definition is missing or cannot be understood.
         """
-        return decoder_of(next(each for each in self._topics if each.name == topic), self._distribution)
+        if isinstance(topic, str):
+            topic = next(each for each in self._topics if each.name == topic)
+        return decoder_of(topic, self._distribution)
 
     def iter_messages(
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None

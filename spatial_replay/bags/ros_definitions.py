@@ -31,6 +31,8 @@ BASE_BYTES: Mapping[str, int] = {
     **dict.fromkeys(("int64", "uint64", "float64"), 8),
 }
 """The least number of bytes that a value takes; a string has at least its length."""
+_NOT_READ = frozenset({"wstring", "wchar", "char16", "float128"})
+"""Base types of ROS that are not read."""
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 _TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*){1,3}")
@@ -133,7 +135,7 @@ def _iter_fields(body: str, owner: str, known: set[str]) -> Iterator[Field]:
 
 
 def _resolved(name: str, owner: str, known: set[str]) -> str:
-    if name in BASE_BYTES:
+    if name in BASE_BYTES or name in _NOT_READ:
         return name
     if name in _BUILT_IN:
         return _BUILT_IN[name]
@@ -199,6 +201,8 @@ class _Walk:
         return self._measured[name]
 
     def _field(self, field: Field, owner: str, above: tuple[str, ...]) -> tuple[int, int]:
+        if field.type in _NOT_READ:
+            raise LogError(f"{field.name!r} of {owner!r} is a {field.type}, which is not read")
         if field.type in BASE_BYTES:
             values, least = 1, BASE_BYTES[field.type]
             by_block = field.type != "string"

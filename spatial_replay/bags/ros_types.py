@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
+from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -38,6 +39,7 @@ _MOST_ANNOTATIONS = 500
 _IDL_ASIDE = re.compile(r'"(?:\\"|[^"])*"|\'(?:[^\'\\\n]|\\.)*\'|//[^\n]*|/\*.*?\*/', re.DOTALL)
 """Strings and comments, as the parser takes them."""
 _IDL_ANNOTATION = re.compile(r"@[A-Za-z_][\w:]*\s*\(")
+_IDL_ENUM = re.compile(r"\benum\s+([A-Za-z]\w*)\s*\{", re.ASCII)
 _IDL_NESTED_TYPE = re.compile(r"<[^<>]*<[^<>]*<")
 _KINDS: dict[int, Kind] = {3: "array", 4: "sequence"}
 
@@ -57,6 +59,10 @@ def ros_definitions(
         LogError: none, or one that cannot be understood.
     """
     empty_bytes = 1 if encoding == "cdr" else 0
+    if not type_name:
+        raise LogError(
+            "the log has no message definition and no type of it; name a standard `type` in a mapping"
+        )
     checked_type_name(type_name)
     if schema is None or not schema.data.strip():
         found = [
@@ -176,7 +182,14 @@ def _from_idl(text: str, type_name: str) -> Definitions:
         raise
     except Exception as error:
         raise LogError(f"the definition of {type_name!r} cannot be read: {_reason(error)}") from None
-    return found
+    enums = {*_IDL_ENUM.findall(_IDL_ASIDE.sub(" ", text))}
+    return {name: tuple(_without_enum(field, found, enums) for field in own) for name, own in found.items()}
+
+
+def _without_enum(field: Field, known: Definitions, enums: Collection[str]) -> Field:
+    """Return a field with an enum as the integer of four bytes that CDR writes for it."""
+    is_enum = field.type not in known and field.type.rpartition("/")[2] in enums
+    return replace(field, type="uint32") if is_enum else field
 
 
 def _check_idl(text: str, type_name: str) -> None:

@@ -11,7 +11,7 @@ from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import count
 from pathlib import Path
@@ -31,6 +31,7 @@ from spatial_replay.bags.unpacking import copy_beginning, temporary_folder
 from spatial_replay.errors import LogError
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.messages import Channel, Schema
+from spatial_replay.logs.read_options import FaultList
 from spatial_replay.text import Instant, Sentence
 
 SQLITE_MAGIC = b"SQLite format 3\x00"
@@ -57,26 +58,63 @@ class SqliteBag(MessageReader):
 
     kind = "ROS 2 bag"
 
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self._remarks = FaultList()
+
     @cached_property
     def _whole(self) -> Path:
         """The file; if it was cut, a copy of its whole pages: the rest of a page would read as zeros."""
-        missing, whole = _bytes_missing(self._path)
+        path = self._with_log
+        missing, whole = _bytes_missing(path)
         if not missing:
-            return self._path
+            return path
         self._faults.add(f"{self.name}: at least {missing} bytes are missing from its end")
-        return copy_beginning(self._path, whole, temporary_folder(self))
+        return copy_beginning(path, whole, temporary_folder(self))
+
+    @cached_property
+    def _with_log(self) -> Path:
+        """The file; if a write-ahead log is next to it, a copy of both, brought together."""
+        log = self._path.with_name(f"{self.name}-wal")
+        if not log.is_file() or not log.stat().st_size:
+            return self._path
+        folder = temporary_folder(self)
+        copy, _ = (copy_beginning(each, each.stat().st_size, folder) for each in (self._path, log))
+        most = copy.stat().st_size + log.stat().st_size
+        try:
+            # in a folder of its own: nothing but the copies is read or written
+            with closing(sqlite3.connect(copy, isolation_level=None)) as database:
+                database.execute("PRAGMA trusted_schema=OFF")
+                (_, frames, _) = database.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchone()
+            if frames < 1:
+                raise sqlite3.DatabaseError("no whole change is in it")
+            if copy.stat().st_size > most:
+                raise sqlite3.DatabaseError("it places pages beyond its own size")
+        except (sqlite3.Error, UnicodeDecodeError) as error:
+            self._faults.add(
+                f"{self.name}: its recorder was interrupted, and what {log.name} holds was not read ({error})"
+            )
+            return self._path
+        self._remarks.add(f"{self.name}: its recorder was interrupted; {log.name} was read, too")
+        return copy
+
+    def take_remarks(self) -> tuple[str, ...]:
+        return self._remarks.take()
 
     @cached_property
     def _tables(self) -> BagTables:
-        for ending in ("-wal", "-journal"):
-            beside = self._path.with_name(self.name + ending)
-            if beside.is_file() and beside.stat().st_size:
-                self._faults.add(
-                    f"{self.name}: its recorder was interrupted, and what {beside.name} holds was not read;"
-                    " open a copy of both with sqlite3 to bring them together"
-                )
+        journal = self._path.with_name(f"{self.name}-journal")
+        if journal.is_file() and journal.stat().st_size:
+            self._faults.add(
+                f"{self.name}: its recorder was interrupted, and {journal.name} was not read; open a copy of"
+                " both with sqlite3 to bring them together"
+            )
         with _opened(self._whole) as database:
-            return _read_tables(database, self.name)
+            tables = _read_tables(database, self.name)
+        if self._with_log != self._path:
+            # the counts are those of a file that was closed before
+            tables = replace(tables, topics={n: replace(t, count=None) for n, t in tables.topics.items()})
+        return tables
 
     @cached_property
     def _topics(self) -> tuple[Topic, ...]:

@@ -5,16 +5,21 @@ from __future__ import annotations
 import shutil
 import tempfile
 import weakref
+from collections.abc import Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 import zstandard
 
 from spatial_replay.errors import LogError, OutputError
 from spatial_replay.logs.mcap.chunks import LARGEST_CHUNK
 from spatial_replay.logs.output_file import open_output, output_error
+from spatial_replay.logs.read_options import FaultList
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _PIECE = 2**20
+_PACKED_PIECE = 2**12
+"""Compressed bytes at a time: few, since each may stand for 32,000."""
 _MOST_TIMES_LARGER = 1_000
 _ALWAYS_ALLOWED = 2**26
 _LEFT_FREE = 2**26
@@ -45,8 +50,11 @@ def copy_beginning(path: Path, size: int, folder: Path) -> Path:
     return target
 
 
-def unpack_file(packed: Path, folder: Path) -> Path:
+def unpack_file(packed: Path, folder: Path, faults: FaultList) -> Path:
     """Decompress a file into a folder; return its path there, without the suffix of the compression.
+
+    Args:
+        faults: takes where it breaks off.
 
     Raises:
         LogError: it does not decompress, or to something absurdly large.
@@ -57,10 +65,10 @@ def unpack_file(packed: Path, folder: Path) -> Path:
     free = shutil.disk_usage(folder).free
     room = free - min(_LEFT_FREE, free // 10)
     written = 0
+    damage = "breaks off"
     try:
         with packed.open("rb") as source, open_output(target) as sink:
-            reader = zstandard.ZstdDecompressor().stream_reader(source, read_across_frames=True)
-            while piece := reader.read(_PIECE):
+            for piece, is_between in _decompressed(source):
                 written += len(piece)
                 if written > most:
                     raise LogError(
@@ -72,11 +80,26 @@ def unpack_file(packed: Path, folder: Path) -> Path:
                         " set TMPDIR to a folder with more room"
                     )
                 sink.write(piece)
+                damage = "" if is_between else "breaks off"
     except zstandard.ZstdError as error:
-        if not written:
-            raise LogError(f"{packed.name} does not decompress ({error})") from None
-        # what came before the damage is a log that breaks off, and is reported as one
+        damage = f"does not decompress to its end ({error})"
+    if not written:
+        raise LogError(f"{packed.name} {damage or 'is empty'}; nothing in it can be decompressed")
+    if damage:
+        faults.add(f"{packed.name} {damage}; {written} bytes could be decompressed")
     return target
+
+
+def _decompressed(source: BinaryIO) -> Iterator[tuple[bytes, bool]]:
+    """Yield what the frames of a file decompress to, and whether the last frame so far is whole."""
+    frame, rest = None, b""
+    while piece := rest or source.read(_PACKED_PIECE):
+        frame = frame or zstandard.ZstdDecompressor().decompressobj()
+        content, rest = frame.decompress(piece), b""
+        if frame.eof:
+            rest = frame.unused_data
+            frame = None
+        yield content, frame is None
 
 
 def unpacked(payload: bytes) -> bytes:

@@ -16,8 +16,10 @@ from types import MappingProxyType
 import numpy as np
 
 from spatial_replay.bags.columns import Columns, MessageColumns, in_pieces, joined, without_jumps
+from spatial_replay.bags.decoders import why_unreadable
 from spatial_replay.bags.open import open_messages
 from spatial_replay.bags.reader import MessageReader
+from spatial_replay.bags.ros_definitions import full_type_name
 from spatial_replay.bags.topic import Topic
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.footprint import Concave
@@ -92,7 +94,8 @@ class MappedSource:
         start_ns = start_ns or None
         end_ns = None if end_ns is None or end_ns >= FOREVER else end_ns
         reader = open_messages(self.path)
-        topics = reader.topics()
+        topics = tuple(map(self._typed, reader.topics()))
+        by_name = {topic.name: topic for topic in topics}
         plan = self._plan(reader, topics)
         mapped = frozenset(plan.topics)
         kept = [topic.name for topic in topics if is_kept(topic.name, self.keep, mapped)]
@@ -100,7 +103,7 @@ class MappedSource:
         read = mapped | copied.topics
         assembler = Assembler(
             plan,
-            reader.decoder,
+            lambda topic: reader.decoder(by_name[topic]),
             name=self.name,
             start_ns=start_ns,
             end_ns=end_ns,
@@ -127,6 +130,15 @@ class MappedSource:
         if not blocks.any_sample and start_ns is None and end_ns is None:
             reason = blocks.first_fault or "its messages make none with this mapping"
             raise LogError(f"{self.name} holds no sample: {reason}")
+
+    def _typed(self, topic: Topic) -> Topic:
+        """Return a topic; one of ROS that the log says nothing about has the type that the mapping names."""
+        names = (each.type for each in self.mapping.topics if each.topic == topic.name and each.type)
+        name = next(names, None)
+        if topic.type or name is None or topic.encoding not in ("ros1", "cdr"):
+            return topic
+        typed = replace(topic, type=full_type_name(name))
+        return replace(typed, unreadable=why_unreadable(typed))
 
     def _plan(self, reader: MessageReader, topics: Sequence[Topic]) -> ReadingPlan:
         """Compare the mapping with the topics of the log.

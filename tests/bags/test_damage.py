@@ -227,3 +227,71 @@ def test_a_refused_bag_is_closed_by_whatever_thread_collects_it(
     assert run(["replay", str(folder), *spec]) == 3
     gc.collect()
     assert not ignored
+
+
+def unindexed(path: Path, *unknown: tuple[int, bytes]) -> Path:
+    """A log of 60 messages without an index, with records of unknown kinds at its beginning."""
+    whole = write_json_mcap(path, [(each.topic, each.time_ns, {"x": 1}) for each in SENT]).read_bytes()
+    head = 8 + 9 + int.from_bytes(whole[9:17], "little")
+    added = b"".join(bytes([kind]) + len(body).to_bytes(8, "little") + body for kind, body in unknown)
+    footer = whole[-37:-8]
+    data = whole[: int.from_bytes(footer[9:17], "little")]
+    path.write_bytes(data[:head] + added + data[head:] + footer[:9] + bytes(20) + whole[-8:])
+    return path
+
+
+def test_records_of_kinds_that_are_not_known_yet_are_skipped(tmp_path: Path) -> None:
+    log = unindexed(tmp_path / "a.mcap", (0x42, b"something new"), (0x7F, b""))
+    reader = open_messages(log)
+    messages = list(reader.iter_messages({"/a", "/b", "/words"}))
+    assert (len(messages), reader.take_faults()) == (len(SENT), ())
+    assert reader.take_remarks() == ("a.mcap: 2 records of kinds that MCAP reserves for later skipped",)
+    assert run(["info", str(log)]) == 0
+    assert run(["recover", str(log), "-o", str(tmp_path / "whole.mcap")]) == 0
+    whole = open_messages(tmp_path / "whole.mcap")
+    assert len(list(whole.iter_messages({"/a", "/b", "/words"}))) == len(SENT)
+    # a chunk under the number of another kind is damage
+    data = log.read_bytes()
+    place = next(at for at in range(len(data)) if data[at] == 6 and data[at + 41 : at + 45] == b"zstd")
+    log.write_bytes(data[:place] + b"\x46" + data[place + 1 :])
+    reader = open_messages(log)
+    assert len(list(reader.iter_messages({"/a", "/b", "/words"}))) < len(SENT)
+    assert "there is no record (opcode 70)" in reader.take_faults()[0]
+
+
+def test_a_write_ahead_log_is_read_with_its_database(tmp_path: Path) -> None:
+    path = next(write_ros2(tmp_path / "drive", drive(60), storage="sqlite3").glob("*.db3"))
+    killed = tmp_path / "killed"
+    killed.mkdir()
+    with closing(sqlite3.connect(path, isolation_level=None)) as database:
+        database.execute("PRAGMA journal_mode=WAL")
+        database.execute("PRAGMA wal_autocheckpoint=0")
+        last = database.execute("SELECT max(id), max(timestamp) FROM messages").fetchone()
+        database.execute(
+            "INSERT INTO messages SELECT id + ?, topic_id, timestamp + ?, data FROM messages",
+            (last[0], last[1] - START_NS + 1),
+        )
+        for ending in ("", "-wal"):
+            copy = killed / (path.name + ending)
+            copy.write_bytes(path.with_name(path.name + ending).read_bytes())
+    before = {each.name: each.read_bytes() for each in killed.iterdir()}
+    reader = open_messages(killed / path.name)
+    assert len(list(reader.iter_messages({"/a", "/b", "/words"}))) == 2 * 180
+    assert reader.take_faults() == ()
+    assert "drive.db3-wal was read, too" in reader.take_remarks()[0]
+    assert {each.name: each.read_bytes() for each in killed.iterdir()} == before
+
+
+@pytest.mark.parametrize("share", [0.02, 0.5, 0.99])
+def test_a_compressed_file_that_was_cut_is_named(tmp_path: Path, share: float) -> None:
+    folder = write_ros2(tmp_path / "drive", drive(3000), compression="file")
+    packed = next(folder.glob("*.zstd"))
+    packed.write_bytes(packed.read_bytes()[: int(share * packed.stat().st_size)])
+    reader = open_messages(folder)
+    try:
+        count = len(list(reader.iter_messages({"/a", "/b", "/words"})))
+        faults = "\n".join(reader.take_faults())
+    except LogError as error:
+        count, faults = 0, str(error)
+    assert f"{packed.name} breaks off" in faults
+    assert (count > 0) == (share > 0.9)

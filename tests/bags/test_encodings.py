@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from bags.bag_files import (
     write_json_mcap,
     write_mcap,
 )
-from spatial_replay import LogError
+from spatial_replay import LogError, read_trace
 from spatial_replay.bags import open_messages
 
 POSES = build_file_descriptor_set(PosesInFrame).SerializeToString()
@@ -144,7 +145,7 @@ def test_what_cannot_be_decoded_says_why_and_hides_nothing_else(tmp_path: Path) 
     assert reported == [
         "topic '/cbor': the encoding 'cbor' is not known",
         "topic '/flat': the encoding 'flatbuffer' is not known",
-        "topic '/nothing': '' is not a name of a message type, such as geometry_msgs/msg/Pose",
+        "topic '/nothing': the log has no message definition and no type of it",
         "topic '/protobuf': the definition of '' is missing",
     ]
     assert [message.payload for message in reader.iter_messages(["/json"])] == [b"{}"]
@@ -186,3 +187,64 @@ def test_an_external_log_is_read_whole(data_folder: Path) -> None:
     for message in reader.iter_messages([topic.name]):
         vehicles.update(each.id.value for each in decode(message.payload).moving_object)
     assert len(vehicles) == 14
+
+
+def test_types_that_every_protobuf_library_has_may_be_missing_from_a_set(tmp_path: Path) -> None:
+    described = FileDescriptorSet.FromString(POSES)
+    own = [each for each in described.file if not each.name.startswith("google/protobuf/")]
+    assert len(own) < len(described.file)
+    reader = open_messages(
+        poses_log(tmp_path / "poses.mcap", FileDescriptorSet(file=own).SerializeToString())
+    )
+    (topic,) = reader.topics()
+    assert topic.unreadable is None
+    decode: Callable[[bytes], Any] = reader.decoder("/poses")
+    assert [decode(each.payload).frame_id for each in reader.iter_messages(["/poses"])] == ["map"] * 20
+
+
+def idl_log(path: Path, members: str, payload: bytes) -> Path:
+    text = (
+        f"{'=' * 80}\nIDL: a/msg/Cup\nmodule a {{ module msg {{\n  enum Kind {{ NONE, FULL }};\n"
+        f"  struct Cup {{ {members} }};\n}}; }};\n"
+    )
+    channels = [("/cup", "cdr", "a/msg/Cup", "ros2idl", text.encode())]
+    return write_mcap(path, channels, [("/cup", START_NS, payload)])
+
+
+def test_enums_of_idl_are_integers_of_four_bytes(tmp_path: Path) -> None:
+    members = "uint8 first; Kind kind; sequence<a::msg::Kind> kinds; double x;"
+    body = struct.pack("<B3xIIIId", 7, 1, 2, 1, 0, 2.5)
+    reader = open_messages(idl_log(tmp_path / "cup.mcap", members, b"\0\1\0\0" + body + bytes(4)))
+    decode: Callable[[bytes], Any] = reader.decoder("/cup")
+    (message,) = reader.iter_messages(["/cup"])
+    cup = decode(message.payload)
+    assert (cup.first, cup.kind, list(cup.kinds)) == (7, 1, [1, 0])
+
+
+def test_wide_texts_are_refused_by_their_name(tmp_path: Path) -> None:
+    (topic,) = open_messages(idl_log(tmp_path / "cup.mcap", "wstring label;", bytes(8))).topics()
+    assert topic.unreadable is not None
+    assert "'label' of 'a/msg/Cup' is a wstring, which is not read" in topic.unreadable
+    channels = [("/cup", "cdr", "a/msg/Cup", "ros2msg", b"wstring label\n")]
+    (topic,) = open_messages(write_mcap(tmp_path / "b.mcap", channels, [])).topics()
+    assert topic.unreadable is not None and "is a wstring" in topic.unreadable
+
+
+def test_a_channel_without_a_schema_is_read_by_the_type_that_the_mapping_names(tmp_path: Path) -> None:
+    payload = bytes(ROS2.serialize_cdr(point(1.0, 2.0), POINT))
+    log = write_mcap(tmp_path / "a.mcap", [("/a", "cdr", "", "", b"")], [("/a", START_NS, payload)])
+    mapping = tmp_path / "m.yaml"
+    mapping.write_text("topics: {/a: {type: geometry_msgs/msg/PoseStamped}}")
+    with pytest.raises(LogError, match="a message is not a geometry_msgs"):
+        read_trace(log, mapping=mapping)
+    mapping.write_text("topics: {/a: {position: [x, y]}}")
+    with pytest.raises(LogError, match="topic '/a': the log has no message definition"):
+        read_trace(log, mapping=mapping)
+    pose = ROS2.types["geometry_msgs/msg/PoseStamped"]
+    header = ROS2.types["std_msgs/msg/Header"](ROS2.types["builtin_interfaces/msg/Time"](0, 0), "map")
+    turn = ROS2.types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
+    message = pose(header, ROS2.types["geometry_msgs/msg/Pose"](point(1.0, 2.0), turn))
+    payload = bytes(ROS2.serialize_cdr(message, "geometry_msgs/msg/PoseStamped"))
+    log = write_mcap(tmp_path / "b.mcap", [("/a", "cdr", "", "", b"")], [("/a", START_NS, payload)])
+    mapping.write_text("topics: {/a: {type: geometry_msgs/PoseStamped}}")
+    assert read_trace(log, mapping=mapping).footprints.vertices.tolist() == [[1.0, 2.0]]

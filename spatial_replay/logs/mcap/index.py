@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from heapq import merge
 from itertools import repeat
@@ -54,6 +55,7 @@ class Directory:
         chunks: in the order of the file.
         attachments, metadata: offset and length of each such record with its head.
         statistics: None without a summary.
+        skipped: how many records of kinds that the format reserves for later a scan came across.
     """
 
     header: records.Header | None = None
@@ -63,6 +65,7 @@ class Directory:
     attachments: list[tuple[int, int]] = field(default_factory=list)
     metadata: list[tuple[int, int]] = field(default_factory=list)
     statistics: records.Statistics | None = None
+    skipped: int = 0
 
 
 def read_directory(stream: BinaryIO, faults: FaultList, name: str) -> Directory:
@@ -302,10 +305,12 @@ class _Scan:
             raise DamageError("the file breaks off")
         opcode, length = RECORD_HEAD.unpack_from(beginning)
         following = int(position + RECORD_HEAD.size + length)
-        if opcode == 0 or (opcode > max(Opcode) and opcode < 0x80):
+        if opcode == 0:
             raise DamageError(f"there is no record (opcode {opcode})")
         if following > self._size:
             raise DamageError("the file breaks off in a record")
+        if max(Opcode) < opcode < 0x80:
+            self._skip(opcode, beginning, following)
         if opcode == Opcode.CHUNK:
             self._end_loose()
             self._directory.chunks.append(chunk_place(position, beginning, RECORD_HEAD.size + length))
@@ -330,6 +335,22 @@ class _Scan:
             # what follows repeats what was read already
             self._ended = True
         return following
+
+    def _skip(self, opcode: int, beginning: bytes, following: int) -> None:
+        """Count a record of a kind that is not known yet; raise DamageError if it is none."""
+        self._stream.seek(following)
+        head = self._stream.read(RECORD_HEAD.size)
+        is_followed = following == self._size - len(MAGIC)
+        if len(head) == RECORD_HEAD.size:
+            after, length = RECORD_HEAD.unpack(head)
+            is_followed = is_followed or (after != 0 and following + RECORD_HEAD.size + length <= self._size)
+        with suppress(DamageError):
+            # a chunk whose opcode is damaged
+            chunk_place(0, beginning, RECORD_HEAD.size + RECORD_HEAD.unpack_from(beginning)[1])
+            is_followed = False
+        if not is_followed:
+            raise DamageError(f"there is no record (opcode {opcode})")
+        self._directory.skipped += 1
 
     def _message(self, position: int, beginning: bytes, following: int) -> None:
         """Put a message outside chunks into a place with its neighbours."""

@@ -42,7 +42,7 @@ from spatial_replay.logs.read_options import FaultList
 from spatial_replay.logs.remote import LogFile, RemoteFile, open_file
 from spatial_replay.logs.sample_cache import DamagedEntryError, cached_samples
 from spatial_replay.logs.topics import ALL, DERIVED, METADATA, OBJECTS, RECOVERY, is_kept
-from spatial_replay.text import Instant, Sentence
+from spatial_replay.text import Instant, Sentence, counted
 from spatial_replay.trace.axes import Axes
 from spatial_replay.trace.declared_units import signal_units_from_metadata
 from spatial_replay.trace.sample import LATEST_NS
@@ -122,7 +122,7 @@ class McapSource:
                 raise self._without_objects(walk, fault)
             if not decoder.any_sample and window == (0, AFTER_ALL_NS) and fault is not None:
                 raise LogError(f"{self.name} holds no sample: {fault}")
-            remarks = recovery_remarks(self.name, self.metadata())
+            remarks = directory_remarks(self.name, walk.directory, self.metadata())
             if rest or remarks:
                 yield Block(replace(Trace.from_samples(()), faults=rest), remarks=remarks)
 
@@ -216,9 +216,16 @@ def is_samples(channel: Channel) -> bool:
     return (channel.topic, channel.encoding, schema) == (OBJECTS, "protobuf", _SAMPLES)
 
 
-def recovery_remarks(name: str, metadata: Sequence[tuple[str, Mapping[str, str]]]) -> tuple[str, ...]:
-    """Return what to say about a log that was recovered from a damaged one."""
-    return tuple(
+def directory_remarks(
+    name: str, directory: Directory, metadata: Sequence[tuple[str, Mapping[str, str]]]
+) -> tuple[str, ...]:
+    """Return what to say about a log with skipped records, or one recovered from a damaged one."""
+    skipped = (
+        (f"{name}: {counted(directory.skipped, 'record')} of kinds that MCAP reserves for later skipped",)
+        if directory.skipped
+        else ()
+    )
+    return skipped + tuple(
         f"{name} was recovered from {data.get('source', 'a damaged log')}:"
         f" {data.get('losses', 'how much is missing is not known')}"
         for record, data in metadata
