@@ -1,14 +1,14 @@
-"""Results of batches as Parquet files: rows by specification, and the table of the last run.
+"""Results of batches as Parquet files: the rows of all runs, and the table of the last run.
 
-    RESULTS/format.json             the version of this layout
-    RESULTS/rows/spec_hash=HASH/*   the rows of everything that was evaluated, by specification
-    RESULTS/last_run.parquet        the table of the last run: its cases, logs and what they failed by
-    RESULTS/identities.jsonl        what unchanged logs hold, so that they need not be hashed again
+    RESULTS/format.json         the version of this layout
+    RESULTS/rows/*.parquet      the rows of everything that was evaluated
+    RESULTS/last_run.parquet    the table of the last run: its cases, logs and their failures
+    RESULTS/identities.parquet  the digests of unchanged logs, so that they need not be hashed again
 
-The rows of one log under one specification have a key, which is a hash of all they depend on. A worker
-writes them as one file named after the key, which is whole or not there. While a run goes on, small files are
-joined into larger ones. A run that is killed between writing and removing leaves rows of one key in two
-files; they are equal, and readers take the first.
+Every Parquet file holds a digest of its own bytes, which is checked whenever it is read. The rows of one log
+under one specification have a key, which is a hash of all they depend on. The first process writes the rows
+of many keys as one file, which is whole or not there. A run that is killed while it joins files leaves the
+rows of one key in two of them; they are equal, and readers take the first.
 
 RESULTS is a folder on this machine, or in a bucket. There, identities are not kept, and there is no lock,
 which a killed batch would leave behind: two batches at once lose no rows, because a file is removed only
@@ -20,12 +20,11 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-from collections import defaultdict
+import time
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager
 from os import PathLike
-from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import TYPE_CHECKING, Any, Final
 
 from spatial_replay.batch.result_files import ResultFiles, result_files
 from spatial_replay.batch.rows import ResultRow
@@ -34,20 +33,21 @@ from spatial_replay.errors import LogError, MissingFileError, UsageError, import
 if TYPE_CHECKING:
     import pyarrow as pa
 
-FORMAT: Final = 2
+FORMAT: Final = 3
 """The version of the layout; rows of another version are never read."""
 LAST_RUN: Final = "last_run.parquet"
-IDENTITIES: Final = "identities.jsonl"
 SOURCE: Final = "source"
 """The column of the file that was read: logs that hold the same share their rows."""
 _FORMAT_FILE: Final = "format.json"
+_IDENTITIES: Final = "identities.parquet"
 _ROWS: Final = "rows"
-_PARTITION: Final = "spec_hash="
-"""Beginning of the name of a folder, of which readers make a column: another than those in the files."""
-_JOINED: Final = "joined-"
-"""Beginning of the name of a file that holds the rows of several keys."""
-_MOST_JOINED: Final = 500
-"""Keys in one file, at most: joining holds that many in memory."""
+_MOST_TOGETHER: Final = 500
+"""Keys in one file, at most: so many wait in memory."""
+_LONGEST_WAIT_S: Final = 0.5
+"""Between two files of rows: a batch that is killed loses the results of this time."""
+_MOST_SMALL: Final = 50
+"""Files of rows that are not full, before they are joined."""
+_DIGEST_BYTES: Final = 32
 
 
 def columns() -> pa.Schema:
@@ -104,93 +104,84 @@ def table_of(rows: Mapping[str, Sequence[ResultRow]]) -> pa.Table:
     return pa.Table.from_arrays(arrays, schema=schema)
 
 
-def write_rows(files: ResultFiles, spec_hash: str, key: str, rows: Sequence[ResultRow]) -> bytes:
-    """Write the rows of one key as one file, which appears when it is whole.
+def _encoded(table: pa.Table) -> bytes:
+    """Return a table as a Parquet file that holds a digest of its other bytes right before its footer.
 
-    Returns:
-        The same rows, as `JoinedRows.add` takes them from another process.
-
-    Raises:
-        OutputError: it cannot be written.
+    Readers of Parquet skip what no column refers to.
     """
-    table = table_of({key: rows})
-    # it is joined with others soon: what makes files small and searching fast would take longer than the rest
-    options = {"compression": "none", "use_dictionary": False, "write_statistics": False}
-    files.write(_row_file(spec_hash, key), _encoded(table, **options))
-    sink = _pyarrow().BufferOutputStream()
-    with _pyarrow().ipc.new_stream(sink, table.schema) as stream:
-        stream.write_table(table)
-    return cast(bytes, sink.getvalue().to_pybytes())
-
-
-def _row_file(spec_hash: str, key: str) -> str:
-    return f"{_ROWS}/{_PARTITION}{spec_hash}/{key}.parquet"
-
-
-def _encoded(table: pa.Table, **options: Any) -> bytes:
     from pyarrow import parquet
 
     stream = io.BytesIO()
     # written in one piece, a table of many small ones takes a quarter of the time
-    parquet.write_table(table.combine_chunks(), stream, **{"compression": "zstd", **options})
-    return stream.getvalue()
+    parquet.write_table(table.combine_chunks(), stream, compression="zstd")
+    data = stream.getvalue()
+    footer = _footer(data)
+    return data[:footer] + hashlib.sha256(data).digest() + data[footer:]
 
 
-class JoinedRows:
-    """Joins the small files of a run into larger ones, while the run goes on.
+def _decoded(data: bytes) -> pa.Table:
+    """Return the table of `_encoded`.
 
-    It has the rows from the workers, and need not read them. Holds up to `_MOST_JOINED` keys of each
-    specification in memory; what it has not joined when a run ends early, the next run joins.
+    Raises:
+        ValueError: the digest does not fit.
     """
+    from pyarrow import parquet
+
+    footer = _footer(data)
+    begin = max(0, footer - _DIGEST_BYTES)
+    digest, own = data[begin:footer], data[:begin] + data[footer:]
+    if hashlib.sha256(own).digest() != digest:
+        raise ValueError("it is damaged: its digest does not fit")
+    # not `read_table`, which takes twice as long
+    with parquet.ParquetFile(_pyarrow().BufferReader(own)) as opened:
+        return opened.read(use_threads=False)
+
+
+def _footer(data: bytes) -> int:
+    """Return where the footer of a Parquet file begins: its length and four letters end the file."""
+    return max(0, len(data) - 8 - int.from_bytes(data[-8:-4], "little"))
+
+
+class NewRows:
+    """Stores the rows of a run, those of many keys as one file; see `ResultsFolder.new_rows`."""
 
     def __init__(self, files: ResultFiles) -> None:
         self._files = files
-        self._tables: dict[str, dict[str, pa.Table]] = defaultdict(dict)
+        self.tables: list[pa.Table] = []
+        """The rows that were written."""
+        self._waiting: dict[str, Sequence[ResultRow]] = {}
+        self._written_s = 0.0
 
-    def add(self, spec_hash: str, key: str, data: bytes) -> None:
-        """Take in what `write_rows` has returned.
+    def add(self, key: str, rows: Sequence[ResultRow]) -> None:
+        """Take the rows of a key.
 
         Raises:
-            UsageError: the workers' files are not here.
-            OutputError: a joined file cannot be written.
+            OutputError: they cannot be written.
         """
-        waiting = self._tables[spec_hash]
-        waiting[key] = _pyarrow().ipc.open_stream(data).read_all()
-        if len(waiting) >= _MOST_JOINED:
-            self._join(spec_hash)
+        self._waiting[key] = rows
+        if len(self._waiting) >= _MOST_TOGETHER or time.monotonic() - self._written_s >= _LONGEST_WAIT_S:
+            self.write()
 
-    def finish(self) -> None:
-        """Join what is left; for what is raised, see `add`."""
-        for spec_hash in list(self._tables):
-            self._join(spec_hash)
-
-    def _join(self, spec_hash: str) -> None:
-        tables = dict(sorted(self._tables.pop(spec_hash).items()))
-        names = {_row_file(spec_hash, key) for key in tables}
-        partition = str(PurePosixPath(next(iter(names))).parent)
-        if not names <= set(self._files.names(partition)):
-            raise UsageError(
-                f"the workers' rows are not in {self._files.location}: they see another disk; "
-                "give a folder that all share"
-            )
-        if len(tables) > 1:
-            _write_joined(self._files, partition, tables)
-            self._files.remove(sorted(names))
+    def write(self) -> None:
+        """Write the rows that wait; for what is raised, see `add`."""
+        if self._waiting:
+            table = table_of(self._waiting)
+            _write_rows(self._files, table)
+            self.tables.append(table)
+        self._waiting.clear()
+        self._written_s = time.monotonic()
 
 
-def _write_joined(files: ResultFiles, partition: str, tables: Mapping[str, pa.Table]) -> None:
-    """Write the rows of several keys as one file."""
-    # named after what it holds, so that joining the same files twice gives one file
-    digest = hashlib.sha256("".join(tables).encode()).hexdigest()[:32]
-    joined = _pyarrow().concat_tables(tables.values(), promote_options="default")
-    files.write(f"{partition}/{_JOINED}{digest}.parquet", _encoded(joined))
+def _write_rows(files: ResultFiles, table: pa.Table) -> str:
+    """Write rows as one file, named after their keys, and return its name."""
+    keys = "".join(table.column("key").to_pylist())
+    name = f"{_ROWS}/{hashlib.sha256(keys.encode()).hexdigest()[:32]}.parquet"
+    files.write(name, _encoded(table))
+    return name
 
 
 class ResultsFolder:
-    """A folder of results, opened.
-
-    Only the process that has it `locked` writes to it, and its workers, which `write_rows`.
-    """
+    """A folder of results, opened; only the process that has it `locked` writes to it."""
 
     def __init__(self, files: ResultFiles) -> None:
         self._files = files
@@ -246,66 +237,80 @@ class ResultsFolder:
         """
         return self._files.locked(_FORMAT_FILE)
 
-    @property
-    def identities(self) -> Path | None:
-        """The file of identities; None in a bucket, where other machines have other files of one path."""
-        return self._files.own_file(IDENTITIES)
+    def rows(self, wanted: set[str]) -> tuple[pa.Table, list[str]]:
+        """Return the stored rows of keys, those of each together, and a remark on each damaged file.
 
-    def joined_rows(self) -> JoinedRows:
-        """Return what joins the files of a run; call it while `locked`."""
-        return JoinedRows(self._files)
+        Damaged files are removed, and small ones are joined; call it while `locked`.
 
-    def keys(self) -> set[str]:
-        """Return the keys whose rows are stored."""
-        joined, single = self._row_files()
-        found = {_key_of(name) for name in single}
-        for table in self._tables(joined, ["key"]):
-            found.update(table.column("key").to_pylist())
-        return found
-
-    def rows(self, wanted: set[str] | None = None) -> pa.Table:
-        """Return the stored rows, those of each key once and together.
-
-        Args:
-            wanted: keys; None for all.
+        Raises:
+            OutputError: that cannot be done.
         """
-        tables, taken = [], set[str]()
-        joined, single = self._row_files()
-        for table in self._tables(joined):
+        found, remarks, taken, small = [columns().empty_table()], [], set[str](), {}
+        names = self._files.names(_ROWS)
+        for name, data in zip(names, self._files.read(names), strict=True):
+            try:
+                table = self._table(name, data)
+            except LogError as error:
+                remarks.append(f"{error}; its rows are evaluated again")
+                self._files.remove([name])
+                continue
             keys = table.column("key").to_pylist()
-            own = {key for key in keys if key not in taken and (wanted is None or key in wanted)}
+            own = set(keys) - taken
             taken |= own
-            tables.append(table if len(own) == len(set(keys)) else table.filter([key in own for key in keys]))
-        fresh = {_key_of(name): name for name in single}
-        tables += self._tables(
-            [name for key, name in fresh.items() if key not in taken and (wanted is None or key in wanted)]
-        )
-        # what was stored before a column was there lacks it
-        return _pyarrow().concat_tables([columns().empty_table(), *tables], promote_options="default")
+            if len(own) < _MOST_TOGETHER:
+                small[name] = table.filter([key in own for key in keys])
+            found.append(table.filter([key in own and key in wanted for key in keys]))
+        if len(small) > _MOST_SMALL:
+            self._join(small)
+        return _pyarrow().concat_tables(found), remarks
 
-    def join_files(self) -> None:
-        """Join small files that runs have left into larger ones; call it while `locked`.
+    def _join(self, tables: Mapping[str, pa.Table]) -> None:
+        """Write tables of rows as one, in place of those that have their names."""
+        name = _write_rows(self._files, _pyarrow().concat_tables(tables.values()))
+        self._files.remove(sorted(set(tables) - {name}))
+
+    @contextmanager
+    def new_rows(self) -> Iterator[NewRows]:
+        """Store rows, the last of them when the block ends, even by an interruption.
 
         Raises:
             OutputError: they cannot be written.
         """
-        partitions: dict[str, tuple[list[str], list[str]]] = defaultdict(lambda: ([], []))
-        for kind, names in enumerate(self._row_files()):
-            for name in names:
-                partitions[str(PurePosixPath(name).parent)][kind].append(name)
-        for partition, (joined, single) in sorted(partitions.items()):
-            if not single:
-                continue
-            stored = {
-                key for table in self._tables(joined, ["key"]) for key in table.column("key").to_pylist()
+        rows = NewRows(self._files)
+        try:
+            yield rows
+        finally:
+            rows.write()
+
+    def identities(self) -> tuple[dict[str, str], list[str]]:
+        """Return the digests of logs by their states, as they were written, and a remark if they are damaged.
+
+        In a bucket, there are none: other machines have other files of one path.
+        """
+        if not self._files.is_on_this_machine:
+            return {}, []
+        try:
+            table = self._read(_IDENTITIES)
+        except MissingFileError:
+            return {}, []
+        except LogError as error:
+            return {}, [f"{error}; all logs are hashed again"]
+        return dict(zip(*(column.to_pylist() for column in table.columns), strict=True)), []
+
+    def write_identities(self, identities: Mapping[str, str]) -> None:
+        """Write digests of logs by their states.
+
+        Raises:
+            OutputError: they cannot be written.
+        """
+        if self._files.is_on_this_machine:
+            pa = _pyarrow()
+            listed = sorted(identities.items())
+            names = ("state", "identity")
+            columns = {
+                name: pa.array([each[n] for each in listed], pa.string()) for n, name in enumerate(names)
             }
-            fresh = [name for name in single if _key_of(name) not in stored]
-            if len(fresh) > 1:
-                for begin in range(0, len(fresh), _MOST_JOINED):
-                    some = fresh[begin : begin + _MOST_JOINED]
-                    tables = dict(zip(map(_key_of, some), self._tables(some), strict=True))
-                    _write_joined(self._files, partition, tables)
-            self._files.remove(single if len(fresh) > 1 else sorted(set(single) - set(fresh)))
+            self._files.write(_IDENTITIES, _encoded(pa.table(columns)))
 
     def write_run(self, table: pa.Table) -> None:
         """Write the table of a run, whole or not at all.
@@ -323,49 +328,29 @@ class ResultsFolder:
             LogError: its file is damaged.
         """
         try:
-            (table,) = self._tables([LAST_RUN])
+            return self._read(LAST_RUN)
         except MissingFileError:
             raise UsageError(
                 f"no run has ended in {self._files} so far; run the batch again, and it goes on"
             ) from None
-        return table
+        except LogError as error:
+            raise LogError(f"{error}; run the batch again, which writes it again") from None
 
-    def _row_files(self) -> tuple[list[str], list[str]]:
-        """Return the names of the files with the rows of several keys, and of those with one."""
-        names = [
-            name
-            for name in self._files.names(_ROWS)
-            if name.startswith(f"{_ROWS}/{_PARTITION}") and name.endswith(".parquet")
-        ]
-        joined = [name for name in names if _key_of(name).startswith(_JOINED)]
-        return joined, [name for name in names if not _key_of(name).startswith(_JOINED)]
+    def _read(self, name: str) -> pa.Table:
+        (data,) = self._files.read([name])
+        return self._table(name, data)
 
-    def _tables(self, names: Sequence[str], columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
-        """Read tables; they were written by us, since nothing else belongs in the folder.
+    def _table(self, name: str, data: bytes) -> pa.Table:
+        """Return the table of a file.
 
         Raises:
-            LogError: one is damaged.
+            LogError: it is damaged.
         """
-        pa = _pyarrow()
-        from pyarrow import parquet
-
-        for name, data in zip(names, self._files.read(names), strict=True):
-            try:
-                # not `read_table`, which takes twice as long
-                with parquet.ParquetFile(pa.BufferReader(data)) as opened:
-                    table = opened.read(columns, use_threads=False)
-            except (OSError, pa.ArrowException) as error:
-                reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-                raise LogError(
-                    f"{self._files}/{name} cannot be read: {reason}; "
-                    "delete it, and the batch evaluates it again"
-                ) from None
-            yield table
-
-
-def _key_of(name: str) -> str:
-    """Return the key whose rows a file holds."""
-    return PurePosixPath(name).stem
+        try:
+            return _decoded(data)
+        except (OSError, ValueError, _pyarrow().ArrowException) as error:
+            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise LogError(f"{self._files}/{name} cannot be used: {reason}") from None
 
 
 def _pyarrow() -> Any:

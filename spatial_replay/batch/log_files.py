@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from glob import glob, has_magic
 from pathlib import Path
@@ -13,12 +13,9 @@ from typing import Final, NamedTuple
 
 from spatial_replay.batch.suite import LogPattern
 from spatial_replay.batch.workers import Progress, ThisProcess, WorkerLost, Workers
-from spatial_replay.errors import LogError, SpatialReplayError, UsageError
-from spatial_replay.logs.mcap.reader import McapSource
-from spatial_replay.logs.output_file import replacing
+from spatial_replay.errors import SpatialReplayError, UsageError
 from spatial_replay.logs.remote import BAG_METADATA, RemoteFile, is_address, log_file
 from spatial_replay.logs.remote_folder import matching_addresses
-from spatial_replay.logs.topics import CERTIFICATE, MAGIC
 from spatial_replay.sources.open_log import bag_files_at
 from spatial_replay.text import counted
 
@@ -28,8 +25,6 @@ _MOST_LOGS: Final = 2_000_000
 _MOST_FAULTS: Final = 100
 _TOGETHER: Final = 16
 """Logs that are hashed as one task."""
-_HASHED_WHOLE: Final = 16 * 2**20
-"""Bytes up to which hashing a log takes no longer than reading its certificate."""
 
 
 class FoundLog(NamedTuple):
@@ -151,28 +146,15 @@ def _nothing(text: str, folder: Path) -> str:
 
 
 class Identities:
-    """What logs hold, as hashes: those of unchanged files are remembered.
+    """The identities of logs: hashes of their bytes, or what a server says of a version.
 
-    A file is unchanged while its path, size and time of modification are. A log of ours that is large is
-    identified by its certificate and size, which its end says; any other by its bytes. At an address, it is
-    the version that the server gives.
-
-    One object belongs to one batch; `save` keeps what it knows for the next one.
+    The path, size, times and inode of a file only decide whether it is hashed again.
     """
 
-    def __init__(self, file: Path | None) -> None:
-        """Read what an earlier batch has left; a file that is damaged is ignored. None remembers nothing."""
-        self._file = file
-        self._known: dict[str, str] = {}
-        self._used: dict[str, str] = {}
-        if file is None:
-            return
-        try:
-            for line in file.read_text("utf-8").splitlines():
-                state, identity = json.loads(line)
-                self._known[str(state)] = str(identity)
-        except (OSError, ValueError):
-            self._known.clear()
+    def __init__(self, known: Mapping[str, str]) -> None:
+        """Take the identities of an earlier batch by the states of files."""
+        self._known = known
+        self._states: dict[str, str | None] = {}
 
     def of(self, paths: Sequence[str], workers: Workers, progress: Progress) -> dict[str, str | None]:
         """Return the identity of each log; None if it cannot be read.
@@ -191,25 +173,23 @@ class Identities:
             for group, identities in at_work.results(identities_of, groups) if groups else ():
                 found |= dict.fromkeys(group) if isinstance(identities, WorkerLost) else identities
                 advance(len(group))
+        self._states = states
         known = {path: found[path] if path in found else self._known[states[path] or ""] for path in paths}
-        self._used = {
+        self._known = {
             state: identity
             for path, identity in known.items()
             if identity is not None and (state := states[path]) is not None
         }
         return known
 
-    def save(self) -> None:
-        """Write the identities that were asked for.
+    @property
+    def by_state(self) -> Mapping[str, str]:
+        """The identities that were asked for, for the next batch."""
+        return self._known
 
-        Raises:
-            OutputError: the machine cannot write them.
-        """
-        if self._file is None or self._used == self._known:
-            return
-        with replacing(self._file) as stream:
-            for item in sorted(self._used.items()):
-                stream.write(json.dumps(item).encode() + b"\n")
+    def is_unchanged(self, path: str) -> bool:
+        """Return whether a file is still what was identified; at an address, readers see to that."""
+        return is_address(path) or _state(path) == self._states[path]
 
 
 def identities_of(paths: tuple[str, ...]) -> dict[str, str | None]:
@@ -233,7 +213,7 @@ def _files_of(path: str) -> list[Path]:
 
 
 def _state(path: str) -> str | None:
-    """Return a hash of the path, size and time of a log's files: equal while they are unchanged.
+    """Return a hash of what the file system says of a log's files: equal while they are unchanged.
 
     Returns:
         None if they cannot be read.
@@ -244,14 +224,19 @@ def _state(path: str) -> str | None:
         states = [(os.path.realpath(each), os.stat(each)) for each in files]  # noqa: PTH116
     except (OSError, ValueError):
         return None
-    text = json.dumps([(name, state.st_size, state.st_mtime_ns) for name, state in states])
+    text = json.dumps(
+        [
+            (name, state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns)
+            for name, state in states
+        ]
+    )
     return hashlib.sha256(text.encode("utf-8", "surrogatepass")).hexdigest()
 
 
 def _hash_of_log(path: str) -> str:
     files = _files_of(path)
     if len(files) == 1 and Path(path).is_file():
-        return _certified(files[0]) or _hash_of(files[0])
+        return _hash_of(files[0])
     total = hashlib.sha256()
     for each in files:
         total.update(f"{each.name}\0{_hash_of(each)}\0".encode("utf-8", "surrogatepass"))
@@ -259,44 +244,29 @@ def _hash_of_log(path: str) -> str:
 
 
 def _version_at(address: str) -> str:
-    """Return the identity of a log at an address; without a version, its bytes are hashed.
+    """Return the identity of a log at an address.
 
     Raises:
         UsageError, RemoteError: it cannot be read.
     """
     file = log_file(address)
     assert isinstance(file, RemoteFile)
-    if file.name == BAG_METADATA:
-        versions = [(str(each), each.current_version()) for each in bag_files_at(file)]
-        states = [(name, version.size, version.tag) for name, version in versions]
-        return f"version:{hashlib.sha256(json.dumps(states).encode()).hexdigest()}"
+    files = bag_files_at(file) if file.name == BAG_METADATA else [file]
+    versions = [(str(each), *_version_of(each)) for each in files]
+    return f"version:{hashlib.sha256(json.dumps(versions).encode()).hexdigest()}"
+
+
+def _version_of(file: RemoteFile) -> tuple[int, str]:
+    """Return the size of a remote file, and its strong tag or, without one, the digest of its bytes."""
     version = file.current_version()
-    if version.tag is not None:
-        text = json.dumps([str(file), version.size, version.tag])
-        return f"version:{hashlib.sha256(text.encode()).hexdigest()}"
+    if version.tag is not None and version.tag.startswith('"'):
+        return version.size, version.tag
     digest = hashlib.sha256()
     for piece in file.iter_whole():
         digest.update(piece)
-    return f"sha256:{digest.hexdigest()}"
+    return version.size, digest.hexdigest()
 
 
 def _hash_of(path: Path) -> str:
     with path.open("rb") as stream:
         return f"sha256:{hashlib.file_digest(stream, 'sha256').hexdigest()}"
-
-
-def _certified(path: Path) -> str | None:
-    """Return the identity of a large log of ours that has a certificate."""
-    size = path.stat().st_size
-    with path.open("rb") as stream:
-        is_ours = size >= _HASHED_WHOLE and stream.read(len(MAGIC)) == MAGIC
-    if not is_ours:
-        return None
-    try:
-        certificate = dict(McapSource(path).metadata()).get(CERTIFICATE)
-    except LogError:
-        return None
-    if certificate is None:
-        return None
-    hashes = [certificate.get(name, "") for name in ("samples_sha256", "messages_sha256")]
-    return f"certificate:{hashlib.sha256(json.dumps([size, *hashes]).encode()).hexdigest()}"

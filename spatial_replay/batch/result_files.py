@@ -21,6 +21,8 @@ _PARTIAL: Final = ".partial"
 class LocalFolder:
     """A folder on this machine. A file is written under another name first, so it is whole or not there."""
 
+    is_on_this_machine: Final = True
+
     def __init__(self, path: Path) -> None:
         """Take a path; nothing is read yet.
 
@@ -91,10 +93,6 @@ class LocalFolder:
         for parent, _, names in os.walk(folder):
             yield from (f"{parent}/{name}" for name in names if not name.endswith(_PARTIAL))
 
-    def own_file(self, name: str) -> Path | None:
-        """Return the place of a file that is about this machine's files."""
-        return self.path / name
-
     @contextmanager
     def locked(self, name: str) -> Iterator[None]:
         """Keep other commands from writing here, by a lock on a file, and remove what killed ones have left.
@@ -117,9 +115,7 @@ class LocalFolder:
 class BucketFolder(RemoteFolder):
     """A folder in a bucket. Many machines write to it, so it has no lock, and nothing about files of one."""
 
-    def own_file(self, name: str) -> Path | None:
-        """Return None: files of one path differ from machine to machine."""
-        return None
+    is_on_this_machine: Final = False
 
     @contextmanager
     def locked(self, name: str) -> Iterator[None]:

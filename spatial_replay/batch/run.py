@@ -8,16 +8,14 @@ import re
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from os import PathLike
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 from spatial_replay import __version__
-from spatial_replay.batch.data_set import FORMAT, SOURCE, ResultsFolder, run_columns, table_of, write_rows
+from spatial_replay.batch.data_set import FORMAT, SOURCE, ResultsFolder, run_columns, table_of
 from spatial_replay.batch.log_files import FoundLog, Identities
 from spatial_replay.batch.prepare import PreparedCase
-from spatial_replay.batch.result_files import result_files
 from spatial_replay.batch.rows import (
     ResultRow,
     Task,
@@ -58,11 +56,10 @@ class Wanted:
 
 @dataclass(frozen=True, slots=True)
 class StoredTask:
-    """A task, and where its rows go: for each specification the key, and the hash of the specification."""
+    """A task, and the key of the rows for each of its specifications."""
 
     task: Task
     keys: tuple[str, ...]
-    hashes: tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,12 +71,14 @@ class BatchResult:
         logs: how many logs.
         evaluated: on how many of them something was evaluated in this run; the rest was known.
         wanted: what the suite asks for.
+        remarks: which stored files were damaged and replaced.
     """
 
     table: pa.Table
     logs: int
     evaluated: int
     wanted: tuple[Wanted, ...]
+    remarks: tuple[str, ...] = ()
 
     @property
     def failures(self) -> pa.Table:
@@ -123,53 +122,36 @@ def run_batch(
     """
     folder = ResultsFolder.create(results)
     with folder.locked():
-        identities = Identities(folder.identities)
+        known, remarks = folder.identities()
+        identities = Identities(known)
         paths = list(dict.fromkeys(log.path for each in cases for log in each.logs))
-        known = identities.of(paths, workers, progress)
-        identities.save()
-        wanted = _wanted(cases, known)
-        stored = folder.keys()
-        tasks = list(_tasks(wanted, stored))
-        errors: dict[str, tuple[ResultRow, ...]] = {}
-        work, joined = partial(evaluate_and_store, folder.location), folder.joined_rows()
-        with progress("logs", len(tasks)) as advance:
-            for task, result in workers.results(work, tasks) if tasks else ():
-                for key, spec_hash, rows in _rows_of(task, result):
-                    if isinstance(rows, bytes):
-                        joined.add(spec_hash, key, rows)
+        wanted = _wanted(cases, identities.of(paths, workers, progress))
+        folder.write_identities(identities.by_state)
+        stored, damaged = folder.rows({each.key for each in wanted if each.key is not None})
+        tasks = list(_tasks(wanted, set(stored.column("key").to_pylist())))
+        unstored: dict[str, Sequence[ResultRow]] = {}
+        with folder.new_rows() as new_rows, progress("logs", len(tasks)) as advance:
+            for task, result in workers.results(_evaluated, tasks) if tasks else ():
+                if isinstance(result, WorkerLost):
+                    result = error_rows(task.task, str(result), "machine")
+                # a log that changed during the run has another key
+                is_same = identities.is_unchanged(task.task.log)
+                for key, rows in zip(task.keys, result, strict=True):
+                    # errors may pass
+                    if is_same and all(row.error is None for row in rows):
+                        new_rows.add(key, rows)
                     else:
-                        errors[key] = rows
+                        unstored[key] = rows
                 advance(1)
-        joined.finish()
-        folder.join_files()
-        table = _table(wanted, folder, errors, fail_on)
+        table = _table(wanted, [stored, *new_rows.tables], unstored, fail_on)
         folder.write_run(table)
     # a log that cannot be read was tried, and is not known
     evaluated = {task.task.log for task in tasks} | {each.log.path for each in wanted if each.key is None}
-    return BatchResult(table, len(paths), len(evaluated), tuple(wanted))
+    return BatchResult(table, len(paths), len(evaluated), tuple(wanted), (*remarks, *damaged))
 
 
-StoredRows: TypeAlias = tuple[ResultRow, ...] | bytes
-"""The rows of one key: those with an error, or what `write_rows` has returned."""
-
-
-def evaluate_and_store(folder: str, stored: StoredTask) -> tuple[StoredRows, ...]:
-    """Evaluate a task and store its rows, for each of its keys; errors are not stored: they may pass."""
-    files = result_files(folder)
-    evaluated = zip(rows_from_task(stored.task), stored.keys, stored.hashes, strict=True)
-    return tuple(
-        rows if any(row.error is not None for row in rows) else write_rows(files, spec_hash, key, rows)
-        for rows, key, spec_hash in evaluated
-    )
-
-
-def _rows_of(
-    stored: StoredTask, result: tuple[StoredRows, ...] | WorkerLost
-) -> Iterator[tuple[str, str, StoredRows]]:
-    """Return the rows of a task, with the key and the specification of each."""
-    if isinstance(result, WorkerLost):
-        result = error_rows(stored.task, str(result), "machine")
-    return zip(stored.keys, stored.hashes, result, strict=True)
+def _evaluated(stored: StoredTask) -> tuple[tuple[ResultRow, ...], ...]:
+    return rows_from_task(stored.task)
 
 
 def _wanted(cases: Sequence[PreparedCase], identities: Mapping[str, str | None]) -> list[Wanted]:
@@ -211,23 +193,22 @@ def _tasks(wanted: Sequence[Wanted], stored: set[str]) -> Iterator[StoredTask]:
             groups[each.log.path, each.case.conditions][each.key] = each.file
     for (path, conditions), files in groups.items():
         task = Task(path, tuple(file.text for file in files.values()), conditions)
-        yield StoredTask(task, tuple(files), tuple(file.hash for file in files.values()))
+        yield StoredTask(task, tuple(files))
 
 
 def _table(
     wanted: Sequence[Wanted],
-    folder: ResultsFolder,
-    errors: dict[str, tuple[ResultRow, ...]],
+    stored: Sequence[pa.Table],
+    unstored: Mapping[str, Sequence[ResultRow]],
     fail_on: frozenset[str],
 ) -> pa.Table:
-    """Return the table of a run: what was wanted, with the rows found for it."""
+    """Return the table of a run: the rows of each log and specification file that the suite asks for."""
     import pyarrow as pa
 
-    rows = folder.rows({each.key for each in wanted if each.key is not None})
     unreadable = {
         f"{each.log.path}\0{each.file.hash}": _unreadable(each) for each in wanted if each.key is None
     }
-    rows = pa.concat_tables([rows, table_of({**errors, **unreadable})])
+    rows = pa.concat_tables([*stored, table_of({**unstored, **unreadable})])
     places: dict[str, list[int]] = defaultdict(list)
     for place, key in enumerate(rows.column("key").to_pylist()):
         places[key].append(place)

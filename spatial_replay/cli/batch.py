@@ -162,6 +162,7 @@ def batch(
         write_json_lines(result.table, outputs.json_file, inputs)
     if outputs.json_file != "-":
         _print(result, found, folder)
+    warn(*found.remarks)
     _warn_of_names(found.table)
     if is_github():
         for line in worst_annotations(result.table, suite.folder):

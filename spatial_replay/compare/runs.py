@@ -20,7 +20,6 @@ from spatial_replay.compare.movement import (
 from spatial_replay.compare.run_results import RunSpecDiff, compare_results
 from spatial_replay.lazy import Displayed
 from spatial_replay.logs.source import Source
-from spatial_replay.logs.topics import CERTIFICATE
 from spatial_replay.monitor.evaluate import Evaluation, evaluate
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, LogNames, ReplayOptions, Selection
@@ -41,8 +40,7 @@ class LogDiff(Displayed):
         a, b: the names of the logs.
         samples: how many each has, where they were compared.
         starts_ns: the times of their first samples, which sentences count from.
-        is_certified: whether the certificates say that samples and messages are equal; nothing else was read.
-        alignment: how samples correspond; None if nothing differs.
+        alignment: how samples correspond.
         objects: those that moved differently, the first apart first.
         signals: those with other values, in the order of their names.
         only_a, only_b: objects and signals that one run never has, and results of templates for them.
@@ -51,15 +49,14 @@ class LogDiff(Displayed):
         has_equal_samples: whether all samples are equal.
         faults: what was lost while reading.
         missing: a warning for each name in the specifications that a log never has.
-        traces: the samples; None if the certificates say that they are equal.
+        traces: the samples.
     """
 
     a: str
     b: str
     samples: tuple[int, int]
     starts_ns: tuple[int, int]
-    is_certified: bool
-    alignment: Alignment | None
+    alignment: Alignment
     objects: tuple[ObjectDiff, ...]
     signals: tuple[SignalDiff, ...]
     only_a: tuple[str, ...]
@@ -68,27 +65,23 @@ class LogDiff(Displayed):
     decision: DecisionDiff | None
     has_equal_samples: bool
     faults: tuple[str, ...]
-    traces: tuple[Trace, Trace] | None = None
+    traces: tuple[Trace, Trace]
     missing: tuple[Diagnostic, ...] = ()
 
     @property
     def is_empty(self) -> bool:
         """Whether nothing differs: no sample, no result, no decision."""
-        return self.is_certified or (self.has_equal_samples and self.decision is None)
+        return self.has_equal_samples and self.decision is None
 
     def lines(self) -> Iterator[str]:
         """Yield the diff as text, as the command `diff` prints it."""
         yield f"A {self.a} | B {self.b}"
-        if self.is_certified:
-            yield "  the same samples and messages, by their certificates"
-            return
         if self.is_empty:
             yield f"  the same {counted(self.samples[0], 'sample')}"
             return
-        if self.alignment is not None:
-            paired = [len(set(rows.tolist())) for rows in (self.alignment.a, self.alignment.b)]
-            counts = " | ".join(counted(count, "sample") for count in self.samples)
-            yield f"  {counts}; {self.alignment}: {paired[0]:,} of A beside {paired[1]:,} of B"
+        paired = [len(set(rows.tolist())) for rows in (self.alignment.a, self.alignment.b)]
+        counts = " | ".join(counted(count, "sample") for count in self.samples)
+        yield f"  {counts}; {self.alignment}: {paired[0]:,} of A beside {paired[1]:,} of B"
         start_ns = self.starts_ns[0]
         for each in self.objects[:_MOST_LISTED]:
             yield f"  {each.name}: {movement_sentence(each, start_ns)}"
@@ -120,11 +113,8 @@ class LogDiff(Displayed):
             "a": self.a,
             "b": self.b,
             "same": self.is_empty,
-            "certified": self.is_certified,
             "damaged": bool(self.faults),
-            "alignment": None
-            if self.alignment is None
-            else {
+            "alignment": {
                 "kind": self.alignment.kind,
                 "about": self.alignment.about,
                 "knots": [list(knot) for knot in self.alignment.knots],
@@ -173,7 +163,7 @@ def diff_sources(
     align: str = "time",
     advance: Callable[[int], None] = lambda samples: None,
 ) -> LogDiff:
-    """Compare two logs; if their certificates say that they are equal, no sample is read.
+    """Compare two logs by all of their samples.
 
     Args:
         options: how each log is evaluated.
@@ -187,10 +177,6 @@ def diff_sources(
         LogError: a log cannot be read.
         SpecificationError: names that a log never has, if names are strict.
     """
-    is_whole = all(each.window.is_whole for each in options)
-    if is_whole and align == "time" and same_by_certificate(*sources):
-        names = sources[0].name, sources[1].name
-        return LogDiff(*names, (0, 0), (0, 0), True, None, (), (), (), (), (), None, True, ())
     selections = [
         Selection(source, tuple(files), replace(each, keep=()))
         for source, each in zip(sources, options, strict=True)
@@ -205,18 +191,6 @@ def diff_sources(
         missing += selection.missing_names(known)
     diff = _compare(sources, traces, files, options, align)
     return replace(diff, missing=tuple(dict.fromkeys(missing)))
-
-
-def same_by_certificate(one: Source, other: Source) -> bool:
-    """Say whether two logs have certificates of equal samples and messages."""
-    hashes = [
-        tuple(dict(source.metadata()).get(CERTIFICATE, {}).get(key) for key in _CERTIFIED)
-        for source in (one, other)
-    ]
-    return None not in hashes[0] and hashes[0] == hashes[1]
-
-
-_CERTIFIED: Final = ("samples_sha256", "messages_sha256")
 
 
 def _compare(
@@ -247,7 +221,6 @@ def _compare(
         sources[1].name,
         (len(a), len(b)),
         (int(a.times_ns[0]), int(b.times_ns[0])),
-        False,
         alignment,
         objects,
         compare_signals(a, b, alignment),

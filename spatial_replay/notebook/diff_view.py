@@ -80,8 +80,6 @@ def draw_runs(diff: LogDiff) -> tuple[Axes, ...]:
     Raises:
         UsageError: no spec was evaluated, or matplotlib is not installed.
     """
-    if diff.alignment is None or diff.traces is None:
-        return _draw([])
     sides = tuple(zip(diff.traces, (diff.alignment.a, diff.alignment.b), strict=True))
     seconds = (diff.traces[0].times_ns[diff.alignment.a] - diff.starts_ns[0]) / 1e9
     pairs = []

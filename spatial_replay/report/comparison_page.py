@@ -103,7 +103,7 @@ def _labels(diff: SpecificationDiff | LogDiff) -> tuple[str, str]:
 def _about(diff: SpecificationDiff | LogDiff) -> str:
     if isinstance(diff, SpecificationDiff):
         return f"two specifications over {diff.log}"
-    return "two runs" if diff.alignment is None else f"two runs, {diff.alignment}"
+    return f"two runs, {diff.alignment}"
 
 
 def _changes(diff: SpecificationDiff | LogDiff, first_ns: tuple[int, int]) -> Iterator[Html]:

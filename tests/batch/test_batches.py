@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import random
 import shutil
 from importlib.resources import files
 from pathlib import Path
@@ -10,6 +12,8 @@ from urllib.request import Request, urlopen
 from xml.etree import ElementTree
 
 import pytest
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
 
 import spatial_replay as sr
 from batch.fleet import GATE, batch, command, write_fleet, write_log
@@ -156,6 +160,78 @@ def test_samples_that_a_recorder_dropped_are_said_and_do_not_pass(fleet: Path) -
 
 def _box(name: str, x: float) -> dict[str, object]:
     return {"name": name, "polygon": [[x, 0], [x + 1, 0], [x + 1, 1], [x, 1]]}
+
+
+def test_a_flipped_bit_in_a_folder_of_results_never_changes_a_result(fleet: Path) -> None:
+    chance = random.Random(3)
+    arguments = ["logs", "--spec", "gate.spatial"]
+    batch(*arguments)
+    sound = sr.read_results("results").drop(["seconds"])
+    files = {name: Path(name).read_bytes() for name in map(str, Path("results").rglob("*.*"))}
+    assert len(files) >= 4
+    for name, data in [item for item in files.items() for _ in range(30)]:
+        for file in Path("results/rows").iterdir():
+            file.unlink()
+        for other, whole in files.items():
+            Path(other).write_bytes(whole)
+        place = chance.randrange(8 * len(data))
+        damaged = bytearray(data)
+        damaged[place // 8] ^= 1 << place % 8
+        Path(name).write_bytes(damaged)
+        if name.endswith("last_run.parquet"):
+            assert "its digest does not fit" in (done := command("results", "results")).err
+            assert done.code == 3
+        done = batch(*arguments)
+        if name.endswith("format.json") and done.code == 2:
+            assert "results of " in done.err
+            continue
+        assert done.code == 1
+        assert sr.read_results("results").drop(["seconds"]).equals(sound)
+        is_of_rows = name.startswith("results/rows")
+        assert ("(0 evaluated now" in done.out) != is_of_rows
+        assert (f"{name} cannot be used" in done.err) == (is_of_rows or "identities" in name)
+
+
+def test_a_log_of_equal_size_and_time_is_evaluated_again(fleet: Path) -> None:
+    near, far = write_log(Path("logs/run-2.jsonl"), 0.25), write_log(Path("logs/run-1.jsonl"), 0.75)
+    assert near.stat().st_size == far.stat().st_size
+    sr.evaluate_logs("logs", "gate.spatial", output="results")
+    times = near.stat().st_atime_ns, near.stat().st_mtime_ns
+    near.write_bytes(far.read_bytes())
+    os.utime(near, ns=times)
+    again = sr.evaluate_logs("logs", "gate.spatial", output="results")
+    verdicts = [row["verdict"] for row in again.table.to_pylist() if row["spec"] == "apart"]
+    assert verdicts == ["satisfied", "satisfied", "satisfied", "violated"]
+
+
+def test_a_damaged_log_never_passes_as_the_one_that_its_certificate_names(fleet: Path) -> None:
+    log = Path("large.mcap")
+    # so large that a look at its end would save time
+    sr.replay_log("logs/run-0.jsonl", "gate.spatial", output="own.mcap")
+    with Path("own.mcap").open("rb") as own, log.open("wb") as stream:
+        writer = Writer(stream, compression=CompressionType.NONE)
+        writer.start()
+        reader = make_reader(own)
+        channels: dict[int, int] = {}
+        for schema, channel, message in reader.iter_messages():
+            assert schema is not None
+            if channel.id not in channels:
+                known = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(
+                    channel.topic, channel.message_encoding, known, channel.metadata
+                )
+            times = message.log_time, message.publish_time
+            writer.add_message(channels[channel.id], times[0], message.data, times[1])
+        for record in reader.iter_metadata():
+            writer.add_metadata(record.name, record.metadata)
+        writer.add_attachment(0, 0, "camera.bin", "application/octet-stream", bytes(17 * 2**20))
+        writer.finish()
+    assert batch(str(log), "--spec", "gate.spatial").code == 0
+    damaged = bytearray(log.read_bytes())
+    damaged[1000] ^= 1
+    log.write_bytes(damaged)
+    done = batch(str(log), "--spec", "gate.spatial")
+    assert done.code == 3, done.out
 
 
 def test_a_log_that_cannot_be_read_is_a_row_until_it_can(fleet: Path) -> None:
@@ -586,12 +662,8 @@ def test_results_in_a_bucket_are_kept_gone_on_with_searched_and_compared(
         here = sr.evaluate_logs("logs", "gate.spatial", output="results").table
         there = sr.read_results("s3://fleet/nightly")
         assert there.drop(["seconds"]).equals(here.drop(["seconds"]))
-        # small files are joined there, too
-        assert [name.partition("/")[0] for name in _names(server)] == [
-            "format.json",
-            "last_run.parquet",
-            "rows",
-        ]
+        kinds = {name.partition("/")[0] for name in _names(server)}
+        assert kinds == {"format.json", "last_run.parquet", "rows"}
 
         write_log(Path("logs/run-4.jsonl"), 0.05)
         assert sr.evaluate_logs("logs", "gate.spatial", output="s3://fleet/nightly", jobs=2).evaluated == 1
