@@ -26,7 +26,7 @@ from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.read_options import FaultList, OnTimeJump
-from spatial_replay.mapping.names import Codes
+from spatial_replay.mapping.names import BY_PLACE, Codes
 from spatial_replay.mapping.reading_plan import ReadingPlan
 from spatial_replay.mapping.topic_reader import MISFITS, TopicReader
 from spatial_replay.mapping.tracker import Remarks, Tracker
@@ -219,6 +219,8 @@ class Assembler:
             self._remarks.add(Sentence(self.jump, what_follows))
         for reader in self._readers.values():
             reader.finish()
+            if reader.extractor is not None and reader.extractor.is_by_place:
+                self._remarks.add(f"{reader.name}: {BY_PLACE}")
             if reader.unstamped:
                 were = (
                     "message without objects was"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import chain, compress
 from typing import Any, NamedTuple
 
@@ -23,6 +23,7 @@ from spatial_replay.mapping.field_paths import (
     FieldPath,
     Get,
     NameTemplate,
+    elements_of,
     iter_elements,
     list_getter,
     style_of,
@@ -81,6 +82,11 @@ class Extractor:
         self._is_time_bound = False
 
     @property
+    def is_by_place(self) -> bool:
+        """Whether nothing but their places in a list distinguished some objects."""
+        return self._namer.is_by_place
+
+    @property
     def is_bound(self) -> bool:
         """Whether an object was read, so that every path is known to lead somewhere."""
         return self._binding is not None
@@ -135,7 +141,8 @@ class Extractor:
         deleted: list[tuple[int, int]] = []
         if self._layout.solids == "scene":
             deleted = self._deleted_entities(messages)
-        objects = _Objects(values, index, self._namer.codes(values, order, style))
+        of_message = [messages[number] for number in index] if self._namer.needs_messages else None
+        objects = _Objects(values, index, self._namer.codes(values, order, style, of_message))
         if self._layout.solids == "marker":
             objects, deleted = _split_deleted_markers(objects)
         if self._namer.is_filtering:
@@ -177,8 +184,8 @@ class Extractor:
             chunk.lifetimes = binding.lifetime.nanoseconds(values)
         chunk.message, chunk.name = objects.message, objects.name
 
-    def _flatten(self, messages: Sequence[object]) -> tuple[list[Any], list[int], list[int]]:
-        """Return all objects, the index of each one's message, and its index in that message."""
+    def _flatten(self, messages: Sequence[object]) -> tuple[list[Any], list[int], list[int | str]]:
+        """Return all objects, the index of each one's message, and its index, or key, in that message."""
         if self._path is None:
             return list(messages), list(range(len(messages))), [0] * len(messages)
         if self._list is None and messages:
@@ -188,7 +195,15 @@ class Extractor:
         lists = list(map(self._list, messages)) if self._list is not None else []
         counts = [len(each) for each in lists]
         index = np.repeat(np.arange(len(counts)), counts).tolist()
-        return list(chain.from_iterable(lists)), index, list(chain.from_iterable(map(range, counts)))
+        order: list[int | str] = list(chain.from_iterable(map(range, counts)))
+        if any(isinstance(each, Mapping) for each in lists):
+            order = [
+                key
+                for each in lists
+                for key in (map(str, each) if isinstance(each, Mapping) else range(len(each)))
+            ]
+            lists = list(map(elements_of, lists))
+        return list(chain.from_iterable(lists)), index, order
 
     def _elements(self, message: object) -> list[object]:
         return [message] if self._path is None else list(iter_elements(self._path, message))
@@ -202,7 +217,7 @@ class Extractor:
                 if get(deletion, "type") == DELETE_ALL_ENTITIES:
                     deleted.append((number, EVERY_OBJECT))
                 else:
-                    (code,) = self._namer.codes([deletion], [0], style_of(deletion))
+                    (code,) = self._namer.codes([deletion], [0], style_of(deletion), [message])
                     deleted.append((number, code))
         return deleted
 

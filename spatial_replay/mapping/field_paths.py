@@ -1,13 +1,15 @@
 """Field paths such as `poses[*].position.x`, and name templates such as `tag{id}` that contain them.
 
     path      =  ["$."] step { step }      "$." starts at the message, not at the object in it
-    step      =  name | "." name | "[" number "]" | "[*]" | name "[" name "=" text "]"
+    step      =  name | "." name | "[" number "]" | "[*]" | "[best]" | "[index]" | name "[" name "=" text "]"
     template  =  { text | "{" path { "|" path } "}" }
 
-`position[name=elbow]` is the element of `position` where the list `name` beside it has `elbow`; only signals
-have such steps. Messages may be decoded ROS, protobuf or JSON. `walk` follows a path step by step and
-explains errors; `getter` compiles it to nested calls. A path comes from a file, so nothing in it is
-evaluated: it reaches only fields that the message declares.
+`[*]` also takes the values of a JSON object. `[best]` is the element with the highest score. `[index]`, in
+names, is the element at the place, or key, that the object has in its own list. `position[name=elbow]` is
+the element of `position` where the list `name` beside it has `elbow`; only signals have such steps.
+Messages may be decoded ROS, protobuf or JSON. `walk` follows a path step by step and explains errors;
+`getter` compiles it to nested calls. A path comes from a file, so nothing in it is evaluated: it reaches
+only fields that the message declares.
 """
 
 from __future__ import annotations
@@ -15,7 +17,9 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
+from math import inf, isnan, nan
 from operator import attrgetter, itemgetter
+from types import MappingProxyType
 from typing import Any, Final, Literal, TypeAlias, TypeGuard
 
 from spatial_replay.errors import UsageError
@@ -70,11 +74,11 @@ Get: TypeAlias = Callable[[Any], Any]
 
 EACH: Final = "*"
 _KEYED = r"[A-Za-z_][\w-]*\[[A-Za-z_][\w-]*=[^\[\]{}|=\s]{1,100}\]"
-PATTERN: Final = rf"(\$\.)?(?=[A-Za-z_])(\.?(?:{_KEYED}|[A-Za-z_][\w-]*)|\[(\d{{1,9}}|\*)\])+"
+PATTERN: Final = rf"(\$\.)?(?=[A-Za-z_])(\.?(?:{_KEYED}|[A-Za-z_][\w-]*)|\[(\d{{1,9}}|\*|best|index)\])+"
 """A path, as a regular expression."""
 
 _STEP = re.compile(
-    r"\.?([A-Za-z_][\w-]*)(?:\[([A-Za-z_][\w-]*)=([^\[\]{}|=\s]+)\])?|\[(\d{1,9}|\*)\]", re.ASCII
+    r"\.?([A-Za-z_][\w-]*)(?:\[([A-Za-z_][\w-]*)=([^\[\]{}|=\s]+)\])?|\[(\d{1,9}|\*|best|index)\]", re.ASCII
 )
 _PATH = re.compile(PATTERN, re.ASCII)
 
@@ -106,7 +110,38 @@ class Keyed:
         return get_field(value, self.field)[keys.index(self.key)] if self.key in keys else None  # type: ignore[index]
 
 
-Step: TypeAlias = str | int | Each | Keyed
+@dataclass(frozen=True, slots=True)
+class Best:
+    """The step `[best]`: the element of a list with the highest score; the first of equals."""
+
+    def read(self, value: Any) -> object:
+        """Return the element.
+
+        Raises:
+            IndexError: there is none.
+        """
+        return value[0] if len(value) < 2 else max(value, key=_score)
+
+
+_SCORES = ("score", "probability", "confidence")
+
+
+def _score(value: object) -> float:
+    """Return the score in a result or in its hypothesis; the least number without one."""
+    names = field_names(value)
+    if "hypothesis" in names:
+        return _score(get_field(value, "hypothesis"))
+    scores: Iterator[Any] = (get_field(value, name) for name in _SCORES if name in names)
+    found = next((float(score) for score in scores if score is not None and is_number(score)), nan)
+    return -inf if isnan(found) else found
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """The step `[index]`: the element at the place, or the key, that an object has in its own list."""
+
+
+Step: TypeAlias = str | int | Each | Keyed | Best | Place
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,12 +175,20 @@ class FieldPath:
             if names:
                 steps.append(Keyed(name, names, key))
             else:
-                steps.append(name if name else Each() if index == EACH else int(index))
+                steps.append(name or _BRACKETS.get(index) or int(index))
         return cls(text, tuple(steps), text.startswith("$."))
 
 
-def walk(path: FieldPath, value: object) -> object:
+_BRACKETS: Mapping[str, Each | Best | Place] = MappingProxyType(
+    {EACH: Each(), "best": Best(), "index": Place()}
+)
+
+
+def walk(path: FieldPath, value: object, index: int | str | None = None) -> object:
     """Return the value at a path without `[*]`.
+
+    Args:
+        index: the place or the key of an object in its list, for `[index]`.
 
     Raises:
         FieldError: the path leads nowhere; the text says where it ends and which fields exist there.
@@ -157,7 +200,18 @@ def walk(path: FieldPath, value: object) -> object:
             value = _numbered(path, value, step)
         elif isinstance(step, Keyed):
             value = _keyed(path, value, step)
+        elif isinstance(step, Best):
+            _numbered(path, value, 0)
+            value = step.read(value)
+        elif isinstance(step, Place):
+            value = _placed(path, value, index)
     return value
+
+
+def _placed(path: FieldPath, value: object, index: int | str | None) -> object:
+    if index is None:
+        raise FieldError(f"{path.text}: [index] is for names: it is the place of an object in its list")
+    return _named(path, value, index) if isinstance(index, str) else _numbered(path, value, index)
 
 
 def leads_somewhere(path: FieldPath, value: object) -> bool:
@@ -220,7 +274,7 @@ def getter(path: FieldPath, style: Style) -> Get:
         return attrgetter(".".join(map(str, path.steps)))
     chain: list[Get] = [
         step.read
-        if isinstance(step, Keyed)
+        if isinstance(step, Keyed | Best)
         else attrgetter(step)
         if style == "attributes" and isinstance(step, str)
         else itemgetter(step)
@@ -258,14 +312,19 @@ def iter_elements(path: FieldPath, message: object) -> Iterator[object]:
             values = [_named(path, value, step) for value in values]
         elif isinstance(step, int):
             values = [_numbered(path, value, step) for value in values]
-        elif isinstance(step, Keyed):
-            values = [_keyed(path, value, step) for value in values]
+        elif not isinstance(step, Each):
+            values = [walk(FieldPath(path.text, (step,)), value) for value in values]
         else:
             for value in values:
-                if not is_list(value):
+                if not is_list(value) and not isinstance(value, Mapping):
                     raise FieldError(f"{path.text}: [*] needs a list, got {type_name(value)}")
-            values = [element for value in values for element in value]  # type: ignore[attr-defined]
+            values = [element for value in values for element in elements_of(value)]
     return iter(values)
+
+
+def elements_of(value: Any) -> Sequence[object]:
+    """Return the elements of a list, or the values of a JSON object or a protobuf map."""
+    return list(value.values()) if isinstance(value, Mapping) else value
 
 
 def list_getter(path: FieldPath, style: Style) -> Get | None:
@@ -313,7 +372,8 @@ class NameTemplate:
 
     Attributes:
         parts: texts, and tuples of alternative fields: the first that exists and is not empty counts. Unless
-            a field has that name, `index` is the object's index in its list and `topic` its topic.
+            a field has that name, `index` is the object's index in its list, or its key in a JSON object,
+            and `topic` its topic.
     """
 
     text: str

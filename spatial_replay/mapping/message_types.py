@@ -68,7 +68,7 @@ _UNKNOWN = ("unknown", "unknown_small", "unknown_medium", "unknown_big")
 _KNOWN = ("pedestrian", "bike", "car", "truck", "motorcycle", "other_vehicle", "barrier", "sign")
 _OBJECT_CLASSES = MappingProxyType({str(i): name for i, name in enumerate((*_UNKNOWN, *_KNOWN))})
 
-_RESULT_CLASS = ("results[0].hypothesis.class_id", "results[0].id", "results[0].hypothesis.id")
+_RESULT_CLASS = ("results[best].hypothesis.class_id", "results[best].id", "results[best].hypothesis.id")
 
 _POSE = MessageLayout(position=(("pose.position",),), orientation=("pose.orientation",))
 _POSE_WITH_COVARIANCE = MessageLayout(

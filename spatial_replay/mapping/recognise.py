@@ -5,8 +5,10 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeGuard
 
 from spatial_replay.mapping.field_paths import (
+    INDEX,
     FieldError,
     FieldPath,
     field_names,
@@ -25,9 +27,18 @@ _YAWS = ("yaw", "theta", "heading", "angle")
 _SIZES = ("dimension", "dimensions", "size", "scale", "extent", "shape", "bbox")
 _OUTLINES = ("corners", "polygon", "points", "vertices", "outline", "footprint", "contour")
 _NAMES = ("name", "id", "track_id", "object_id", "tracking_id", "child_frame_id", "uuid", "label")
+_NAMES_BESIDE = ("name", "names", "id", "ids", "object_names", "object_ids", "tracking_ids", "track_ids")
+"""Lists with a name for each element of another list."""
 _NO_IDENTITIES = frozenset({"frame", "class", "type", "category", "parent", "sensor", "status", "seq"})
 """Fields such as `class_id` and `frame_id` are the same for several objects."""
 _CLASSES = ("class", "class_name", "classification", "category", "label", "object_type", "type")
+_PARTS = frozenset(
+    {
+        *(*_POSITIONS, *_TURNS, *_YAWS, *_SIZES, *_OUTLINES, *_NAMES, *_CLASSES),
+        *("pose", "min", "max", "start", "end", "from", "to", "goal", "offset", "base"),
+    }
+)
+"""Keys of parts of one object; other keys of a JSON object may be names of objects."""
 _LISTS = re.compile("object|detection|track|tag|agent|obstacle|pose|vehicle|pedestrian|marker")
 _NOT_PLACES = frozenset(
     {
@@ -41,6 +52,7 @@ _VECTORS = re.compile(r"twist|vector3|accel|wrench|imu|cmd_vel|velocity", re.IGN
 """Topics and types whose x and y are no place."""
 _TIMES = frozenset({"time", "stamp", "timestamp", "sec", "secs", "nsec", "nsecs", "nanosec", "nanos", "seq"})
 """Words in the names of numbers that say when, and not what."""
+_UUID_BYTES = 16
 _FIELD = re.compile(r"[A-Za-z_][\w-]*", re.ASCII)
 _KEY = re.compile(r"[^\[\]{}|=\s]{1,100}", re.ASCII)
 
@@ -53,7 +65,7 @@ class Guess:
         objects: of the list of objects, or None for a single one.
         position: of a point, or of x and y.
         size: of length, width and maybe height; or of a radius.
-        names: candidates for what distinguishes objects, the likeliest first.
+        names: candidates for what distinguishes objects, the likeliest first; `index` for keys of an object.
         is_in_pixels: whether coordinates look like pixels.
         others: of further lists whose elements look like objects.
     """
@@ -88,7 +100,28 @@ def guess_objects(topic: str, kind: str, messages: Sequence[object]) -> Guess | 
     if not guesses:
         return None
     best = max(guesses, key=lambda guess: guess.score)
-    return replace(best, names=tuple(name for name in best.names if _distinguishes(name, best, messages)))
+    if best.names == (INDEX,):
+        return best
+    names = tuple(name for name in best.names if _distinguishes(name, best, messages))
+    return replace(best, names=names or tuple(_names_beside(best, messages)))
+
+
+def _names_beside(guess: Guess, messages: Sequence[object]) -> Iterator[str]:
+    """Yield paths of lists next to that of the objects, which have a name for each of them."""
+    if guess.objects is None or guess.objects.count("[*]") > 1:
+        return
+    prefix = guess.objects.rpartition(".")[0]
+    for name in _NAMES_BESIDE:
+        path = FieldPath.of(f"{prefix}.{name}" if prefix else name)
+        objects = FieldPath.of(guess.objects)
+        try:
+            pairs = [(walk(path, each), sum(1 for _ in iter_elements(objects, each))) for each in messages]
+        except FieldError:
+            continue
+        texts = [list(map(str, names)) for names, _ in pairs if is_list(names)]
+        counts = [count for _, count in pairs]
+        if [len(each) for each in texts] == [len(set(each)) for each in texts] == counts:
+            yield f"$.{path.text}[{INDEX}]"
 
 
 def numbers_in(message: object) -> tuple[str, ...]:
@@ -151,11 +184,21 @@ def _distinguishes(name: str, guess: Guess, messages: Sequence[object]) -> bool:
 
 def _iter_lists(message: object) -> Iterator[tuple[str, Guess]]:
     for path, value in _iter_fields(message):
-        if is_list(value) and len(value) and field_names(value[0]):
+        if _is_table_of_objects(value) and (guess := _object_in(next(iter(value.values())))) is not None:
+            yield f"{path}[*]", replace(guess, names=(INDEX,))
+        elif is_list(value) and len(value) and field_names(value[0]):
             guess = _object_in(value[0])
             # the corners of an outline are points, not objects
             if guess is not None and not (path.split(".")[-1] in _OUTLINES and guess.score <= 10):
                 yield f"{path}[*]", guess
+
+
+def _is_table_of_objects(value: object) -> TypeGuard[dict[str, object]]:
+    """Return whether a JSON object has other objects, all alike, by their names."""
+    if not isinstance(value, dict) or len(value) < 2 or not _PARTS.isdisjoint(value):
+        return False
+    fields = {frozenset(field_names(each)) for each in value.values()}
+    return len(fields) == 1 and bool(next(iter(fields)))
 
 
 def _object_in(value: object) -> Guess | None:
@@ -268,9 +311,12 @@ def _names_in(fields: dict[str, object]) -> tuple[str, ...]:
         value = fields[path]
         if isinstance(value, str | int) and not isinstance(value, bool) and value != "":
             names.append(path)
-        elif "value" in field_names(value):
-            names.append(f"{path}.value")
-    return tuple(names)
+        elif isinstance(value, bytes) or (is_list(value) and len(value) in (1, _UUID_BYTES)):
+            # ids in lists, of one number or of the bytes of a UUID
+            names.append(path)
+        elif inner := next((name for name in ("value", "uuid") if name in field_names(value)), None):
+            names.append(f"{path}.{inner}")
+    return tuple(dict.fromkeys(names))
 
 
 def _words(name: str) -> list[str]:

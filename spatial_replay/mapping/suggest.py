@@ -10,6 +10,7 @@ import json
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from math import isfinite
 from operator import itemgetter
@@ -19,8 +20,10 @@ from typing import Literal, TypeAlias
 from spatial_replay.bags.topic import Topic
 from spatial_replay.logs.topics import DERIVED
 from spatial_replay.mapping.field_paths import (
+    INDEX,
     FieldError,
     FieldPath,
+    NameTemplate,
     field_names,
     get_field,
     getter,
@@ -40,6 +43,7 @@ from spatial_replay.mapping.message_types import (
     short_type,
 )
 from spatial_replay.mapping.model import NO_TOPIC, TopicMapping
+from spatial_replay.mapping.names import BY_PLACE, Codes, Namer
 from spatial_replay.mapping.recognise import Guess, frame_of, guess_objects, numbers_in
 from spatial_replay.mapping.yaml_document import LARGEST_TEXT
 from spatial_replay.text import counted
@@ -244,7 +248,10 @@ def _suggestion(topic: Topic, examples: Sequence[object]) -> TopicSuggestion:
         has_outline = bool(reading.polygon or reading.sizes or reading.solids)
         name = reading.name.replace("{topic}", name_from_topic(topic.name))
         fields = {} if has_outline else _POINT
-        return _placed(topic, reading, examples, fields, name, () if has_outline else _SIZELESS)
+        remarks = () if has_outline else _SIZELESS
+        if _is_by_place(topic, reading, examples):
+            remarks = (*remarks, BY_PLACE)
+        return _placed(topic, reading, examples, fields, name, remarks)
     guess = guess_objects(topic.name, topic.type, examples)
     if guess is None:
         return TopicSuggestion(topic, numbers=numbers_in(examples[0]) if examples else ())
@@ -273,6 +280,18 @@ def _placed(
     elif any(map(_MAVROS.search, (topic.name, topic.type))):
         remarks = (*remarks, _OF_MAVROS)
     return TopicSuggestion(topic, kept, name, remarks, frames=frames, axes=axes)
+
+
+def _is_by_place(topic: Topic, layout: MessageLayout, examples: Sequence[object]) -> bool:
+    """Return whether names of the objects in some messages fall back on their places in a list."""
+    if f"{INDEX}}}" not in layout.name:
+        return False
+    namer = Namer(NameTemplate.of(layout.name), topic.name, Codes(), (), ())
+    for message in examples:
+        things = [thing for _, thing in _iter_objects(layout, [message])]
+        with suppress(FieldError):
+            namer.codes(things, range(len(things)), style_of(message))
+    return namer.is_by_place or not examples
 
 
 def _iter_frames(layout: MessageLayout, examples: Sequence[object]) -> Iterator[str]:
@@ -327,7 +346,6 @@ _OF_MAVROS = (
     " these, axes: {y: down}"
 )
 _POINT = MappingProxyType({"shape": f"{{disc: {_RADIUS}}}"})
-_INDEXED = "only the places in the list distinguish objects: objects swap where these change"
 
 
 def _fields(name: str, guess: Guess) -> dict[str, str]:
@@ -373,14 +391,18 @@ def _shape(guess: Guess) -> str:
 def _name(topic: Topic, guess: Guess) -> str:
     if guess.objects is None:
         return name_from_topic(topic.name)
+    path = guess.names[0] if guess.names else INDEX
+    if guess.names and (path == INDEX or path.startswith("$.") or path.split(".")[-1] == "name"):
+        # names by themselves, and not numbers that need a word
+        return f"{{{path}}}"
     word = guess.objects.removesuffix("[*]").split(".")[-1].removesuffix("s") or "object"
-    return f"{word}{{{guess.names[0] if guess.names else 'index'}}}"
+    return f"{word}{{{path}}}"
 
 
 def _remarks(guess: Guess) -> tuple[str, ...]:
     sizeless = () if guess.polygon is not None or guess.size else _SIZELESS
     others = (f"other lists that look like objects: {', '.join(guess.others[:6])}",) if guess.others else ()
-    indexed = (_INDEXED,) if guess.objects is not None and not guess.names else ()
+    indexed = (BY_PLACE,) if guess.objects is not None and not guess.names else ()
     return sizeless + indexed + others
 
 

@@ -94,6 +94,22 @@ def test_the_fields_of_a_message_are_listed_in_every_encoding() -> None:
     assert field_names([1]) == field_names("x") == field_names(None) == ()
 
 
+def test_the_best_of_some_results_has_the_highest_score() -> None:
+    path = FieldPath.of("results[best].id")
+
+    def best(*results: dict[str, Any]) -> object:
+        message = {"results": list(results)}
+        assert walk(path, message) == getter(path, "keys")(message)
+        return walk(path, message)
+
+    assert best({"id": 1, "score": 0.2}, {"id": 2, "score": 0.9}, {"id": 3, "score": 0.9}) == 2
+    assert best({"id": 1, "hypothesis": {"score": 0.2}}, {"id": 2, "hypothesis": {"score": 0.9}}) == 2
+    assert best({"id": 1, "probability": float("nan")}, {"id": 2, "probability": 0.0}) == 2
+    assert best({"id": 1}, {"id": 2}) == 1
+    with pytest.raises(FieldError, match="out of range"):
+        walk(path, {"results": []})
+
+
 def names(template: str, *things: dict[str, Any], topic: str = "/a/pose") -> list[str]:
     codes = Codes()
     namer = Namer(NameTemplate.of(template), topic, codes, (), ())
@@ -109,6 +125,12 @@ def test_a_template_makes_names() -> None:
     assert names("{ns|topic}_{id|index}", {"ns": "", "id": ""}, {"id": 7}) == ["a_0", "a_7"]
     assert names("{index}", {"index": 9}) == ["9"]
     assert names("{a.b[0]}", {"a": {"b": ["x"]}}) == ["x"]
+    assert names("tag{id}", {"id": [3]}, {"id": [4, 5]}) == ["tag3", "tag4_5"]
+    identity = bytes([0xAB, *range(15)])
+    for each in (identity, list(identity), {"uuid": identity}):
+        assert names("{id}", {"id": each}) == ["ab000102030405060708090a0b0c0d0e"]
+    # the UUID of zeros is none
+    assert names("{id|index}", {"id": bytes(16)}) == ["0"]
 
 
 @pytest.mark.parametrize(

@@ -71,7 +71,7 @@ def test_classes_are_texts() -> None:
     people = {"name": "anna", "class_name": "person", "position": POINT, "radius": 0.4}
     _, mapping = suggested(people={"tracks": [people]})
     (topic,) = mapping.topics
-    assert topic.name == "track{name}"
+    assert topic.name == "{name}"
     assert topic.class_name is not None
     assert topic.shape == ShapeMapping("disc", ("radius",))
 
@@ -215,6 +215,43 @@ def test_ids_distinguish_objects_rather_than_places_in_a_list() -> None:
     text, mapping = suggested(detector={"tags": [{"class_id": 1, "position": POINT}] * 2})
     assert mapping.topics[0].name == "tag{index}"
     assert "objects swap" in text
+
+
+def test_identities_are_found_in_bytes_lists_of_one_and_lists_side_by_side() -> None:
+    def tracks(**identity: Any) -> dict[str, Any]:
+        return {
+            "tracks": [
+                {**{key: value[k] for key, value in identity.items()}, "position": POINT} for k in (0, 1)
+            ]
+        }
+
+    one, other = list(range(16)), list(range(1, 17))
+    cases = {
+        "track{object_id.uuid}": tracks(object_id=({"uuid": one}, {"uuid": other})),
+        "track{uuid}": tracks(uuid=(one, other)),
+        "track{id}": tracks(id=([4], [5])),
+        "{$.names[index]}": {"names": ["cup", "plate"], "poses": [{"position": POINT}] * 2},
+        "{$.world.name[index]}": {"world": {"name": ["cup", "plate"], "pose": [{"position": POINT}] * 2}},
+        "{index}": {"objects": {"cup": {"x": 1.0, "y": 2.0}, "plate": {"x": 1.0, "y": 3.0}}},
+    }
+    for name, message in cases.items():
+        text, mapping = suggested(thing=message)
+        assert mapping.topics[0].name == name
+        assert "objects swap" not in text
+    # lists that do not name each element once
+    for names in (["cup", "cup"], ["cup"], "cup"):
+        text, _ = suggested(thing={"names": names, "poses": [{"position": POINT}] * 2})
+        assert "objects swap" in text
+    # the parts of one object are no objects by name
+    _, mapping = suggested(box={"box": {"min": {"x": 1.0, "y": 2.0}, "max": {"x": 2.0, "y": 3.0}}})
+    assert not any(topic.reads_objects for topic in mapping.topics)
+
+
+@pytest.mark.parametrize(("ids", "swap"), [(("", ""), True), (("a", "b"), False)])
+def test_empty_ids_leave_only_places_in_the_list(ids: tuple[str, str], swap: bool) -> None:
+    detections = {"detections": [{"id": each, "bbox": {"center": {"x": 1, "y": 1}}} for each in ids]}
+    topic = Topic("/det", "vision_msgs/msg/Detection2DArray", "json")
+    assert ("objects swap" in suggest_mapping("run", [topic], {"/det": [detections]})) == swap
 
 
 def test_names_that_several_topics_share_get_the_topic_as_prefix() -> None:

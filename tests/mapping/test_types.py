@@ -354,3 +354,47 @@ def test_joints_are_read_by_their_names_whatever_their_order() -> None:
     assert made.faults == ()
     with pytest.raises(UsageError, match="name has no 'elbo'; did you mean 'elbow'"):
         make('topics: {/joints: {signals: {elbow: "position[name=elbo]"}}}', feed)
+
+
+def test_objects_are_named_by_a_list_next_to_theirs() -> None:
+    feed = Feed(types={"/models": "gazebo_msgs/msg/ModelStates"})
+    for number, order in enumerate((("cup", "robot"), ("robot", "cup"))):
+        poses = [{"position": {"x": float(len(name)), "y": 0.0}} for name in order]
+        feed.add("/models", number * SECOND, {"name": list(order), "pose": poses})
+    made = make("topics: {/models: {objects: 'pose[*]', name: '{$.name[index]}', except: [none]}}", feed)
+    assert [made.centre(sample, "cup") for sample in (0, 1)] == [(3.0, 0.0)] * 2
+    assert [made.centre(sample, "robot") for sample in (0, 1)] == [(5.0, 0.0)] * 2
+    assert made.remarks == ()
+
+
+def test_the_keys_of_a_json_object_name_its_objects() -> None:
+    feed = Feed(types={"/all": "a/All"})
+    for number, names in enumerate((("cup", "plate"), ("plate", "cup"), ("plate",))):
+        feed.add("/all", number * SECOND, {"objects": {name: {"x": len(name), "y": 0} for name in names}})
+    made = make("topics: {/all: {objects: 'objects[*]', name: '{index}'}}", feed)
+    assert (made.states("cup"), made.states("plate")) == ("++-", "+++")
+    assert made.centre(1, "cup") == (3.0, 0.0)
+    assert made.remarks == ()
+
+
+def test_objects_that_only_places_distinguish_are_remarked() -> None:
+    def poses(count: int) -> Feed:
+        return Feed().add(
+            "/p", 0, ros("geometry_msgs/PoseArray", header=header("map"), poses=[pose(0, 0)] * count)
+        )
+
+    assert "only the places in the list distinguish objects" in make("topics: {/p: {}}", poses(2)).remarks[0]
+    assert make("topics: {/p: {}}", poses(1)).remarks == ()
+
+
+def test_the_class_of_a_detection_is_that_of_its_best_result() -> None:
+    results = [
+        ros(
+            "vision_msgs/ObjectHypothesisWithPose",
+            hypothesis=ros("vision_msgs/ObjectHypothesis", class_id=c, score=s),
+        )
+        for c, s in (("cup", 0.2), ("person", 0.9))
+    ]
+    detection = ros("vision_msgs/Detection2D", id="a", results=results)
+    feed = Feed().add("/det", 0, ros("vision_msgs/Detection2DArray", detections=[detection]))
+    assert make("topics: {/det: {}}", feed).trace.classes == ("person",)
