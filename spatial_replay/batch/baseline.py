@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
 
@@ -21,7 +21,9 @@ Change: TypeAlias = Literal["worse", "verdict", "gone", "better"]
 
 BASELINE_VERDICT: Final = "baseline_verdict"
 BASELINE_ROBUSTNESS: Final = "baseline_robustness"
-_NUMBER: Final = re.compile(r"(?P<number>\d+(?:\.\d*)?|\.\d+)(?P<percent>%?)", re.ASCII)
+_NUMBER: Final = re.compile(
+    r"(?P<number>(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][-+]?\d{1,3})?) ?(?P<unit>%|[^\W\d]\S{0,20})?"
+)
 _KEY: Final = ("case", "log", "file", "spec", "object")
 _ORDER: Final = {"satisfied": 0, "unknown": 1, "violated": 2, None: 3}
 """Verdicts from good to bad; None is an error."""
@@ -33,31 +35,56 @@ class Tolerance:
 
     Attributes:
         amount: a part of the baseline's number if it `is_relative`, else in units of robustness.
+        unit: of the amount; "" for results without one.
     """
 
     amount: float = 0.0
     is_relative: bool = False
+    unit: str = ""
 
     @classmethod
     def parse(cls, text: str) -> Tolerance:
-        """Read `5%`, or an absolute number such as `0.02`.
+        """Read `5%`, or an absolute number with the unit of the robustness, such as `0.02m`, if it has one.
 
         Raises:
             UsageError: anything else.
         """
         match = _NUMBER.fullmatch(text.strip())
         if match is None:
-            raise UsageError(f"{text!r} is not a tolerance; write 5% or, in units of robustness, 0.02")
+            raise UsageError(f"{text!r} is not a tolerance; write 5% or, in units of robustness, 0.02m")
         number = float(match["number"])
-        return cls(number / 100.0, True) if match["percent"] else cls(number)
+        unit = match["unit"] or ""
+        return cls(number / 100.0, True) if unit == "%" else cls(number, unit=unit)
 
-    def allows(self, before: float, now: float) -> bool:
-        """Return whether a number is not worse than before by more than this."""
+    def check(self, units: Iterable[str | None]) -> None:
+        """Check that an absolute amount says which unit of the results it is in.
+
+        Raises:
+            UsageError: it has none, and results have one; or no result has its unit.
+        """
+        known = sorted({each for each in units if each and each != "1"})
+        if self.is_relative or not self.amount or self.unit in known or not (known or self.unit):
+            return
+        found = f"is in {', '.join(known)}" if known else "has no unit"
+        absolute = f"{self.amount:g}{known[0] if known else ''}"
+        raise UsageError(
+            f"--tolerance {self.amount:g}{self.unit}: robustness {found}; write {absolute}, or "
+            f"{self.amount:g}% for a part of it"
+        )
+
+    def allows(self, before: float, now: float, unit: str = "") -> bool:
+        """Return whether a number is not worse than before by more than this.
+
+        Args:
+            unit: of both; an amount in another unit allows nothing.
+        """
         if math.isnan(before) or math.isnan(now):
             return math.isnan(before)
         if math.isinf(before) or math.isinf(now):
             return now >= before
-        return now >= before - self.amount * (abs(before) if self.is_relative else 1.0)
+        if self.is_relative:
+            return now >= before - self.amount * abs(before)
+        return now >= before - (self.amount if self.unit in ("", unit) else 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,9 +134,22 @@ def compare(table: pa.Table, baseline: pa.Table, tolerance: Tolerance) -> list[D
     """Return the differences of a run from a baseline, the worst first; new results are none.
 
     Results are the same if case, log, specification file, spec and object are.
+
+    Raises:
+        UsageError: a tolerance without the unit that results have.
     """
-    found = _differences(_by_key(table), _by_key(baseline), tolerance)
+    units = dict(zip(_keys(table), table.column("unit").to_pylist(), strict=True))
+    tolerance.check(units.values())
+    found = _differences(_by_key(table), _by_key(baseline), tolerance, units)
     return sorted(found, key=lambda each: (RANKS[each.now], _least_first(each.robustness)))
+
+
+def edited_files(table: pa.Table, baseline: pa.Table) -> list[str]:
+    """Return the specification files that mean something else than when the baseline was made."""
+    before = set(zip(*(baseline.column(name).to_pylist() for name in ("file", "meaning")), strict=True))
+    names = {file for file, _ in before}
+    now = zip(*(table.column(name).to_pylist() for name in ("file", "meaning")), strict=True)
+    return [file for file, meaning in dict.fromkeys(now) if file in names and (file, meaning) not in before]
 
 
 def with_baseline(table: pa.Table, baseline: pa.Table, differences: Sequence[Difference]) -> pa.Table:
@@ -154,9 +194,9 @@ def with_baseline(table: pa.Table, baseline: pa.Table, differences: Sequence[Dif
 
 def _gone_row(row: dict[str, Any], difference: Difference) -> dict[str, Any]:
     """Return the row of a result that only the baseline has, given its row there."""
-    kept = ("key", *_KEY, "requirement", "title", "line", "expected")
+    kept = ("key", *_KEY, "meaning", "requirement", "title", "line", "expected")
     nothing: dict[str, Any] = {
-        name: [] for name in ("explanation", "vacuous", "faults", "remarks", "missing")
+        name: [] for name in ("explanation", "untested", "vacuous", "faults", "remarks", "missing")
     }
     nothing |= dict.fromkeys(("robustness", "lower", "upper"), math.nan)
     return {
@@ -184,6 +224,7 @@ def _differences(
     now: dict[Key, tuple[str | None, float]],
     before: dict[Key, tuple[str | None, float]],
     tolerance: Tolerance,
+    units: Mapping[Key, str | None],
 ) -> Iterator[Difference]:
     for key, (old, old_number) in before.items():
         # an error in place of all objects of a template stands for each
@@ -197,7 +238,7 @@ def _differences(
         change: Change | None = None
         if new != old:
             change = "verdict" if _ORDER[new] > _ORDER[old] else "better"
-        elif not tolerance.allows(old_number, number):
+        elif not tolerance.allows(old_number, number, units.get(key) or ""):
             change = "worse"
         if change is not None:
             yield Difference(

@@ -63,6 +63,7 @@ def columns() -> pa.Schema:
             ("title", text),
             ("line", pa.int32()),
             ("verdict", text),
+            ("unit", text),
             *((name, pa.float64()) for name in ("robustness", "lower", "upper")),
             *((name, time) for name in ("first_satisfied_ns", "violated_at_ns", "satisfied_at_ns")),
             ("atom", text),
@@ -90,7 +91,7 @@ def run_columns() -> pa.Schema:
     """Return the columns of the table of a run: those of rows, and what the run asked for."""
     pa = _pyarrow()
     text = pa.string()
-    asked = [(name, text) for name in ("case", "log", "file", "expected", "failure")]
+    asked = [(name, text) for name in ("case", "log", "file", "meaning", "expected", "failure")]
     return pa.schema([*asked, *(each for each in columns() if each.name != SOURCE)])
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 _ANNOTATIONS: Final = 10
 """GitHub shows no more of one kind for a step."""
 _WORST: Final = 10
+_MOST_COMPARED: Final = 10_000
+"""Of the worst rows, so many are looked through for failures of different kinds."""
 
 
 def is_github(environment: Mapping[str, str] = os.environ) -> bool:
@@ -70,12 +73,20 @@ def repository_path(file: str | Path, environment: Mapping[str, str] = os.enviro
 def worst_annotations(table: pa.Table, folder: Path = Path()) -> Iterator[str]:
     """Yield an annotation for each of the worst rows that fail, at the line of its spec.
 
+    Rows of one spec and verdict repeat only where there are not enough others.
+
     Args:
         folder: what the paths of specifications are relative to.
     """
-    for row in worst_rows(table, _ANNOTATIONS):
-        if row["failure"] is None:
-            return
+    rows = [row for row in worst_rows(table, _MOST_COMPARED) if row["failure"] is not None]
+    kinds = Counter[tuple[str, str, str]]()
+    ranks = []
+    for row in rows:
+        kind = (row["file"], row["spec"], verdict_word(row))
+        ranks.append(kinds[kind])
+        kinds[kind] += 1
+    order = sorted(range(len(rows)), key=lambda place: ranks[place])
+    for row in (rows[place] for place in order[:_ANNOTATIONS]):
         about = requirement_of(row)
         name = f"{row['spec']} ({about})" if about else row["spec"]
         message = f"{row['log']}: {row['failure']}. {row['reason']}".rstrip()

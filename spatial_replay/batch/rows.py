@@ -75,6 +75,7 @@ class ResultRow:
         requirement, title: the id and sentence of the spec, or None.
         line: of the spec in its file, from 1.
         verdict: None if there is an error.
+        unit: the declared unit of the robustness, or "".
         robustness, lower, upper: NaN where not determined.
         first_satisfied_ns, violated_at_ns, satisfied_at_ns: as in `SpecResult`.
         atom, atom_time_ns, atom_objects: what decides the verdict: the first cause of a violation.
@@ -101,6 +102,7 @@ class ResultRow:
     title: str | None
     line: int
     verdict: Verdict | None = None
+    unit: str = ""
     robustness: float = float("nan")
     lower: float = float("nan")
     upper: float = float("nan")
@@ -280,6 +282,7 @@ def _row(log: ResultRow, result: SpecResult, first_ns: int, line: int) -> Result
         title=result.spec.title,
         line=line,
         verdict=result.verdict,
+        unit=result.unit,
         robustness=result.robustness,
         lower=result.lower,
         upper=result.upper,

@@ -6,7 +6,7 @@ import hashlib
 import json
 import re
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from os import PathLike
 from types import SimpleNamespace
@@ -88,15 +88,18 @@ class BatchResult:
         return self.table.filter(pc.is_valid(self.table.column("failure")))
 
 
-def workers_of(jobs: int, dask: str | None = None) -> Workers:
+def workers_of(
+    jobs: int, dask: str | None = None, report: Callable[[str], None] = lambda text: None
+) -> Workers:
     """Return what evaluates logs.
 
     Args:
         jobs: how many processes; with 1, this one.
         dask: address of a scheduler, whose workers see the same files.
+        report: takes what a user who waits should know.
     """
     if dask is not None:
-        return DaskCluster(dask)
+        return DaskCluster(dask, report)
     return LocalProcesses(jobs) if jobs > 1 else ThisProcess()
 
 
@@ -272,6 +275,7 @@ def _judged(rows: pa.Table, asked: Sequence[Wanted], fail_on: frozenset[str]) ->
         "case": [each.case.name for each in asked],
         "log": [each.log.name for each in asked],
         "file": [each.file.name for each in asked],
+        "meaning": [each.file.hash for each in asked],
         "expected": [each.case.expectation.text for each in asked],
         "failure": [
             _failure(row, each.case.expectation, fail_on) for row, each in zip(judged, asked, strict=True)

@@ -14,6 +14,7 @@ from spatial_replay.errors import UsageError
 from spatial_replay.logs.downloads import local_copy
 from spatial_replay.logs.remote import RemoteFile, log_file
 from spatial_replay.monitor.instances import Choice
+from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.format import format_specification
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.overrides import SpecificationText
@@ -30,12 +31,14 @@ class SpecFile:
         name: as it is written: relative to the suite's folder.
         hash: of its meaning, with ids and titles: layout and comments do not count.
         lines: the line of each spec.
+        warnings: what `check` warns of.
     """
 
     name: str
     text: SpecificationText
     hash: str
     lines: tuple[tuple[str, int], ...]
+    warnings: tuple[Diagnostic, ...] = ()
 
 
 def read_specification_text(path: Path | str) -> SpecificationText:
@@ -53,7 +56,7 @@ def spec_file(path: Path | str, text: SpecificationText, parsed: Specification, 
     """Return a specification file that was read and parsed; paths are shown relative to a folder."""
     meaning = f"{parsed.profile}\n{format_specification(parsed)}"
     digest = hashlib.sha256(meaning.encode("utf-8", "surrogatepass")).hexdigest()[:HASH_DIGITS]
-    return SpecFile(_shown(path, folder), text, digest, tuple(spec_lines(parsed).items()))
+    return SpecFile(_shown(path, folder), text, digest, tuple(spec_lines(parsed).items()), parsed.warnings)
 
 
 def _shown(file: Path | str, folder: Path) -> str:

@@ -39,6 +39,8 @@ _AHEAD: Final = 2
 """Tasks for each process that are handed out at once, so that none has to wait for its next."""
 _PRELOADED: Final = "spatial_replay.batch.run"
 """Imported once, by the process that all workers are copies of."""
+_PATIENCE_S: Final = 10
+"""How long no task of a cluster ends before its lack of workers is said."""
 _ANSWER_S: Final = 15
 """How long the scheduler of a cluster has to answer."""
 
@@ -172,16 +174,18 @@ class DaskCluster:
     connection of its own: a client that was closed cannot be opened again.
     """
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, address: str, report: Callable[[str], None] = lambda text: None) -> None:
         """Take a scheduler that answers.
 
         Args:
             address: such as "tcp://scheduler:8786".
+            report: takes what a user who waits should know.
 
         Raises:
             UsageError: Dask is not installed, or no scheduler answers.
         """
         self._address = address
+        self._report = report
         with self._connected():
             pass
 
@@ -196,11 +200,19 @@ class DaskCluster:
         """
         rest = iter(tasks)
         waiting: dict[Future[_Result], _Task] = {}
+        is_reported = False
         with self._connected() as client:
             pool = client.get_executor(pure=False)
             try:
                 while self._hand_out(client, pool, work, rest, waiting):
-                    for future in wait(waiting, return_when=FIRST_COMPLETED).done:
+                    done = wait(waiting, timeout=_PATIENCE_S, return_when=FIRST_COMPLETED).done
+                    if not done and not is_reported and not client.nthreads():
+                        self._report(
+                            f"--dask {self._address}: the scheduler has no workers, so nothing is evaluated; "
+                            f"start some with `dask worker {self._address}`, or stop with Ctrl-C"
+                        )
+                        is_reported = True
+                    for future in done:
                         task = waiting.pop(future)
                         yield task, self._result(future)
             finally:

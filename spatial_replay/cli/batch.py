@@ -29,7 +29,7 @@ from spatial_replay.cli.options import (
     semantics_option,
 )
 from spatial_replay.cli.progress import progress
-from spatial_replay.cli.terminal import show, warn
+from spatial_replay.cli.terminal import show, show_diagnostics, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import local_files, sendable
 from spatial_replay.text import counted
@@ -46,6 +46,7 @@ if TYPE_CHECKING:
 
 _WORST = 10
 _MOST_WARNINGS = 5
+_MOST_NAMED = 5
 _MOST_DIFFERENCES = 20
 
 
@@ -83,7 +84,7 @@ _OUTPUTS = (
         metavar="RESULTS",
         help="Results of an earlier run: what got worse than there, or is gone, fails.",
     ),
-    click.option("--tolerance", metavar="T", help="With --baseline: how much worse passes, as 5% or 0.02."),
+    click.option("--tolerance", metavar="T", help="With --baseline: how much worse passes, as 5% or 0.02m."),
     click.option("--update-baseline", is_flag=True, help="Write this run's results to --baseline."),
 )
 
@@ -126,7 +127,7 @@ def batch(
       spatial-replay batch logs --spec safety.spatial --dask tcp://scheduler:8786
     """
     # imported here so that --help stays fast
-    from spatial_replay.batch.baseline import compare, with_baseline
+    from spatial_replay.batch.baseline import compare, edited_files, with_baseline
     from spatial_replay.batch.github import is_github, worst_annotations, write_summary
     from spatial_replay.batch.junit import write_junit
     from spatial_replay.batch.prepare import prepare
@@ -137,12 +138,14 @@ def batch(
         raise UsageError("--jobs is for this machine, and a cluster has its own; remove --jobs or --dask")
     suite = _suite(logs, conditions, semantics).allowing(allow)
     cases = prepare(suite, progress)
+    warnings = [each for case in cases for file in case.files for each in file.warnings]
+    show_diagnostics({str(each): each for each in warnings}.values())
     folder = outputs.output
     if folder is None:
         folder = "results" if suite.path is None else str(suite.folder / f"{suite.name}.results")
     tolerance, before = _baseline(outputs)
     _check_outputs(outputs, suite)
-    workers = workers_of(jobs or os.cpu_count() or 1, dask)
+    workers = workers_of(jobs or os.cpu_count() or 1, dask, warn)
     found = _run(cases, folder, workers, fail_on)
     differences = None if before is None else compare(found.table, before, tolerance)
     # what is worse than the baseline fails wherever results are shown
@@ -164,11 +167,14 @@ def batch(
         _print(result, found, folder)
     warn(*found.remarks)
     _warn_of_names(found.table)
+    _warn_of_damage(found.table)
     if is_github():
         for line in worst_annotations(result.table, suite.folder):
             show(line, err=True)
         write_summary(result.table)
     code = exit_code_from_table(found.table, fail_on)
+    if before is not None and (edited := edited_files(found.table, before)):
+        warn(f"edited since the baseline, which may be why results differ: {_listed(edited)}")
     if differences is not None and _print_differences(differences, outputs.json_file == "-"):
         code = most_severe([code, ExitCode.VIOLATED])
     if outputs.update_baseline and outputs.baseline is not None:
@@ -272,8 +278,13 @@ def _baseline(outputs: BatchOutputs) -> tuple[Tolerance, pa.Table | None]:
         return Tolerance(), None
     with naming_option("--tolerance"):
         tolerance = Tolerance.parse(outputs.tolerance or "0")
-    if outputs.update_baseline and not result_files(outputs.baseline).exists():
-        return tolerance, None
+    if not result_files(outputs.baseline).exists():
+        if outputs.update_baseline:
+            return tolerance, None
+        raise UsageError(
+            f"--baseline {outputs.baseline}: no such folder, or an empty one; add --update-baseline once, "
+            "which writes the results of this run there"
+        )
     return tolerance, ResultsFolder.open(outputs.baseline).read_run()
 
 
@@ -321,13 +332,28 @@ def _print(result: BatchResult, found: BatchResult, folder: str) -> None:
 
 def _warn_of_names(table: pa.Table) -> None:
     """Warn of names that logs lack; the same name is reported once."""
-    logs: dict[str, int] = {}
-    for missing in dict(_columns(table, "log", "missing")).values():
+    logs: dict[str, list[str]] = {}
+    for log, missing in dict(_columns(table, "log", "missing")).items():
         for message in missing:
-            logs[message] = logs.get(message, 0) + 1
-    found = [f"{message} (in {counted(count, 'log')})" for message, count in logs.items()]
+            logs.setdefault(message, []).append(log)
+    found = [f"{message} (in {_listed(names)})" for message, names in logs.items()]
     more = [f"… and {len(found) - _MOST_WARNINGS} more"] if len(found) > _MOST_WARNINGS else []
     warn(*found[:_MOST_WARNINGS], *more)
+
+
+def _warn_of_damage(table: pa.Table) -> None:
+    """Name the logs that are damaged or cannot be read, for which the exit code is 3."""
+    rows = _columns(table, "log", "faults", "error_kind")
+    logs = list(dict.fromkeys(log for log, faults, kind in rows if faults or kind == "log"))
+    if logs:
+        warn(f"damaged, or not to be read: {_listed(logs)}")
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Return the first few names, and how many others there are."""
+    more = [f"{len(names) - _MOST_NAMED:,} more"] if len(names) > _MOST_NAMED else []
+    listed = [*names[:_MOST_NAMED], *more]
+    return " and ".join(filter(None, [", ".join(listed[:-1]), listed[-1]]))
 
 
 def _columns(table: pa.Table, *names: str) -> list[tuple[Any, ...]]:

@@ -11,6 +11,7 @@ import numpy as np
 
 from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene
+from spatial_replay.monitor.witness.evidence import NamedPart, is_missing, named_parts
 from spatial_replay.spec.diagnostics import Diagnostic, SourceText
 from spatial_replay.spec.format import format_bound, format_number, format_term
 from spatial_replay.spec.formula import (
@@ -34,7 +35,7 @@ from spatial_replay.spec.formula import (
     operands_of,
 )
 from spatial_replay.spec.walks import base_of, iter_expressions, iter_formulas, terms_of
-from spatial_replay.text import counted
+from spatial_replay.text import counted, time_text
 from spatial_replay.trace.trace import Trace
 
 _LENGTH_RELATIONS = frozenset({"closeto", "farfrom", "touch", "moved", "dist"})
@@ -55,6 +56,7 @@ class ThresholdRange:
             if it is never known.
         known, holding, failing: samples in which it is known, in which the atom holds, and in which it fails,
             whatever objects the variables stand for.
+        samples: how many there are.
     """
 
     atom: Atom
@@ -64,6 +66,7 @@ class ThresholdRange:
     known: int = 0
     holding: int = 0
     failing: int = 0
+    samples: int = 0
 
     @property
     def holds(self) -> Literal["always", "never", "sometimes", "unknown"]:
@@ -90,8 +93,11 @@ class ThresholdRange:
         if not self.known:
             return f"{self.text}: unknown in every sample"
         span = f"{self.text}: goes from {self.least:.4g} to {self.greatest:.4g}"
+        unknown = self.samples - self.known
+        if unknown:
+            span += f", is unknown in {unknown:,} of {counted(self.samples, 'sample')}"
         if self.holds != "sometimes":
-            return f"{span}, {self.holds} holds"
+            return f"{span}, {self.holds} holds{' in the others' if unknown else ''}"
         samples = counted(self.known, "sample")
         if self.bound:
             return f"{span}, holds for all in {self.holding:,} and for none in {self.failing:,} of {samples}"
@@ -105,6 +111,7 @@ class LogNumbers:
         box: xmin, ymin, xmax, ymax of all footprints; empty (xmin > xmax) without any.
         samples: how many there are.
         times_ns: of the first and the last one.
+        missing: by object and signal of the specification, how many samples lack it, and the first of them.
     """
 
     def __init__(self, specification: Specification) -> None:
@@ -113,6 +120,11 @@ class LogNumbers:
         self.samples = 0
         self.times_ns = (0, 0)
         self._regions = specification.regions
+        # by part: how many samples lack it, and the first of them
+        self.missing: dict[NamedPart, tuple[int, int]] = {}
+        self._parts = list(
+            dict.fromkeys(part for spec in specification.results for part in named_parts(spec.formula))
+        )
         self._ranges = {
             _key(each, bound): ThresholdRange(each, bound)
             for each, bound in _bound_nodes(specification)
@@ -134,6 +146,11 @@ class LogNumbers:
             int(trace.times_ns[-1]),
         )
         self.samples += len(trace)
+        for part in self._parts:
+            lacking = np.flatnonzero(is_missing(trace, part))
+            if len(lacking):
+                count, first_ns = self.missing.get(part, (0, int(trace.times_ns[lacking[0]])))
+                self.missing[part] = count + len(lacking), first_ns
         self._add_ranges(trace)
 
     def _add_ranges(self, trace: Trace) -> None:
@@ -164,7 +181,7 @@ class LogNumbers:
     @property
     def ranges(self) -> Sequence[ThresholdRange]:
         """What each atom with a threshold compares with it."""
-        return tuple(self._ranges.values())
+        return tuple(replace(each, samples=self.samples) for each in self._ranges.values())
 
     def range_of(self, atom: Atom, bound: tuple[Quantified, ...]) -> ThresholdRange | None:
         """Return what an atom compares with its threshold; None if that is not one number."""
@@ -213,6 +230,17 @@ def plausibility_warnings(specification: Specification, log: LogNumbers) -> tupl
             hint = f"objects lie in x {log.box[0]:.4g} to {log.box[2]:.4g}, y {log.box[1]:.4g} to "
             span = Span(start, start + len(f"region {name}"))
             found[name] = source.diagnostic("warning", span, message, f"{hint}{log.box[3]:.4g}")
+    for part, (count, first_ns) in log.missing.items():
+        named = (each for each in _nodes(specification) if isinstance(each, Atom))
+        span = next(each.span for each in named if part in named_parts(each))
+        # one that the log never has is an error of names
+        if count < log.samples:
+            at = time_text(first_ns, log.times_ns[0])
+            message = (
+                f"{part.shown} is missing in {count:,} of {counted(log.samples, 'sample')}, first at {at}"
+            )
+            hint = "atoms about it are unknown there, and so may be a verdict"
+            found[part.shown] = source.diagnostic("warning", span, message, hint)
     for node, bound in _bound_nodes(specification):
         doubts: Iterator[tuple[str, str]] = iter(())
         key = ""

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from enum import StrEnum
 
+from spatial_replay.errors import UsageError
+
 
 class Verdict(StrEnum):
     """The verdict of a formula.
@@ -17,6 +19,14 @@ class Verdict(StrEnum):
     VIOLATED = "violated"
     PENDING = "pending"
     UNKNOWN = "unknown"
+
+    def __bool__(self) -> bool:
+        """Refuse: "violated" would be true as every text is.
+
+        Raises:
+            UsageError: always.
+        """
+        raise UsageError(f'a verdict is no truth value; write verdict == "satisfied" (it is {self.value!r})')
 
 
 def final_verdict(lower: float, upper: float) -> Verdict:

@@ -158,6 +158,62 @@ def test_samples_that_a_recorder_dropped_are_said_and_do_not_pass(fleet: Path) -
     assert said in Path("lossy.html").read_text()
 
 
+def test_warnings_of_specifications_are_those_of_replay(fleet: Path) -> None:
+    Path("both.spatial").write_text("spec s = G (cart dist person >= 0) && F (cart dist person >= 0)")
+    (warning, *_) = command("check", "both.spatial").err.splitlines()
+    assert "warning" in warning
+    assert warning in batch("logs/run-0.jsonl", "--spec", "both.spatial").err
+    assert warning in command("replay", "logs/run-0.jsonl", "--spec", "both.spatial").err
+
+
+def test_an_absolute_tolerance_has_the_unit_of_the_results(fleet: Path) -> None:
+    Path("m.spatial").write_text("spec s = G (cart dist person >= 0)")
+    for folder, gap in (("before", 0.5), ("after", 0.4)):
+        Path(folder).mkdir()
+        with sr.Recorder(f"{folder}/run.mcap", units={"": "m"}) as recorder:
+            objects = {"cart": sr.Footprint.box(0, 0, 1, 1), "person": sr.Footprint.box(1 + gap, 0, 3, 1)}
+            recorder.write(sr.Sample(0, objects))
+    Path("log").symlink_to("before")
+    run = ("log/run.mcap", "--spec", "m.spatial", "--baseline", "main")
+    missing = batch(*run)
+    assert (missing.code, "add --update-baseline once" in missing.err) == (2, True)
+    assert batch(*run, "--update-baseline").code == 0
+    Path("log").unlink()
+    Path("log").symlink_to("after")
+    bare = batch(*run, "--tolerance", "5")
+    assert (bare.code, "robustness is in m; write 5m, or 5% for a part of it" in bare.err) == (2, True)
+    for tolerance, code in (("0.2m", 0), ("0.05 m", 1), ("30%", 0), ("5%", 1)):
+        assert batch(*run, "--tolerance", tolerance).code == code
+    assert "edited" not in batch(*run).err
+    Path("m.spatial").write_text("spec s = G (cart dist person >= 0.05)")
+    assert "edited since the baseline, which may be why results differ: m.spatial" in batch(*run).err
+
+
+def test_a_batch_names_the_logs_that_are_damaged_and_those_that_lack_a_name(fleet: Path) -> None:
+    Path("logs/run-1.jsonl").write_text("{")
+    Path("logs/run-2.jsonl").write_text('{"time_ns": 0, "objects": []}\n')
+    done = batch("logs", "--spec", "gate.spatial")
+    assert (done.code, "damaged, or not to be read: logs/run-1.jsonl" in done.err) == (3, True)
+    assert "(in logs/run-2.jsonl)" in done.err
+
+
+def test_annotations_are_of_different_kinds_before_they_repeat_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("GITHUB_ACTIONS", "true")
+    write_fleet(tmp_path, [0.1] * 12)
+    Path("other.spatial").write_text(
+        "spec high = G (cart dist person >= 0.2)\nspec low = G (cart ovlp person)"
+    )
+    done = batch("logs", "--spec", "gate.spatial", "--spec", "other.spatial")
+    lines = [line for line in done.err.splitlines() if line.startswith("::error")]
+    assert len(lines) == 10
+    assert [sum(f"title={name}" in line for line in lines[:3]) for name in ("apart", "high", "low")] == [
+        1
+    ] * 3
+
+
 def _box(name: str, x: float) -> dict[str, object]:
     return {"name": name, "polygon": [[x, 0], [x + 1, 0], [x + 1, 1], [x, 1]]}
 

@@ -88,10 +88,15 @@ def test_names_are_compared_with_those_in_a_log(
     output = capsys.readouterr()
     assert "3:30: warning: the log never has the object 'hand'" in output.err
     assert "did you mean 'hans'?" in output.err
-    assert output.out.endswith("2 samples of run.jsonl over 6.000 s: 1 name that it never has\n")
+    assert output.out.endswith(
+        "2 samples of run.jsonl over 6.000 s: 1 name that it never has and 1 other warning\n"
+    )
+    assert "cube is missing in 1 of 2 samples, first at 6.000 s" in output.err
     assert run(["check", str(specification), "--log", str(log), "--strict-names"]) == 2
     assert "3:30: error: the log never has the object 'hand'" in capsys.readouterr().err
-    log.write_text(LOG.replace("hans", "hand"))
+    both = LOG.splitlines()[0].replace("cube", "hand")[len('{"time_ns": 0, "objects": [') :]
+    seen = LOG.splitlines()[0].removesuffix("]}")
+    log.write_text("\n".join(f"{seen}, {both}".replace(': 0, "o', f': {t}, "o') for t in (0, 6 * 10**9)))
     assert run(["check", str(specification), "--log", str(log), "--strict-names"]) == 0
     assert capsys.readouterr().out.endswith("all names, thresholds and windows fit\n")
 

@@ -306,3 +306,8 @@ def test_units_that_are_no_texts_by_names_are_refused(units: Any) -> None:
         Trace.from_samples([], units=units)
     with pytest.raises(UsageError, match="unit"):
         Monitor(parse_specification("G p >= 2"), units=units)
+
+
+def test_a_verdict_is_no_truth_value() -> None:
+    with pytest.raises(UsageError, match=r"write verdict == \"satisfied\" \(it is 'violated'\)"):
+        bool(Verdict.VIOLATED)

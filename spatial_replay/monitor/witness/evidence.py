@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -120,22 +121,16 @@ class Evidence:
 
     def gaps(self, formula: Formula) -> tuple[Gap, ...]:
         """Return when each object and signal that a formula names is missing, for those that ever are."""
-        atoms = [each for each in iter_formulas(formula) if isinstance(each, Atom)]
-        expressions = [each for atom in atoms for each in iter_expressions(atom.expression)]
-        signals = [each.name for each in expressions if isinstance(each, Signal)]
-        terms = [term for atom in atoms for term in atom.terms]
-        objects = dict.fromkeys(name for term in terms for name in _object_names(base_of(term)))
-        kinds = [(f"signal {name!r}", name, True) for name in dict.fromkeys(signals)]
-        kinds += [(name, name, False) for name in objects]
+        kinds = named_parts(formula)
         parts: list[NDArray[np.bool_]] = []
         for scene in self._scenes():
             trace = scene.trace.slice(scene.skip, len(scene.trace))
             inside = slice(*window_of(trace.times_ns, self.instance.start_ns, self.instance.end_ns))
-            columns = [_is_missing(trace, name, is_signal=is_signal)[inside] for _, name, is_signal in kinds]
+            columns = [is_missing(trace, each)[inside] for each in kinds]
             parts.append(np.stack(columns) if columns else np.empty((0, 0), np.bool_))
         times_ns = self.times_ns()
         found = zip(kinds, np.concatenate(parts, axis=1), strict=True)
-        return tuple(_gap(shown, missing, times_ns) for (shown, _, _), missing in found if missing.any())
+        return tuple(_gap(part.shown, missing, times_ns) for part, missing in found if missing.any())
 
     def members(self, groups: Sequence[Group | Earlier]) -> NDArray[np.bool_]:
         """Return (G, T), in which samples each open group has a member, or may have had one."""
@@ -164,6 +159,28 @@ class Evidence:
                 yield TraceScene(trace, self._regions, skip)
 
 
+class NamedPart(NamedTuple):
+    """An object or a signal that a formula names."""
+
+    name: str
+    is_signal: bool
+
+    @property
+    def shown(self) -> str:
+        """What sentences call it."""
+        return f"signal {self.name!r}" if self.is_signal else self.name
+
+
+def named_parts(formula: Formula) -> list[NamedPart]:
+    """Return the signals and objects that a formula names, each once."""
+    atoms = [each for each in iter_formulas(formula) if isinstance(each, Atom)]
+    expressions = [each for atom in atoms for each in iter_expressions(atom.expression)]
+    found = [NamedPart(each.name, True) for each in expressions if isinstance(each, Signal)]
+    terms = [term for atom in atoms for term in atom.terms]
+    found += [NamedPart(name, False) for term in terms for name in _object_names(base_of(term))]
+    return list(dict.fromkeys(found))
+
+
 def _object_names(base: Term) -> tuple[str, ...]:
     """Return the objects that a term names, itself or as the members of a group."""
     if isinstance(base, Group):
@@ -177,9 +194,10 @@ def _joined(parts: Sequence[Floats], axis: int) -> Floats:
     return np.concatenate([in_channels(part, channels) for part in parts], axis=axis)
 
 
-def _is_missing(trace: Trace, name: str, *, is_signal: bool) -> NDArray[np.bool_]:
+def is_missing(trace: Trace, part: NamedPart) -> NDArray[np.bool_]:
     """Return (T,), in which samples an object is not seen, or a signal has no finite value."""
-    if is_signal:
+    name = part.name
+    if part.is_signal:
         values = trace.signals.get(name)
         return np.ones(len(trace), np.bool_) if values is None else ~np.isfinite(values)
     if name not in trace.names:
