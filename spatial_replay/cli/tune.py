@@ -206,7 +206,11 @@ def _lines(tuning: Tuning) -> Iterator[str]:
         return
     kind = ("widest margin" if tuning.is_widest else "margin") if count[False] else "tightest values"
     yield f"{kind} for {runs}: {tuning.margin:.6g}" if count[False] else f"{kind} for {runs}"
-    if not tuning.is_widest:
+    undecided = [each.name for each in tuning.constants if not each.is_decided]
+    if undecided:
+        names = ", ".join(undecided)
+        yield f"  no run decides {names}: no bad run fails by it, so it stays as written, or as near as fits"
+    elif not tuning.is_widest:
         yield "  as far as was searched: a narrower range may hold a wider margin"
     rows = [_row(constant) for constant in tuning.constants]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]

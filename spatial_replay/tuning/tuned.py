@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Final
 
@@ -43,6 +43,8 @@ class TunedConstant:
         tried: the range that was tried.
         step: the least difference of two values, or the seconds of it.
         direction: 1 if greater values are looser, -1 if they are tighter, None if neither is certain.
+        is_decided: whether runs decide it; else no bad run keeps it from being looser, and it keeps the
+            written value, or the nearest that fits.
     """
 
     name: str
@@ -53,6 +55,7 @@ class TunedConstant:
     tried: tuple[Value, Value]
     step: float
     direction: Direction | None
+    is_decided: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +140,8 @@ class Tuning(Displayed):
         runs: every run, in the order given.
         conflict: why nothing was found, or None.
         is_widest: whether other values are known to have no wider margin, or to be no tighter: not if the
-            search ran out of evaluations, nor if it tried values of a constant without a direction.
+            search ran out of evaluations, or tried values of a constant without a direction, or if a constant
+            keeps its value since no bad run decides it.
         specification: the specification with the values, its comments and layout kept.
     """
 
@@ -229,6 +233,7 @@ class Tuning(Displayed):
                     "tried": list(each.tried),
                     "step": each.step,
                     "direction": each.direction,
+                    "decided": each.is_decided,
                 }
                 for each in self.constants
             ],
@@ -266,7 +271,8 @@ def tune_runs(
 
     With bad runs those of the widest margin: the least of the good runs' robustness and the bad runs' negated
     one is the greatest. With good runs only the tightest ones: all are tightened together, in proportion to
-    their ranges, and then one after the other.
+    their ranges, and then one after the other. With bad runs, a constant that none of them keeps
+    from being looser stays as written as far as that fits.
 
     Args:
         ranges: the values to try for each constant, by name; None takes the range in the text, and no ranges
@@ -289,7 +295,28 @@ def tune_runs(
     margins = Margins(runs, parse, varied, each or {}, advance=advance)
     search = Search(margins, seed)
     found = search.best()
-    return _tuning(specification, margins, search, found)
+    kept = _kept(margins, search, found) if found.is_held else {}
+    point = tuple(kept.get(axis, number) for axis, number in enumerate(found.point))
+    is_widest = found.is_proven and point == found.point
+    found = replace(found, point=point, is_proven=is_widest if found.is_held else found.is_proven)
+    return _tuning(specification, margins, search, found, kept)
+
+
+def _kept(margins: Margins, search: Search, found: Found) -> dict[int, int]:
+    """Return the constants that no bad run decides, with the numbers of the values that they keep.
+
+    The widest margin would loosen them as far as can be. Good runs alone find the tightest values.
+    """
+    kept: dict[int, int] = {}
+    if all(run.is_good for run in margins.runs):
+        return kept
+    for axis, one in enumerate(margins.varied):
+        point = tuple(kept.get(place, number) for place, number in enumerate(found.point))
+        low, high = search.interval(point, axis)
+        is_free = {1: high == one.steps, -1: low == 0}.get(margins.directions[axis] or 0, False)
+        if (low, high) == (0, one.steps) or is_free:
+            kept[axis] = min(max(one.start, low), high)
+    return kept
 
 
 def _check(specification: Specification, runs: Sequence[LabelledRun]) -> None:
@@ -313,7 +340,9 @@ def _with_values(
     return parse_specification(write(values), filename=specification.filename, profile=specification.profile)
 
 
-def _tuning(specification: Specification, margins: Margins, search: Search, found: Found) -> Tuning:
+def _tuning(
+    specification: Specification, margins: Margins, search: Search, found: Found, kept: Collection[int]
+) -> Tuning:
     constants = []
     for axis, one in enumerate(margins.varied):
         number = found.point[axis]
@@ -329,6 +358,7 @@ def _tuning(specification: Specification, margins: Margins, search: Search, foun
                 (one.value(0), one.value(one.steps)),
                 _number(one.step, duration_ns),
                 margins.directions[axis],
+                axis not in kept,
             )
         )
     listed = []

@@ -67,6 +67,29 @@ def test_write_changes_the_numbers_and_nothing_else(folder: Path) -> None:
     assert (folder / "s.spatial").read_text() == written
 
 
+def test_a_constant_that_no_bad_run_decides_stays_as_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    text = "const safe = 0.5 in [0.1, 1]\nconst full = 3 in [1, 9]\nspec s = {}"
+    both = "G (cube dist cup >= safe) and G (battery >= full)"
+    Path("s.spatial").write_text(text.format(both))
+    # the bad run is as far away as the good ones: it fails by its battery
+    for name, battery in (("good", 8.0), ("bad", 2.0)):
+        with sr.Recorder(f"{name}.mcap") as recorder:
+            for sample in run_at([2.0, 3.0], battery=battery).samples():
+                recorder.write(sample)
+    runs = ("--good", "good.mcap", "--bad", "bad.mcap")
+    assert tune(*runs, "--write") == 0
+    said = capsys.readouterr().out
+    assert "no run decides safe: no bad run fails by it" in said
+    assert Path("s.spatial").read_text() == text.format(both).replace("= 3", "= 5")
+    # where the good run does not satisfy the written value, it is loosened no further than that takes
+    Path("s.spatial").write_text(text.format(both).replace("0.5 in [0.1, 1]", "2.5 in [0.1, 3]"))
+    assert tune(*runs, "--write") == 0
+    assert "const safe = 2 in [0.1, 3]" in Path("s.spatial").read_text()
+
+
 def test_runs_that_contradict_each_other_are_named_with_what_they_need(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
