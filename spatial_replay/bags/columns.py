@@ -21,6 +21,7 @@ import numpy as np
 
 from spatial_replay.errors import LogError
 from spatial_replay.geometry.arrays import Integers
+from spatial_replay.logs.mcap.chunks import too_many_waiting
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.text import Instant
 
@@ -173,16 +174,27 @@ def places_in(part: int, within: Integers) -> Integers:
     return (np.int64(part) << 28) + within
 
 
-def in_order(starts_ns: Sequence[int], chunks: Iterable[MessageColumns]) -> Columns:
+def in_order(
+    starts_ns: Sequence[int], chunks: Iterable[MessageColumns], name: str, most_bytes: int
+) -> Columns:
     """Yield the messages of several chunks by log time, topic and sequence.
 
     It holds no more messages than overlap.
 
     Args:
         starts_ns: when each chunk begins, in order; a message before that comes late.
+        name: of the log.
+        most_bytes: of the messages that it may hold.
+
+    Raises:
+        LogError: it would hold more.
     """
     waiting = MessageColumns()
+    held = 0
     for number, chunk in enumerate(chunks, 1):
+        held += sum(map(len, chunk.payloads))
+        if held > most_bytes:
+            raise too_many_waiting(name, most_bytes)
         waiting = joined([waiting, chunk] if len(waiting) else [chunk]).ordered()
         if number == len(starts_ns):
             break
@@ -190,6 +202,7 @@ def in_order(starts_ns: Sequence[int], chunks: Iterable[MessageColumns]) -> Colu
         if ready:
             yield waiting.slice(0, ready)
             waiting = waiting.slice(ready, len(waiting))
+            held = sum(map(len, waiting.payloads))
     if len(waiting):
         yield waiting
 

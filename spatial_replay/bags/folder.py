@@ -20,7 +20,7 @@ from spatial_replay.bags.reader import MessageReader
 from spatial_replay.bags.ros_definitions import full_type_name
 from spatial_replay.bags.sqlite import SQLITE_MAGIC, SqliteBag
 from spatial_replay.bags.topic import Topic
-from spatial_replay.bags.unpacking import ZSTD_MAGIC, temporary_folder, unpack_file, unpacked
+from spatial_replay.bags.unpacking import ZSTD_MAGIC, temporary_folder, unpack_file, unpacked, unpacked_size
 from spatial_replay.errors import LogError, MissingFileError
 from spatial_replay.logs.messages import Attachment, Channel
 from spatial_replay.logs.read_options import FaultList
@@ -32,6 +32,9 @@ _ENDINGS = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
 
 _CDR_BEGIN = b"\x00"
 """How every message of ROS 2 begins, and none that is compressed."""
+
+_MOST_UNPACKED = 2**26
+"""Bytes of messages that are decompressed at a time, and one message more."""
 
 _File: TypeAlias = McapLog | SqliteBag
 
@@ -158,7 +161,13 @@ class BagFolder(MessageReader):
         """Decompress messages; a topic with messages that are plain is remarked once."""
         plain = set[str]()
         for packed in columns:
-            yield self._unpacked(packed, plain)
+            # some at a time, however much they decompress to
+            begin = size = 0
+            for number, payload in enumerate(packed.payloads, 1):
+                size += unpacked_size(payload)
+                if size >= _MOST_UNPACKED or number == len(packed):
+                    yield self._unpacked(packed.slice(begin, number), plain)
+                    begin, size = number, 0
 
     def channels(self, topics: Collection[str]) -> Mapping[int, Channel]:
         return {

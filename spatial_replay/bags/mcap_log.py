@@ -21,7 +21,7 @@ from spatial_replay.bags.topic import Topic
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.mcap.chunk_records import DamageError, walk_records
 from spatial_replay.logs.mcap.chunk_walk import ChunkWalk
-from spatial_replay.logs.mcap.chunks import ChunkPlace, plan_places, read_records
+from spatial_replay.logs.mcap.chunks import ChunkPlace, most_waiting, plan_places, read_records
 from spatial_replay.logs.mcap.index import Directory, iter_attachments, iter_metadata, read_directory
 from spatial_replay.logs.mcap.reader import directory_remarks
 from spatial_replay.logs.messages import Attachment, Channel
@@ -103,9 +103,11 @@ class McapLog(MessageReader):
         with open_file(self._file) as stream:
             plan_places(stream, (place for _, place in places))
             contents = (self._messages(stream, *ranked, wanted, first, last) for ranked in places)
-            yield from (
-                contents if as_recorded else in_order([place.start_ns for _, place in places], contents)
-            )
+            if as_recorded:
+                yield from contents
+                return
+            most = most_waiting(place.length for _, place in places)
+            yield from in_order([place.start_ns for _, place in places], contents, self.name, most)
 
     def _counted(self, columns: Columns, topics: Collection[str], name: str | None = None) -> Columns:
         yield from super()._counted(columns, topics, name)

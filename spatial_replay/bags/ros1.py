@@ -32,6 +32,7 @@ from spatial_replay.bags.ros_definitions import full_type_name
 from spatial_replay.bags.topic import Topic
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.mcap.chunk_records import DamageError
+from spatial_replay.logs.mcap.chunks import most_waiting
 from spatial_replay.logs.messages import Channel, Schema
 from spatial_replay.text import Instant, Sentence
 
@@ -75,9 +76,11 @@ class Ros1Bag(MessageReader):
                 chunks = [(rank, chunk) for rank, (_, chunk) in enumerate(chunks)]
         with self._path.open("rb") as stream:
             contents = (self._messages(stream, *ranked, wanted, first, last) for ranked in chunks)
-            yield from (
-                contents if as_recorded else in_order([chunk.start_ns for _, chunk in chunks], contents)
-            )
+            if as_recorded:
+                yield from contents
+                return
+            most = most_waiting([self._path.stat().st_size])
+            yield from in_order([chunk.start_ns for _, chunk in chunks], contents, self.name, most)
 
     @cached_property
     def _is_in_parts(self) -> bool:

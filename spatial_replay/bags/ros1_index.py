@@ -20,14 +20,12 @@ from numpy.typing import NDArray
 from spatial_replay.compiled import kernel, piece
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.mcap.chunk_records import DamageError
-from spatial_replay.logs.mcap.chunks import LARGEST_CHUNK
+from spatial_replay.logs.mcap.chunks import ALWAYS_ALLOWED, LARGEST_CHUNK, MOST_TIMES_LARGER
 from spatial_replay.logs.read_options import FaultList
 
 BAG_MAGIC = b"#ROSBAG V2.0\n"
 MESSAGE, BAG_HEADER, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
 LONGEST_HEAD = 2**20
-_ALWAYS_ALLOWED, _MOST_TIMES_LARGER = 2**26, 1_000
-"""Bytes, and times its own size, that a chunk may decompress to: no recorder's chunk needs more."""
 _SECOND_NS = 1_000_000_000
 # op=, conn=, time= begin with these
 _C, _I, _O, _P, _T = b"ciopt"
@@ -98,7 +96,7 @@ def decompressed(compression: bytes, data: bytes, size: int) -> bytes:
     Raises:
         DamageError: it does not decompress to `size` bytes.
     """
-    most = max(_ALWAYS_ALLOWED, _MOST_TIMES_LARGER * len(data))
+    most = max(ALWAYS_ALLOWED, MOST_TIMES_LARGER * len(data))
     if size > LARGEST_CHUNK or (compression != b"none" and size > most):
         raise DamageError(f"the chunk claims to hold {size} bytes in {len(data)}")
     try:

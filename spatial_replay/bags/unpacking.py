@@ -12,7 +12,7 @@ from typing import BinaryIO
 import zstandard
 
 from spatial_replay.errors import LogError, OutputError
-from spatial_replay.logs.mcap.chunks import LARGEST_CHUNK
+from spatial_replay.logs.mcap.chunks import ALWAYS_ALLOWED, LARGEST_CHUNK, MOST_TIMES_LARGER
 from spatial_replay.logs.output_file import open_output, output_error
 from spatial_replay.logs.read_options import FaultList
 
@@ -20,8 +20,6 @@ ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _PIECE = 2**20
 _PACKED_PIECE = 2**12
 """Compressed bytes at a time: few, since each may stand for 32,000."""
-_MOST_TIMES_LARGER = 1_000
-_ALWAYS_ALLOWED = 2**26
 _LEFT_FREE = 2**26
 """Bytes of a disk that are never filled; of a small one, a tenth."""
 
@@ -61,7 +59,7 @@ def unpack_file(packed: Path, folder: Path, faults: FaultList) -> Path:
         OutputError: the folder has no room for it.
     """
     target = folder / (packed.stem if packed.suffix in (".zstd", ".zst") else packed.name)
-    most = packed.stat().st_size * _MOST_TIMES_LARGER + _ALWAYS_ALLOWED
+    most = packed.stat().st_size * MOST_TIMES_LARGER + ALWAYS_ALLOWED
     free = shutil.disk_usage(folder).free
     room = free - min(_LEFT_FREE, free // 10)
     written = 0
@@ -102,17 +100,26 @@ def _decompressed(source: BinaryIO) -> Iterator[tuple[bytes, bool]]:
         yield content, frame is None
 
 
+def unpacked_size(payload: bytes) -> int:
+    """Return how many bytes a message that may be compressed decompresses to, at most."""
+    try:
+        size = zstandard.frame_content_size(payload)
+    except zstandard.ZstdError:
+        return len(payload)
+    return size if size >= 0 else ALWAYS_ALLOWED
+
+
 def unpacked(payload: bytes) -> bytes:
     """Decompress a message that was compressed by itself.
 
     Raises:
-        LogError: it does not decompress.
+        LogError: it does not decompress, or to more than a chunk of an MCAP log may.
     """
     try:
         size = zstandard.frame_content_size(payload)
-        if size > LARGEST_CHUNK:
-            raise LogError(f"a message claims to hold {size} bytes")
-        most = size if size >= 0 else min(LARGEST_CHUNK, len(payload) * _MOST_TIMES_LARGER + _PIECE)
+        most = min(LARGEST_CHUNK, max(ALWAYS_ALLOWED, MOST_TIMES_LARGER * len(payload)))
+        if size > most:
+            raise LogError(f"a message claims to hold {size} bytes in {len(payload)}")
         return zstandard.ZstdDecompressor().decompress(payload, max_output_size=most)
     except zstandard.ZstdError as error:
         raise LogError(f"a message does not decompress ({error})") from None

@@ -36,7 +36,7 @@ class ChunkWalk:
     def __init__(self, stream: BinaryIO, directory: Directory, faults: FaultList, name: str) -> None:
         self.stream = stream
         self.faults = faults
-        self._name = name
+        self.name = name
         self.directory = directory
         self._schemas = dict(directory.schemas)
         self.channels: dict[int, Channel] = {}
@@ -121,5 +121,5 @@ class ChunkWalk:
         """Report what happened to messages in some places, in words before and after their times."""
         first, last = min(place.start_ns for place in places), max(place.end_ns for place in places)
         span = "messages between ", Instant(first, 0), " and ", Instant(last, 0)
-        where = f"{self._name}: at byte {places[0].offset}: "
+        where = f"{self.name}: at byte {places[0].offset}: "
         self.faults.add(Sentence(where, Sentence(before, *span, after)))

@@ -22,6 +22,7 @@ import zstandard
 
 from spatial_replay.compiled import bytes_at, copying_kernel, integers_at
 from spatial_replay.cores import Work, cores, drop, first_result
+from spatial_replay.errors import LogError
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.byte_ranges import is_planned, plan_reads
 from spatial_replay.logs.checksums import crc32, joined_checksum
@@ -37,8 +38,11 @@ from spatial_replay.logs.payloads import Bytes
 LARGEST_CHUNK = 2**30
 """Bytes, uncompressed; a chunk that claims more is damaged."""
 
-_ALWAYS_ALLOWED, _MOST_TIMES_LARGER = 2**26, 1_000
-"""Bytes, and times its own size, that a chunk may decompress to: no recorder's chunk needs more."""
+ALWAYS_ALLOWED, MOST_TIMES_LARGER = 2**26, 1_000
+"""Bytes, and times its own size, that a chunk or a message may decompress to: no recorder's needs more."""
+
+_ALWAYS_WAITING, _MOST_TIMES_WAITING = 2**28, 20
+"""Bytes, and times the size of the log, of messages that wait until all chunks before them are read."""
 
 _CHUNK_HEAD = struct.Struct("<QQQII")
 _FIXED_HEAD = RECORD_HEAD.size + _CHUNK_HEAD.size
@@ -60,6 +64,8 @@ _AHEAD, _AHEAD_BYTES = 24, 2**24
 has."""
 _LEAST_AHEAD = 8
 """So many times at most, as long as each thread has some, they are read ahead however large they are."""
+_USUAL_TIMES_LARGER = 8
+"""A chunk that decompresses to more than so many times its size counts as one of a larger size."""
 _MOST_SPREAD = 1.5
 """Times their own bytes that chunks and what lies between them may have, to be read at once."""
 
@@ -73,6 +79,7 @@ class ChunkPlace(NamedTuple):
         compressed: whether it is a chunk; else records outside chunks.
         channels: those with messages in it, by the index; None where it does not say.
         has_checksum: whether a chunk must have a checksum, as those of our own logs do.
+        size: bytes that a chunk decompresses to, by the index or by its head; 0 for records outside chunks.
     """
 
     offset: int
@@ -82,6 +89,25 @@ class ChunkPlace(NamedTuple):
     compressed: bool = True
     channels: frozenset[int] | None = None
     has_checksum: bool = False
+    size: int = 0
+
+    @property
+    def weight(self) -> int:
+        """Bytes by which it counts where many are read at the same time."""
+        return max(self.length, self.size // _USUAL_TIMES_LARGER)
+
+
+def most_waiting(lengths: Iterable[int]) -> int:
+    """Return the bytes of messages that may wait for others, by the lengths of all chunks."""
+    return max(_ALWAYS_WAITING, _MOST_TIMES_WAITING * sum(lengths))
+
+
+def too_many_waiting(name: str, most: int) -> LogError:
+    """Return the error that more messages wait than that."""
+    return LogError(
+        f"{name}: chunks that overlap in time hold more than {most} bytes of messages, far more than the log;"
+        " give a part of it by --start and --end, or fewer topics"
+    )
 
 
 def chunk_place(offset: int, record: bytes, length: int) -> ChunkPlace:
@@ -103,7 +129,7 @@ def chunk_place(offset: int, record: bytes, length: int) -> ChunkPlace:
     stored = int.from_bytes(record[data_length : data_length + 8], "little")
     if data_length + 8 + stored != length or size > LARGEST_CHUNK or not start <= end < 2**63:
         raise DamageError("a chunk's head is inconsistent")
-    return ChunkPlace(offset, length, start, end)
+    return ChunkPlace(offset, length, start, end, size=size)
 
 
 def read_records(stream: BinaryIO, place: ChunkPlace) -> bytes:
@@ -161,6 +187,8 @@ def _content(place: ChunkPlace, record: memoryview, decompressor: zstandard.Zstd
         return bytes(record)
     chunk_place(place.offset, bytes(record[:_LONGEST_HEAD]), len(record))
     _, _, size, checksum, name_length = _CHUNK_HEAD.unpack_from(record, RECORD_HEAD.size)
+    if size > max(place.size, ALWAYS_ALLOWED // _TOGETHER):
+        raise DamageError(f"the chunk claims to hold {size} bytes, and the index {place.size}")
     begin = _FIXED_HEAD + name_length
     content = _decompressed(bytes(record[_FIXED_HEAD:begin]), record[begin + 8 :], size, decompressor)
     if len(content) != size:
@@ -198,7 +226,7 @@ def iter_records(
     ahead = 0
     try:
         for group in _groups(places):
-            size = sum(place.length for place in group)
+            size = sum(place.weight for place in group)
             waiting.append((size, Work(partial(reader.read, group), waits=is_planned(stream))))
             waiting[-1][1].hand_out()
             ahead += size
@@ -220,7 +248,7 @@ def _groups(places: Sequence[ChunkPlace]) -> Iterator[Sequence[ChunkPlace]]:
     """Yield the places that a thread takes at once, in order."""
     begin = size = 0
     for number, place in enumerate(places, 1):
-        size += place.length
+        size += place.weight
         if number - begin == _TOGETHER or size >= _TOGETHER_BYTES or number == len(places):
             yield places[begin:number]
             begin, size = number, 0
@@ -412,7 +440,7 @@ def _gather_frames(data: Bytes, table: Integers, frames: Bytes) -> bool:
 def _decompressed(
     compression: bytes, data: memoryview, size: int, decompressor: zstandard.ZstdDecompressor
 ) -> bytes:
-    if compression and size > max(_ALWAYS_ALLOWED, _MOST_TIMES_LARGER * len(data)):
+    if compression and size > max(ALWAYS_ALLOWED, MOST_TIMES_LARGER * len(data)):
         raise DamageError(f"the chunk claims to hold {size} bytes in {len(data)}")
     try:
         if compression == b"zstd":

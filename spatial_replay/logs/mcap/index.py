@@ -31,6 +31,8 @@ from spatial_replay.text import Instant, Sentence
 _FOOTER_BYTES = RECORD_HEAD.size + 20
 _CHUNK_HEAD_BYTES = 64
 _CHUNK_INDEX = struct.Struct("<QQQQI")
+_SIZE_BYTES = 8
+"""At the end of the index of a chunk: what it decompresses to."""
 _CHUNK_INDEX_HEAD = RECORD_HEAD.size + _CHUNK_INDEX.size
 _MOST_ALIKE = 128
 """Indexes of chunks that are taken in together, at most."""
@@ -200,7 +202,8 @@ def _take_in_alike(directory: Directory, section: bytes, position: int) -> int:
     numbers = rows[:count, RECORD_HEAD.size : _CHUNK_INDEX_HEAD - 4].copy().view("<u8")
     start_ns, end_ns, offset, length = numbers.T.tolist()
     beside = repeat(True), repeat(channels), repeat(_is_own(directory.header))
-    directory.chunks += map(ChunkPlace, offset, length, start_ns, end_ns, *beside)
+    sizes = rows[:count, -_SIZE_BYTES:].copy().view("<u8")[:, 0].tolist()
+    directory.chunks += map(ChunkPlace, offset, length, start_ns, end_ns, *beside, sizes)
     return count
 
 
@@ -219,7 +222,8 @@ def _take_in(directory: Directory, opcode: int, body: bytes) -> None:
         start_ns, end_ns, offset, length, indexed = _CHUNK_INDEX.unpack_from(body)
         channels = _indexed_channels(body, indexed)
         is_own = _is_own(directory.header)
-        directory.chunks.append(ChunkPlace(offset, length, start_ns, end_ns, True, channels, is_own))
+        size = int.from_bytes(body[-_SIZE_BYTES:], "little")
+        directory.chunks.append(ChunkPlace(offset, length, start_ns, end_ns, True, channels, is_own, size))
     elif opcode == Opcode.ATTACHMENT_INDEX:
         attachment = decoded(records.AttachmentIndex.read, body)
         directory.attachments.append((attachment.offset, attachment.length))

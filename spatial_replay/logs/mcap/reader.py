@@ -21,6 +21,7 @@ from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.byte_ranges import plan_reads
 from spatial_replay.logs.mcap.chunk_records import RawMessages
 from spatial_replay.logs.mcap.chunk_walk import ChunkWalk
+from spatial_replay.logs.mcap.chunks import most_waiting, too_many_waiting
 from spatial_replay.logs.mcap.index import (
     Directory,
     check_attachments,
@@ -256,6 +257,7 @@ def _blocks(
         and (place.channels is None or not place.channels.isdisjoint(numbers))
     ]
     waiting: list[RawMessages] = []
+    most = most_waiting(place.length for place in places)
     size = samples = number = 0
     enough = FIRST_SAMPLES
     for several, messages in walk.iter_messages(places, is_wanted, prepare):
@@ -283,6 +285,8 @@ def _blocks(
                 yield block
                 enough = min(3 * enough // 2, BLOCK_SAMPLES)
                 waiting, size, samples = [rest], rest.buffer_bytes, _count(rest, objects)
+            if size > most:
+                raise too_many_waiting(walk.name, most)
     rest = _in_order(waiting)
     if len(rest):
         yield rest
