@@ -31,7 +31,7 @@ from spatial_replay.mapping.reading_plan import ReadingPlan
 from spatial_replay.mapping.topic_reader import MISFITS, TopicReader
 from spatial_replay.mapping.tracker import Remarks, Tracker
 from spatial_replay.mapping.transforms import HISTORY_NS, FrameTree
-from spatial_replay.text import Instant, Sentence, nearest_hint, times_apart
+from spatial_replay.text import Instant, Sentence, counted, nearest_hint, times_apart
 from spatial_replay.trace.sample import FOREVER, LATEST_NS
 from spatial_replay.trace.trace import Trace
 
@@ -221,6 +221,11 @@ class Assembler:
             reader.finish()
             if reader.extractor is not None and reader.extractor.is_by_place:
                 self._remarks.add(f"{reader.name}: {BY_PLACE}")
+            if reader.extractor is not None and reader.extractor.cornerless:
+                outlines = counted(reader.extractor.cornerless, "outline")
+                what = "other than two corners" if reader.extractor.is_bounds else "fewer than three corners"
+                hint = "" if reader.extractor.is_bounds else "; `bounds` reads two opposite corners of a box"
+                self._remarks.add(f"{reader.name}: {outlines} with {what}: objects are unknown there{hint}")
             if reader.unstamped:
                 were = (
                     "message without objects was"

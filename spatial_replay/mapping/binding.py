@@ -20,6 +20,7 @@ from spatial_replay.mapping.field_paths import (
     Style,
     below,
     field_names,
+    get_field,
     getter,
     is_list,
     is_number,
@@ -245,10 +246,14 @@ def _first(alternatives: Sequence[_Option], resolve: Callable[[_Option], _Resolv
 
 
 def _polygon(layout: MessageLayout, example: object, style: Style) -> Get | None:
-    if not layout.polygon:
+    text = layout.polygon[0] if layout.polygon else layout.shape.outline if layout.shape else ""
+    if not text:
         return None
-    path = FieldPath.of(layout.polygon[0])
+    path = FieldPath.of(text)
     value = walk(path, example)
+    if "points" in field_names(value):
+        # geometry_msgs/Polygon
+        path, value = below(path, "points"), get_field(value, "points")
     if not is_list(value):
         raise FieldError(f"{path.text}: expected a list of corners, got {type_name(value)}")
     return getter(path, style)

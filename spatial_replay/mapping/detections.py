@@ -17,6 +17,7 @@ from spatial_replay.mapping.binding import Binding
 from spatial_replay.mapping.field_paths import FieldPath, Style, field_names, style_of, tuple_getter
 from spatial_replay.mapping.footprints import BOX, DISC, POLYGON, SPHERE, Solid, Solids
 from spatial_replay.mapping.message_types import MessageLayout
+from spatial_replay.mapping.model import ShapeMapping
 from spatial_replay.mapping.transforms import (
     Transforms,
     matrices_from_quaternions,
@@ -157,7 +158,10 @@ def detections_from_chunks(
         poses = _poses(layout, binding, numbers)
         if binding.polygon is not None:
             counts = np.concatenate([chunk.corner_counts for chunk in chunks])
-            solids = _polygons(counts, np.concatenate([chunk.corners for chunk in chunks]))
+            own = None
+            if layout.shape is not None:
+                own = _placed_shape(layout.shape, poses), poses.rotation
+            solids = _polygons(counts, np.concatenate([chunk.corners for chunk in chunks]), own)
         else:
             solids = _shapes(layout, binding, poses, numbers)
     has_frames, has_stamps = chunks[0].frames is not None, chunks[0].stamps is not None
@@ -301,7 +305,8 @@ def _listed_solids(listed: list[list[Solid]]) -> tuple[Solids, Poses]:
 
 def _shapes(layout: MessageLayout, binding: Binding, poses: Poses, numbers: Floats) -> Solids:
     """Return one solid each: the shape of the mapping or of the message; a point without either."""
-    shape, position = layout.shape, poses.position
+    shape = layout.shape
+    position = poses.position if shape is None else _placed_shape(shape, poses)
     count = len(position)
     size = np.full((count, 3), np.nan)
     counts, points = np.zeros(count, np.int64), np.empty((0, 3))
@@ -316,8 +321,6 @@ def _shapes(layout: MessageLayout, binding: Binding, poses: Poses, numbers: Floa
             size[:, axis] = numbers[:, measure] if isinstance(measure, int) else measure
         if kind == DISC:
             size[:, 0] *= 2
-        if shape.offset != (0.0, 0.0):
-            position = position + poses.rotation[:, :, :2] @ np.array(shape.offset)
         if shape.points:
             corners = np.array([(x, y, 0.0) for x, y in shape.points])
             counts, points = np.full(count, len(corners)), np.tile(corners, (count, 1))
@@ -327,16 +330,57 @@ def _shapes(layout: MessageLayout, binding: Binding, poses: Poses, numbers: Floa
     return Solids(owner, kinds, position, poses.rotation, size, starts_from_counts(counts), points)
 
 
-def _polygons(counts: Integers, points: Floats) -> Solids:
-    """Return polygons with corners in the frame of their message, not in the object's own."""
+def _placed_shape(shape: ShapeMapping, poses: Poses) -> Floats:
+    """Return where the origins (R, 3) of a shape are, with its offset from those of objects."""
+    if shape.offset == (0.0, 0.0):
+        return poses.position
+    return np.asarray(poses.position + poses.rotation[:, :, :2] @ np.array(shape.offset))
+
+
+def _polygons(counts: Integers, points: Floats, own: tuple[Floats, Floats] | None) -> Solids:
+    """Return polygons with corners in the frame of their message, or in the objects' own.
+
+    Args:
+        own: positions (R, 3), rotations (R, 3, 3) of the objects' own frames; None for that of the message.
+    """
     count = len(counts)
     owner, kind = np.arange(count), np.full(count, POLYGON, np.int8)
-    position, rotation = np.zeros((count, 3)), no_rotations(count)
+    position, rotation = own or (np.zeros((count, 3)), no_rotations(count))
     size = np.full((count, 3), np.nan)
     return Solids(owner, kind, position, rotation, size, starts_from_counts(counts), points)
 
 
-def points_from_lists(lists: list[Any]) -> tuple[Integers, Floats]:
+_LEAST_CORNERS = 3
+
+
+def outlines_from_lists(lists: list[Any], *, is_bounds: bool) -> tuple[Integers, Floats, int]:
+    """Return the counts (R,) and the corners (V, 3) of outlines, and how many have too few corners.
+
+    These have one corner, NaN, so that their objects are unknown.
+
+    Args:
+        is_bounds: whether each list has two opposite corners of a box, which become four.
+    """
+    counts, points = _points_from_lists(lists)
+    if is_bounds:
+        few = counts != 2
+        starts = starts_from_counts(counts)[:-1][~few]
+        ends = np.stack([points[starts], points[starts + 1]]) if len(starts) else np.empty((2, 0, 3))
+        (left, low, _), (right, high, _) = ends.min(axis=0).T, ends.max(axis=0).T
+        xs, ys = np.stack([left, right, right, left], axis=1), np.stack([low, low, high, high], axis=1)
+        boxes = np.stack([xs, ys, np.zeros_like(xs)], axis=2).reshape(-1, 3)
+        counts, points = np.where(few, 0, 4), boxes
+    else:
+        few = counts < _LEAST_CORNERS
+    if not few.any():
+        return counts, points, 0
+    kept = np.repeat(~few, counts)
+    at = starts_from_counts(np.where(few, 0, counts))[:-1][few]
+    points = np.insert(points[kept], at, np.nan, axis=0)
+    return np.where(few, 1, counts), points, int(np.count_nonzero(few))
+
+
+def _points_from_lists(lists: list[Any]) -> tuple[Integers, Floats]:
     """Return the counts (R,) and the corners (V, 3) of lists of points, of pairs, or of x, y, x, y …."""
     example = next((each[0] for each in lists if len(each)), None)
     flat = list(chain.from_iterable(lists))

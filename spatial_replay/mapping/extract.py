@@ -16,7 +16,7 @@ from spatial_replay.mapping.detections import (
     Detections,
     covariances,
     detections_from_chunks,
-    points_from_lists,
+    outlines_from_lists,
     rows_from_tuples,
 )
 from spatial_replay.mapping.field_paths import (
@@ -70,6 +70,8 @@ class Extractor:
         self, layout: MessageLayout, mapping: TopicMapping, names: Codes, classes: Codes, *, needs_frame: bool
     ) -> None:
         self.noted_frames: set[str] = set()
+        self.cornerless = 0
+        """Outlines with too few corners, whose objects are unknown."""
         self._layout = layout
         self._classes = classes
         self._namer = Namer(NameTemplate.of(layout.name), mapping.topic, names, mapping.only, mapping.without)
@@ -80,6 +82,11 @@ class Extractor:
         self._time: TimeGetter | None = None
         self._time_of_empty: TimeGetter | None = None
         self._is_time_bound = False
+
+    @property
+    def is_bounds(self) -> bool:
+        """Whether outlines are boxes by two of their corners."""
+        return self._layout.is_bounds
 
     @property
     def is_by_place(self) -> bool:
@@ -163,6 +170,7 @@ class Extractor:
     def _fill(
         self, chunk: DetectionChunk, binding: Binding, messages: Sequence[object], objects: _Objects
     ) -> None:
+        cornerless = 0
         if self._layout.solids:
             get, solids_of = lenient_getter(binding.style), _SOLIDS_OF[self._layout.solids]
             solids = [solids_of(each, get) for each in objects.values]
@@ -171,7 +179,8 @@ class Extractor:
             objects = objects.where([bool(each) for each in solids])
         elif binding.polygon is not None:
             corners = [binding.polygon(each) for each in objects.values]
-            chunk.corner_counts, chunk.corners = points_from_lists(corners)
+            outlines = outlines_from_lists(corners, is_bounds=self._layout.is_bounds)
+            chunk.corner_counts, chunk.corners, cornerless = outlines
         values = objects.values
         if binding.numbers is not None:
             rows = map(binding.numbers, values)
@@ -183,6 +192,7 @@ class Extractor:
         if binding.lifetime is not None:
             chunk.lifetimes = binding.lifetime.nanoseconds(values)
         chunk.message, chunk.name = objects.message, objects.name
+        self.cornerless += cornerless
 
     def _flatten(self, messages: Sequence[object]) -> tuple[list[Any], list[int], list[int | str]]:
         """Return all objects, the index of each one's message, and its index, or key, in that message."""

@@ -12,6 +12,7 @@ import re
 from collections.abc import Mapping as Table
 from functools import cache
 from importlib.resources import files
+from itertools import combinations
 from math import pi
 from os import PathLike
 from types import MappingProxyType
@@ -116,7 +117,8 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
         if isinstance(shape, str) and shape not in shapes:
             hint = nearest_hint(shape, shapes) or f"shapes are {', '.join(shapes) or 'none'}"
             faults.append((("topics", topic, "shape"), f"there is no shape {shape[:60]!r}; {hint}"))
-        for one, other in (("polygon", "shape"), ("orientation", "yaw")):
+        outlines = combinations(("polygon", "bounds", "shape"), 2)
+        for one, other in (*outlines, ("orientation", "yaw")):
             if one in entry and other in entry:
                 faults.append((("topics", topic, other), f"there is {one!r} already; give one of the two"))
     for place, text in _durations(value):
@@ -159,6 +161,7 @@ def _topic_mapping(topic: str, entry: Table[str, Any], shapes: Table[str, Any]) 
         yaw=yaw["field"] if isinstance(yaw, dict) else yaw,
         yaw_scale=pi / 180 if isinstance(yaw, dict) and yaw.get("unit") == "deg" else 1.0,
         polygon=entry.get("polygon"),
+        bounds=entry.get("bounds"),
         shape=_shape(entry.get("shape"), shapes),
         height=(_measure(height[0]), _measure(height[1])) if height else None,
         uncertainty=_uncertainty(entry.get("uncertainty")),
@@ -197,6 +200,8 @@ def _shape(value: Any, shapes: Table[str, Any]) -> ShapeMapping | None:
         return ShapeMapping("box", tuple(_measure(size) for size in value["box"]), offset=offset)
     if "disc" in value:
         return ShapeMapping("disc", (_measure(value["disc"]),), offset=offset)
+    if isinstance(value["polygon"], str):
+        return ShapeMapping("polygon", outline=value["polygon"], offset=offset)
     corners = tuple((float(x), float(y)) for x, y in value["polygon"])
     return ShapeMapping("polygon", points=corners, offset=offset)
 

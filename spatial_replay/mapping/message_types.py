@@ -30,6 +30,7 @@ class MessageLayout:
         name: a name template.
         position: alternatives, each the path of a point or the paths of its coordinates.
         angle_scale: radians in one unit of `yaw`.
+        is_bounds: whether `polygon` leads to two opposite corners of a box along the axes.
         sizes: alternatives, each the paths of length, width and maybe height of a box.
         frame, stamp: in the object, or with `$.` in the message.
         solids: the kind of message that lists the solids of an object; "" for objects with a single shape.
@@ -46,6 +47,7 @@ class MessageLayout:
     yaw: Alternatives = ()
     angle_scale: float = 1.0
     polygon: Alternatives = ()
+    is_bounds: bool = False
     sizes: tuple[Alternatives, ...] = ()
     class_name: str | None = None
     class_field: Alternatives = ()
@@ -243,6 +245,8 @@ def _shape_changes(mapping: TopicMapping) -> dict[str, object]:
     changes: dict[str, object] = {}
     if mapping.polygon is not None:
         changes |= {"polygon": (mapping.polygon,), "sizes": (), "solids": ""}
+    if mapping.bounds is not None:
+        changes |= {"polygon": (mapping.bounds,), "is_bounds": True, "sizes": (), "solids": ""}
     if mapping.shape is not None:
         changes |= {"shape": mapping.shape, "polygon": (), "sizes": (), "solids": ""}
     if mapping.height is not None:

@@ -37,13 +37,14 @@ class ShapeMapping:
 
     Attributes:
         kind: "box" (sizes: length along x, width along y, or also height along z), "disc" (sizes: radius) or
-            "polygon" (points: its corners).
+            "polygon" (points: its corners; or outline: the path of these in each message).
         offset: its centre (x, y) in the object's own frame, in footprint units.
     """
 
     kind: Literal["box", "disc", "polygon"]
     sizes: tuple[Measure, ...] = ()
     points: tuple[tuple[float, float], ...] = ()
+    outline: str = ""
     offset: tuple[float, float] = (0.0, 0.0)
 
 
@@ -97,6 +98,7 @@ class TopicMapping:
         position: path of a point, or paths of x, y and maybe z.
         orientation: path of a quaternion.
         yaw: path of an angle; times `yaw_scale` it is in radians.
+        bounds: path of two opposite corners of a box along the axes.
         only, without: patterns of names to keep, and to leave out.
         max_age_ns: how long an observation stays valid.
         clock: the clock of this topic, if not that of the mapping.
@@ -116,6 +118,7 @@ class TopicMapping:
     yaw: str | None = None
     yaw_scale: float = 1.0
     polygon: str | None = None
+    bounds: str | None = None
     shape: ShapeMapping | None = None
     height: tuple[Measure, Measure] | None = None
     uncertainty: Uncertainty | None = None

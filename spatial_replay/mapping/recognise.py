@@ -26,6 +26,7 @@ _TURNS = ("orientation", "rotation", "quaternion")
 _YAWS = ("yaw", "theta", "heading", "angle")
 _SIZES = ("dimension", "dimensions", "size", "scale", "extent", "shape", "bbox")
 _OUTLINES = ("corners", "polygon", "points", "vertices", "outline", "footprint", "contour")
+_BOUNDS = ("xyxy", "bounds", "bbox_xyxy", "box_xyxy")
 _NAMES = ("name", "id", "track_id", "object_id", "tracking_id", "child_frame_id", "uuid", "label")
 _NAMES_BESIDE = ("name", "names", "id", "ids", "object_names", "object_ids", "tracking_ids", "track_ids")
 """Lists with a name for each element of another list."""
@@ -64,6 +65,7 @@ class Guess:
     Attributes:
         objects: of the list of objects, or None for a single one.
         position: of a point, or of x and y.
+        is_own: whether the outline is in the object's own frame, at its pose.
         size: of length, width and maybe height; or of a radius.
         names: candidates for what distinguishes objects, the likeliest first; `index` for keys of an object.
         is_in_pixels: whether coordinates look like pixels.
@@ -75,6 +77,8 @@ class Guess:
     orientation: str | None = None
     yaw: str | None = None
     polygon: str | None = None
+    is_own: bool = False
+    bounds: str | None = None
     size: tuple[str, ...] = ()
     names: tuple[str, ...] = ()
     class_name: str | None = None
@@ -84,8 +88,15 @@ class Guess:
     @property
     def score(self) -> int:
         """How many fields of an object there are; a place counts most."""
-        parts = (self.polygon, self.size, self.names, self.orientation or self.yaw, self.class_name)
-        return 10 * (self.polygon is not None or self.position is not None) + sum(map(bool, parts))
+        parts = (
+            self.polygon or self.bounds,
+            self.size,
+            self.names,
+            self.orientation or self.yaw,
+            self.class_name,
+        )
+        has_place = any(each is not None for each in (self.polygon, self.bounds, self.position))
+        return 10 * has_place + sum(map(bool, parts))
 
 
 def guess_objects(topic: str, kind: str, messages: Sequence[object]) -> Guess | None:
@@ -99,7 +110,8 @@ def guess_objects(topic: str, kind: str, messages: Sequence[object]) -> Guess | 
     guesses = [guess for each in messages if (guess := _guess(each)) is not None]
     if not guesses:
         return None
-    best = max(guesses, key=lambda guess: guess.score)
+    # an outline at a pose near the origin may be in either frame, which another message decides
+    best = max(guesses, key=lambda guess: (guess.score, guess.is_own))
     if best.names == (INDEX,):
         return best
     names = tuple(name for name in best.names if _distinguishes(name, best, messages))
@@ -204,26 +216,48 @@ def _is_table_of_objects(value: object) -> TypeGuard[dict[str, object]]:
 def _object_in(value: object) -> Guess | None:
     """Find the fields of one object in a message or an element of a list."""
     fields = dict(_iter_fields(value))
-    polygon = next((path for path in _named(fields, _OUTLINES) if _is_outline(fields[path])), None)
-    if polygon is not None and not is_list(fields[polygon]):
-        polygon = f"{polygon}.points"
     position, turn = _pose_in(fields)
-    if polygon is not None and turn is not None and not _is_around(fields[polygon], fields, position):
-        # such as pixels beside a pose in metres
-        polygon = None
-    if polygon is None and position is None:
+    polygon, corners = _outline_in(fields)
+    bounds = next((path for path in _named(fields, _BOUNDS) if _numbers(fields[path], 4)), None)
+    is_own = False
+    if polygon is not None and turn is not None and isinstance(position, str):
+        place = _point(fields[position]) or (0.0, 0.0)
+        is_own = not _is_around(corners, place) and _is_around(corners, (0.0, 0.0))
+        if not is_own and not _is_around(corners, place):
+            # such as pixels beside a pose in metres
+            polygon, corners = None, []
+    if polygon is not None or position is not None:
+        bounds = None
+    if polygon is None and position is None and bounds is None:
         return None
-    yaw = _first(fields, _YAWS, _is_number) if polygon is None else None
+    is_posed = polygon is None or is_own
+    if bounds is not None:
+        corners = [tuple(_numbers(fields[bounds], 4))]
+    elif polygon is None and isinstance(position, str) and _IMAGES.search(position):
+        corners = [_point(fields[position]) or ()]
     return Guess(
-        position=position if polygon is None else None,
-        orientation=turn if polygon is None else None,
-        yaw=None if turn else yaw,
+        position=position if is_posed else None,
+        orientation=turn if is_posed else None,
+        yaw=_first(fields, _YAWS, _is_number) if is_posed and not turn else None,
         polygon=polygon,
+        is_own=is_own,
+        bounds=bounds,
         size=_size_in(fields) if polygon is None else (),
         names=_names_in(fields),
         class_name=_first(fields, _CLASSES, lambda each: isinstance(each, str)),
-        is_in_pixels=_is_in_pixels(fields, polygon, position),
+        is_in_pixels=not is_own and _are_pixels(corners),
     )
+
+
+def _outline_in(fields: dict[str, object]) -> tuple[str | None, list[tuple[float, ...]]]:
+    """Return the path of an outline and its corners, if there is one."""
+    for path in _named(fields, _OUTLINES):
+        value = fields[path]
+        if not is_list(value) and "points" in field_names(value):
+            path, value = f"{path}.points", get_field(value, "points")
+        if is_list(value) and len(value) >= 3 and _has(value[0], "xy"):
+            return path, [point for each in value if (point := _point(each)) is not None]
+    return None, []
 
 
 def _pose_in(fields: dict[str, object]) -> tuple[str | tuple[str, ...] | None, str | None]:
@@ -250,21 +284,19 @@ def _point(value: object) -> tuple[float, ...] | None:
     if _has(value, "xy"):
         known = field_names(value)
         return tuple(float(get_field(value, name)) for name in "xyz" if name in known)  # type: ignore[arg-type]
-    if is_list(value) and len(value) in (2, 3) and all(map(is_number, value)) and None not in list(value):
-        return tuple(map(float, value))  # type: ignore[arg-type]
-    return None
+    return tuple(_numbers(value, 2) or _numbers(value, 3)) or None
 
 
-def _corners(value: object) -> list[tuple[float, ...]]:
-    return [point for each in value if (point := _point(each)) is not None]  # type: ignore[attr-defined]
+def _numbers(value: object, count: int) -> list[float]:
+    """Return the numbers of a list that has so many; an empty list for anything else."""
+    if not is_list(value) or len(value) != count:
+        return []
+    numbers = [float(each) for each in value if is_number(each) and each is not None]  # type: ignore[arg-type]
+    return numbers if len(numbers) == count else []
 
 
-def _is_around(outline: object, fields: dict[str, object], position: str | tuple[str, ...] | None) -> bool:
-    """Return whether an outline lies around a position; at most its own size apart."""
-    place = _point(fields[position]) if isinstance(position, str) else None
-    if place is None:
-        return True
-    corners = _corners(outline)
+def _is_around(corners: Sequence[tuple[float, ...]], place: tuple[float, ...]) -> bool:
+    """Return whether an outline lies around a place; at most its own size apart."""
     low, high = (tuple(pick(each[axis] for each in corners) for axis in (0, 1)) for pick in (min, max))
     size = sum(high) - sum(low)
     return all(low[axis] - size <= place[axis] <= high[axis] + size for axis in (0, 1))
@@ -272,18 +304,13 @@ def _is_around(outline: object, fields: dict[str, object], position: str | tuple
 
 _PIXELS = 50
 """Coordinates in pixels reach beyond this as a rule, and are not below 0."""
-_IMAGES = re.compile("pixel|image|bbox|xyxy|keypoint", re.IGNORECASE)
+_IMAGES = re.compile("pixel|image|bbox|keypoint", re.IGNORECASE)
 
 
-def _is_in_pixels(
-    fields: dict[str, object], polygon: str | None, position: str | tuple[str, ...] | None
-) -> bool:
-    """Return whether an outline, or a position whose name speaks of an image, has coordinates like pixels."""
-    points = _corners(fields[polygon]) if polygon is not None else []
-    if polygon is None and isinstance(position, str) and _IMAGES.search(position):
-        points = [point for point in [_point(fields[position])] if point is not None]
-    flat = [number for x, y, *_ in points for number in (x, y)]
-    is_flat = not any(z for _, _, *rest in points for z in rest)
+def _are_pixels(points: Sequence[tuple[float, ...]]) -> bool:
+    """Return whether points, whose z is 0 if there is one, or two corners in a row, look like pixels."""
+    flat = [number for point in points for number in (point if len(point) > 3 else point[:2])]
+    is_flat = not any(point[2] for point in points if len(point) == 3)
     return bool(flat) and is_flat and min(flat) >= 0 and max(flat) >= _PIXELS
 
 
@@ -369,9 +396,3 @@ def _has(value: object, names: str) -> bool:
     """Return whether a message has numbers as fields with these names of one letter."""
     known = field_names(value)
     return all(name in known and _is_number(get_field(value, name)) for name in names)
-
-
-def _is_outline(value: object) -> bool:
-    if not is_list(value):
-        return "points" in field_names(value) and _is_outline(get_field(value, "points"))
-    return len(value) >= 3 and _has(value[0], "xy")

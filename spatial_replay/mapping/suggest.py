@@ -56,6 +56,7 @@ _RADIUS = "0.5"
 _TOGETHER_NS = 10**9
 _NOT_KNOWN: Mapping[str, int] = MappingProxyType({})
 _MOST_SIGNALS = 12
+_TEXTS = frozenset({"name", "label"})
 _PLAIN = re.compile(r"/?[A-Za-z_][\w/.-]*", re.ASCII)
 _MIDDLEWARE = frozenset({"rosout", "rosout_agg", "parameter_events", "clock", "diagnostics"})
 """Topics about programs rather than objects, by the last part of their names."""
@@ -356,10 +357,11 @@ def _fields(name: str, guess: Guess) -> dict[str, str]:
         ("position", guess.position),
         ("orientation", guess.orientation),
         ("yaw", guess.yaw),
-        ("polygon", guess.polygon),
+        ("polygon", None if guess.is_own else guess.polygon),
+        ("bounds", guess.bounds),
     ]
     fields = {key: _value(key, value) for key, value in parts if value is not None}
-    return fields if guess.polygon is not None else {**fields, "shape": _shape(guess)}
+    return fields if {"polygon", "bounds"} & fields.keys() else {**fields, "shape": _shape(guess)}
 
 
 def _flow(fields: Mapping[str, str]) -> str:
@@ -383,6 +385,8 @@ def _value(key: str, value: str | tuple[str, ...]) -> str:
 
 
 def _shape(guess: Guess) -> str:
+    if guess.polygon is not None:
+        return f"{{polygon: {_text(guess.polygon)}}}"
     if not guess.size:
         return f"{{disc: {_RADIUS}}}"
     return f"{{disc: {guess.size[0]}}}" if len(guess.size) == 1 else f"{{box: [{', '.join(guess.size)}]}}"
@@ -392,15 +396,15 @@ def _name(topic: Topic, guess: Guess) -> str:
     if guess.objects is None:
         return name_from_topic(topic.name)
     path = guess.names[0] if guess.names else INDEX
-    if guess.names and (path == INDEX or path.startswith("$.") or path.split(".")[-1] == "name"):
+    if guess.names and (path == INDEX or path.startswith("$.") or path.split(".")[-1] in _TEXTS):
         # names by themselves, and not numbers that need a word
         return f"{{{path}}}"
-    word = guess.objects.removesuffix("[*]").split(".")[-1].removesuffix("s") or "object"
+    word = re.sub("(?<=x)es$|s$", "", guess.objects.removesuffix("[*]").split(".")[-1]) or "object"
     return f"{word}{{{path}}}"
 
 
 def _remarks(guess: Guess) -> tuple[str, ...]:
-    sizeless = () if guess.polygon is not None or guess.size else _SIZELESS
+    sizeless = () if guess.polygon or guess.bounds or guess.size else _SIZELESS
     others = (f"other lists that look like objects: {', '.join(guess.others[:6])}",) if guess.others else ()
     indexed = (BY_PLACE,) if guess.objects is not None and not guess.names else ()
     return sizeless + indexed + others

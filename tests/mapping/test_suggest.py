@@ -67,6 +67,25 @@ def test_corners_are_an_outline() -> None:
     assert topic.position is topic.shape is None
 
 
+def test_an_outline_in_the_objects_own_frame_is_told_from_one_in_the_messages() -> None:
+    around = [{"x": x, "y": y} for x, y in ((-2, -1), (2, -1), (2, 1), (-2, 1))]
+    there = [{"x": 50 + each["x"], "y": each["y"]} for each in around]
+    pose = {"position": {"x": 50.0, "y": 0.0, "z": 0.0}, "orientation": TURN}
+    for corners, is_own in ((around, True), (there, False)):
+        track = {"name": "car", "pose": pose, "shape": {"footprint": {"points": corners}}}
+        (topic,) = suggested(cars={"tracks": [track]})[1].topics
+        own = topic.shape is not None and topic.shape.outline == "shape.footprint.points"
+        assert (own, topic.polygon, topic.position) == (
+            (True, None, "pose.position") if is_own else (False, "shape.footprint.points", None)
+        )
+
+
+def test_boxes_by_two_corners_are_suggested() -> None:
+    _, mapping = suggested(cup={"boxes": [{"label": "cup", "xyxy": [1, 2, 3, 6]}]})
+    (topic,) = mapping.topics
+    assert (topic.objects, topic.name, topic.bounds) == ("boxes[*]", "{label}", "xyxy")
+
+
 def test_classes_are_texts() -> None:
     people = {"name": "anna", "class_name": "person", "position": POINT, "radius": 0.4}
     _, mapping = suggested(people={"tracks": [people]})

@@ -398,3 +398,53 @@ def test_the_class_of_a_detection_is_that_of_its_best_result() -> None:
     detection = ros("vision_msgs/Detection2D", id="a", results=results)
     feed = Feed().add("/det", 0, ros("vision_msgs/Detection2DArray", detections=[detection]))
     assert make("topics: {/det: {}}", feed).trace.classes == ("person",)
+
+
+def points(*pairs: tuple[float, float]) -> list[dict[str, float]]:
+    return [{"x": x, "y": y} for x, y in pairs]
+
+
+RECTANGLE = points((-3, -1), (3, -1), (3, 1), (-3, 1))
+
+
+@pytest.mark.parametrize("outline", [RECTANGLE, {"points": RECTANGLE}])
+@pytest.mark.parametrize("offset", [0.0, 2.0])
+def test_outlines_in_the_objects_own_frame_lie_at_their_poses(outline: object, offset: float) -> None:
+    feed = Feed(types={"/t": "a/Tracks"})
+    thing = {"position": {"x": 10.0, "y": 10.0}, "yaw": pi / 2, "shape": {"footprint": outline}}
+    feed.add("/t", 0, {"tracks": [thing]})
+    shape = f"{{polygon: shape.footprint, offset: [{offset}, 0]}}"
+    made = make(f"topics: {{/t: {{objects: 'tracks[*]', name: car, yaw: yaw, shape: {shape}}}}}", feed)
+    expected = [(11, 7), (11, 13), (9, 13), (9, 7)]
+    found = made.footprint_row(0, "car")
+    assert sorted(map(tuple, found.round(9).tolist())) == sorted((x, y + offset) for x, y in expected)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+@pytest.mark.parametrize("key", ["polygon: outline", "shape: {polygon: outline}"])
+def test_fewer_than_three_corners_are_no_outline(count: int, key: str) -> None:
+    feed = Feed(types={"/t": "a/Tracks"})
+    for time, outline in enumerate((RECTANGLE, RECTANGLE[:count], RECTANGLE)):
+        thing = {"id": 1, "x": 1.0, "y": 1.0, "outline": outline}
+        feed.add("/t", time * SECOND, {"tracks": [thing, {**thing, "id": 2, "outline": RECTANGLE}]})
+    made = make(f"topics: {{/t: {{objects: 'tracks[*]', name: '{{id}}', {key}}}}}", feed)
+    assert (made.states("1"), made.states("2"), made.faults) == ("+?+", "+++", ())
+    assert "/t: 1 outline with fewer than three corners" in made.remarks[0]
+
+
+@pytest.mark.parametrize(
+    "box", [[10, 20, 30, 60], [30, 60, 10, 20], [[10, 60], [30, 20]], points((10, 20), (30, 60))]
+)
+def test_two_opposite_corners_are_a_box_by_a_key_of_its_own(box: object) -> None:
+    feed = Feed(types={"/b": "a/Boxes"})
+    feed.add("/b", 0, {"boxes": [{"id": 1, "box": box}, {"id": 2, "box": box}]})
+    made = make("topics: {/b: {objects: 'boxes[*]', name: '{id}', bounds: box}}", feed)
+    for name in ("1", "2"):
+        found = made.footprint_row(0, name).tolist()
+        assert found == [[10, 20], [30, 20], [30, 60], [10, 60]]
+
+
+def test_an_outline_is_given_once() -> None:
+    for pair in ("polygon: a, bounds: b", "bounds: a, shape: {disc: 1}", "polygon: a, shape: {polygon: b}"):
+        with pytest.raises(UsageError, match="give one of the two"):
+            make(f"topics: {{/b: {{{pair}}}}}", Feed())
