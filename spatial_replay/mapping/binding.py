@@ -7,7 +7,7 @@ are two fields or a number.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from typing import TypeVar
 
@@ -17,6 +17,7 @@ from spatial_replay.mapping.field_paths import (
     FieldError,
     FieldPath,
     Get,
+    Sparse,
     Style,
     below,
     field_names,
@@ -30,12 +31,13 @@ from spatial_replay.mapping.field_paths import (
     type_name,
     walk,
 )
-from spatial_replay.mapping.message_types import MessageLayout
+from spatial_replay.mapping.message_types import Alternatives, MessageLayout
 from spatial_replay.mapping.model import Measure, Stamp
 from spatial_replay.trace.sample import LATEST_NS
 
 _Option = TypeVar("_Option")
 _Resolved = TypeVar("_Resolved")
+_Alternative = TypeVar("_Alternative", str, tuple[str, ...])
 
 _SECOND_NS = 10**9
 _TIME_FIELDS = (
@@ -142,13 +144,14 @@ class _Columns:
     def point(self, path: FieldPath, names: str) -> tuple[int, ...]:
         """Return the columns of a point's coordinates, at least two."""
         value = walk(path, self.example)
-        known = field_names(value)
+        known = tuple(names) if isinstance(value, Sparse) else field_names(value)
         if all(name in known for name in names[:2]):
             return tuple(self.add(below(path, name)) for name in names if name in known)
         if is_list(value) and 2 <= len(value) <= len(names):
             return tuple(self.add(below(path, index)) for index in range(len(value)))
         fields = f"; its fields are {', '.join(known)}" if known else ""
-        raise FieldError(f"{path.text}: {type_name(value)} has no {' and '.join(names[:2])}{fields}")
+        zeros = "; if zeros are left out, add `missing: 0`" if isinstance(value, dict) else ""
+        raise FieldError(f"{path.text}: {type_name(value)} has no {' and '.join(names[:2])}{fields}{zeros}")
 
     def measure(self, measure: Measure) -> float | int:
         """Return a column (int) for a path, or the number itself (float)."""
@@ -165,6 +168,8 @@ def bind(layout: MessageLayout, example: object, message: object, *, needs_frame
         FieldError: a path leads nowhere; the message lists the existing fields.
     """
     style = style_of(example)
+    if isinstance(example, Sparse):
+        layout = _with_what_is_there(layout, example)
     columns = _Columns(example)
     position: tuple[int, ...] = ()
     orientation: tuple[int, ...] = ()
@@ -201,6 +206,26 @@ def bind(layout: MessageLayout, example: object, message: object, *, needs_frame
         class_gets=tuple(getter(path, style) for path in class_paths),
         frame=_frame(layout, example, message, needs_frame),
         lifetime=lifetime,
+    )
+
+
+def _with_what_is_there(layout: MessageLayout, example: Sparse) -> MessageLayout:
+    """Return a layout without alternatives of which nothing is there, which would all be 0."""
+
+    def is_there(paths: Alternatives | str) -> bool:
+        listed = (paths,) if isinstance(paths, str) else paths
+        return any(leads_somewhere(FieldPath.of(path), example) for path in listed)
+
+    def present(alternatives: tuple[_Alternative, ...]) -> tuple[_Alternative, ...]:
+        return alternatives if len(alternatives) < 2 else tuple(filter(is_there, alternatives))
+
+    return replace(
+        layout,
+        # where nothing looks like a position, that is said
+        position=present(layout.position) or layout.position[:1],
+        orientation=present(layout.orientation),
+        yaw=present(layout.yaw),
+        sizes=present(layout.sizes),
     )
 
 
@@ -303,8 +328,9 @@ def bind_time(stamps: Sequence[Stamp], example: object, message: object) -> Time
         value = walk(path, root)
         style = style_of(root)
         names = field_names(value)
+        fits = any if isinstance(value, Sparse) else all
         for parts in _TIME_FIELDS:
-            if all(part in names for part in parts):
+            if fits(part in names for part in parts):
                 pair = tuple_getter([below(path, part) for part in parts], style)
                 return TimeGetter(path, pair, parts, 1)
         if is_number(value):

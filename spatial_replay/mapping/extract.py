@@ -25,6 +25,7 @@ from spatial_replay.mapping.field_paths import (
     NameTemplate,
     elements_of,
     iter_elements,
+    leads_somewhere,
     list_getter,
     style_of,
 )
@@ -70,6 +71,10 @@ class Extractor:
         self, layout: MessageLayout, mapping: TopicMapping, names: Codes, classes: Codes, *, needs_frame: bool
     ) -> None:
         self.noted_frames: set[str] = set()
+        self.unseen: tuple[str, ...] = ()
+        """With zeros left out, the paths of the position while no object had any of them."""
+        if mapping.has_zeros_left_out and mapping.position is not None:
+            self.unseen = (mapping.position,) if isinstance(mapping.position, str) else mapping.position
         self.cornerless = 0
         """Outlines with too few corners, whose objects are unknown."""
         self._layout = layout
@@ -161,6 +166,9 @@ class Extractor:
                 self._binding = bind(self._layout, example, message, needs_frame=self._needs_frame)
                 self._bind_time(example, message)
             self._fill(chunk, self._binding, messages, objects)
+            paths = [FieldPath.of(each) for each in self.unseen]
+            if any(leads_somewhere(path, each) for path in paths for each in objects.values):
+                self.unseen = ()
         return chunk
 
     def detections(self, chunks: Sequence[DetectionChunk], good: Booleans) -> Detections:

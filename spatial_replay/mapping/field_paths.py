@@ -51,6 +51,44 @@ def get_field(value: Any, name: str) -> object:
     return field
 
 
+class Sparse(dict[str, Any]):
+    """A JSON object that leaves out fields which are 0, as proto3 writes it."""
+
+    def __missing__(self, key: str) -> Zero:
+        return ZERO
+
+
+class Zero(Sparse):
+    """A field that was left out: a number, or a message or a list without anything in it."""
+
+    def __float__(self) -> float:
+        return 0.0
+
+    def __index__(self) -> int:
+        return 0
+
+
+ZERO = Zero()
+
+
+def sparse(value: object) -> object:
+    """Return a decoded message with its JSON objects as `Sparse`.
+
+    Raises:
+        ContentError: it is nested too deeply.
+    """
+    try:
+        return _sparse(value)
+    except RecursionError:
+        raise ContentError("its JSON is nested too deeply") from None
+
+
+def _sparse(value: object) -> object:
+    if isinstance(value, dict):
+        return Sparse({key: _sparse(each) for key, each in value.items()})
+    return [_sparse(each) for each in value] if isinstance(value, list) else value
+
+
 def type_name(value: object) -> str:
     """Describe the type of a message or a part of it."""
     if isinstance(value, dict):
@@ -184,18 +222,22 @@ _BRACKETS: Mapping[str, Each | Best | Place] = MappingProxyType(
 )
 
 
-def walk(path: FieldPath, value: object, index: int | str | None = None) -> object:
+def walk(
+    path: FieldPath, value: object, index: int | str | None = None, *, is_strict: bool = False
+) -> object:
     """Return the value at a path without `[*]`.
 
     Args:
         index: the place or the key of an object in its list, for `[index]`.
+        is_strict: whether fields that a sparse message leaves out are missing, and not 0.
 
     Raises:
         FieldError: the path leads nowhere; the text says where it ends and which fields exist there.
     """
     for step in path.steps:
         if isinstance(step, str):
-            value = _named(path, value, step)
+            is_left_out = isinstance(value, Sparse) and not is_strict
+            value = value[step] if is_left_out else _named(path, value, step)  # type: ignore[index]
         elif isinstance(step, int):
             value = _numbered(path, value, step)
         elif isinstance(step, Keyed):
@@ -215,9 +257,9 @@ def _placed(path: FieldPath, value: object, index: int | str | None) -> object:
 
 
 def leads_somewhere(path: FieldPath, value: object) -> bool:
-    """Return whether a path without `[*]` leads somewhere from a value."""
+    """Return whether a path without `[*]` leads to something that is there, from a value."""
     try:
-        walk(path, value)
+        walk(path, value, is_strict=True)
     except FieldError:
         return False
     return True
@@ -308,11 +350,7 @@ def iter_elements(path: FieldPath, message: object) -> Iterator[object]:
     """
     values: list[object] = [message]
     for step in path.steps:
-        if isinstance(step, str):
-            values = [_named(path, value, step) for value in values]
-        elif isinstance(step, int):
-            values = [_numbered(path, value, step) for value in values]
-        elif not isinstance(step, Each):
+        if not isinstance(step, Each):
             values = [walk(FieldPath(path.text, (step,)), value) for value in values]
         else:
             for value in values:

@@ -44,7 +44,7 @@ from spatial_replay.trace.axes import Axes
 SCHEMA_FILE = "mapping.schema.json"
 
 _NO_TIME = re.compile(r"0+(\.0*)?[nums]*", re.ASCII)
-_SIGNAL_KEYS = frozenset({"signals", "max_age", "clock", "stamp", "optional"})
+_SIGNAL_KEYS = frozenset({"signals", "max_age", "clock", "stamp", "optional", "missing"})
 """Keys that do not concern objects: a topic with signals and no other keys has no objects."""
 
 
@@ -173,6 +173,7 @@ def _topic_mapping(topic: str, entry: Table[str, Any], shapes: Table[str, Any]) 
         without=tuple(entry.get("except", ())),
         max_age_ns=age_ns(entry["max_age"]) if "max_age" in entry else None,
         clock=entry.get("clock"),
+        has_zeros_left_out="missing" in entry,
         optional=entry.get("optional", False),
     )
 

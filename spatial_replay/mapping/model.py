@@ -102,6 +102,7 @@ class TopicMapping:
         only, without: patterns of names to keep, and to leave out.
         max_age_ns: how long an observation stays valid.
         clock: the clock of this topic, if not that of the mapping.
+        has_zeros_left_out: whether fields that JSON messages lack are 0.
         reads_objects: false for topics that are read for their signals only.
         optional: whether a log may lack the topic.
     """
@@ -130,6 +131,7 @@ class TopicMapping:
     without: tuple[str, ...] = ()
     max_age_ns: int | None = None
     clock: Clock | None = None
+    has_zeros_left_out: bool = False
     optional: bool = False
 
 

@@ -21,6 +21,7 @@ from spatial_replay.mapping.field_paths import (
     NameTemplate,
     Place,
     Style,
+    Zero,
     field_names,
     get_field,
     getter,
@@ -171,7 +172,8 @@ class Namer:
                 self.is_by_place = self.is_by_place or (isinstance(index, int) and index > 0)
                 return str(index)
             try:
-                word = _text(walk(path, message if path.from_message else thing, index), path)
+                root = message if path.from_message else thing
+                word = _text(walk(path, root, index, is_strict=len(alternatives) > 1), path)
             except FieldError:
                 if len(alternatives) == 1:
                     raise
@@ -205,6 +207,8 @@ def _first_value(gets: Sequence[Get], thing: object) -> Any:
             value = get(thing)
         except (AttributeError, LookupError, TypeError):
             continue
+        if isinstance(value, Zero):
+            return None
         # lists and messages cannot be keys of a dictionary
         return value if isinstance(value, str | int | float | bool) else str(value)
     return None
@@ -223,6 +227,8 @@ def _class_name(layout: MessageLayout, value: object) -> str | None:
 def _text(value: object, path: FieldPath) -> str:
     if isinstance(value, str):
         return value
+    if isinstance(value, Zero):
+        return "0"
     if isinstance(value, float) and value.is_integer():
         return str(int(value))
     if isinstance(value, int | float) or (hasattr(value, "item") and not hasattr(value, "__len__")):

@@ -11,11 +11,13 @@ from spatial_replay.mapping.field_paths import (
     INDEX,
     FieldError,
     FieldPath,
+    Sparse,
     field_names,
     get_field,
     is_list,
     is_number,
     iter_elements,
+    sparse,
     walk,
 )
 
@@ -69,6 +71,7 @@ class Guess:
         size: of length, width and maybe height; or of a radius.
         names: candidates for what distinguishes objects, the likeliest first; `index` for keys of an object.
         is_in_pixels: whether coordinates look like pixels.
+        has_zeros_left_out: whether some objects lack coordinates that others have.
         others: of further lists whose elements look like objects.
     """
 
@@ -83,6 +86,7 @@ class Guess:
     names: tuple[str, ...] = ()
     class_name: str | None = None
     is_in_pixels: bool = False
+    has_zeros_left_out: bool = False
     others: tuple[str, ...] = ()
 
     @property
@@ -107,6 +111,30 @@ def guess_objects(topic: str, kind: str, messages: Sequence[object]) -> Guess | 
     """
     if _VECTORS.search(kind) or _VECTORS.search(topic.rsplit("/", 1)[-1]):
         return None
+    best = _best(messages)
+    if any(isinstance(each, dict) for each in messages):
+        zeros = _best([sparse(each) for each in messages])
+        if zeros is not None and isinstance(zeros.position, str) and _lacks_coordinates(zeros, messages):
+            return replace(zeros, has_zeros_left_out=True)
+    return best
+
+
+def _lacks_coordinates(guess: Guess, messages: Sequence[object]) -> bool:
+    """Return whether every object has a position, some without x or y."""
+    counts = set()
+    for message in messages:
+        try:
+            things = iter_elements(FieldPath.of(guess.objects), message) if guess.objects else [message]
+            places = [walk(FieldPath.of(str(guess.position)), each) for each in things]
+        except FieldError:
+            return False
+        if not all(isinstance(each, dict) for each in places):
+            return False
+        counts |= {len({"x", "y"} & each.keys()) for each in places if isinstance(each, dict)}
+    return bool(counts - {2})
+
+
+def _best(messages: Sequence[object]) -> Guess | None:
     guesses = [guess for each in messages if (guess := _guess(each)) is not None]
     if not guesses:
         return None
@@ -282,7 +310,7 @@ def _pose_in(fields: dict[str, object]) -> tuple[str | tuple[str, ...] | None, s
 def _point(value: object) -> tuple[float, ...] | None:
     """Return the coordinates of a point: of a message with x and y, or of a list of two or three numbers."""
     if _has(value, "xy"):
-        known = field_names(value)
+        known = "xy" if isinstance(value, Sparse) else field_names(value)
         return tuple(float(get_field(value, name)) for name in "xyz" if name in known)  # type: ignore[arg-type]
     return tuple(_numbers(value, 2) or _numbers(value, 3)) or None
 
@@ -395,4 +423,7 @@ def _is_number(value: object) -> bool:
 def _has(value: object, names: str) -> bool:
     """Return whether a message has numbers as fields with these names of one letter."""
     known = field_names(value)
+    if isinstance(value, Sparse):
+        allowed = "xyz" if names == "xy" else names
+        return all(name in allowed and _is_number(value[name]) for name in known)
     return all(name in known and _is_number(get_field(value, name)) for name in names)

@@ -361,6 +361,8 @@ def _fields(name: str, guess: Guess) -> dict[str, str]:
         ("bounds", guess.bounds),
     ]
     fields = {key: _value(key, value) for key, value in parts if value is not None}
+    if guess.has_zeros_left_out:
+        fields["missing"] = "0"
     return fields if {"polygon", "bounds"} & fields.keys() else {**fields, "shape": _shape(guess)}
 
 

@@ -25,6 +25,7 @@ from spatial_replay.mapping.field_paths import (
     FieldPath,
     Get,
     getter,
+    sparse,
     style_of,
     walk,
 )
@@ -106,6 +107,9 @@ class TopicReader:
         self._report = report
         reads = self.is_mapped or self.decodes_on_arrival
         self._decode: Decoder = decoder(planned.name) if reads else _skip
+        if reads and planned.mapping is not None and planned.mapping.has_zeros_left_out:
+            decode = self._decode
+            self._decode = lambda payload: sparse(decode(payload))
         self._time: TimeGetter | None = None
         self._is_time_bound = False
         self._signal_fields = [] if planned.mapping is None else [s.field for s in planned.mapping.signals]
@@ -194,6 +198,11 @@ class TopicReader:
                 is_bound = self.extractor is None or self.extractor.is_bound
             if not is_bound:
                 raise self._misfit_error(first)
+        if self.extractor is not None and self.extractor.is_bound and self.extractor.unseen:
+            listed = ", ".join(self.extractor.unseen)
+            raise self._misfit_error(
+                f"none of its messages has {listed}; with `missing: 0` it would be 0 in all"
+            )
 
     def _read_each(
         self, read: Callable[[Any], Any], items: Sequence[Any], log_times_ns: Sequence[int], good: Booleans

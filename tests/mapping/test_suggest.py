@@ -67,7 +67,7 @@ def test_corners_are_an_outline() -> None:
     assert topic.position is topic.shape is None
 
 
-def test_an_outline_in_the_objects_own_frame_is_told_from_one_in_the_messages() -> None:
+def test_outlines_in_the_frames_of_objects_and_of_messages_are_distinguished() -> None:
     around = [{"x": x, "y": y} for x, y in ((-2, -1), (2, -1), (2, 1), (-2, 1))]
     there = [{"x": 50 + each["x"], "y": each["y"]} for each in around]
     pose = {"position": {"x": 50.0, "y": 0.0, "z": 0.0}, "orientation": TURN}
@@ -84,6 +84,24 @@ def test_boxes_by_two_corners_are_suggested() -> None:
     _, mapping = suggested(cup={"boxes": [{"label": "cup", "xyxy": [1, 2, 3, 6]}]})
     (topic,) = mapping.topics
     assert (topic.objects, topic.name, topic.bounds) == ("boxes[*]", "{label}", "xyxy")
+
+
+def test_zeros_that_json_leaves_out_are_suggested_as_such() -> None:
+    def models(*places: dict[str, float]) -> dict[str, Any]:
+        poses = [
+            {"name": f"m{k}", "position": place, "orientation": {"w": 1}} for k, place in enumerate(places)
+        ]
+        return {"pose": poses}
+
+    for places in (({}, {"x": 2, "z": 0.1}), ({"x": 1, "y": 2}, {"y": 1})):
+        (topic,) = suggested(world=models(*places))[1].topics
+        assert (topic.has_zeros_left_out, topic.name, topic.position) == (True, "{name}", "position")
+        assert topic.orientation == "orientation"
+    (topic,) = suggested(world=models({"x": 1, "y": 2}, {"x": 0, "y": 1}))[1].topics
+    assert not topic.has_zeros_left_out
+    # an object without a position at all is another thing
+    partial = {"pose": [{"name": "a", "position": POINT}, {"name": "b"}]}
+    assert not suggested(world=partial)[1].topics[0].has_zeros_left_out
 
 
 def test_classes_are_texts() -> None:

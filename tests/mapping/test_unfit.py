@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from mapping.feeding import SECOND, Feed, make, pose_stamped, tf, transform
 from spatial_replay import UsageError
@@ -94,3 +98,59 @@ def test_a_fixed_frame_that_the_log_lacks_is_refused_with_the_frames_there_are()
     # the frame of the objects themselves needs no transform
     alone = Feed().add("/p", 1, pose_stamped(1, 0, "odom"))
     assert make("fixed_frame: odom\ntopics: {/p: {}}", alone).states("p") == "+"
+
+
+ZEROS = (
+    "topics: {/w: {objects: 'pose[*]', name: '{name}{id}', position: position, orientation: q, missing: 0}}"
+)
+
+
+def without_zeros(value: Any) -> Any:
+    """The message as proto3 writes it to JSON: without numbers that are 0, and empty lists."""
+    if isinstance(value, dict):
+        return {key: without_zeros(each) for key, each in value.items() if each not in (0, [])}
+    return [without_zeros(each) for each in value] if isinstance(value, list) else value
+
+
+@given(
+    st.lists(
+        st.lists(st.tuples(*[st.sampled_from([0, 1, -2.5])] * 2, st.integers(0, 3)), max_size=3), max_size=4
+    )
+)
+def test_messages_without_their_zeros_read_like_those_with_them(
+    messages: list[list[tuple[float, float, int]]],
+) -> None:
+    made = []
+    for form in (lambda message: message, without_zeros):
+        feed = Feed(types={"/w": "gz.msgs.Pose_V"})
+        # the first message has one object, by which the paths are known
+        for time, objects in enumerate([[(1, 0, 9)], *messages]):
+            poses = [
+                {"name": f"n{k}_", "id": number, "position": {"x": x, "y": y, "z": 0}, "q": {"w": 1, "z": 0}}
+                for k, (x, y, number) in enumerate(objects)
+            ]
+            feed.add("/w", time * SECOND, form({"pose": poses, "header": {"seq": 0}}))
+        made.append(make(ZEROS, feed))
+    assert made[0].trace == made[1].trace
+    assert made[0].faults == made[1].faults == ()
+
+
+def test_a_position_that_no_message_has_is_an_error_even_where_zeros_are_left_out() -> None:
+    feed = Feed(types={"/w": "gz.msgs.Pose_V"}).add("/w", 0, {"pose": [{"name": "a", "position": {"x": 1}}]})
+    for position in ("positoin", "[u, v]"):
+        with pytest.raises(UsageError, match="none of its messages has"):
+            make(f"topics: {{/w: {{objects: 'pose[*]', position: {position}, missing: 0}}}}", feed)
+    # without the key, the error names it
+    with pytest.raises(UsageError, match="add `missing: 0`"):
+        make("topics: {/w: {objects: 'pose[*]', name: '{name}', position: position}}", feed)
+
+
+def test_stamps_and_signals_may_lack_zeros_too() -> None:
+    feed = Feed(types={"/w": "a/Thing"})
+    for seconds, stamp in enumerate(({"nsec": 5}, {"sec": "1"}, {"sec": "2", "nsec": 7})):
+        speed = {"speed": seconds} if seconds else {}
+        feed.add("/w", seconds * SECOND, {"header": {"stamp": stamp}, "position": {"x": 1}, **speed})
+    text = "clock: header\ntopics: {/w: {name: a, position: position, missing: 0, signals: {speed: speed}}}"
+    made = make(text, feed)
+    assert made.trace.times_ns.tolist() == [5, SECOND, 2 * SECOND + 7]
+    assert made.trace.signals["speed"].tolist() == [0, 1, 2]
