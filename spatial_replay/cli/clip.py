@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     "--of",
     metavar="NAME",
     multiple=True,
-    help="Spec to keep the verdict of; repeat for several.  [default: all results]",
+    help="Spec to keep the verdict of; repeat for several.  [default: the violated ones, or all]",
 )
 @click.option(
     "--around", metavar="T", default="0s", help="Keep at least T before and after the samples that decide."
@@ -49,7 +49,8 @@ def clip(
 ) -> int:
     """Cut the smallest part of a log that shows a verdict, for a bug report.
 
-    The clip has the same verdicts, robustness and witnesses as the log. It is an annotated log: every
+    The clip has the same verdicts, robustness and witnesses as the log, of the results that are violated or,
+    where none is, of all. It is an annotated log: every
     viewer plays it, and `replay` evaluates it without other files. Messages of all topics are cut to its
     time; before it come the last message of each topic and the last transform of each frame, with their own
     times.
@@ -83,7 +84,9 @@ def clip(
     warn_of_input(found.whole)
     print_verdicts(found.replayed, output)
     show(_summary(found))
-    for title in found.changed:
+    if found.left_out and not of:
+        show(f"  not kept, since nothing failed there: {', '.join(found.left_out)}; --of NAME keeps one")
+    for title in (each for each in found.changed if of or each not in found.left_out):
         warn(f"{title} has another verdict in the clip than in the log; only {', '.join(found.kept)} is kept")
     if found.added:
         warn(f"{', '.join(found.added)}: fails in the clip alone, which has not all samples of the log")

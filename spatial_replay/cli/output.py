@@ -170,7 +170,7 @@ def _numbers(result: SpecResult, first_ns: int) -> str:
 def _below(result: SpecResult, first_ns: int) -> Iterator[str]:
     """Yield a line for each cause of the verdict, and for each part that decided nothing."""
     # imported here so that --help stays fast
-    from spatial_replay.monitor.sentences import reason_sentence
+    from spatial_replay.monitor.sentences import gap_sentence, reason_sentence
 
     for cause in result.causes:
         is_own = cause.spec == result.name
@@ -182,6 +182,10 @@ def _below(result: SpecResult, first_ns: int) -> Iterator[str]:
             yield f"{label}{reason_sentence(cause.witness, first_ns=first_ns)}"
         elif label:
             yield f"{label}{cause.verdict}, robustness {_shown(cause.robustness)}"
+    witness = result.worst
+    for gap in () if witness is None else witness.gaps:
+        if gap.next_ns is not None and gap.is_at_start:
+            yield gap_sentence(gap, first_ns)
     cut = result.untested if result.tested == "cut" else ()
     for label, parts in (("vacuous", result.vacuous), ("cut", cut)):
         for message in counted_from((part.message for part in parts), first_ns):

@@ -46,9 +46,13 @@ class KeptNode(NamedTuple):
 
 
 def chosen_nodes(results: Sequence[SpecResult], of: Sequence[str]) -> list[KeptNode]:
-    """Return the results, or the results and named specs within them that are asked for."""
+    """Return the results and named specs within them that are asked for, by default those that are violated.
+
+    Where none is violated these are all results.
+    """
     if not of:
-        return [KeptNode(result, 0, result.title) for result in results]
+        violated = [result for result in results if result.verdict is Verdict.VIOLATED]
+        return [KeptNode(result, 0, result.title) for result in violated or results]
     found, known = [], dict[str, None]()
     for result in results:
         names = {node.name: node.id for node in reversed(result.nodes) if node.name is not None}

@@ -40,6 +40,16 @@ class Clip:
     clip_bytes: int
 
     @property
+    def left_out(self) -> tuple[str, ...]:
+        """The titles of results of which nothing is kept, in the order of the log."""
+        kept = {*self.kept}
+        return tuple(
+            each.title
+            for each in self.whole.results
+            if kept.isdisjoint({each.title, *(node.name for node in each.nodes if node.name)})
+        )
+
+    @property
     def is_whole(self) -> bool:
         """Whether nothing smaller has the same verdict and witness."""
         return self.replayed.samples == self.whole.samples
@@ -88,7 +98,7 @@ def cut_clip(
     Args:
         options: what is evaluated; `keep` chooses the topics.
         around_ns: keep at least so much before and after the samples that decide.
-        of: names of the specs to keep; all results without it.
+        of: names of the specs to keep; without it the violated results, or all where none is violated.
         inputs: files that the output must not be.
 
     Raises:

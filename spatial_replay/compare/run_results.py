@@ -14,7 +14,7 @@ from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.sentences import reason_sentence
 from spatial_replay.spec.formula import Atom, Specification, iter_nodes
 from spatial_replay.spec.walks import other_names
-from spatial_replay.text import Instant, Sentence, json_number, number_text
+from spatial_replay.text import Instant, Sentence, json_number, with_unit
 from spatial_replay.trace.trace import Trace
 
 
@@ -50,7 +50,7 @@ class RunSpecDiff:
 
     def sentences(self, starts_ns: tuple[int, int]) -> Iterator[Sentence]:
         """Yield what differs; times of each run count from its own start."""
-        texts = [f"{each.verdict} ({number_text(each.robustness)})" for each in (self.a, self.b)]
+        texts = [f"{each.verdict} ({with_unit(each.robustness, each.unit)})" for each in (self.a, self.b)]
         yield Sentence(" | ".join(texts) + ("" if self.is_different else ", the same"))
         if self.first_ns is not None:
             yield Sentence("the sign of its value differs since ", Instant(self.first_ns, starts_ns[0]))

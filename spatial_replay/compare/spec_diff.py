@@ -15,7 +15,7 @@ from spatial_replay.compare.edits import Edit, TreeDiff
 from spatial_replay.lazy import Displayed
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.sentences import reason_sentence
-from spatial_replay.text import Instant, Sentence, counted, json_number, number_text
+from spatial_replay.text import Instant, Sentence, counted, json_number, with_unit
 
 
 class FirstDifference(NamedTuple):
@@ -94,7 +94,8 @@ class SpecDiff(Displayed):
             f"{outcome} → {_outcome_text(self.new)}" if self.is_different else f"{outcome}, the same"
         )
         if self.first is not None:
-            values = f"{number_text(self.first.old)} → {number_text(self.first.new)}"
+            old, new = with_unit(self.first.old, self.old.unit), with_unit(self.first.new, self.new.unit)
+            values = f"{old} → {new}"
             yield Sentence("first differs at ", Instant(self.first.time_ns, first_ns), f": {values}")
         for edit, alone in zip(self.cause, self.alone, strict=True):
             more = max(len(edit.old_nodes), len(edit.new_nodes)) - 1
@@ -102,7 +103,7 @@ class SpecDiff(Displayed):
             yield Sentence(f"because: {edit}, in `{edit.spec}`{elsewhere}")
             yield from self._lines_of(edit, shown)
             if alone is not None:
-                number = number_text(alone.robustness)
+                number = with_unit(alone.robustness, self.old.unit)
                 yield Sentence(f"  with this edit alone: {alone.verdict}, robustness {number}")
         if len(self.cause) > 1:
             yield Sentence(self._together())
@@ -184,4 +185,4 @@ _MOST_LISTED: Final = 8
 
 
 def _outcome_text(result: SpecResult) -> str:
-    return f"{result.verdict} ({number_text(result.robustness)})"
+    return f"{result.verdict} ({with_unit(result.robustness, result.unit)})"

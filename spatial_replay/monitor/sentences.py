@@ -75,7 +75,7 @@ def sentences_of(
         sentences.append(_dead_end(witness.path[-1], first_ns))
     elif witness.deciding.unknown:
         sentences.append(_unknown(witness, witness.deciding, first_ns))
-        sentences += [_gap(each, first_ns) for each in witness.gaps]
+        sentences += [gap_sentence(each, first_ns) for each in witness.gaps]
     elif witness.verdict is Verdict.UNKNOWN:
         sentences.append(_uncertain(witness, witness.deciding, first_ns))
     else:
@@ -374,7 +374,7 @@ def _unknown(witness: Witness, deciding: DecidingAtom, first_ns: int) -> Sentenc
     )
 
 
-def _gap(gap: Gap, first_ns: int) -> Sentence:
+def gap_sentence(gap: Gap, first_ns: int) -> Sentence:
     """Return in how many samples an object or a signal is missing, and which samples leave that out."""
     if gap.missing == gap.samples:
         return Sentence(f"{gap.name} is missing in every sample.")

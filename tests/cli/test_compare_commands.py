@@ -195,6 +195,21 @@ def test_a_clip_says_how_small_it_got_and_is_replayed_without_other_files(
     assert said(capsys, *arguments, "--around", "1s")[1].count("92 of 546 samples") == 1
 
 
+@pytest.mark.usefixtures("folder")
+def test_a_clip_of_several_results_keeps_those_that_failed_and_says_what_it_left_out(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    Path("two.spatial").write_text(
+        "spec rest = F (cup dist plate >= 0)\nspec apart = G (cup dist plate >= 1)"
+    )
+    arguments = ("clip", "table.jsonl", "--spec", "two.spatial", "-o", "two.mcap")
+    code, out, err = said(capsys, *arguments)
+    assert (code, "another verdict" in err) == (0, False)
+    assert "\n  apart: " in out
+    assert "not kept, since nothing failed there: rest; --of NAME keeps one" in out
+    assert "not kept" not in said(capsys, *arguments, "--of", "rest", "--of", "apart")[1]
+
+
 def test_a_clip_fails_for_the_reason_that_settled_the_verdict_not_only_with_the_least_number(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -266,6 +266,21 @@ def test_an_antecedent_that_never_held_fails_a_gate_under_the_semantics_of_the_p
     assert _document(folder, "polite.spatial", *paper, "--allow", "vacuous")[0] == 0
 
 
+def test_replay_names_the_option_that_leaves_out_what_is_missing_at_the_start(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "near.spatial").write_text("spec near = G (cup dist plate >= 0)\n")
+    lines = LOG.read_text().splitlines()
+    first = json.loads(lines[0])
+    first["objects"] = [each for each in first["objects"] if each["name"] != "plate"]
+    (folder / "late.jsonl").write_text("\n".join([json.dumps(first), *lines[1:]]))
+    log = str(folder / "late.jsonl")
+    assert run(["replay", log, "--spec", "near.spatial"]) == 4
+    said = capsys.readouterr().out
+    assert "plate is missing in 1 of 300 samples, all before 0.033 s: --from 0.033s leaves them out." in said
+    assert run(["replay", log, "--spec", "near.spatial", "--from", "0.033s"]) == 0
+
+
 def test_an_unknown_verdict_can_fail_a_gate(folder: Path) -> None:
     (folder / "unknown.spatial").write_text("spec s = G (cupp ovlp plate)\n")
     assert _document(folder, "unknown.spatial")[0] == 4

@@ -182,7 +182,8 @@ def test_a_clip_has_the_verdicts_the_robustness_and_the_witnesses_of_the_log(spe
     assume(whole.results)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "clip.mcap")
-        clip = sr.clip_log(trace, specification, output=path, each=each)
+        titles = [result.title for result in whole]
+        clip = sr.clip_log(trace, specification, output=path, each=each, of=titles)
         cut = sr.read_trace(path)
     assert len(cut) == clip.replayed.samples <= len(trace)
     assert set(cut.times_ns.tolist()) <= set(trace.times_ns.tolist())
