@@ -39,6 +39,16 @@ _MOST_UNPACKED = 2**26
 _File: TypeAlias = McapLog | SqliteBag
 
 
+def files_of_bag_around(path: Path) -> tuple[str, ...]:
+    """Return the names of all files of the bag that a file is in; none where no metadata lists it."""
+    try:
+        with path.with_name(METADATA_FILE).open("rb") as stream:
+            listed = bag_metadata_from_text(stream.read(LARGEST_METADATA + 1).decode()).files
+    except (OSError, UnicodeDecodeError, LogError):
+        return ()
+    return listed if path.name in listed else ()
+
+
 class BagFolder(MessageReader):
     """A folder with the files of one ROS 2 bag."""
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from spatial_replay.bags.columns import Columns, MessageColumns, in_pieces, joined, without_jumps
 from spatial_replay.bags.decoders import why_unreadable
+from spatial_replay.bags.folder import files_of_bag_around
 from spatial_replay.bags.open import open_messages
 from spatial_replay.bags.reader import MessageReader
 from spatial_replay.bags.ros_definitions import full_type_name
@@ -116,6 +117,10 @@ class MappedSource:
             for topic in plan.absent
         )
         blocks.remarks.extend(_unread(self.name, topics, plan))
+        files = files_of_bag_around(self.path) if isinstance(self.path, Path) else ()
+        if len(files) > 1:
+            what = f"one of the {len(files)} files of a bag; give its folder for all of them"
+            blocks.remarks.append(f"{self.name}: it is {what}")
         as_recorded = self.on_time_jump == "split"
         columns = _columns(reader, plan, read, start_ns, end_ns, as_recorded=as_recorded)
         if not as_recorded and plan.late_ns < LATEST_NS:

@@ -76,11 +76,8 @@ def export_table(
         LogError: a damaged log of which no robustness is left.
         OutputError: the output cannot be written.
     """
-    writer = _WRITERS.get(output.suffix.lower())
-    if writer is None:
-        raise UsageError(
-            f"{output.name} ends in neither {' nor '.join(_WRITERS)}; the ending gives the format"
-        )
+    check_table_name(output)
+    writer = _WRITERS[output.suffix.lower()]
     titles, automata = _titles(source)
     faults: list[str] = []
     rows, first_ns = 0, 0
@@ -101,6 +98,14 @@ def export_table(
     return rows, len(titles), counted_from(faults, first_ns)
 
 
+def check_table_name(output: Path) -> None:
+    """Raise UsageError if the ending of a file's name is that of no table."""
+    if output.suffix.lower() not in _WRITERS:
+        raise UsageError(
+            f"{output.name} ends in neither {' nor '.join(_WRITERS)}; the ending gives the format"
+        )
+
+
 def _iter_series(source: Source) -> Iterator[tuple[list[RobustnessSeries], tuple[str, ...]]]:
     """Read the robustness of a log, block by block, with what was lost.
 
@@ -110,7 +115,8 @@ def _iter_series(source: Source) -> Iterator[tuple[list[RobustnessSeries], tuple
     """
     if not isinstance(source, McapSource):
         raise UsageError(
-            f"{source.name} is not an annotated log; write one with spatial-replay replay … -o FILE.mcap"
+            f"{source.name} is not an annotated log; give --spec SPEC, or write one with spatial-replay"
+            " replay … -o FILE.mcap"
         )
     for payloads, faults in source.iter_payloads(ROBUSTNESS):
         try:

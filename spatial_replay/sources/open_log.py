@@ -85,6 +85,10 @@ def open_source(
         return FORMATS[kind].open(path, kind, options)
     if not _head(path):
         raise LogError(f"{path.name} is empty; give a log with at least one sample")
+    if isinstance(path, Path) and path.name.endswith((".db3.zstd", ".mcap.zstd")):
+        raise LogError(
+            f"{path.name} is a compressed file of a ROS 2 bag; give its folder, {path.absolute().parent}"
+        )
     raise LogError(f"{path.name} is not a log in a known format; known formats are {', '.join(FORMATS)}")
 
 
@@ -156,6 +160,12 @@ def readable_file(path: str | PathLike[str]) -> LogFile:
             file.stat()
         except (OSError, ValueError) as error:
             raise MissingFileError.of(path, error) from None
+        if file.name == BAG_METADATA and is_bag_folder(file.absolute().parent):
+            # the bag, by one of its files
+            return file.absolute().parent
+        if file.is_dir() and not is_bag_folder(file):
+            what = "no file of a ROS 2 bag (.db3, .mcap)" if any(file.iterdir()) else "nothing"
+            raise MissingFileError(f"{path}: there is {what} in this folder; give the path of a log")
         return file
     if not file.version.has_ranges:
         return downloaded(file, "its server does not give parts of files")

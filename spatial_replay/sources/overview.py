@@ -19,7 +19,7 @@ from spatial_replay.errors import LogError, MissingFileError, UsageError
 from spatial_replay.logs.mcap.reader import McapSource
 from spatial_replay.logs.mcap.summary import LogSummary, summarise_mcap
 from spatial_replay.logs.read_options import FaultList
-from spatial_replay.logs.remote import RemoteFile
+from spatial_replay.logs.remote import RemoteFile, log_file
 from spatial_replay.logs.source import Source, TrackSource, axes_of, reading_only
 from spatial_replay.logs.topics import OBJECTS
 from spatial_replay.mapping.suggest import EXAMPLES, suggest_mapping, suggest_topics
@@ -83,9 +83,10 @@ def messages_in(path: str | PathLike[str]) -> MessageReader | None:
     Raises:
         MissingFileError: there is no such file.
     """
-    file = readable_file(path)
+    file = log_file(path)
     if isinstance(file, Path) and file.is_dir() and not is_bag_folder(file):
         return None
+    file = readable_file(path)
     try:
         reader = open_messages(file)
         if isinstance(reader, McapLog) and (OBJECTS in reader.channel_topics or not reader.channel_topics):
@@ -148,7 +149,9 @@ class _Counter:
         self.missing = {topic.name for topic in topics if topic.count != 0}
         for topic in topics:
             try:
-                self._decoders[topic.name] = reader.decoder(topic.name)
+                if topic.unreadable is not None:
+                    raise LogError(topic.unreadable)
+                self._decoders[topic.name] = reader.decoder(topic)
                 self.examples[topic.name] = []
             except LogError as error:
                 self._remarks.append(_of_topic(topic.name, Sentence(str(error))))

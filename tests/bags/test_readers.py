@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from mcap.writer import Writer
 
 from bags.bag_files import (
+    MAPPING,
     POINT,
     SECOND,
     START_NS,
@@ -20,8 +22,9 @@ from bags.bag_files import (
     write_ros1,
     write_ros2,
 )
-from spatial_replay import LogError, MissingFileError
+from spatial_replay import LogError, MissingFileError, read_trace
 from spatial_replay.bags import MessageReader, Topic, open_messages
+from spatial_replay.cli import run
 
 Write = Callable[[Path, list[Sent]], Path]
 
@@ -316,3 +319,54 @@ def test_a_file_that_is_not_a_log_is_refused(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(LogError, match="not a ROS 2 bag that can be read"):
         open_messages(tmp_path / "empty").topics()
+
+
+def test_a_bag_may_be_given_by_its_metadata(tmp_path: Path) -> None:
+    folder = write_ros2(tmp_path / "drive", drive(5))
+    mapping = tmp_path / "m.yaml"
+    mapping.write_text(MAPPING)
+    assert read_trace(folder / "metadata.yaml", mapping=mapping) == read_trace(folder, mapping=mapping)
+
+
+def test_one_file_of_a_split_bag_says_that_there_are_others(tmp_path: Path) -> None:
+    parts = [write_ros2(tmp_path / f"part{number}", drive(5)) for number in (0, 1)]
+    bag = split_ros2(tmp_path / "drive", parts)
+    mapping = tmp_path / "m.yaml"
+    mapping.write_text(MAPPING)
+    first = next(each for each in sorted(bag.iterdir()) if each.suffix != ".yaml")
+    assert "one of the 2 files of a bag; give its folder" in read_trace(first, mapping=mapping).remarks[-1]
+    (alone,) = write_ros2(tmp_path / "alone", drive(5)).glob("*.mcap")
+    assert read_trace(alone, mapping=mapping).remarks == ()
+
+
+def test_folders_and_files_that_are_no_logs_say_what_to_give(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(MissingFileError, match="there is nothing in this folder"):
+        read_trace(tmp_path / "empty")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "notes.txt").write_text("words")
+    with pytest.raises(MissingFileError, match="no file of a ROS 2 bag"):
+        read_trace(tmp_path / "other")
+    packed = next(write_ros2(tmp_path / "drive", drive(5), compression="file").glob("*.zstd"))
+    with pytest.raises(LogError, match="compressed file of a ROS 2 bag; give its folder"):
+        read_trace(packed)
+
+
+def test_a_survey_names_two_definitions_of_a_topic(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    definitions = ((f"{kind} x\nfloat64 y\n").encode() for kind in ("float64", "float32"))
+    log = tmp_path / "two.mcap"
+    with log.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("ros2", "test")
+        for definition in definitions:
+            channel = writer.register_channel(
+                "/a", "cdr", writer.register_schema("b/msg/P", "ros2msg", definition)
+            )
+            writer.add_message(channel, START_NS, bytes(20), START_NS)
+        writer.finish()
+    run(["info", str(log)])
+    said = capsys.readouterr().err
+    assert "in two definitions" in said
+    assert "bytes" not in said

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from bags.bag_files import MAPPING, drive, write_ros2
 from cli.program import run_program
 from replay.runs import SPECIFICATION, PiecewiseSource, record, run
 from spatial_replay import parse_specification
@@ -50,7 +51,7 @@ def test_the_quantity_can_be_chosen(folder: Path) -> None:
         ("none.mcap", "run.csv", 2, "none.mcap: no such file"),
         ("annotated.mcap", "run.txt", 2, "run.txt ends in neither .csv nor .parquet"),
         ("annotated.mcap", "none/run.csv", 2, "there is no folder none"),
-        ("tracks.csv", "run.csv", 2, "tracks.csv is not an annotated log; write one with"),
+        ("tracks.csv", "run.csv", 2, "tracks.csv is not an annotated log; give --spec"),
         ("recorded.mcap", "run.csv", 2, "recorded.mcap holds no /spatial/robustness; write it with"),
         ("annotated.mcap", "-", 2, "'-' is not a file"),
     ],
@@ -91,3 +92,23 @@ def test_an_export_that_is_interrupted_at_its_end_leaves_nothing_and_says_nothin
         export_table(open_source("annotated.mcap"), folder / f"run.{ending}", advance=interrupt)
     gc.collect()
     assert (sorted(folder.iterdir()), complaints) == (before, [])
+
+
+DRIVE = "spec apart = G (a dist b >= 0.1)\n"
+
+
+def test_a_bag_becomes_a_table_in_one_step(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag = write_ros2(folder / "drive", drive(10))
+    (folder / "m.yaml").write_text(MAPPING)
+    (folder / "s.spatial").write_text(DRIVE)
+    given = ["--mapping", "m.yaml", "--spec", "s.spatial"]
+    assert run_in_process(["export", str(bag), *given, "-o", "a.csv"]) == 0
+    assert run_in_process(["replay", str(bag), *given, "-o", "annotated2.mcap"]) == 0
+    assert run_in_process(["export", "annotated2.mcap", "-o", "b.csv"]) == 0
+    assert (folder / "a.csv").read_bytes() == (folder / "b.csv").read_bytes()
+    # an annotated log is evaluated again where the command says how
+    assert run_in_process(["export", "annotated2.mcap", "--to", "0.35s", "-o", "c.csv"]) == 0
+    assert len((folder / "c.csv").read_text().splitlines()) == 1 + 4
+    # before anything is evaluated, the name of the output is checked
+    assert run_in_process(["export", str(bag), *given, "-o", "a.txt"]) == 2
+    assert "ends in neither" in capsys.readouterr().err
