@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Final, NamedTuple, TypeAlias
 
@@ -34,8 +34,15 @@ MOST_WAITING: Final = 8_192
 MOST_WAITING_BYTES: Final = 64 * 2**20
 """Messages, and bytes of them, that may wait to be evaluated; of more, the oldest are dropped."""
 
+MOST_WARNINGS: Final = 1_000
+"""Warnings of a server that are shown in one run."""
+
 _MOST_CHANNELS: Final = 100_000
-_FRAMES: Final = 64
+_MOST_DEFINITION_BYTES: Final = 64 * 2**20
+"""Of all channels together."""
+_FRAMES: Final = 4
+"""Frames that wait to be decoded, each of up to `LARGEST_FRAME` bytes."""
+_LONGEST_TURN_S: Final = 0.02
 _OPEN_S: Final = 10.0
 _ALIVE_S: Final = 10.0
 """How long a connection may take, and how often and for how long a server is asked whether it is there."""
@@ -63,7 +70,7 @@ class Connected(NamedTuple):
 class Offered(NamedTuple):
     """All channels that the server offers now, after a change."""
 
-    channels: tuple[Channel, ...]
+    channels: Collection[Channel]
 
 
 class Disconnected(NamedTuple):
@@ -93,6 +100,8 @@ class Inbox:
         self._items: deque[Item] = deque()
         self._messages = self._bytes = 0
         self._others: list[Item] = []
+        self._offered: Offered | None = None
+        self._warnings = 0
         self.dropped = 0
         self.filled = asyncio.Event()
 
@@ -103,6 +112,17 @@ class Inbox:
             self._bytes += len(item.payload)
             while self._messages > 1 and (self._messages > MOST_WAITING or self._bytes > MOST_WAITING_BYTES):
                 self._drop()
+        if isinstance(item, Offered):
+            # channels are a view: what waits already says all that is offered now
+            if self._offered is not None and self._offered.channels is item.channels:
+                return
+            self._offered = item
+        if isinstance(item, Warned):
+            self._warnings += 1
+            if self._warnings == MOST_WARNINGS:
+                item = Warned("the server sends too many warnings; further ones are left out")
+            elif self._warnings > MOST_WARNINGS:
+                return
         self._items.append(item)
         self.filled.set()
 
@@ -111,6 +131,7 @@ class Inbox:
         taken = [*self._others, *self._items]
         self._items.clear()
         self._others.clear()
+        self._offered = None
         self._messages = self._bytes = 0
         self.filled.clear()
         return taken
@@ -176,11 +197,18 @@ class Client:
     async def _listen(self, connection: ClientConnection) -> str:
         """Take what comes, until the connection ends; return why it did."""
         offered: dict[int, Channel] = {}
+        channels_now = offered.values()
         subscribed: dict[int, Channel] = {}
         has_warned = False
+        definition_bytes = 0
+        turn_s = time.monotonic()
         try:
             async for raw in connection:
                 arrived_s = time.monotonic()
+                if arrived_s - turn_s > _LONGEST_TURN_S:
+                    # a flood must not keep Ctrl-C and the evaluation waiting
+                    await asyncio.sleep(0)
+                    turn_s = arrived_s
                 try:
                     frame = decoded(raw)
                 except LogError as error:
@@ -201,16 +229,21 @@ class Client:
                         offered |= channels
                         if len(offered) > _MOST_CHANNELS:
                             return f"it offers more than {_MOST_CHANNELS} channels"
+                        definition_bytes += sum(map(_definition_bytes, channels.values()))
+                        if definition_bytes > _MOST_DEFINITION_BYTES:
+                            return (
+                                f"its channels have more than {_MOST_DEFINITION_BYTES} bytes of definitions"
+                            )
                         new = {n: each for n, each in channels.items() if self.wants(each.topic)}
                         if new:
                             subscribed |= new
                             await connection.send(subscribe(new))
-                        self.inbox.put(Offered(tuple(offered.values())))
+                        self.inbox.put(Offered(channels_now))
                     case Unadvertised(numbers):
                         for number in numbers:
                             offered.pop(number, None)
                             subscribed.pop(number, None)
-                        self.inbox.put(Offered(tuple(offered.values())))
+                        self.inbox.put(Offered(channels_now))
                     case StatusMessage(level, text) if level > 0:
                         self.inbox.put(Warned(f"{self.address} says: {text}"))
                     case _:
@@ -218,6 +251,11 @@ class Client:
         except ConnectionClosed as closed:
             return _closing_reason(closed)
         return "the server closed it"
+
+
+def _definition_bytes(channel: Channel) -> int:
+    own = len(channel.topic) + len(channel.encoding)
+    return own if channel.schema is None else own + len(channel.schema.name) + len(channel.schema.data)
 
 
 def _closing_reason(closed: ConnectionClosed) -> str:

@@ -267,7 +267,7 @@ class LiveSession:
                     self.connected.set()
                     self._offered_s = time.monotonic() + _OFFER_S
                 case Offered(channels):
-                    self._channels = channels
+                    self._channels = tuple(channels)
                     self._plan()
                 case Warned(text):
                     self._notes.append(text)

@@ -19,6 +19,7 @@ import pytest
 from mcap.reader import make_reader
 
 import spatial_replay as sr
+from cli.program import PROGRAM, environment
 from live.robots import (
     MAPPING,
     MS,
@@ -302,6 +303,38 @@ def test_a_huge_frame_ends_the_connection_and_not_the_run(tmp_path: Path) -> Non
         found = asyncio.run(updates_of(address, spec, mapped, 2))
     assert any("a frame of more than 64 MB" in note for note in found[1].notes)
     assert set(found[1].sample.unknown) == {"robot", "vase"}
+
+
+def test_what_a_server_floods_with_is_bounded_and_ctrl_c_ends_the_run(tmp_path: Path) -> None:
+    mapped, spec = files(tmp_path, MAPPING, SPEC)
+    channel = {"topic": "/more", "encoding": "json", "schemaName": "", "schema": ""}
+    status = json.dumps({"op": "status", "level": 1, "message": "look out"})
+    sent: list[str | bytes] = []
+    for tick in range(100):
+        sent += [pose(2, tick), pose(1, tick)]
+        for number in range(200):
+            offered = {**channel, "id": 100 + 200 * tick + number}
+            sent += [json.dumps({"op": "advertise", "channels": [offered]}), status]
+    with rude_server(*sent) as address:
+        command = [*PROGRAM, "monitor", address, "--mapping", str(mapped), "--spec", str(spec)]
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+        with subprocess.Popen(command, env=environment(), text=True, **pipes) as process:
+            assert process.stdout is not None
+            said = next(line for line in process.stdout if "too many warnings" in line)
+            process.send_signal(signal.SIGINT)
+            rest, _ = process.communicate(timeout=PATIENCE_S)
+    assert "look out" not in said + rest
+
+
+def test_definitions_without_end_end_the_connection(tmp_path: Path) -> None:
+    mapped, spec = files(tmp_path, MAPPING, SPEC)
+    long = {"topic": "/more", "encoding": "json", "schemaName": "long", "schema": "x" * 2**24}
+    advertised = [
+        json.dumps({"op": "advertise", "channels": [{**long, "id": 100 + number}]}) for number in range(6)
+    ]
+    with rude_server(pose(2, 0), pose(1, 0), *advertised, pose(1, 1)) as address:
+        found = asyncio.run(updates_of(address, spec, mapped, 2))
+    assert any("bytes of definitions" in note for note in found[1].notes)
 
 
 def test_a_clock_that_jumps_back_ends_the_run_with_a_whole_log(
