@@ -349,6 +349,7 @@ def evaluate_logs(
     jobs: int = 1,
     dask: str | None = None,
     fail_on: Sequence[str] = (),
+    allow: Sequence[str] = (),
     constants: Mapping[str, float | str] | None = None,
     each: Mapping[str, str] | None = None,
     semantics: Semantics = "ltlf",
@@ -366,6 +367,8 @@ def evaluate_logs(
             `if __name__ == "__main__":`, as for every process pool.
         dask: the address of a Dask scheduler, whose workers evaluate instead.
         fail_on: "vacuous", "cut", "unknown": results that fail as well.
+        allow: "vacuous", "dropped": results that pass although nothing tested them, and logs that lack
+            samples which their recorder dropped.
         constants, each, semantics, strict_names, reading: as for `replay_log`.
 
     Returns:
@@ -401,6 +404,7 @@ def evaluate_logs(
     else:
         files = [specifications] if isinstance(specifications, str | PathLike) else specifications
         suite = Suite.of_logs([fspath(log) for log in named], [sendable(file) for file in files], conditions)
+    suite = suite.allowing(frozenset(allow))
     return run_batch(prepare(suite), output, workers_of(jobs, dask), fail_on=frozenset(fail_on))
 
 

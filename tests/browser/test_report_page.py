@@ -70,6 +70,19 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Path]:
     report_of_trace(folder / "long.html", two_discs(100_000), text)
     parts = " and ".join(f"(a dist b >= {k / 1000})" for k in range(100))
     report_of_trace(folder / "thinned.html", two_discs(12_000), f"spec s = F[0s, 1s] ({parts})")
+    pressed = [
+        sr.Sample(
+            t * 10**8,
+            {"a": sr.Footprint.disc(0, 0, 1), "b": sr.Footprint.disc(3 + t / 10, 0, 1)},
+            signals={"force": 400.0 - 10 * t},
+        )
+        for t in range(20)
+    ]
+    report_of_trace(
+        folder / "units.html",
+        sr.Trace.from_samples(pressed, units={"": "m", "force": "N"}),
+        "spec apart = G (a dist b >= 1)\nspec soft = G (force <= 300)\nspec s = apart and soft",
+    )
     unseen = [
         sr.Sample(
             t * 10**8,
@@ -337,6 +350,18 @@ def test_lanes_and_curves_share_one_time_axis(open_page: Open) -> None:
             for place in (".strip", ".u-over")
         ]
         assert np.allclose(*edges, atol=1.5)
+
+
+def test_each_unit_has_an_axis_of_its_own(open_page: Open) -> None:
+    page = open_page("units")
+    # time, the result over both units, and each of these
+    assert page.locator(".curves .u-axis").count() == 4
+    left, width = page.locator(".u-over").evaluate(
+        "each => [each.getBoundingClientRect().left, each.clientWidth]"
+    )
+    assert page.locator(".strip").first.evaluate("each => each.getBoundingClientRect().left") == left
+    assert width > 0
+    assert open_page("violated").locator(".curves .u-axis").count() == 2
 
 
 def test_looking_closer_keeps_the_cursor_in_sight(open_page: Open) -> None:

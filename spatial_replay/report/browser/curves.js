@@ -2,6 +2,8 @@
 
 const CHART_HEIGHT = 250;
 const AXIS_LABEL = 18;
+const MOST_AXES = 3;
+const LEAST_AXIS = 50;
 
 function makeCurves(clock) {
   const place = element("div", {class: "curves", role: "group", "aria-label": "Robustness over time"});
@@ -110,21 +112,24 @@ function options(clock, result, curves, shown, width) {
   const axis = {stroke: ink, grid: {stroke: grid, width: 1}, ticks: {stroke: grid, width: 1, size: 4}, font: FONT,
     labelFont: FONT};
   const root = result.nodes[0];
-  const visible = curves.filter((curve) => !shown.hidden.has(curve.node.id));
+  const scales = scalesOf(curves, root, shown.hidden);
+  // a narrow screen has no room for more axes than that of the root
+  const drawn = gutter() / scales.length < LEAST_AXIS ? scales.slice(0, 1) : scales;
+  const axisSize = gutter() / drawn.length - AXIS_LABEL;
   return {
     width, height: CHART_HEIGHT, padding: [8, 0, 0, 0],
     cursor: {show: false}, legend: {show: false},
     scales: {
       x: {time: false, min: clock.view[0], max: clock.view[1]},
-      y: {range: () => rangeOf(visible)},
+      ...Object.fromEntries(scales.map(({key, range}) => [key, {range: () => range}])),
     },
     axes: [
       {...axis, size: 30, values: (_, ticks) => ticks.map((tick) => `${Number(tick.toFixed(6))} s`)},
-      {...axis, size: gutter() - AXIS_LABEL, label: unitText(root.unit), labelSize: AXIS_LABEL,
-        values: (_, ticks) => ticks.map(numberText)},
+      ...drawn.map(({key, unit}) => ({...axis, scale: key, side: 3, size: axisSize, label: unitText(unit),
+        labelSize: AXIS_LABEL, grid: {...axis.grid, show: key === "y"}, values: (_, ticks) => ticks.map(numberText)})),
     ],
     series: [{}, ...curves.map((curve) => ({
-      label: curve.name, show: !shown.hidden.has(curve.node.id), points: {show: result.samples === 1, size: 8},
+      scale: scales.find(({curves}) => curves.includes(curve)).key, label: curve.name, show: !shown.hidden.has(curve.node.id), points: {show: result.samples === 1, size: 8},
       width: curve.colour ? 1.5 : 2.5, dash: curve.isDashed ? [6, 4] : undefined, stroke: curve.colour ?? ((chart) => signGradient(chart)),
     }))],
     hooks: {
@@ -142,8 +147,27 @@ function unitText(unit) {
   return unit === "mixed" ? "robustness, several units" : `robustness in ${unit}`;
 }
 
-// Everything finite, and zero, with some air around.
-function rangeOf(curves) {
+// A scale for each unit, that of the root first; zero is at one height for all, since it is where verdicts change.
+function scalesOf(curves, root, hidden) {
+  const units = [...new Set([root.unit, ...curves.map((curve) => curve.node.unit ?? root.unit)])];
+  const last = Math.min(units.length, MOST_AXES) - 1;
+  const scales = units.slice(0, last + 1).map((unit, index) => ({
+    key: index ? `y${index}` : "y",
+    unit: index === last && units.length > MOST_AXES ? "mixed" : unit,
+    curves: curves.filter((curve) => Math.min(units.indexOf(curve.node.unit ?? root.unit), last) === index),
+  }));
+  for (const scale of scales) {
+    scale.ends = endsOf(scale.curves.filter((curve) => !hidden.has(curve.node.id)));
+    scale.greatest = Math.max(-scale.ends[0], scale.ends[1]) || 1;
+  }
+  const [low, high] = [0, 1].map((end) => Math.max(...scales.map(({ends, greatest}) => Math.abs(ends[end]) / greatest)));
+  const air = 0.08 * (low + high) || 1;
+  for (const scale of scales) scale.range = [-(low + air) * scale.greatest, (high + air) * scale.greatest];
+  return scales;
+}
+
+// The least and the greatest finite number of curves, and zero.
+function endsOf(curves) {
   let low = 0, high = 0;
   for (const {numbers} of curves) {
     for (const number of numbers) {
@@ -151,8 +175,7 @@ function rangeOf(curves) {
       else if (number > high && number < Infinity) high = number;
     }
   }
-  const air = 0.08 * (high - low) || 1;
-  return [low - air, high + air];
+  return [low, high];
 }
 
 function zeroOf(chart) {
