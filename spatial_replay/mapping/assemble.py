@@ -226,6 +226,10 @@ class Assembler:
                 what = "other than two corners" if reader.extractor.is_bounds else "fewer than three corners"
                 hint = "" if reader.extractor.is_bounds else "; `bounds` reads two opposite corners of a box"
                 self._remarks.add(f"{reader.name}: {outlines} with {what}: objects are unknown there{hint}")
+            for signal, texts in reader.unnamed.items():
+                listed = ", ".join(map(repr, texts))
+                what = f"`names` of the signal {signal!r} lacks {listed}; it is unknown there"
+                self._remarks.add(f"{reader.name}: {what}")
             if reader.unstamped:
                 were = (
                     "message without objects was"

@@ -25,6 +25,7 @@ from spatial_replay.mapping.field_paths import (
     NameTemplate,
     elements_of,
     iter_elements,
+    keys_of,
     leads_somewhere,
     list_getter,
     style_of,
@@ -215,12 +216,11 @@ class Extractor:
         index = np.repeat(np.arange(len(counts)), counts).tolist()
         order: list[int | str] = list(chain.from_iterable(map(range, counts)))
         if any(isinstance(each, Mapping) for each in lists):
-            order = [
-                key
-                for each in lists
-                for key in (map(str, each) if isinstance(each, Mapping) else range(len(each)))
-            ]
+            keys = (map(str, keys_of(e)) if isinstance(e, Mapping) else range(len(e)) for e in lists)
+            order = list(chain.from_iterable(keys))
             lists = list(map(elements_of, lists))
+            counts = [len(each) for each in lists]
+            index = np.repeat(np.arange(len(counts)), counts).tolist()
         return list(chain.from_iterable(lists)), index, order
 
     def _elements(self, message: object) -> list[object]:

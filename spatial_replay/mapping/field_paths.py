@@ -112,7 +112,9 @@ Get: TypeAlias = Callable[[Any], Any]
 
 EACH: Final = "*"
 _KEYED = r"[A-Za-z_][\w-]*\[[A-Za-z_][\w-]*=[^\[\]{}|=\s]{1,100}\]"
-PATTERN: Final = rf"(\$\.)?(?=[A-Za-z_])(\.?(?:{_KEYED}|[A-Za-z_][\w-]*)|\[(\d{{1,9}}|\*|best|index)\])+"
+PATTERN: Final = (
+    rf"(\$\.)?(?=[A-Za-z_]|\[\*\])(\.?(?:{_KEYED}|[A-Za-z_][\w-]*)|\[(\d{{1,9}}|\*|best|index)\])+"
+)
 """A path, as a regular expression."""
 
 _STEP = re.compile(
@@ -362,7 +364,12 @@ def iter_elements(path: FieldPath, message: object) -> Iterator[object]:
 
 def elements_of(value: Any) -> Sequence[object]:
     """Return the elements of a list, or the values of a JSON object or a protobuf map."""
-    return list(value.values()) if isinstance(value, Mapping) else value
+    return [value[key] for key in keys_of(value)] if isinstance(value, Mapping) else value
+
+
+def keys_of(value: Mapping[Any, object]) -> list[Any]:
+    """Return the keys of the objects in a JSON object, which may have numbers and texts, too, or in a map."""
+    return [key for key, each in value.items() if not isinstance(value, dict) or isinstance(each, dict)]
 
 
 def list_getter(path: FieldPath, style: Style) -> Get | None:

@@ -229,7 +229,8 @@ def _stamp(value: Any) -> Stamp | None:
 
 def _signal(name: str, value: Any) -> SignalMapping:
     if isinstance(value, dict):
-        return SignalMapping(name, value["field"], value.get("unit", ""))
+        table = {text: float(number) for text, number in value.get("names", {}).items()}
+        return SignalMapping(name, value["field"], value.get("unit", ""), MappingProxyType(table))
     return SignalMapping(name, value)
 
 

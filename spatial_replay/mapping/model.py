@@ -73,11 +73,16 @@ class Uncertainty:
 
 @dataclass(frozen=True, slots=True)
 class SignalMapping:
-    """A numeric signal: the path of its field, and its unit for readers."""
+    """A numeric signal: the path of its field, and its unit for readers.
+
+    Attributes:
+        table: the numbers of texts; other texts are unknown. Empty for a field with numbers.
+    """
 
     name: str
     field: str
     unit: str = ""
+    table: Table[str, float] = value_of(default_factory=lambda: MappingProxyType({}), hash=False)
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeGuard
 
 from spatial_replay.mapping.field_paths import (
     INDEX,
@@ -17,6 +16,7 @@ from spatial_replay.mapping.field_paths import (
     is_list,
     is_number,
     iter_elements,
+    keys_of,
     sparse,
     walk,
 )
@@ -223,8 +223,9 @@ def _distinguishes(name: str, guess: Guess, messages: Sequence[object]) -> bool:
 
 
 def _iter_lists(message: object) -> Iterator[tuple[str, Guess]]:
-    for path, value in _iter_fields(message):
-        if _is_table_of_objects(value) and (guess := _object_in(next(iter(value.values())))) is not None:
+    for path, value in (("", message), *_iter_fields(message)):
+        table = _table_of_objects(value)
+        if table and (guess := _object_in(table[0])) is not None:
             yield f"{path}[*]", replace(guess, names=(INDEX,))
         elif is_list(value) and len(value) and field_names(value[0]):
             guess = _object_in(value[0])
@@ -233,12 +234,13 @@ def _iter_lists(message: object) -> Iterator[tuple[str, Guess]]:
                 yield f"{path}[*]", guess
 
 
-def _is_table_of_objects(value: object) -> TypeGuard[dict[str, object]]:
-    """Return whether a JSON object has other objects, all alike, by their names."""
-    if not isinstance(value, dict) or len(value) < 2 or not _PARTS.isdisjoint(value):
-        return False
-    fields = {frozenset(field_names(each)) for each in value.values()}
-    return len(fields) == 1 and bool(next(iter(fields)))
+def _table_of_objects(value: object) -> list[object]:
+    """Return the objects that a JSON object has by their names: at least two, and all alike."""
+    keys = keys_of(value) if isinstance(value, dict) else []
+    objects = list(map(value.get, keys)) if isinstance(value, dict) else []
+    fields = {frozenset(field_names(each)) for each in objects}
+    is_table = len(objects) > 1 and len(fields) == 1 and _PARTS.isdisjoint(keys)
+    return objects if is_table and not any(map(_is_no_place, keys)) else []
 
 
 def _object_in(value: object) -> Guess | None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from itertools import compress
+from math import nan
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -30,6 +31,7 @@ from spatial_replay.mapping.field_paths import (
     walk,
 )
 from spatial_replay.mapping.message_types import GENERIC
+from spatial_replay.mapping.model import SignalMapping
 from spatial_replay.mapping.names import Codes
 from spatial_replay.mapping.reading_plan import PlannedTopic
 from spatial_replay.mapping.transforms import TransformReader
@@ -45,6 +47,8 @@ _NO_STAMP = "the clock is header, but its messages have no stamp; give `stamp`, 
 
 _PATIENCE = 100
 """Messages of a topic that may misfit before the first that fits; beyond that the mapping is wrong."""
+
+_MOST_UNNAMED, _LONGEST_UNNAMED = 8, 40
 
 _CHUNK = 256
 _CHUNK_BYTES = 2**14
@@ -112,8 +116,10 @@ class TopicReader:
             self._decode = lambda payload: sparse(decode(payload))
         self._time: TimeGetter | None = None
         self._is_time_bound = False
-        self._signal_fields = [] if planned.mapping is None else [s.field for s in planned.mapping.signals]
+        self._signal_fields = () if planned.mapping is None else planned.mapping.signals
         self._signals: list[Get] | None = None
+        self.unnamed: dict[str, dict[str, None]] = {}
+        """Some texts of signals, by signal, for which the mapping has no number."""
         self._misfits: dict[str, tuple[int, str]] = {}
 
     @property
@@ -259,11 +265,34 @@ class TopicReader:
     def _signal_values(self, message: object) -> list[float]:
         if self._signals is None:
             try:
-                self._signals = [_bind_signal(field, message) for field in self._signal_fields]
+                self._signals = [self._bind_signal(each, message) for each in self._signal_fields]
             except FieldError as error:
                 self._count_misfit("signals", error)
                 raise
-        return [_number(get(message)) for get in self._signals]
+        return [read(message) for read in self._signals]
+
+    def _bind_signal(self, signal: SignalMapping, message: object) -> Get:
+        path = FieldPath.of(signal.field)
+        value = walk(path, message)
+        get, table = getter(path, style_of(message)), signal.table
+        if table:
+
+            def number_of(message: object) -> float:
+                text = str(get(message))
+                if (
+                    text not in table
+                    and len(known := self.unnamed.setdefault(signal.name, {})) < _MOST_UNNAMED
+                ):
+                    known.setdefault(text[:_LONGEST_UNNAMED])
+                return table.get(text, nan)
+
+            return number_of
+        try:
+            _number(value)
+        except (TypeError, ValueError, OverflowError):
+            remedy = "give `names: {TEXT: NUMBER}`" if isinstance(value, str) else "give the path of one"
+            raise FieldError(f"{signal.field}: its value is not a number; {remedy}") from None
+        return lambda message: _number(get(message))
 
     def _stamp(self, message: object) -> int | None:
         if self.transforms is not None and self.extractor is None:
@@ -347,16 +376,6 @@ class PendingMessages:
         self._times_ns, self._sequences = [times[count:]], [sequences[count:]]
         self._log_times_ns, self._contents = [log_times[count:]], contents[count:]
         return times[:count], log_times[:count], contents[:count]
-
-
-def _bind_signal(text: str, message: object) -> Get:
-    path = FieldPath.of(text)
-    value = walk(path, message)
-    try:
-        _number(value)
-    except (TypeError, ValueError, OverflowError):
-        raise FieldError(f"{text}: its value is not a number; give the path of one") from None
-    return getter(path, style_of(message))
 
 
 def _number(value: object) -> float:

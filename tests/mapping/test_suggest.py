@@ -263,15 +263,16 @@ def test_identities_are_found_in_bytes_lists_of_one_and_lists_side_by_side() -> 
         }
 
     one, other = list(range(16)), list(range(1, 17))
+    table = {"cup": {"x": 1.0, "y": 2.0}, "plate": {"x": 1.0, "y": 3.0}}
     cases = {
         "track{object_id.uuid}": tracks(object_id=({"uuid": one}, {"uuid": other})),
         "track{uuid}": tracks(uuid=(one, other)),
         "track{id}": tracks(id=([4], [5])),
         "{$.names[index]}": {"names": ["cup", "plate"], "poses": [{"position": POINT}] * 2},
         "{$.world.name[index]}": {"world": {"name": ["cup", "plate"], "pose": [{"position": POINT}] * 2}},
-        "{index}": {"objects": {"cup": {"x": 1.0, "y": 2.0}, "plate": {"x": 1.0, "y": 3.0}}},
+        "{index}": {"objects": table},
     }
-    for name, message in cases.items():
+    for name, message in [*cases.items(), ("{index}", {**table, "time": 3.0})]:
         text, mapping = suggested(thing=message)
         assert mapping.topics[0].name == name
         assert "objects swap" not in text

@@ -377,6 +377,26 @@ def test_the_keys_of_a_json_object_name_its_objects() -> None:
     assert made.remarks == ()
 
 
+def test_a_message_may_be_the_json_object_that_names_its_objects() -> None:
+    feed = Feed(types={"/all": "a/All"})
+    feed.add("/all", 0, {"time": 1.5, "cup": {"x": 1, "y": 0}, "plate": {"x": 2, "y": 0}, "frame": "map"})
+    made = make("topics: {/all: {objects: '[*]', name: '{index}'}}", feed)
+    assert made.trace.names == ("cup", "plate")
+    assert made.centre(0, "plate") == (2.0, 0.0)
+
+
+def test_texts_become_signals_by_their_names() -> None:
+    feed = Feed(types={"/m": "a/Mode"})
+    for time, mode in enumerate(("AUTO", "MANUAL", "HOLD", "AUTO")):
+        feed.add("/m", time * SECOND, {"mode": mode})
+    made = make("topics: {/m: {signals: {mode: {field: mode, names: {AUTO: 1, MANUAL: 0}}}}}", feed)
+    assert made.trace.signals["mode"].tolist()[:2] == [1, 0]
+    assert np.isnan(made.trace.signals["mode"][2])
+    assert "lacks 'HOLD'; it is unknown there" in made.remarks[0]
+    with pytest.raises(UsageError, match="give `names: "):
+        make("topics: {/m: {signals: {mode: mode}}}", feed)
+
+
 def test_objects_that_only_places_distinguish_are_remarked() -> None:
     def poses(count: int) -> Feed:
         return Feed().add(
