@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 from spatial_replay.mapping.field_paths import (
@@ -67,6 +68,7 @@ class Guess:
     Attributes:
         objects: of the list of objects, or None for a single one.
         position: of a point, or of x and y.
+        bounds: of two opposite corners of a box.
         is_own: whether the outline is in the object's own frame, at its pose.
         size: of length, width and maybe height; or of a radius.
         names: candidates for what distinguishes objects, the likeliest first; `index` for keys of an object.
@@ -113,9 +115,10 @@ def guess_objects(topic: str, kind: str, messages: Sequence[object]) -> Guess | 
         return None
     best = _best(messages)
     if any(isinstance(each, dict) for each in messages):
-        zeros = _best([sparse(each) for each in messages])
-        if zeros is not None and isinstance(zeros.position, str) and _lacks_coordinates(zeros, messages):
-            return replace(zeros, has_zeros_left_out=True)
+        with suppress(FieldError):
+            zeros = _best([sparse(each) for each in messages])
+            if zeros is not None and isinstance(zeros.position, str) and _lacks_coordinates(zeros, messages):
+                return replace(zeros, has_zeros_left_out=True)
     return best
 
 
@@ -297,7 +300,8 @@ def _pose_in(fields: dict[str, object]) -> tuple[str | tuple[str, ...] | None, s
         path
         for path in _named(fields, _POSITIONS)
         # the positions of joints stand beside a list of their names
-        if _point(fields[path]) is not None and not (is_list(fields[path]) and is_list(fields.get("name")))
+        if _point(fields[path]) is not None
+        and not (is_list(fields[path]) and is_list(fields.get(f"{path.rpartition('.')[0]}.name".lstrip("."))))
     ]
     for place in places:
         for turn in turns:

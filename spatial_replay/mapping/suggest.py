@@ -62,23 +62,19 @@ _MIDDLEWARE = frozenset({"rosout", "rosout_agg", "parameter_events", "clock", "d
 """Topics about programs rather than objects, by the last part of their names."""
 _SENSORS = re.compile("camera|optical|lidar|laser|velodyne|radar|imu|gps|gnss|sensor", re.IGNORECASE)
 """Names of frames that are mounted on an object."""
-_NORTH_EAST_DOWN = re.compile(r"(?<![a-z0-9])(px4|ned|fmu|vehicle_local_position)(?![a-z0-9])", re.IGNORECASE)
+_NORTH_EAST_DOWN = re.compile(
+    r"(?<![a-z0-9])(px4|ned|fmu|vehicle_local_position|vehicle_odometry)(?![a-z0-9])", re.IGNORECASE
+)
 """Topics, types and frames whose x points north, y east and z down."""
 _MAVROS = re.compile(r"(?<![a-z0-9])mavros(?![a-z0-9])", re.IGNORECASE)
 
 _LARGEST_SUGGESTION = LARGEST_TEXT // 2
 """Bytes of a suggestion, so that a reader's additions fit, too."""
-_LONGEST_KEY = 1_000
-"""Characters of a topic's name as a key; YAML allows 1024."""
+_LONGEST_KEY = 500
+"""Characters of a topic's name, which are in keys; YAML allows 1024 in one."""
 
 _Axes: TypeAlias = Literal["plane", "north", "image"]
-_AXES: Mapping[_Axes, str] = MappingProxyType(
-    {
-        "plane": "",
-        "north": "x north, y east",
-        "image": "in pixels",
-    }
-)
+_AXES: Mapping[_Axes, str] = MappingProxyType({"plane": "", "north": "x north, y east", "image": "in pixels"})
 """Axes of coordinates, in words. One scene has one kind: the first of these that a log has is suggested."""
 
 
@@ -148,13 +144,15 @@ def suggest_mapping(
         first_ns: log time of the first message of each topic, by its name.
     """
     suggestions = suggest_topics(topics, examples)
-    usable = [each for each in suggestions if each.entry and len(_text(each.topic.name)) <= _LONGEST_KEY]
-    mapped = [each for each in usable if not each.is_transforms]
+    usable = [each for each in suggestions if len(_text(each.topic.name)) <= _LONGEST_KEY]
+    mapped = [each for each in usable if each.entry and not each.is_transforms]
     transforms = [each for each in suggestions if each.is_transforms]
     axes: _Axes = next((axes for axes in _AXES if any(each.axes == axes for each in mapped)), "plane")
     mapped = [each for each in mapped if each.axes == axes]
-    active = _distinguished(mapped or [each for each in usable if each.is_transforms])
-    signals = [] if active else [each for each in suggestions if each.signals]
+    active = _distinguished(mapped or [each for each in usable if each.entry and each.is_transforms])
+    if any(each.frames for each in active):
+        active = [_with_frame_remark(each) if examples.get(each.topic.name) else each for each in active]
+    signals = [] if active else [each for each in usable if each.signals]
     lines = [f"# How messages of {_comment(log)} become objects: a start, made from the first of them."]
     if not active:
         lines.append(f"# Nothing looks like an object{': these are signals' if signals else ''}.")
@@ -202,6 +200,10 @@ def _distinguished(active: Sequence[TopicSuggestion]) -> list[TopicSuggestion]:
     """Return suggestions with the topic in those names that several topics share."""
     shared = Counter(each.name for each in active)
     return [_with_own_name(each) if shared[each.name] > 1 else each for each in active]
+
+
+def _with_frame_remark(each: TopicSuggestion) -> TopicSuggestion:
+    return each if each.frames else replace(each, remarks=(*each.remarks, _FRAMELESS))
 
 
 def _with_own_name(each: TopicSuggestion) -> TopicSuggestion:
@@ -292,7 +294,7 @@ def _is_by_place(topic: Topic, layout: MessageLayout, examples: Sequence[object]
         things = [thing for _, thing in _iter_objects(layout, [message])]
         with suppress(FieldError):
             namer.codes(things, range(len(things)), style_of(message))
-    return namer.is_by_place or not examples
+    return namer.is_by_place
 
 
 def _iter_frames(layout: MessageLayout, examples: Sequence[object]) -> Iterator[str]:
@@ -342,6 +344,7 @@ _IN_IMAGES = frozenset({"vision_msgs/Detection2DArray", "apriltag_msgs/AprilTagD
 _SIZELESS = (f"messages have no size: {_RADIUS} is a guess, {{box: [length, width]}} is another shape",)
 
 
+_FRAMELESS = "its messages name no frame: they are taken to be in that of the others, or give them a `frame`"
 _OF_MAVROS = (
     "MAVROS turns local positions to x east, y north, z up; raw MAVLink messages are north, east, down: for"
     " these, axes: {y: down}"

@@ -186,6 +186,24 @@ def test_frames_inside_lists_count_and_only_a_common_root_is_suggested() -> None
             parse_mapping(suggested_with(*apart))
 
 
+def test_a_topic_without_frames_beside_others_is_remarked() -> None:
+    robot = {"header": {"frame_id": "odom"}, "pose": {"position": POINT, "orientation": TURN}}
+    text, _ = suggested(robot=robot, cup={"x": 1.0, "y": 2.0})
+    lines = text.splitlines()
+    (place,) = (number for number, line in enumerate(lines) if line.startswith("  /cup:"))
+    assert "name no frame" in lines[place - 1]
+    assert text.count("name no frame") == 1
+    assert "name no frame" not in suggested(cup={"x": 1.0, "y": 2.0})[0]
+
+
+def test_json_that_is_nested_deeply_is_surveyed() -> None:
+    inner: Any = {}
+    for _ in range(5000):
+        inner = {"a": inner}
+    _, mapping = suggested(robot={"position": POINT, "rest": inner})
+    assert mapping.topics[0].position == "position"
+
+
 def test_transforms_as_objects_are_brought_into_their_root() -> None:
     moved = [{"header": {"frame_id": a}, "child_frame_id": b} for a, b in (("map", "odom"), ("odom", "base"))]
     tf = Topic("/tf", "tf2_msgs/msg/TFMessage", "json")
