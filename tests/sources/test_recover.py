@@ -206,3 +206,18 @@ def test_text_files_and_files_without_a_message_are_refused(tmp_path: Path) -> N
     with pytest.raises(sr.LogError, match=r"nothing of empty[.]mcap can be recovered"):
         call("recover", tmp_path / "empty.mcap", "-o", tmp_path / "saved.mcap")
     assert not (tmp_path / "saved.mcap").exists()
+
+
+def test_records_of_unknown_kinds_are_passed_over_in_our_own_logs(recorded: Path, tmp_path: Path) -> None:
+    whole = recorded.read_bytes()
+    head = 8 + 9 + int.from_bytes(whole[9:17], "little")
+    data = whole[: int.from_bytes(whole[-28:-20], "little")]
+    unknown = b"\x42" + (3).to_bytes(8, "little") + b"new"
+    # without a summary, whose places would be wrong
+    log = tmp_path / "new.mcap"
+    log.write_bytes(data[:head] + unknown + data[head:] + whole[-37:-28] + bytes(20) + whole[-8:])
+    assert call("verify", log)[0] == 0
+    assert sr.read_trace(log) == sr.read_trace(recorded)
+    assert "1 record" in sr.read_trace(log).remarks[0]
+    assert call("recover", log, "-o", tmp_path / "again.mcap")[0] == 0
+    assert sr.read_trace(tmp_path / "again.mcap") == sr.read_trace(recorded)
