@@ -52,7 +52,7 @@ def _cache_parents() -> Iterator[Path]:
         if value := os.environ.get(name):
             yield Path(value)
     yield _PACKAGE / "__pycache__"
-    if value := os.environ.get("XDG_CACHE_HOME"):
+    if Path(value := os.environ.get("XDG_CACHE_HOME", "")).is_absolute():
         yield Path(value) / "spatial-replay"
     # a user without a home folder
     with suppress(RuntimeError):

@@ -18,6 +18,7 @@ from typing import Any, Final, Protocol, cast
 import numpy as np
 
 from spatial_replay.code_cache import cache_folder
+from spatial_replay.errors import UsageError
 
 ROW: Final = 32
 """So many neighbouring numbers are a row (see `row_code` in `compiled`)."""
@@ -49,8 +50,11 @@ class Compiler:
     """What this process knows of its kernels: which form they take, the compiler, the cache, who listens."""
 
     def __init__(self) -> None:
-        form = os.environ.get("SPATIAL_REPLAY_KERNELS")
-        self.only = form if form in ("compiled", "interpreted") else None
+        self.only = os.environ.get("SPATIAL_REPLAY_KERNELS") or None
+        if self.only not in (None, "compiled", "interpreted"):
+            raise UsageError(
+                f"SPATIAL_REPLAY_KERNELS is {self.only!r:.100}; give 'compiled' or 'interpreted', or unset it"
+            )
         self.interprets = True
         self.spent_s = 0.0
         self.listeners: list[Callable[[], None]] = []

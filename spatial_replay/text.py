@@ -24,6 +24,11 @@ def is_encodable(text: str) -> bool:
     return text.isascii() or not any("\ud800" <= character <= "\udfff" for character in text)
 
 
+def encodable(text: str) -> str:
+    """Return a text that fits UTF-8: bytes of a file name that do not are written as escapes."""
+    return text.encode("utf-8", "backslashreplace").decode()
+
+
 @dataclass(frozen=True, slots=True)
 class Instant:
     """A time in a sentence, printed in seconds since `first_ns`."""

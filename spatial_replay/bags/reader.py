@@ -13,6 +13,7 @@ from spatial_replay.errors import LogError
 from spatial_replay.logs.messages import Attachment, Channel
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.logs.remote import LogFile
+from spatial_replay.text import encodable
 from spatial_replay.trace.sample import LATEST_NS
 
 
@@ -73,7 +74,7 @@ class MessageReader(ABC):
     @property
     def name(self) -> str:
         """The base name of its file or folder."""
-        return self._path.name or self._path.absolute().name
+        return encodable(self._path.name or self._path.absolute().name)
 
     def topics(self) -> tuple[Topic, ...]:
         """Return the topics, by name.

@@ -17,7 +17,7 @@ from spatial_replay.errors import SpatialReplayError, UsageError
 from spatial_replay.logs.remote import BAG_METADATA, RemoteFile, is_address, log_file
 from spatial_replay.logs.remote_folder import matching_addresses
 from spatial_replay.sources.open_log import bag_files_at
-from spatial_replay.text import counted
+from spatial_replay.text import counted, encodable
 
 _ENDINGS: Final = (".mcap", ".bag", ".db3", ".jsonl", ".jsonl.gz", ".csv", ".xml")
 """Of logs in a folder; any other file has to be named."""
@@ -126,12 +126,13 @@ def _logs_in(path: Path, folder: Path) -> Iterator[FoundLog]:
         for name in sorted(names):
             if name.lower().endswith(_ENDINGS) and not name.startswith("."):
                 # as texts: paths would take most of the time
-                yield FoundLog(name if here.name == "." else f"{here.name}/{name}", f"{here.path}/{name}")
+                shown = name if here.name == "." else f"{here.name}/{name}"
+                yield FoundLog(encodable(shown), f"{here.path}/{name}")
 
 
 def _found(path: Path, folder: Path) -> FoundLog:
     name = path.relative_to(folder) if path.is_relative_to(folder) else path
-    return FoundLog(name.as_posix(), str(path))
+    return FoundLog(encodable(name.as_posix()), str(path))
 
 
 def _nothing(text: str, folder: Path) -> str:

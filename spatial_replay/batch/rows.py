@@ -33,7 +33,7 @@ from spatial_replay.sources.open_log import open_source
 from spatial_replay.spec.diagnostics import SourceText
 from spatial_replay.spec.formula import NamedSpec, Specification
 from spatial_replay.spec.overrides import SpecificationText, load_specifications
-from spatial_replay.text import counted_from, printable
+from spatial_replay.text import counted_from, encodable, printable
 from spatial_replay.trace.time_points import time_point_from_text
 
 ErrorKind: TypeAlias = Literal["usage", "log", "machine"]
@@ -147,7 +147,7 @@ def rows_from_task(task: Task) -> tuple[tuple[ResultRow, ...], ...]:
         rows = [_rows_of_file(replay, replayed, file, index) for index, file in enumerate(files)]
     except Exception as error:  # one log must not end a batch
         return error_rows(task, *error_from_exception(error))
-    seconds, name = time.perf_counter() - begin, log_file(task.log).name
+    seconds, name = time.perf_counter() - begin, encodable(log_file(task.log).name)
     return tuple(tuple(replace(row, seconds=seconds, source=name) for row in each) for each in rows)
 
 

@@ -35,6 +35,7 @@ from spatial_replay.batch.workers import (
 )
 from spatial_replay.logs.remote import log_file
 from spatial_replay.mapping.mapping_file import load_mapping
+from spatial_replay.text import encodable
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -229,7 +230,7 @@ def _named(rows: pa.Table, asked: Sequence[Wanted]) -> pa.Table:
     import pyarrow as pa
 
     sources = rows.column(SOURCE).to_pylist()
-    names = [log_file(each.log.path).name for each in asked]
+    names = [encodable(log_file(each.log.path).name) for each in asked]
     other = [
         place for place, (old, new) in enumerate(zip(sources, names, strict=True)) if old not in (None, new)
     ]

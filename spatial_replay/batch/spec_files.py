@@ -18,6 +18,7 @@ from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.format import format_specification
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.overrides import SpecificationText
+from spatial_replay.text import encodable
 
 HASH_DIGITS: Final = 32
 """Digits of a hash in a name."""
@@ -49,7 +50,7 @@ def read_specification_text(path: Path | str) -> SpecificationText:
     """
     from spatial_replay.spec.load import load_specification
 
-    return SpecificationText(load_specification(local_copy(path)).source, log_file(path).name)
+    return SpecificationText(load_specification(local_copy(path)).source, encodable(log_file(path).name))
 
 
 def spec_file(path: Path | str, text: SpecificationText, parsed: Specification, folder: Path) -> SpecFile:
@@ -63,7 +64,7 @@ def _shown(file: Path | str, folder: Path) -> str:
     path = log_file(file)
     if isinstance(path, RemoteFile):
         return str(path)
-    return (path.relative_to(folder) if path.is_relative_to(folder) else path).as_posix()
+    return encodable((path.relative_to(folder) if path.is_relative_to(folder) else path).as_posix())
 
 
 def choice_faults(case: Case, files: Sequence[Specification]) -> Iterator[str]:

@@ -24,10 +24,12 @@ from concurrent.futures import (
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from itertools import islice
+from multiprocessing import forkserver, resource_tracker
 from multiprocessing.connection import Connection
 from typing import Any, Final, Protocol, TypeAlias, TypeVar, cast
 
 from spatial_replay.errors import ClusterError, UsageError, importing
+from spatial_replay.recording.interruption import uninterrupted
 
 _Task = TypeVar("_Task")
 _Result = TypeVar("_Result")
@@ -116,7 +118,9 @@ def _results(
     while True:
         for task in islice(tasks, ahead - len(waiting) if is_whole else 0):
             try:
-                waiting[pool.submit(work, task)] = task
+                # a process that is half started could not be ended
+                with uninterrupted():
+                    waiting[pool.submit(work, task)] = task
             except BrokenProcessPool:
                 is_whole = False
                 suspects.append(task)
@@ -139,6 +143,8 @@ def _pool(count: int) -> Iterator[Executor]:
     """Start processes; they are ended at once when the block ends early."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([_PRELOADED])
+    _start_server()
+    others = set(multiprocessing.active_children())
     ours, theirs = multiprocessing.Pipe(duplex=False)
     try:
         with ProcessPoolExecutor(count, context, _begin_worker, (ours,)) as pool:
@@ -147,15 +153,32 @@ def _pool(count: int) -> Iterator[Executor]:
             except BaseException:
                 theirs.close()
                 pool.shutdown(wait=False, cancel_futures=True)
+                # those that are still starting would miss what this process takes away as it ends
+                for process in set(multiprocessing.active_children()) - others:
+                    process.kill()
                 raise
     finally:
         theirs.close()
         ours.close()
 
 
+def _start_server() -> None:
+    """Start the process that workers are forked from with Ctrl-C blocked, which all of them inherit.
+
+    Ctrl-C goes to all processes of a terminal; the first one decides.
+    """
+    # it unblocks Ctrl-C itself when it starts
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        forkserver.ensure_running()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _begin_worker(connection: Connection) -> None:
     """End this process when the other end of the connection is closed, or its process ends."""
-    # Ctrl-C goes to all processes of a terminal; the first one decides
+    # a server that was there before may not block it
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with, args=(connection,), daemon=True).start()
 

@@ -265,7 +265,7 @@ def _tidy(vertices: ArrayLike) -> tuple[Floats, bool]:
     """
     try:
         corners = np.array(vertices, dtype=np.float64, order="C")
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise GeometryError(f"vertices are {vertices!r}; give pairs of numbers (x, y)") from error
     if corners.ndim != 2 or corners.shape[1] != 2 or not len(corners):
         raise GeometryError(f"vertices have the shape {corners.shape}; give one or more pairs (x, y)")

@@ -163,8 +163,9 @@ def user_cache_folder(name: str) -> Path:
     """
     if chosen := os.environ.get("SPATIAL_REPLAY_CACHE"):
         return Path(chosen) / name
-    parent = os.environ.get("XDG_CACHE_HOME")
-    return (Path(parent) if parent else Path.home() / ".cache") / "spatial-replay" / name
+    # the XDG specification has a relative path ignored
+    parent = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    return (parent if parent.is_absolute() else Path.home() / ".cache") / "spatial-replay" / name
 
 
 def gigabytes(variable: str, otherwise: float) -> int:

@@ -118,14 +118,20 @@ class _DurableWriter(io.BufferedWriter):
 
 
 class _OutputFile(io.FileIO):
-    """An unbuffered file whose failures become OutputErrors, also under a library that writes to it."""
+    """An unbuffered file whose failures become OutputErrors, also under a library that writes to it.
+
+    A process that was forked from its own writes nothing to it: what the two buffer would be there twice.
+    """
 
     def __init__(self, file: int, output: Path) -> None:
         super().__init__(file, "wb")
         self._output = output
+        self._process = os.getpid()
 
     # collections.abc.Buffer exists from Python 3.12 on
     def write(self, data: Any, /) -> int:
+        if os.getpid() != self._process:
+            return memoryview(data).nbytes
         with _writing(self._output):
             return super().write(data)
 

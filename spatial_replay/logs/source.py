@@ -14,6 +14,7 @@ from spatial_replay.errors import LogError
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.messages import BLOCK_SAMPLES, Attachment, Block
 from spatial_replay.logs.read_options import FaultList
+from spatial_replay.text import encodable
 from spatial_replay.trace.axes import OUR_AXES, Axes
 from spatial_replay.trace.declared_units import signal_units_metadata
 from spatial_replay.trace.sample import Sample
@@ -116,7 +117,7 @@ class TrackSource(_Bare):
 
     @property
     def name(self) -> str:
-        return self.path.name
+        return encodable(self.path.name)
 
     def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
         """See `Source.iter_blocks`."""

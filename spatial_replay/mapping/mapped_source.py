@@ -31,6 +31,7 @@ from spatial_replay.logs.topics import DERIVED, MAPPED, OBJECTS, is_kept
 from spatial_replay.mapping.assemble import Assembler
 from spatial_replay.mapping.model import LogMapping
 from spatial_replay.mapping.reading_plan import ReadingPlan
+from spatial_replay.text import encodable
 from spatial_replay.trace.axes import Axes
 from spatial_replay.trace.sample import FOREVER, LATEST_NS
 from spatial_replay.trace.trace import Trace
@@ -62,7 +63,7 @@ class MappedSource:
 
     @property
     def name(self) -> str:
-        return self.path.name or Path(self.path).absolute().name
+        return encodable(self.path.name or Path(self.path).absolute().name)
 
     @property
     def axes(self) -> Axes:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import operator
+import os
 import queue
 import threading
 import time
@@ -73,6 +74,7 @@ class MessageQueue:
         self._queue: queue.SimpleQueue[_Waiting] = queue.SimpleQueue()
         self._bytes_in = self._bytes_out = 0
         self._is_closed = False
+        self._process = os.getpid()
         self._failure: Exception | None = None
 
     @property
@@ -110,11 +112,13 @@ class MessageQueue:
         """Check that messages can be taken.
 
         Raises:
-            UsageError: the recorder is closed.
+            UsageError: the recorder is closed, or another process has it since a fork.
             Exception: what prevents writing.
         """
         if self._is_closed:
             raise UsageError(f"{self._name} is closed; open another recorder")
+        if os.getpid() != self._process:
+            raise UsageError(f"{self._name} belongs to another process; open a recorder in this one")
         if self._failure is not None:
             raise self._failure
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import queue
 import threading
 import time
@@ -65,6 +66,7 @@ class SampleWriter:
             most_lost_s: how much time of samples a kill may cost.
         """
         self._log, self.name = log, name
+        self._process = os.getpid()
         # unlike a queue with a limit of its own, an interruption never leaves this one locked
         self._queue: queue.SimpleQueue[Sample | None] = queue.SimpleQueue()
         self._bell: queue.SimpleQueue[None] = queue.SimpleQueue()
@@ -123,8 +125,7 @@ class SampleWriter:
         """
         if not isinstance(sample, Sample):
             raise UsageError(f"{sample!r} is not a sample; give a Sample(time_ns, objects)")
-        if self._closed:
-            raise UsageError(f"{self.name} is closed; open another recorder")
+        self._messages.require_open()
         self._raise_failure()
         if sample.time_ns <= self._last_ns:
             at, last = times_apart(sample.time_ns, self._last_ns)
@@ -161,13 +162,13 @@ class SampleWriter:
         return since is not None and time.monotonic() - since > self._most_lost_s
 
     def close(self, *, interrupted: bool = False) -> None:
-        """Write all waiting samples and finish the log; closing twice does nothing.
+        """Write all waiting samples and finish the log; closing twice, or after a fork, does nothing.
 
         Raises:
             OutputError: something could not be written.
         """
         with uninterrupted():
-            if self._closed:
+            if self._closed or os.getpid() != self._process:
                 return
             self._closed = True
             self._messages.close()

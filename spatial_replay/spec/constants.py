@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from fractions import Fraction
 from typing import TypeAlias
 
@@ -172,8 +173,11 @@ def value_given(name: str, value: object) -> Value:
     Raises:
         UsageError: it is neither a finite number nor the text of a number or a duration.
     """
-    if isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value):
-        return float(value)
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        # an integer beyond every float is none
+        with suppress(OverflowError):
+            if math.isfinite(value):
+                return float(value)
     if isinstance(value, str) and (_DURATION.fullmatch(value) or _NUMBER.fullmatch(value)):
         try:
             number = read_number(value.removeprefix("-"), Span(0, 0))

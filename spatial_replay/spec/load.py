@@ -23,6 +23,7 @@ from spatial_replay.spec.relations import DEFAULT_PROFILE, PROFILES, RELATION_NA
 from spatial_replay.spec.resolve import Namespace
 from spatial_replay.spec.syntax import BrokenStatement, ConstStatement, SpecStatement, Statement, UseStatement
 from spatial_replay.spec.tokens import MAX_TOKENS, is_reserved, tokenize
+from spatial_replay.text import encodable
 
 MAX_LENGTH = 256 * 1024
 """Characters of a text."""
@@ -99,7 +100,7 @@ def parse_specification(
         listed,
         scales=tuple(namespace.scales),
         source=text,
-        filename=filename,
+        filename=encodable(filename),
         warnings=tuple(warnings[:_MAX_WARNINGS]),
     )
 

@@ -218,6 +218,22 @@ def _box(name: str, x: float) -> dict[str, object]:
     return {"name": name, "polygon": [[x, 0], [x + 1, 0], [x + 1, 1], [x, 1]]}
 
 
+def test_file_names_that_are_not_utf_8_are_shown_with_escapes(fleet: Path) -> None:
+    folder = Path(os.fsdecode(b"logs/n\xff"))
+    log, spec = write_log(folder / os.fsdecode(b"r\xfe.jsonl"), 0.5), Path(os.fsdecode(b"g\xfd.spatial"))
+    shutil.copy("gate.spatial", spec)
+    outputs = ("--junit", "junit.xml", "--html", "pages", "--json", "rows.jsonl")
+    done = batch(str(folder), "--spec", str(spec), *outputs)
+    assert done.code == 0, done.err
+    rows = sr.read_results("results").to_pylist()
+    assert {(row["log"], row["file"]) for row in rows} == {
+        (r"logs/n\udcff/r\udcfe.jsonl", r"g\udcfd.spatial")
+    }
+    assert command("replay", str(log), "--spec", str(spec), "-o", "own.mcap").code == 0
+    assert command("verify", "own.mcap", "--source", str(log)).code == 0
+    assert command("report", str(log), "--spec", str(spec), "-o", "page.html").code == 0
+
+
 def test_a_flipped_bit_in_a_folder_of_results_never_changes_a_result(fleet: Path) -> None:
     chance = random.Random(3)
     arguments = ["logs", "--spec", "gate.spatial"]

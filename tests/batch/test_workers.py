@@ -114,6 +114,25 @@ def test_a_batch_that_is_killed_loses_no_row_and_has_none_twice(fleet: Path) -> 
     assert not list(fleet.glob("results/**/*.partial"))
 
 
+@pytest.mark.parametrize("processes", [2, 3, 4, 5])
+def test_ctrl_c_while_workers_start_prints_no_traceback(fleet: Path, processes: int) -> None:
+    arguments = ["batch", "logs", "--spec", "gate.spatial", "--jobs", "3"]
+    with subprocess.Popen(
+        [*PROGRAM, *arguments],
+        env=environment(),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    ) as process:
+        # as a terminal does it: to the first process, the server of workers, and those that are there so far
+        while len(processes_in(fleet)) < processes and process.poll() is None:
+            time.sleep(0.001)
+        os.killpg(process.pid, signal.SIGINT)
+        _, said = process.communicate(timeout=60)
+    assert (process.returncode, "Traceback" in said) == (130, False), said
+
+
 def keys_of_files(folder: Path) -> list[int]:
     """One for each file with rows."""
     return [1 for _ in folder.glob("results/rows/*.parquet")]

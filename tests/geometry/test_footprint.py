@@ -100,6 +100,7 @@ def test_a_star_polygon_is_not_convex():
         (lambda: Footprint.polygon([]), "one or more pairs"),
         (lambda: Footprint.polygon([(0, 0, 0)]), r"\(1, 3\)"),
         (lambda: Footprint.polygon([(0, "east")]), "pairs of numbers"),
+        (lambda: Footprint.polygon([(0, 10**400)]), "pairs of numbers"),
         (lambda: Footprint.polygon([(0, 0), (math.nan, 1), (1, 1)]), "nan.*finite"),
         (lambda: Footprint.polygon([(0, 0), (math.inf, 1), (1, 1)]), "inf.*finite"),
         (lambda: Footprint.polygon([(0, 0), (1e200, 1), (1, 1)]), "1e100"),

@@ -16,6 +16,7 @@ from mcap.exceptions import EndOfFile
 from mcap.records import Message
 from mcap.stream_reader import StreamReader
 
+import spatial_replay as sr
 from replay.runs import PAST, SPECIFICATION, content_of, run, sample
 from spatial_replay import (
     Footprint,
@@ -383,3 +384,36 @@ def test_a_replay_of_a_recording_has_its_certificate(tmp_path: Path, count: int)
     if count:
         source = open_source(path)
         assert run_replay(source, load_files([], source)).certificate == certificate
+
+
+def test_a_forked_process_leaves_the_log_of_its_parent_alone(tmp_path: Path) -> None:
+    code = """
+import os, sys
+import spatial_replay as sr
+
+box = {"a": sr.Footprint.box(0, 0, 1, 1)}
+with sr.Recorder(sys.argv[1]) as recorder:
+    words = recorder.channel("/words")
+    for number in range(200):
+        recorder.write(sr.Sample(number, box))
+    child = os.fork()
+    if not child:
+        for write in (lambda: recorder.write(sr.Sample(999, box)), lambda: words.write(999, {})):
+            try:
+                write()
+            except sr.UsageError as error:
+                print(error, flush=True)
+        recorder.close()
+        sys.exit(7)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
+    for number in range(200, 400):
+        recorder.write(sr.Sample(number, box))
+"""
+    log = tmp_path / "run.mcap"
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(log)], capture_output=True, text=True, check=False, timeout=60
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("run.mcap belongs to another process; open a recorder in this one") == 2
+    trace = sr.read_trace(log)
+    assert (len(trace), trace.faults) == (400, ())

@@ -6,6 +6,8 @@ import os
 import subprocess
 import sys
 
+from spatial_replay.logs.downloads import user_cache_folder
+
 _EVERY_KERNEL = """
 import importlib, pkgutil
 import spatial_replay
@@ -39,6 +41,22 @@ def test_the_command_says_where_the_code_is(tmp_path):
     (folder,) = tmp_path.iterdir()
     assert done.stdout == f"compiled into {folder}\n"
     assert list(folder.rglob("*.nbi"))
+
+
+def test_an_unknown_form_of_kernels_is_refused_with_those_that_are_known():
+    code = "import spatial_replay.compiled"
+    environment = os.environ | {"SPATIAL_REPLAY_KERNELS": "fast"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False
+    )
+    assert "SPATIAL_REPLAY_KERNELS is 'fast'; give 'compiled' or 'interpreted'" in done.stderr
+
+
+def test_a_relative_cache_folder_is_ignored(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", "here")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.delenv("SPATIAL_REPLAY_CACHE", raising=False)
+    assert user_cache_folder("downloads") == tmp_path / ".cache/spatial-replay/downloads"
 
 
 _THREADS = """

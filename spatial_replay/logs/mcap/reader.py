@@ -43,7 +43,7 @@ from spatial_replay.logs.read_options import FaultList
 from spatial_replay.logs.remote import LogFile, RemoteFile, open_file
 from spatial_replay.logs.sample_cache import DamagedEntryError, cached_samples
 from spatial_replay.logs.topics import ALL, DERIVED, METADATA, OBJECTS, RECOVERY, is_kept
-from spatial_replay.text import Instant, Sentence, counted
+from spatial_replay.text import Instant, Sentence, counted, encodable
 from spatial_replay.trace.axes import Axes
 from spatial_replay.trace.declared_units import signal_units_from_metadata
 from spatial_replay.trace.sample import LATEST_NS
@@ -76,7 +76,7 @@ class McapSource:
 
     @property
     def name(self) -> str:
-        return self.path.name
+        return encodable(self.path.name)
 
     def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
         """See `Source.iter_blocks`; derived topics, and those that `keep` does not name, are left out.
