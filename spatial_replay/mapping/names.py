@@ -114,7 +114,8 @@ class Namer:
                     known[index] = self._codes[self._name(each, index, None)]
             return [known[index] for index in indices]
         get = self._get
-        rows = zip(objects, indices, messages or repeat(None), strict=messages is not None)
+        of_objects = repeat(None, len(objects)) if messages is None else messages
+        rows = zip(objects, indices, of_objects, strict=True)
         if get is None:
             return [self._codes[self._name(*row)] for row in rows]
         codes = []

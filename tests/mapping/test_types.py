@@ -358,13 +358,19 @@ def test_joints_are_read_by_their_names_whatever_their_order() -> None:
 
 def test_objects_are_named_by_a_list_next_to_theirs() -> None:
     feed = Feed(types={"/models": "gazebo_msgs/msg/ModelStates"})
-    for number, order in enumerate((("cup", "robot"), ("robot", "cup"))):
+    for number, order in enumerate((("cup", "robot"), ("robot", "cup"), (), ("cup",))):
         poses = [{"position": {"x": float(len(name)), "y": 0.0}} for name in order]
         feed.add("/models", number * SECOND, {"name": list(order), "pose": poses})
-    made = make("topics: {/models: {objects: 'pose[*]', name: '{$.name[index]}', except: [none]}}", feed)
+    text = "topics: {/models: {objects: 'pose[*]', name: '{$.name[index]}', except: [none]}}"
+    made = make(text, feed)
     assert [made.centre(sample, "cup") for sample in (0, 1)] == [(3.0, 0.0)] * 2
     assert [made.centre(sample, "robot") for sample in (0, 1)] == [(5.0, 0.0)] * 2
-    assert made.remarks == ()
+    assert (made.states("cup"), made.states("robot")) == ("++-+", "++--")
+    assert made.remarks == made.faults == ()
+    assert make(text, feed, batch=1).trace == made.trace
+    # names that are fewer than the poses
+    feed.add("/models", 4 * SECOND, {"name": ["cup"], "pose": [{"position": {"x": 0.0, "y": 0.0}}] * 2})
+    assert "/models at 4.000 s" in make(text, feed).faults[0]
 
 
 def test_the_keys_of_a_json_object_name_its_objects() -> None:
