@@ -15,8 +15,10 @@ from numpy.typing import ArrayLike
 from spatial_replay.errors import GeometryError
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.geometry.outline import (
+    MOST_CONVEX_CORNERS,
     NOT_CONVEX,
     SOUND,
+    TOO_MANY_CORNERS,
     convex_hull,
     convex_pieces,
     normalise_polygon,
@@ -270,6 +272,9 @@ def _tidy(vertices: ArrayLike) -> tuple[Floats, bool]:
     if corners.ndim != 2 or corners.shape[1] != 2 or not len(corners):
         raise GeometryError(f"vertices have the shape {corners.shape}; give one or more pairs (x, y)")
     corners, fault = normalise_polygon(corners)
+    if fault == TOO_MANY_CORNERS:
+        most = f"{MOST_CONVEX_CORNERS:,}"
+        raise GeometryError(f"a polygon has {len(corners):,} corners; simplify it to at most {most}")
     if fault not in (SOUND, NOT_CONVEX):
         raise GeometryError(f"vertices {_shown(corners)} are not all finite numbers of at most 1e100")
     return corners, fault == SOUND

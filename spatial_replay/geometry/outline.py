@@ -13,13 +13,16 @@ from spatial_replay.compiled import elementwise, inlined, kernel, long_kernel
 from spatial_replay.errors import GeometryError
 from spatial_replay.geometry.arrays import Floats, Integers
 
-SOUND, EMPTY, NOT_FINITE, NOT_CONVEX = 0, 1, 2, 3
+SOUND, EMPTY, NOT_FINITE, NOT_CONVEX, TOO_MANY_CORNERS = 0, 1, 2, 3, 4
 
 LARGEST_COORDINATE = 1e100
 """Larger coordinates are rejected: products of a few of them must stay finite."""
 
 MOST_CORNERS = 2_000
 """Of a polygon that is split: its parts are measured one by one, in each sample."""
+
+MOST_CONVEX_CORNERS = 10_000
+"""Of a convex polygon: each pair of objects is measured by its corners, in each sample."""
 
 # A vertex counts as on a line within the greatest of these: relative to the outline's extent, to the
 # resolution of its coordinates, and a floor that keeps squares of the tolerance above zero.
@@ -63,6 +66,7 @@ def normalise_polygons(vertex_start: Integers, vertices: Floats) -> Outlines:
     fault = np.empty(len(counts), dtype=np.int8)
     raw_start = np.array(vertex_start, dtype=np.int64)
     used = _normalise_all(raw_start, tidy, counts, fault)
+    _limit_corners(counts, fault)
     start = np.zeros(len(counts) + 1, dtype=np.int64)
     np.cumsum(counts, out=start[1:])
     return Outlines(start, tidy[:used], fault)
@@ -84,7 +88,12 @@ def normalise_polygon(vertices: Floats) -> tuple[Floats, int]:
     """Normalise one outline (n, 2), in place; return its vertices and its fault (see `Outlines`)."""
     counts, fault = np.empty(1, np.int64), np.empty(1, np.int8)
     used = _normalise_all(np.array([0, len(vertices)]), vertices, counts, fault)
+    _limit_corners(counts, fault)
     return vertices[:used], fault.item(0)
+
+
+def _limit_corners(counts: Integers, fault: NDArray[np.int8]) -> None:
+    fault[(counts > MOST_CONVEX_CORNERS) & (fault == SOUND)] = TOO_MANY_CORNERS
 
 
 @elementwise

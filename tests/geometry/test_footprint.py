@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import math
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
-from spatial_replay import ConvexPart, Footprint, GeometryError, TrackedObject
+import spatial_replay as sr
+from spatial_replay import ConvexPart, Footprint, GeometryError, LogError, TrackedObject
 
 SQUARE = [(0, 0), (2, 0), (2, 2), (0, 2)]
 L_SHAPE = [(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)]
@@ -78,6 +80,19 @@ def test_a_polygon_of_very_many_corners_is_split_only_up_to_a_number():
     along = np.linspace(0, 1, 5_000, endpoint=False)
     sides = [np.add(a, np.outer(along, np.subtract(b, a))) for a, b in pairwise([*SQUARE, SQUARE[0]])]
     assert Footprint.polygon(np.concatenate(sides)) == Footprint.polygon(SQUARE)
+
+
+def test_a_convex_polygon_of_very_many_corners_is_refused(tmp_path):
+    turns = np.linspace(0, 2 * np.pi, 10_001, endpoint=False)
+    circle = np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    assert len(Footprint.polygon(circle[:-1]).parts[0].vertices) == 10_000
+    with pytest.raises(GeometryError, match="has 10,001 corners; simplify it to at most 10,000"):
+        Footprint.polygon(circle)
+    log = tmp_path / "run.jsonl"
+    objects = [{"name": "wheel", "polygon": circle.tolist()}]
+    log.write_text(json.dumps({"time_ns": 0, "objects": objects}))
+    with pytest.raises(LogError, match=r"'wheel'.*10,001 corners"):
+        sr.read_trace(log)
 
 
 def test_a_boundary_that_crosses_itself_is_refused_by_place_and_remedy():

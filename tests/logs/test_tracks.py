@@ -283,3 +283,16 @@ def test_a_csv_without_its_columns_is_an_error(csv):
 def test_a_value_that_is_not_a_path_is_refused(given):
     with pytest.raises(UsageError, match=r"^path is .*; give the path of a log; Trace\.from_samples"):
         read_trace(given)
+
+
+def test_lines_without_end_that_are_blank_are_not_read_to_their_end(tmp_path):
+    path = tmp_path / "run.jsonl.gz"
+    sample = json.dumps({"time_ns": 0, "objects": [{"name": "cup", "polygon": [[0, 0], [1, 0], [1, 1]]}]})
+    with gzip.open(path, "wb", 1) as stream:
+        stream.write(sample.encode() + b"\n")
+        for _ in range(11):
+            stream.write(b"\n" * 1_000_000)
+        stream.write(b"{")
+    with pytest.raises(LogError, match="gz:10000002: it has more than 10,000,000 blank lines"):
+        read_trace(path)
+    assert len(read_trace(path, allow_damage=True)) == 1

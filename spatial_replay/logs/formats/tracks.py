@@ -31,6 +31,9 @@ GZIP_MAGIC = b"\x1f\x8b"
 LONGEST_LINE = 16 * 2**20
 """Bytes; a line beyond this is a file of another kind, or damage."""
 
+MOST_BLANK_LINES = 10_000_000
+"""Of a file; after that many the rest is not read."""
+
 
 def open_text(path: Path) -> BinaryIO:
     """Open a file for its bytes, decompressed if it begins as a gzip file does, whatever its name."""
@@ -41,7 +44,7 @@ def open_text(path: Path) -> BinaryIO:
 
 def iter_lines(path: Path, faults: FaultList) -> Iterator[tuple[int, str]]:
     """Yield each line that is not blank, numbered from 1; what cannot be read goes to `faults`."""
-    number = 0
+    number = blank = 0
     with open_text(path) as stream:
         while True:
             number += 1
@@ -65,6 +68,12 @@ def iter_lines(path: Path, faults: FaultList) -> Iterator[tuple[int, str]]:
                 continue
             if not text.isspace():
                 yield number, text
+                continue
+            blank += 1
+            if blank > MOST_BLANK_LINES:
+                most = f"{MOST_BLANK_LINES:,}"
+                faults.add(f"{path.name}:{number}: it has more than {most} blank lines; the rest is not read")
+                return
 
 
 @dataclass(slots=True)
