@@ -276,7 +276,7 @@ def test_no_mapping_is_suggested_if_none_is_needed(log: Path, capsys: pytest.Cap
 def test_a_folder_without_a_bag_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for more in ([], ["--suggest-mapping"]):
         assert run(["info", str(tmp_path), *more]) == 2
-        assert "is a directory; check the path" in capsys.readouterr().err
+        assert "there is nothing in this folder; give the path of a log" in capsys.readouterr().err
 
 
 def test_a_damaged_bag_is_reported(

@@ -179,7 +179,7 @@ def test_many_faults_are_counted(jsonl):
 def test_a_file_without_a_sample_is_an_error(tmp_path, jsonl):
     with pytest.raises(MissingFileError, match=r"nothing\.jsonl: no such file; check the path$"):
         open_source(tmp_path / "nothing.jsonl")
-    with pytest.raises(MissingFileError, match=r"is a directory; check the path$"):
+    with pytest.raises(MissingFileError, match=r"there is nothing in this folder; give the path of a log$"):
         open_source(tmp_path)
     empty = tmp_path / "empty.jsonl"
     empty.touch()
