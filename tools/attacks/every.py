@@ -9,11 +9,13 @@ from attacks.clients import Clients
 from attacks.commands import Interrupts, Names
 from attacks.damage import Damage
 from attacks.kills import Kills
+from attacks.results import Results
 from attacks.texts import Texts
 
 ATTACKS: dict[str, Callable[[], Attack]] = {
     "kills": Kills,
     "damage": Damage,
+    "results": Results,
     "texts": Texts,
     "names": Names,
     "interrupts": Interrupts,
