@@ -98,7 +98,7 @@ def step_lines(decision: PlanDecision) -> Iterator[str]:
         yield f"  since {time_text(decision.lost.time_ns)} it cannot be satisfied{why}"
     if decision.HasField("outcome"):
         outcome = decision.outcome
-        how = "done" if outcome.succeeded else "failed"
+        how = "done" if outcome.succeeded else f"failed ({outcome.at})" if outcome.at else "failed"
         after = ", ".join(map(str, outcome.states))
         yield f"  {how} at {time_text(outcome.end_ns)}: {outcome.reason}; state {after}"
 

@@ -110,7 +110,14 @@ class Movables:
         settings, maps = self._settings, self.maps_of(name)
         cubes = consideration.progress.cubes, consideration.constraints.cubes
         gradient = gradient_map(maps, *cubes, settings.workspace, settings.constraint_margin)
-        room_from = None if settings.room_from == "all" or name in later else later
+        keeps_all = settings.room_from == "all" or name in later or self._attempts.needs_room(name)
+        room_from = None if keeps_all else later
+        if self._attempts.failed_pick(name, self._sample, settings):
+            # no other target helps
+            rejected = "it could not be picked up where it lies"
+            return Candidate(
+                name, gradient, None, rejected, failed=tuple(failed), room_from=_tuple(room_from)
+            )
         target = find_target(
             gradient, tracked, settings, maps.room(room_from), failed, self.failed_here(name)
         )
@@ -123,9 +130,12 @@ class Movables:
             target = self.with_way(target, consideration.constraints.cubes)
         if isinstance(target, Target) and self.is_repeated(target):
             target = "it was tried wherever it would hold, and nothing has changed since"
-        kept_from = None if room_from is None else tuple(room_from)
         found, why = (None, target) if isinstance(target, str) else (target, "")
-        return Candidate(name, gradient, found, why, failed=tuple(failed), room_from=kept_from)
+        return Candidate(name, gradient, found, why, failed=tuple(failed), room_from=_tuple(room_from))
+
+    def failed_places(self, name: str) -> tuple[tuple[float, float], ...]:
+        """Return the places (x, y) where moving an object failed, whatever it was for."""
+        return self._attempts.places_of(name)
 
     def failed_here(self, name: str) -> tuple[Target, ...]:
         """Return the targets for which motions of an object failed while everything stood as it does."""
@@ -135,6 +145,8 @@ class Movables:
         """Return whether a motion to a target would repeat one that failed while everything stood as now."""
         failures = self.failed_here(target.name)
         if self._settings.skill == "place":
+            if self._attempts.failed_pick(target.name, self._sample, self._settings):
+                return True
             return is_repeated(target, failures, self._settings)
         return begins_as(target, failures, self._tracked(target.name))
 
@@ -282,6 +294,10 @@ class Movables:
             about = self._propositions, self._regions, self._sample, name
             self._maps[name] = proposition_maps(*about, workspace, grid)
         return self._maps[name]
+
+
+def _tuple(names: Collection[str] | None) -> tuple[str, ...] | None:
+    return None if names is None else tuple(names)
 
 
 def with_choice(

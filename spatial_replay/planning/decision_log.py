@@ -170,6 +170,7 @@ class BlackBox:
             end_ns=end_ns,
             succeeded=outcome.succeeded,
             reason=outcome.reason,
+            at=outcome.at or "",
             states=self.planner.states,
             travelled=[coordinate for point in self._travelled for coordinate in point],
         )

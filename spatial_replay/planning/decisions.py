@@ -6,8 +6,9 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import TYPE_CHECKING, Final, Literal, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Final, Literal, Protocol, TypeAlias, get_args
 
+from spatial_replay.errors import UsageError
 from spatial_replay.lazy import Displayed
 from spatial_replay.text import counted, time_text
 
@@ -20,6 +21,9 @@ if TYPE_CHECKING:
 Kind: TypeAlias = Literal["execute", "hold", "wait", "no path"]
 """The kind of a step: move an object; hold, since the specification is satisfied; wait for an observation or
 for time to pass; stop, since no path to acceptance is left."""
+
+Stage: TypeAlias = Literal["pick", "way", "place"]
+"""Of a motion: taking hold of its object, moving it, leaving it at the target."""
 
 _MOST_LISTED: Final = 3
 """Conjuncts and causes that are listed of a map."""
@@ -215,10 +219,21 @@ class Outcome:
     Attributes:
         succeeded: whether the controller takes the object to be at its target.
         reason: what happened, as a sentence.
+        at: the stage at which it failed; None if it is not known.
     """
 
     succeeded: bool
     reason: str = ""
+    at: Stage | None = None
+
+    def __post_init__(self) -> None:
+        """Check the stage.
+
+        Raises:
+            UsageError: another stage.
+        """
+        if self.at is not None and self.at not in get_args(Stage):
+            raise UsageError(f'a motion fails at {self.at!r}; give at="pick", "way" or "place", or None')
 
 
 def wait_outcome(step: Step, states: tuple[int, ...]) -> Outcome:

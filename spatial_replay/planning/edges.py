@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from copy import copy
 from itertools import pairwise, takewhile
 from typing import Any, Final, NamedTuple, TypeAlias
 
@@ -18,8 +19,8 @@ from spatial_replay.errors import NoAutomatonError, UsageError
 from spatial_replay.geometry.footprint import TrackedObject
 from spatial_replay.geometry.poses import centre_of, radius_of
 from spatial_replay.monitor.atoms.live import SampleLeaves
-from spatial_replay.planning.decisions import Consideration, Edge, Guards, Outcome, Reason, Target
-from spatial_replay.planning.maps import Cubes, concerns
+from spatial_replay.planning.decisions import Consideration, Edge, Guards, Outcome, Reason, Stage, Target
+from spatial_replay.planning.maps import concerns
 from spatial_replay.planning.settings import Settings
 from spatial_replay.spec.formula import Formula, Outline, Specification
 from spatial_replay.trace.sample import Sample
@@ -35,6 +36,8 @@ BESIDE: Final = 1.5
 """How near an object stands to another one that may keep it from being pushed, in radii of that one."""
 _LISTED: Final = 4
 """The most edges that a reason names; the others are counted."""
+_TRIED: Final = "tried "
+"""The beginning of a kind of reason that counts motions."""
 LATER: Final = "what has to come after it cannot be done"
 """The kind of reason of an edge that could be taken now, and leads nowhere."""
 
@@ -221,7 +224,9 @@ def why_no_path(automaton: Automaton, state: int, pruned: Mapping[Edge, Reason],
     edges: dict[str, list[str]] = {}
     for (source, target), reason in sorted(pruned.items()):
         if source in reachable:
-            edges.setdefault(reason.kind, []).append(f"{source} -> {target}")
+            # the last failure of an edge says more than how often it was tried
+            kind = str(reason) if reason.kind.startswith(_TRIED) else reason.kind
+            edges.setdefault(kind, []).append(f"{source} -> {target}")
     reasons = "; ".join(f"{_listed(each)}: {kind}" for kind, each in edges.items())
     later = [
         each.detail for edge, each in sorted(pruned.items()) if edge[0] in reachable and each.kind == LATER
@@ -245,22 +250,32 @@ class FailedMotion(NamedTuple):
         target: what it was for.
         before: the newest sample when it began.
         stayed: whether its object stayed where it was.
+        refused: whether no sample came during the motion.
+        at: the stage at which it failed; None if it is not known.
     """
 
     target: Target
     before: Sample
     stayed: bool
+    refused: bool
+    at: Stage | None
 
 
 class Attempts:
-    """The motions of a run, by the edge that they were for."""
+    """The motions of a run, by the edge that they were for.
+
+    Attributes:
+        motions: the number of motions concluded, without refused ones.
+    """
 
     def __init__(self) -> None:
         """Begin with none."""
+        self.motions = 0
         self._failed: Counter[Edge] = Counter()
         self._total: Counter[Edge] = Counter()
-        self._places: dict[tuple[Cubes, str], tuple[tuple[float, float], ...]] = {}
+        self._places: dict[str, tuple[tuple[float, float], ...]] = {}
         self._left: dict[Edge, int] = {}
+        self._last: dict[Edge, str] = {}
         self._motions: list[FailedMotion] = []
         self._begin: tuple[Sample, Settings] | None = None
 
@@ -269,10 +284,16 @@ class Attempts:
         """Whether anything was tried."""
         return bool(self._total)
 
+    def forgiven(self) -> Attempts:
+        """Return the same attempts with only the refused motions as failures, so that others are repeated."""
+        attempts = copy(self)
+        attempts._motions, attempts._places = [each for each in self._motions if each.refused], {}
+        return attempts
+
     def why_exhausted(self, edge: Edge, most_failed: int) -> Reason | None:
         """Return why an edge is not tried again; None if it may be."""
         if self._failed[edge] >= most_failed:
-            return Reason(f"tried {self._failed[edge]} times")
+            return Reason(_tried(self._failed[edge]), self._last.get(edge, ""))
         # a motion that succeeds clears the failures, so that G F … would go on without end
         return Reason(f"tried {MOST_MOTIONS} times in all") if self._total[edge] >= MOST_MOTIONS else None
 
@@ -286,10 +307,14 @@ class Attempts:
         self, aim: Consideration, target: Target, outcome: Outcome, states: Sequence[int], sample: Sample
     ) -> None:
         """Take the outcome of a motion, and the automaton's states and the newest sample after it."""
+        refused = self._begin is not None and self._begin[0] is sample and not outcome.succeeded
+        self.motions += not refused
         if not outcome.succeeded:
-            if not self._failed_at_once(target, sample):
-                key = (aim.progress.cubes, target.name)
-                self._places[key] = (*self._places.get(key, ()), (target.x, target.y))
+            said = (outcome.reason, "no sample came during the motion" if refused else "")
+            self._last[aim.edge] = "; ".join(filter(None, said))
+            failed = self._kept(target, outcome, sample, refused)
+            if failed is None or self._is_about_place(failed):
+                self._places[target.name] = (*self.places_of(target.name), (target.x, target.y))
         elif tuple(states) == aim.edge[1:]:
             del self._failed[aim.edge]
         elif aim.is_joint and len(aim.motions) < self._left.get(aim.edge, MOST_MOTIONS):
@@ -297,33 +322,52 @@ class Attempts:
             self._left[aim.edge] = len(aim.motions)
             self._failed[aim.edge] -= 1
 
-    def _failed_at_once(self, target: Target, sample: Sample) -> bool:
-        """Keep a motion that failed; return whether its object was not even pushed away."""
+    def _kept(self, target: Target, outcome: Outcome, sample: Sample, refused: bool) -> FailedMotion | None:
+        """Keep a motion that failed, and return it."""
         if self._begin is None or self._begin[1].rules < 4:
-            return False
+            return None
         before, settings = self._begin
         stayed = _stands(target.name, before, sample, settings)
-        self._motions.append(FailedMotion(target, before, stayed))
-        return stayed and settings.skill == "push"
+        self._motions.append(FailedMotion(target, before, stayed, refused, outcome.at))
+        return self._motions[-1]
+
+    def _is_about_place(self, failed: FailedMotion) -> bool:
+        """Return whether another place may help after a failed motion."""
+        pushes = self._begin is not None and self._begin[1].skill == "push"
+        return failed.at in (None, "place") and not (pushes and failed.stayed)
 
     def places_of(self, name: str) -> tuple[tuple[float, float], ...]:
         """Return the places (x, y) where moving an object failed, whatever it was for."""
-        return tuple(place for (_, moved), each in self._places.items() if moved == name for place in each)
+        return self._places.get(name, ())
 
-    def failed_places(self, aim: Consideration, name: str) -> tuple[tuple[float, float], ...]:
-        """Return the places (x, y) where moving an object for the same progress failed."""
-        return self._places.get((aim.progress.cubes, name), ())
+    def needs_room(self, name: str) -> bool:
+        """Return whether an object could not be moved to a place, perhaps for lack of room there."""
+        return any(
+            each.target.name == name and each.stayed and each.at in (None, "place") for each in self._motions
+        )
+
+    def failed_pick(self, name: str, sample: Sample, settings: Settings) -> bool:
+        """Return whether an object could not be picked up while everything stood as in a sample."""
+        return settings.skill == "place" and any(
+            each.at == "pick" for each in self._here(name, sample, settings)
+        )
 
     def failed_here(self, name: str, sample: Sample, settings: Settings) -> tuple[Target, ...]:
         """Return the targets for which motions of an object failed while everything stood as in a sample.
 
         Of a push that left its object where it was, this asks only for what stands beside that.
         """
-        return tuple(
-            each.target
-            for each in self._motions
-            if each.target.name == name and _is_same_scene(each, sample, settings)
-        )
+        return tuple(each.target for each in self._here(name, sample, settings))
+
+    def _here(self, name: str, sample: Sample, settings: Settings) -> Iterator[FailedMotion]:
+        """Yield the failed motions of an object that began with everything as in a sample."""
+        for each in self._motions:
+            if each.target.name == name and _is_same_scene(each, sample, settings):
+                yield each
+
+
+def _tried(count: int) -> str:
+    return f"{_TRIED}{count} times" if count > 1 else f"{_TRIED}once"
 
 
 def _is_same_scene(motion: FailedMotion, sample: Sample, settings: Settings) -> bool:

@@ -135,6 +135,11 @@ class Planner:
         return tuple(sorted(self._states))
 
     @property
+    def motions(self) -> int:
+        """The number of motions concluded, without refused ones, during which no sample came."""
+        return self._attempts.motions
+
+    @property
     def has_observed(self) -> bool:
         """Whether it has observed a sample."""
         return self._sample is not None
@@ -280,10 +285,9 @@ class Planner:
     def _step_from(self, state: int) -> Step:
         """Return the step for the first edge, over the paths by length, that can be taken."""
         idle = idle_transitions(self.automaton, state, self._symbol)
-        movables = Movables(self._formulas, self._regions, self._newest(), self.settings, self._attempts)
+        movables = self._movables(self._attempts)
+        foresight = self._foresight(self._attempts)
         considered: list[Consideration] = []
-        about = self.automaton, self._formulas, self._regions, self.settings
-        foresight = Foresight(*about, self._attempts) if self.settings.motions > 1 else None
         # time takes idle transitions without any object being moved, so they stay possible
         pruned = set(self._pruned) - idle.edges
         while (path := next(self.automaton.paths(state, pruned), None)) is not None:
@@ -291,6 +295,12 @@ class Planner:
             if ahead := idle.along(path):
                 return self._waiting_step([*considered, consideration], ahead)
             considered.append(self._considered(consideration, path, movables, foresight))
+            if considered[-1].pruned and self._may_repeat(consideration.edge):
+                # a motion may fail by chance: without any other, one that failed is made again
+                forgiven = self._attempts.forgiven()
+                again = self._movables(forgiven), self._foresight(forgiven)
+                repeated = self._considered(consideration, path, *again)
+                considered[-1] = considered[-1] if repeated.pruned else repeated
             if (reason := considered[-1].pruned) is None:
                 return self._running_step(considered)
             edge = consideration.edge
@@ -303,6 +313,17 @@ class Planner:
             why = foresight.why_not(state) or ("" if first is None or is_later else first.detail)
         said = why_no_path(self.automaton, state, self._pruned, why)
         return self._decided("no path", considered, said)
+
+    def _movables(self, attempts: Attempts) -> Movables:
+        return Movables(self._formulas, self._regions, self._newest(), self.settings, attempts)
+
+    def _foresight(self, attempts: Attempts) -> Foresight | None:
+        about = self.automaton, self._formulas, self._regions, self.settings
+        return Foresight(*about, attempts) if self.settings.motions > 1 else None
+
+    def _may_repeat(self, edge: Edge) -> bool:
+        exhausted = self._attempts.why_exhausted(edge, self.settings.attempts)
+        return self.settings.rules > 3 and self._attempts.motions > 0 and exhausted is None
 
     def _considered(
         self,
@@ -317,9 +338,7 @@ class Planner:
             return replace(consideration, pruned=exhausted)
         later = moved_later(path, self._symbol, self._formulas, movables.names)
         candidates = [
-            movables.candidate(
-                name, consideration, self._attempts.failed_places(consideration, name), later, refine=True
-            )
+            movables.candidate(name, consideration, movables.failed_places(name), later, refine=True)
             for name in movables.names_for(consideration.progress)
         ]
         alone = with_choice(consideration, candidates, self.settings)

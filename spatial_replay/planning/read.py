@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from os import PathLike
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, get_args
 
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.lazy import Displayed
@@ -26,7 +26,7 @@ from spatial_replay.planning.decision_log import (
     decision_from_payload,
     latest_decisions,
 )
-from spatial_replay.planning.decisions import Outcome, Step
+from spatial_replay.planning.decisions import Outcome, Stage, Step
 from spatial_replay.planning.planner import Planner
 from spatial_replay.planning.settings import settings_from_text
 from spatial_replay.sources.open_log import open_source
@@ -292,4 +292,8 @@ class Rerun:
 
 
 def _outcome(decision: PlanDecision) -> Outcome:
-    return Outcome(decision.outcome.succeeded, decision.outcome.reason)
+    at = decision.outcome.at
+    stage = next((each for each in get_args(Stage) if each == at), None)
+    if at and stage is None:
+        raise LogError(f"the outcome of decision {decision.number} is at {at!r:.40}, not pick, way or place")
+    return Outcome(decision.outcome.succeeded, decision.outcome.reason, stage)

@@ -77,9 +77,13 @@ def find_target(
         return _why_nowhere(gradient, settings, bool(failed))
     if settings.skill == "place":
         # near a cell that was tried, a refined target may still be another one
-        untried = good & ~tried(gradient, failures, settings)
-        good = untried if untried.any() else good
-        return _best_cell(gradient, good & (room >= settings.room), good, tracked)
+        for apart in (_spread(settings), _SAME * _cell(settings)):
+            untried = good & ~tried(gradient, failures, apart)
+            if untried.any():
+                good = untried
+                break
+        wanted = min(settings.room, float(room[good].max())) if failures else settings.room
+        return _best_cell(gradient, good & (room >= wanted), good, tracked)
     return _nearest_cell(gradient, good, tracked, settings, failures)
 
 
@@ -360,9 +364,12 @@ def refined(
     size = settings.workspace.grid.cell_size
     spacing, turning, halved = _COARSEST * size, _widest_turn(target, tracked, settings) / 2.0, 0
     pose, best, least = (target.x, target.y, target.turn), target.robustness, -math.inf
+    apart = _spread(settings)
     if is_repeated(target, failures, settings):
         # any other place that is good enough is better
         best = settings.margin - 2.0 * _BETTER
+    if _is_near(target, failures, apart):
+        apart = _SAME * _cell(settings)
     for number in range(_MOST_GRIDS):
         x, y, turn = pose
         low = x - 2.5 * spacing, y - 2.5 * spacing
@@ -373,7 +380,7 @@ def refined(
             middle = len(gradient.turns) // 2, 2, 2
             least = settings.room if room[middle] >= settings.room else -math.inf
         good = (gradient.blocked == FREE) & (room >= least) & _near(gradient, target, tracked, settings)
-        good &= ~tried(gradient, failures, settings)
+        good &= ~tried(gradient, failures, apart)
         values = np.where(good, gradient.robustness, -np.inf)
         place = tuple(map(int, np.unravel_index(int(np.argmax(values)), values.shape)))
         if values[place] > best + _BETTER:
@@ -390,23 +397,32 @@ def refined(
     return Target(target.name, x, y, turn, yaw, (*target.waypoints[:-1], (x, y)), best)
 
 
-def tried(gradient: GradientMap, failures: Sequence[Target], settings: Settings) -> Booleans:
-    """Return (A, rows, columns): which poses of a map are some targets, but for a fraction of a cell."""
+def tried(gradient: GradientMap, failures: Sequence[Target], apart: float) -> Booleans:
+    """Return (A, rows, columns): which poses of a map are some targets, but for a distance."""
     same = np.zeros(gradient.blocked.shape, np.bool_)
     centres = gradient.grid.centres().reshape(*gradient.grid.shape, 2)
     for each in failures:
-        near = np.hypot(centres[..., 0] - each.x, centres[..., 1] - each.y) <= _SAME * _cell(settings)
+        near = np.hypot(centres[..., 0] - each.x, centres[..., 1] - each.y) <= apart
         same |= (np.abs(gradient.turns - each.turn) <= _SAME_TURN)[:, None, None] & near
     return same
 
 
 def is_repeated(target: Target, failures: Sequence[Target], settings: Settings) -> bool:
     """Return whether a target is one of some others, but for a fraction of a cell."""
+    return _is_near(target, failures, _SAME * _cell(settings))
+
+
+def _is_near(target: Target, failures: Sequence[Target], apart: float) -> bool:
     return any(
-        math.dist((target.x, target.y), (each.x, each.y)) <= _SAME * _cell(settings)
+        math.dist((target.x, target.y), (each.x, each.y)) <= apart
         and abs(target.turn - each.turn) <= _SAME_TURN
         for each in failures
     )
+
+
+def _spread(settings: Settings) -> float:
+    """Return how far other places are from one that failed, if there are any: about a finger's width."""
+    return max(_cell(settings), settings.room / 4.0)
 
 
 def _cell(settings: Settings) -> float:

@@ -40,7 +40,7 @@ class Decider(Protocol):
 
 
 class LoopEnd(NamedTuple):
-    """How a loop ended: the last decision, and the number of motions."""
+    """How a loop ended: the last decision, and the number of motions, without refused ones."""
 
     last: Step
     motions: int
@@ -84,19 +84,19 @@ def run_plan(decider: Decider, execute: Callable[[Step], Outcome], look: Callabl
     look()
     planner = decider.planner
     assert planner is not None
-    motions, waited, reached = 0, 0, {planner.states}
+    waited, reached = 0, {planner.states}
     while True:
         step = decider.next_step()
         if step.kind == "execute":
             decider.conclude(execute(step))
-            motions, waited, reached = motions + 1, 0, {planner.states}
+            waited, reached = 0, {planner.states}
         elif step.kind == "wait" and waited < MOST_WAITING_SAMPLES:
             look()
             # samples count only while the automaton reaches no new state
             waited += not step.ahead or planner.states in reached
             reached.add(planner.states)
         elif step.kind != "hold" or _holds(planner, look):
-            return LoopEnd(step, motions)
+            return LoopEnd(step, planner.motions)
 
 
 def _holds(planner: Planner, look: Callable[[], None]) -> bool:

@@ -163,7 +163,7 @@ class WorldExecutor:
             done = self._world.push(target.name, target.waypoints[1:] or target.waypoints, yaw)
         else:
             done = self._world.place(target.name, target.x, target.y, target.yaw, target.waypoints[1:-1])
-        return Outcome(done.succeeded, done.reason)
+        return Outcome(done.succeeded, done.reason, done.at)
 
 
 class PlanLoop:

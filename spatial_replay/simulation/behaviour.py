@@ -16,7 +16,7 @@ from py_trees.decorators import Retry
 from spatial_replay.simulation.grasp import Grasp, Point, best_grasp
 from spatial_replay.simulation.picking import carry, let_go, missed, pick_up, set_down
 from spatial_replay.simulation.scene import Scene
-from spatial_replay.simulation.world import Execution, TreeNode, TreeTick
+from spatial_replay.simulation.world import Execution, Stage, TreeNode, TreeTick
 
 Goal = tuple[Point, float | None]
 """The target position of a body, and its yaw there; None for any yaw."""
@@ -41,8 +41,8 @@ def setting_by_tree(
     succeeded = tree.status is Status.SUCCESS
     done = f"placed {', '.join(goals)}"
     if blackboard.failures:
-        done += f", after this went wrong: {'; '.join(blackboard.failures)}"
-    return Execution(succeeded, done if succeeded else blackboard.failures[-1])
+        done += f", after this went wrong: {'; '.join(each.reason for each in blackboard.failures)}"
+    return Execution(True, done) if succeeded else blackboard.failures[-1]
 
 
 class _Ticks:
@@ -74,7 +74,7 @@ class _Blackboard:
 
     def __init__(self) -> None:
         self.grasps: dict[str, Grasp] = {}
-        self.failures: list[str] = []
+        self.failures: list[Execution] = []
 
 
 def _task(
@@ -92,13 +92,13 @@ def _task(
         yield from let_go(scene, _opening(blackboard, name))
         return missed(scene, name, point)
 
-    steps: dict[str, _Motion] = {
-        "pick": lambda: pick_up(scene, name, blackboard.grasps[name]),
-        "carry": lambda: carry(scene, name, blackboard.grasps[name], point, via),
-        "place": lambda: set_down(scene, name, point),
-        "leave": leave,
+    steps: dict[str, tuple[Stage, _Motion]] = {
+        "pick": ("pick", lambda: pick_up(scene, name, blackboard.grasps[name])),
+        "carry": ("way", lambda: carry(scene, name, blackboard.grasps[name], point, via)),
+        "place": ("place", lambda: set_down(scene, name, point)),
+        "leave": ("place", leave),
     }
-    leaves = (_Moving(f"{verb} {name}", motion, blackboard) for verb, motion in steps.items())
+    leaves = (_Moving(f"{verb} {name}", motion, blackboard, stage) for verb, (stage, motion) in steps.items())
     stages = [_Detecting(scene, name, goal, blackboard), *leaves]
     move = Sequence(f"move {name}", memory=True, children=stages)
     options = [_Placed(scene, name, goal), move, _Moving(f"recover {name}", recover, None)]
@@ -117,8 +117,11 @@ _Motion = Callable[[], Generator[None, None, str]]
 class _Moving(Behaviour):
     """A motion as a leaf of the tree: each tick of the tree is one tick of the motion."""
 
-    def __init__(self, name: str, motion: _Motion, blackboard: _Blackboard | None) -> None:
+    def __init__(
+        self, name: str, motion: _Motion, blackboard: _Blackboard | None, stage: Stage | None = None
+    ) -> None:
         super().__init__(name)
+        self._stage = stage
         self._begin = motion
         self._blackboard = blackboard
         self._motion: Generator[None, None, str] | None = None
@@ -135,7 +138,7 @@ class _Moving(Behaviour):
             next(self._motion)
         except StopIteration as end:
             if end.value and self._blackboard is not None:
-                self._blackboard.failures.append(end.value)
+                self._blackboard.failures.append(Execution(False, end.value, self._stage))
             return Status.FAILURE if end.value else Status.SUCCESS
         return Status.RUNNING
 
@@ -150,7 +153,7 @@ class _Detecting(Behaviour):
     def update(self) -> Status:
         """Choose the grasp."""
         grasp = best_grasp(self._scene, self._body, *self._goal)
-        if isinstance(grasp, str):
+        if isinstance(grasp, Execution):
             self._blackboard.failures.append(grasp)
             return Status.FAILURE
         self._blackboard.grasps[self._body] = grasp

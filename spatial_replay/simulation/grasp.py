@@ -17,6 +17,7 @@ from spatial_replay.simulation.arm import (
 )
 from spatial_replay.simulation.scene import Scene, extent, rectangle
 from spatial_replay.simulation.shapes import Box
+from spatial_replay.simulation.world import Execution
 
 Point = tuple[float, float]
 
@@ -52,21 +53,21 @@ class Grasp:
 
 def best_grasp(
     scene: Scene, name: str, goal: Point, yaw: float | None, *, is_lifted: bool = True
-) -> Grasp | str:
-    """Return the grasp with the most clearance, preferring thin sides; or the reason why there is none.
+) -> Grasp | Execution:
+    """Return the grasp with the most clearance, preferring thin sides; or the failure if there is none.
 
     A body that is not lifted is turned the shorter way round.
     """
     start = scene.place_of(name)
     if not in_reach(*start):
-        return f"{name} lies out of the robot's reach"
+        return Execution(False, f"{name} lies out of the robot's reach", "pick")
     if not in_reach(*goal):
-        return f"({goal[0]:.2f}, {goal[1]:.2f}) is out of the robot's reach"
+        return Execution(False, f"({goal[0]:.2f}, {goal[1]:.2f}) is out of the robot's reach", "place")
     angles = _angles(scene, name)
     across = [(thickness, angle) for thickness, angle in angles if thickness <= _THICKEST]
     if not across:
         thinnest = f"{min(angles)[0] * 100:.1f} cm, and {_THICKEST * 100:.1f} cm fit between the fingers"
-        return f"{name} is too thick for the gripper as it lies: {thinnest}"
+        return Execution(False, f"{name} is too thick for the gripper as it lies: {thinnest}", "pick")
     bottom, top = scene.height(name)
     above_bottom = max(FINGERTIP + 0.003, top - bottom - _BELOW_TOP)
     best, best_room, can_turn_hand, can_pick, can_place = None, _ROOM, False, False, False
@@ -84,13 +85,14 @@ def best_grasp(
     if best is not None:
         return best
     if not can_turn_hand:
-        return f"the hand cannot turn as far as {name} has to be turned"
+        return Execution(False, f"the hand cannot turn as far as {name} has to be turned", "place")
     if can_pick and can_place:
-        return f"no grasp of {name} has room for the fingers both where it lies and where it should go"
+        said = f"no grasp of {name} has room for the fingers both where it lies and where it should go"
+        return Execution(False, said, "place")
     where = (
         "where it lies" if can_place else "where it should go" if can_pick else "where it lies and should go"
     )
-    return f"no room for the fingers around {name} {where}"
+    return Execution(False, f"no room for the fingers around {name} {where}", "place" if can_pick else "pick")
 
 
 def surface(scene: Scene, name: str, goal: Point) -> float:

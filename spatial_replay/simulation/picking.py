@@ -9,7 +9,7 @@ from itertools import pairwise
 from spatial_replay.simulation.arm import ABOVE, WIDEST, Motion
 from spatial_replay.simulation.grasp import Grasp, Point, best_grasp, surface
 from spatial_replay.simulation.scene import Scene
-from spatial_replay.simulation.world import Execution
+from spatial_replay.simulation.world import Execution, Stage
 
 _SLOW = 0.15
 _SETTING_DOWN = 0.002
@@ -27,17 +27,18 @@ def picking(
 ) -> Generator[None, None, Execution]:
     """Pick a body up and place its centre at a point, along others, with `yaw` unless that is None."""
     grasp = best_grasp(scene, name, goal, yaw)
-    if isinstance(grasp, str):
-        return Execution(False, grasp)
+    if isinstance(grasp, Execution):
+        return grasp
     stood = scene.pose(name).stands
+    at: Stage = "pick"
     trouble = yield from pick_up(scene, name, grasp)
     if not trouble:
-        trouble = yield from carry(scene, name, grasp, goal, via)
+        at, trouble = "way", (yield from carry(scene, name, grasp, goal, via))
     if not trouble:
-        trouble = yield from set_down(scene, name, goal)
+        at, trouble = "place", (yield from set_down(scene, name, goal))
     yield from let_go(scene, grasp.opening)
     trouble = trouble or missed(scene, name, goal, stood=stood)
-    return Execution(not trouble, trouble or f"placed {name}")
+    return Execution(False, trouble, at) if trouble else Execution(True, f"placed {name}")
 
 
 def pick_up(scene: Scene, name: str, grasp: Grasp) -> Generator[None, None, str]:
@@ -78,8 +79,8 @@ def carry(
 def turn_on_the_spot(scene: Scene, name: str, yaw: float) -> Generator[None, None, str]:
     """Turn a body on its support between the fingers; return the reason of a failure, or ""."""
     grasp = best_grasp(scene, name, scene.place_of(name), yaw, is_lifted=False)
-    if isinstance(grasp, str):
-        return grasp
+    if isinstance(grasp, Execution):
+        return grasp.reason
     trouble = yield from take_hold(scene, name, grasp)
     if not trouble:
         turned = yield from _holding(scene, name, scene.arm.move(*scene.arm.commanded, grasp.turn))

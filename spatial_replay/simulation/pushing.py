@@ -50,29 +50,34 @@ def pushing(
     corners = straightened([scene.place_of(name), *path])[1:]
     for corner in corners[:-1]:
         trouble = yield from _push_to(scene, name, corner, strokes=1, allowed=3 * _FAR)
-        if trouble:
-            return Execution(False, trouble)
+        if trouble is not None:
+            return trouble
     trouble = yield from _push_to(scene, name, corners[-1], strokes=_STROKES, allowed=_FAR)
-    trouble = trouble or (yield from _turn_to(scene, name, corners[-1], yaw))
+    if trouble is not None:
+        return trouble
+    if turning := (yield from _turn_to(scene, name, corners[-1], yaw)):
+        return Execution(False, turning, "place")
     is_straight = len(corners) == 1
     way = "straight to its place" if is_straight else f"along {len(corners)} straight stretches"
     turned = "" if yaw is None else ", and turned it there"
-    return Execution(not trouble, trouble or f"pushed {name} {way}{turned}")
+    return Execution(True, f"pushed {name} {way}{turned}")
 
 
 def _push_to(
     scene: Scene, name: str, goal: Point, *, strokes: int, allowed: float
-) -> Generator[None, None, str]:
-    """Push a body to a point in several strokes; return the reason of a failure, or ""."""
+) -> Generator[None, None, Execution | None]:
+    """Push a body to a point in several strokes; return the failure, if it fails."""
     missed = 0.0
     for _ in range(strokes):
         trouble = yield from _stroke(scene, name, goal)
-        if trouble:
+        if trouble is not None:
             return trouble
         missed = math.dist(scene.place_of(name), goal)
         if missed <= _CLOSE:
             break
-    return "" if missed <= allowed else f"{name} ended {missed * 100:.1f} cm from where it was pushed to"
+    if missed <= allowed:
+        return None
+    return Execution(False, f"{name} ended {missed * 100:.1f} cm from where it was pushed to", "place")
 
 
 def _turn_to(scene: Scene, name: str, goal: Point, yaw: float | None) -> Generator[None, None, str]:
@@ -110,23 +115,24 @@ def straightened(path: Sequence[Point]) -> list[Point]:
     return straightened(path[: farthest + 1])[:-1] + straightened(path[farthest:])
 
 
-def _stroke(scene: Scene, name: str, goal: Point) -> Generator[None, None, str]:
-    """Push a body straight towards a point; return the reason of a failure, or ""."""
+def _stroke(scene: Scene, name: str, goal: Point) -> Generator[None, None, Execution | None]:
+    """Push a body straight towards a point; return the failure, if it fails."""
     x, y = scene.place_of(name)
     length = math.dist((x, y), goal)
     if length < _CLOSE:
-        return ""
+        return None
     heading = math.atan2(goal[1] - y, goal[0] - x)
     u, v = math.cos(heading), math.sin(heading)
     back = u * x + v * y - extent(scene.footprint(name), heading)[0] + FINGER_DEPTH / 2
     behind = (x - u * (back + _AWAY), y - v * (back + _AWAY))
     if not in_reach(*goal):
-        return f"the robot does not reach ({goal[0]:.2f}, {goal[1]:.2f}), where {name} should go"
+        said = f"the robot does not reach ({goal[0]:.2f}, {goal[1]:.2f}), where {name} should go"
+        return Execution(False, said, "place")
     if not in_reach(*behind):
-        return f"the robot does not reach behind {name} where it lies"
+        return Execution(False, f"the robot does not reach behind {name} where it lies", "pick")
     gap = _gap(scene, name, behind, heading)
     if gap is None:
-        return f"no room for the fingers behind {name}"
+        return Execution(False, f"no room for the fingers behind {name}", "pick")
     arm = scene.arm
     yield from arm.travel(*behind, turn_towards(heading, *behind))
     yield from arm.grip(gap)
@@ -136,7 +142,7 @@ def _stroke(scene: Scene, name: str, goal: Point) -> Generator[None, None, str]:
     x, y, z = arm.commanded
     yield from arm.move(x - 0.02 * u, y - 0.02 * v, z)
     yield from arm.move(x - 0.02 * u, y - 0.02 * v, 0.1)
-    return "" if reached else f"the fingers lost {name}"
+    return None if reached else Execution(False, f"the fingers lost {name}", "way")
 
 
 def _advance(

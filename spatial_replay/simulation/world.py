@@ -13,6 +13,8 @@ from spatial_replay.trace.sample import Sample
 
 Skill = Literal["push", "place"]
 """What the robot does with an object: push it along a path, or pick and place it."""
+Stage = Literal["pick", "way", "place"]
+"""Of a motion: taking hold of its object, moving it, leaving it at its goal."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,10 +67,12 @@ class Execution:
     Attributes:
         succeeded: whether the object is at its goal.
         reason: what happened, as text.
+        at: the stage at which it failed; None if it is not known.
     """
 
     succeeded: bool
     reason: str
+    at: Stage | None = None
 
 
 class TreeNode(NamedTuple):

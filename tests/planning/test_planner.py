@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -86,6 +86,80 @@ def test_a_step_that_fails_is_tried_elsewhere():
     assert math.dist((first.x, first.y), (second.x, second.y)) > TABLE.workspace.grid.cell_size
 
 
+@dataclass
+class Stubborn(Table):
+    """A robot whose first motions are refused, or fail at a stage, while nothing moves."""
+
+    at: str | None = None
+    refusals: int = 0
+    looks: bool = False
+
+    def execute(self, step):
+        if self.refusals:
+            self.refusals -= 1
+            if self.looks:
+                self.look()
+            return Outcome(False, "no room for the fingers", self.at)
+        return super().execute(step)
+
+
+def ended(one, objects, **options):
+    """The steps of a run of a stubborn robot."""
+    table = Stubborn(dict(objects), one, **options)
+    table.look()
+    steps = [one.next_step()]
+    while steps[-1].kind == "execute":
+        one.conclude(table.execute(steps[-1]))
+        steps.append(one.next_step())
+    return steps
+
+
+def test_a_place_without_room_is_followed_by_one_with_room_from_everything():
+    settings = replace(TABLE, movable=("cup",), room=1.5)
+    one = planner("F (cup dist plate <= 2)", settings)
+    first, second, last = ended(one, THINGS, at="place", refusals=1)
+    assert last.kind == "hold"
+    before, after = (next(each for each in step.candidates if each.is_chosen) for step in (first, second))
+    assert before.room_from == ()
+    assert after.room_from is None
+    assert math.dist((first.target.x, first.target.y), (second.target.x, second.target.y)) > 0.5
+
+
+def test_refused_motions_are_not_counted_and_the_last_reason_is_said():
+    one = planner("F (cup enclosedin plate)", replace(TABLE, movable=("cup",)))
+    steps = ended(one, THINGS, refusals=100)
+    assert one.motions == 0
+    assert steps[-1].kind == "no path"
+    assert "no room for the fingers" in steps[-1].reason
+    assert "no sample came during the motion" in steps[-1].reason
+
+
+def test_after_a_failed_pick_no_other_target_is_tried():
+    one = planner("F (cup enclosedin plate)", replace(TABLE, movable=("cup",)))
+    first, second, last = ended(one, THINGS, at="pick", refusals=1, looks=True)
+    assert second.target == first.target
+    assert last.kind == "hold"
+    refused = ended(
+        planner("F (cup enclosedin plate)", replace(TABLE, movable=("cup",))), THINGS, at="pick", refusals=1
+    )
+    assert [each.kind for each in refused] == ["execute", "no path"]
+    assert "could not be picked up" in str(refused[-1].pruned[0][1])
+
+
+def test_a_push_that_failed_is_made_again_without_any_other():
+    walls = (sr.Footprint.box(0, 3, 10, 4.2), sr.Footprint.box(0, 5.8, 10, 7))
+    workspace = Workspace(Grid.over(0, 0, 10, 10, 0.5), obstacles=walls)
+    objects = {"cup": block(1, 5, size=1), "plate": block(8, 5, size=1)}
+    one = planner("F (cup dist plate <= 1)", Settings(workspace, "push", movable=("cup",)))
+    steps = ended(one, objects, at="way", refusals=3, looks=True)
+    assert [each.kind for each in steps] == ["execute"] * 4 + ["hold"]
+
+
+def test_a_failure_has_one_of_three_stages():
+    with pytest.raises(UsageError, match="fails at 'lift'"):
+        Outcome(False, "", "lift")
+
+
 def samples_on_the_way(step, objects):
     """What would be seen while a step's object follows its waypoints."""
     (name, points) = step.target.name, [np.array(each) for each in step.target.waypoints]
@@ -133,7 +207,7 @@ def test_an_object_without_a_free_path_is_not_pushed():
 def test_an_edge_is_pruned_after_failed_motions():
     steps, _ = run(planner("F (cup enclosedin plate)"), THINGS, stuck={"cup", "plate"})
     assert steps[-1].kind == "no path"
-    assert steps[-1].pruned == (((0, 1), Reason("tried 6 times")),)
+    assert steps[-1].pruned == (((0, 1), Reason("tried 6 times", "it does not move")),)
     assert "no path left" in steps[-1].reason
     assert len(steps) == 1 + TABLE.attempts
 
@@ -188,7 +262,7 @@ def test_the_only_target_is_tried_again_until_attempts_are_used_up():
     text = "F (cup leftof plate and cup dist plate <= 1)"
     steps, _ = run(planner(text, settings), THINGS, stuck={"cup"})
     assert [step.kind for step in steps] == ["execute"] * 4 + ["no path"]
-    assert steps[-1].pruned == (((0, 1), Reason("tried 4 times")),)
+    assert steps[-1].pruned == (((0, 1), Reason("tried 4 times", "it does not move")),)
     steps, _ = run(planner(text, replace(settings, rules=1)), THINGS, stuck={"cup"})
     assert [step.kind for step in steps] == ["execute", "no path"]
     assert "it was tried wherever it would hold" in steps[-1].pruned[0][1].detail

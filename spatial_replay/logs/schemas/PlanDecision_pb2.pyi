@@ -552,6 +552,7 @@ class PlanOutcome(google.protobuf.message.Message):
     REASON_FIELD_NUMBER: builtins.int
     STATES_FIELD_NUMBER: builtins.int
     TRAVELLED_FIELD_NUMBER: builtins.int
+    AT_FIELD_NUMBER: builtins.int
     end_ns: builtins.int
     """Time in nanoseconds of the last sample before its end."""
     succeeded: builtins.bool
@@ -560,6 +561,8 @@ class PlanOutcome(google.protobuf.message.Message):
     """
     reason: builtins.str
     """What happened, in words."""
+    at: builtins.str
+    """The stage at which a motion failed: pick, way or place; empty if it is not known."""
     @property
     def states(self) -> google.protobuf.internal.containers.RepeatedScalarFieldContainer[builtins.int]:
         """Where the automaton is then."""
@@ -576,9 +579,10 @@ class PlanOutcome(google.protobuf.message.Message):
         reason: builtins.str = ...,
         states: collections.abc.Iterable[builtins.int] | None = ...,
         travelled: collections.abc.Iterable[builtins.float] | None = ...,
+        at: builtins.str = ...,
     ) -> None: ...
     def HasField(self, field_name: typing.Literal["_end_ns", b"_end_ns", "_succeeded", b"_succeeded", "end_ns", b"end_ns", "succeeded", b"succeeded"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["_end_ns", b"_end_ns", "_succeeded", b"_succeeded", "end_ns", b"end_ns", "reason", b"reason", "states", b"states", "succeeded", b"succeeded", "travelled", b"travelled"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["_end_ns", b"_end_ns", "_succeeded", b"_succeeded", "at", b"at", "end_ns", b"end_ns", "reason", b"reason", "states", b"states", "succeeded", b"succeeded", "travelled", b"travelled"]) -> None: ...
     @typing.overload
     def WhichOneof(self, oneof_group: typing.Literal["_end_ns", b"_end_ns"]) -> typing.Literal["end_ns"] | None: ...
     @typing.overload
