@@ -16,12 +16,14 @@ class Table:
     Attributes:
         stuck: objects that do not move.
         slips: how many of the next motions end half way.
+        stage: the stage at which these fail, if the robot says it.
     """
 
     objects: dict[str, sr.TrackedObject]
     planner: object
     stuck: set[str] = field(default_factory=set)
     slips: int = 0
+    stage: str | None = None
     time_ns: int = 0
     samples: list[sr.Sample] = field(default_factory=list)
 
@@ -49,7 +51,7 @@ class Table:
             self.objects[target.name] = moved_object(start, x, y, turn)
             self.look()
             if share < 1.0:
-                return Outcome(False, "it slipped")
+                return Outcome(False, "it slipped", self.stage)
         if target.turn and not carried:
             for number in range(1, 7):
                 self.objects[target.name] = moved_object(start, *ends[-1], number / 6 * target.turn)

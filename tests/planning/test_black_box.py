@@ -60,6 +60,14 @@ def test_recomputed_decisions_are_the_same(tmp_path):
     assert recomputed.maps == sum(len(each.candidates) for step in steps for each in step.considered)
 
 
+def test_the_stage_of_a_failure_is_logged_and_read_back(tmp_path):
+    record_plan_of(tmp_path / "run.mcap", slips=1, stage="way")
+    assert read_decisions(tmp_path / "run.mcap").decisions[0].outcome.at == "way"
+    first, *_ = sr.planning.read_steps(tmp_path / "run.mcap")
+    assert first.outcome == sr.Outcome(False, "it slipped", "way")
+    assert recompute_decisions(open_source(tmp_path / "run.mcap")).differences == ()
+
+
 def test_equal_runs_give_equal_logs(tmp_path):
     for name in ("one.mcap", "two.mcap"):
         record_plan_of(tmp_path / name)
