@@ -156,7 +156,7 @@ def _compare_with_log(
 ) -> _Compared:
     """Compare names, thresholds, regions and windows with what a log has."""
     # only needed with --log: log readers load the numerical libraries
-    from spatial_replay.logs.source import samples_only
+    from spatial_replay.logs.source import reading_only
     from spatial_replay.monitor.plausibility import LogNumbers, plausibility_warnings, window_lines
     from spatial_replay.replay import LogNames
     from spatial_replay.sources.open_log import open_source
@@ -166,7 +166,7 @@ def _compare_with_log(
     faults: list[str] = []
     first_ns: int | None = None
     with progress("samples") as advance:
-        for block in samples_only(source).iter_blocks():
+        for block in reading_only(source).iter_blocks():
             names.add(block.trace)
             numbers.add(block.trace)
             faults += block.trace.faults

@@ -16,7 +16,6 @@ import click
 from spatial_replay.cli.terminal import show_diagnostics, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.downloads import local_copy
-from spatial_replay.logs.read_options import SAMPLES_LIMIT
 from spatial_replay.logs.remote import LogFile, is_address, local_files, log_file
 from spatial_replay.text import counted, nearest_hint
 from spatial_replay.trace.time_points import time_point_from_text
@@ -206,22 +205,6 @@ def add_options(options: Sequence[_Option], command: Callable[..., Any]) -> Call
     return command
 
 
-def _read_without_cache(context: click.Context, parameter: click.Parameter, is_given: bool) -> None:
-    """Allow the cache of samples no room while the command runs, in its other processes, too."""
-    if not is_given:
-        return
-    before = os.environ.get(SAMPLES_LIMIT)
-
-    def restore() -> None:
-        if before is None:
-            os.environ.pop(SAMPLES_LIMIT, None)
-        else:
-            os.environ[SAMPLES_LIMIT] = before
-
-    os.environ[SAMPLES_LIMIT] = "0"
-    context.call_on_close(restore)
-
-
 class ReadArguments(TypedDict):
     """How to read a log: the keyword arguments of `open_source`."""
 
@@ -273,13 +256,6 @@ _READING = (
         type=click.Choice(["decompose", "hull"]),
         default="decompose",
         help="Split concave polygons into convex parts, or take their hull.  [default: decompose]",
-    ),
-    click.option(
-        "--no-cache",
-        is_flag=True,
-        expose_value=False,
-        callback=_read_without_cache,
-        help="Large logs: read no samples that an earlier command has kept, and keep none.",
     ),
 )
 

@@ -21,9 +21,6 @@ Lost = Literal["drop", "keep"]
 OnTimeJump = Literal["error", "split"]
 """Whether a clock that jumps back, as when a simulation restarts, is an error or ends the log."""
 
-SAMPLES_LIMIT: Final = "SPATIAL_REPLAY_SAMPLES"
-"""Names the gigabytes of samples of large logs that are kept for a second read; 0 for none."""
-
 FASTEST_RATE = 10**9
 """Frames a second; at a higher rate, frames would share a nanosecond."""
 

@@ -206,13 +206,6 @@ def reading_only(source: Source, keep: tuple[str, ...] = ()) -> Source:
     return cast(Source, replace(cast(Any, source), keep=keep)) if hasattr(source, "keep") else source
 
 
-def samples_only(source: Source) -> Source:
-    """Return a source whose blocks hold its samples and no messages, which may come from a cache."""
-    if hasattr(source, "without_messages"):
-        return cast(Source, replace(cast(Any, source), keep=(), without_messages=True))
-    return reading_only(source)
-
-
 def axes_of(source: Source) -> Axes:
     """Return the axes of a source, or of what a log was recorded from; its samples have ours."""
     axes = getattr(source, "axes", None)

@@ -19,7 +19,6 @@ from spatial_replay.logs.source import (
     read_ahead,
     read_blocks,
     reading_only,
-    samples_only,
 )
 from spatial_replay.logs.topics import OBJECTS, protobuf_channel
 from spatial_replay.monitor.atoms.delays import look_back
@@ -174,7 +173,7 @@ class Selection:
         # every Nth sample is counted from the log's first, wherever the window starts
         from_start = look_before(self.files) or window.every > 1
         read = 0
-        source = self.source if messages else samples_only(self.source)
+        source = self.source if messages else reading_only(self.source)
         for block in read_blocks(source, None if from_start else window.start_ns, window.end_ns):
             trace = block.trace
             if window.every > 1:
@@ -248,7 +247,7 @@ class Selection:
         if missing and not self.window.is_whole:
             # an object that appears outside the window is no mistake in the specification
             whole = LogNames()
-            for block in read_blocks(samples_only(self.source)):
+            for block in read_blocks(reading_only(self.source)):
                 whole.add(block.trace)
             missing = self._missing_names(whole)
         if missing and self.options.strict_names:
@@ -264,7 +263,7 @@ class Selection:
         name = self.source.name
         spans = [
             (int(block.trace.times_ns[0]), int(block.trace.times_ns[-1]))
-            for block in read_blocks(samples_only(self.source))
+            for block in read_blocks(reading_only(self.source))
             if len(block.trace)
         ]
         if not spans:

@@ -28,7 +28,7 @@ from spatial_replay.logs.formats.drone import FRAMES_A_SECOND, is_annotations, i
 from spatial_replay.logs.formats.tracks import iter_jsonl, open_text
 from spatial_replay.logs.read_options import Lost, OnTimeJump, ReadOptions, count_of
 from spatial_replay.logs.remote import BAG_METADATA, LogFile, RemoteFile, is_web, log_file
-from spatial_replay.logs.source import IterTraces, Source, TrackSource, samples_only, units_of
+from spatial_replay.logs.source import IterTraces, Source, TrackSource, reading_only, units_of
 from spatial_replay.logs.topics import MAGIC
 from spatial_replay.text import counted_from
 from spatial_replay.trace.axes import Axes
@@ -126,7 +126,7 @@ def read_trace(
         y_down=y_down,
         late=late,
     )
-    blocks = samples_only(source).iter_blocks()
+    blocks = reading_only(source).iter_blocks()
     traces = [replace(block.trace, remarks=block.remarks) for block in blocks]
     trace = Trace.concatenate(traces)
     first_ns = int(trace.times_ns[0]) if len(trace) else 0

@@ -8,24 +8,20 @@ import resource
 import subprocess
 import sys
 import tempfile
-import time
 import zlib
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 import numpy as np
 import zstandard
 from mcap.reader import make_reader
 
-from spatial_replay.cores import cores
 from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.logs.messages import Block
-from spatial_replay.logs.source import samples_only
+from spatial_replay.logs.source import reading_only
 from spatial_replay.recording import record_source
 from spatial_replay.replay import run_replay
 from spatial_replay.sources.open_log import open_source
@@ -103,38 +99,19 @@ def _peak_bytes(*arguments: str) -> int:
 
 
 def bench_reading(measure: Any) -> None:
-    """Reading our own log, all samples into columns: once, again, and with one core."""
+    """Reading our own log, all samples into columns."""
     count = 200_000
-    kept = {name: os.environ.get(name) for name in ("SPATIAL_REPLAY_CACHE", "SPATIAL_REPLAY_SAMPLES")}
     with tempfile.TemporaryDirectory() as folder, _as_the_command_line():
         log = Path(folder) / "run.mcap"
         record_source(Moving(count), log)
-        os.environ["SPATIAL_REPLAY_CACHE"] = folder
         per_sample: Any = {"per": count, "unit": "sample", "runs": 5}
         records = _chunk_records(log)
-        bare = measure("decompressed, checked, no more", lambda _: _decompressed(records), **per_sample)
+        measure("decompressed, checked, no more", lambda _: _decompressed(records), **per_sample)
 
-        def read(room: str) -> int:
-            os.environ["SPATIAL_REPLAY_SAMPLES"] = room
-            return sum(len(block.trace) for block in samples_only(open_source(log)).iter_blocks())
+        def read(_: object) -> int:
+            return sum(len(block.trace) for block in reading_only(open_source(log)).iter_blocks())
 
-        try:
-            first = measure("reading", lambda _: read("0"), limit_s=5e-6, **per_sample)
-            measure("reading and keeping", lambda _: read("4"), **(per_sample | {"runs": 1, "warmups": 0}))
-            measure("reading again", lambda _: read("4"), limit_s=0.5e-6, **per_sample)
-            if cores() > 1:
-                with _on_one_core():
-                    measure("reading with one core", lambda _: read("0"), **per_sample)
-                measure.ratio(f"{cores()} cores, time of one", _time_of_one(lambda: read("0")), 1 / 1.7)
-                bare_share = _time_of_one(lambda: _decompressed_by_all(records))
-                measure.remark(f"decompression alone: {cores()} cores, time of one {bare_share:.2f}")
-        finally:
-            for name, value in kept.items():
-                if value is None:
-                    os.environ.pop(name, None)
-                else:
-                    os.environ[name] = value
-        measure.ratio("reading, times the bare pass", first.median_s / bare.median_s, 2.0)
+        measure("reading", read, limit_s=12e-6, **per_sample)
 
 
 def _chunk_records(log: Path) -> list[tuple[bytes, int]]:
@@ -153,15 +130,8 @@ def _decompressed(records: list[tuple[bytes, int]]) -> int:
     return sum(zlib.crc32(decompressor.decompress(data, max_output_size=size)) for data, size in records)
 
 
-def _decompressed_by_all(records: list[tuple[bytes, int]]) -> int:
-    """Do the same on all cores, which have nothing but the memory in common."""
-    shares = [records[begin :: cores()] for begin in range(cores())]
-    with ThreadPoolExecutor(cores()) as threads:
-        return sum(threads.map(_decompressed, shares))
-
-
 def bench_annotating(measure: Any) -> None:
-    """`replay -o`: a log of 80 MB to an annotated one, on all cores and on one, beside bare zstd."""
+    """`replay -o`: a log of 80 MB to an annotated one, next to bare zstd."""
     count = 100_000
     with tempfile.TemporaryDirectory() as folder, _as_the_command_line():
         log, annotated = Path(folder) / "run.mcap", Path(folder) / "annotated.mcap"
@@ -174,55 +144,10 @@ def bench_annotating(measure: Any) -> None:
             annotated.unlink(missing_ok=True)
             run_replay(open_source(log), files, keep_leaves=True, output=annotated)
 
-        processor_s: list[float] = []
-
-        def timed(_: object) -> None:
-            begin = time.process_time()
-            annotate(None)
-            processor_s.append(time.process_time() - begin)
-
         annotate(None)
         chunks = _chunk_contents(annotated)
-        bare = measure("compressed, checksums, no more", lambda _: _compressed(chunks), **per_sample)
-        measure("replay -o", timed, limit_s=15e-6, **per_sample)
-        measure.ratio("processor time, times bare", median(processor_s) / count / bare.median_s, 6.0)
-        if cores() > 1:
-            with _on_one_core():
-                measure("replay -o with one core", annotate, **per_sample)
-            measure.ratio(f"{cores()} cores, time of one", _time_of_one(lambda: annotate(None)), 1 / 1.7)
-
-
-def _time_of_one(run: Callable[[], object]) -> float:
-    """Return what a run takes on all cores, of its time on one: in turns, as shared machines change speed."""
-    found = []
-    for _ in range(7):
-        on_all_s = _seconds(run)
-        with _on_one_core():
-            found.append(on_all_s / _seconds(run))
-    return median(found)
-
-
-def _seconds(run: Callable[[], object]) -> float:
-    begin = time.perf_counter()
-    run()
-    return time.perf_counter() - begin
-
-
-@contextmanager
-def _on_one_core() -> Iterator[None]:
-    """Have all threads of this process run on one core, those that it has started already, too."""
-    chosen = os.sched_getaffinity(0)
-    try:
-        _pin_threads({min(chosen)})
-        yield
-    finally:
-        _pin_threads(chosen)
-
-
-def _pin_threads(chosen: set[int]) -> None:
-    for thread in Path("/proc/self/task").iterdir():
-        with suppress(ProcessLookupError):
-            os.sched_setaffinity(int(thread.name), chosen)
+        measure("compressed, checksums, no more", lambda _: _compressed(chunks), **per_sample)
+        measure("replay -o", annotate, limit_s=35e-6, **per_sample)
 
 
 @contextmanager
@@ -266,6 +191,6 @@ def bench_replay_large(measure: Any) -> None:
             unit="sample",
             runs=1,
             warmups=0,
-            limit_s=1 / 30_000,
+            limit_s=35e-6,
         )
         print(f"{'':20} peak memory {max(peaks) / 1e6:,.0f} MB, limit 1,500 MB")

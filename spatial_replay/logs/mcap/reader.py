@@ -7,7 +7,7 @@ out only when no later chunk can hold an earlier one.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -41,13 +41,11 @@ from spatial_replay.logs.objects.decode import decode_objects
 from spatial_replay.logs.objects.sample_columns import ColumnReader, trace_of
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.logs.remote import LogFile, RemoteFile, open_file
-from spatial_replay.logs.sample_cache import DamagedEntryError, cached_samples
 from spatial_replay.logs.topics import ALL, DERIVED, METADATA, OBJECTS, RECOVERY, is_kept
 from spatial_replay.text import Instant, Sentence, counted, encodable
 from spatial_replay.trace.axes import Axes
 from spatial_replay.trace.declared_units import signal_units_from_metadata
-from spatial_replay.trace.sample import LATEST_NS
-from spatial_replay.trace.trace import Trace, within
+from spatial_replay.trace.trace import Trace
 
 FIRST_SAMPLES = 1_024
 """Samples of the first block; each one after it has half as many again, up to those of a block. Other threads
@@ -65,14 +63,12 @@ class McapSource:
     Attributes:
         keep: which of its other messages its blocks hold, as `is_kept` takes them. What they do not hold is
             not read, where chunks say what they hold.
-        without_messages: whether the blocks hold no messages, so that samples may come from a cache.
     """
 
     path: LogFile
     kind: str = "MCAP"
     concave: Concave = "decompose"
     keep: tuple[str, ...] = (ALL,)
-    without_messages: bool = False
 
     @property
     def name(self) -> str:
@@ -83,32 +79,6 @@ class McapSource:
 
         Only chunks that reach into the window are read, if the log has an index.
         """
-        if not self.without_messages:
-            yield from self._blocks(start_ns, end_ns)
-            return
-        cached = None if isinstance(self.path, RemoteFile) else cached_samples(self.path, self.concave)
-        if cached is not None and (entry := cached.open()) is not None:
-            with entry, suppress(DamagedEntryError):
-                for trace in cached.iter_traces(entry):
-                    if len(window := within(trace, start_ns, end_ns)):
-                        yield Block(window)
-                    # from where the log itself is read, if the entry turns out to be damaged
-                    start_ns = max(start_ns or 0, int(trace.times_ns[-1]) + 1)
-                return
-        is_whole = not start_ns and (end_ns is None or end_ns > LATEST_NS)
-        writer = cached.writer() if cached is not None and is_whole else None
-        try:
-            for block in self._blocks(start_ns, end_ns):
-                if writer is not None:
-                    writer.add(replace(block.trace, remarks=block.remarks))
-                yield replace(block, messages=Messages())
-            if writer is not None:
-                writer.finish()
-        finally:
-            if writer is not None:
-                writer.give_up()
-
-    def _blocks(self, start_ns: int | None, end_ns: int | None) -> Iterator[Block]:
         with self.open_walk() as walk:
             window = (0 if start_ns is None else start_ns, AFTER_ALL_NS if end_ns is None else end_ns)
             decoder = _BlockDecoder(self, walk)
@@ -354,7 +324,7 @@ class _BlockDecoder:
         trace, faults = self._trace(messages, own, columns.log_time_ns[own])
         for fault in faults:
             self._fault(fault)
-        if len(trace) < int(is_own.sum()) and not self._source.without_messages:
+        if len(trace) < int(is_own.sum()):
             # a copy holds the samples that were read, and is sound
             read = own[np.isin(columns.log_time_ns[own], trace.times_ns)]
             columns = select(columns, np.union1d(np.flatnonzero(~is_own), read))
@@ -392,7 +362,7 @@ class _BlockDecoder:
             sequence=heads["sequence"].astype(np.int64),
             log_time_ns=heads["log_time"].astype(np.int64),
             publish_time_ns=heads["publish_time"].astype(np.int64),
-            payloads=() if self._source.without_messages else messages.payloads,
+            payloads=messages.payloads,
         )
 
     def _fault(self, what: str) -> None:
