@@ -108,7 +108,7 @@ def test_the_commands_of_the_readme_run_in_a_clone_with_the_exit_code_they_show(
             code = int(comment.split(":")[0]) if comment else 0
             assert run_in_process(shlex.split(command)[1:]) == code, line
             ran.append(command.split()[1])
-    assert {"record", "check", "replay", "explain", "report", "export", "info"} <= set(ran)
+    assert set(ran) == {"record", "replay", "explain", "report"}
 
 
 def test_every_input_that_the_documentation_takes_from_recordings_exists() -> None:
@@ -141,7 +141,6 @@ def test_every_extra_is_explained_where_one_installs() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     install = (ROOT / "docs/install.md").read_text("utf-8")
     for extra in project["optional-dependencies"]:
-        assert f"| `{extra}` |" in README
         assert f"| `{extra}` |" in install
     for dependency in project["dependencies"]:
         name = re.split(r"[<>=~ ;]", dependency)[0]
