@@ -171,11 +171,10 @@ def test_a_search_with_nothing_else_to_try_ends(tmp_path: Path) -> None:
 def test_the_example_of_the_page_prints_what_the_page_shows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    page = (Path(__file__).parents[2] / "docs" / "falsification.md").read_text("utf-8")
-    (example,) = re.findall(r"^```python\n(.*?)^```", page, re.M | re.S)
-    (shown,) = re.findall(r"^```text\n(.*?)^```", page, re.M | re.S)
+    page = (Path(__file__).parents[2] / "docs" / "simulation.md").read_text("utf-8")
+    example, shown = re.findall(r"^```python\n([^`]*)```\n\n```text\n(.*?)^```", page, re.M | re.S)[0]
     monkeypatch.chdir(tmp_path)
-    exec(compile(example, "docs/falsification.md", "exec"), {})  # noqa: S102
+    exec(compile(example, "docs/simulation.md", "exec"), {})  # noqa: S102
     assert capsys.readouterr().out == shown
 
 
