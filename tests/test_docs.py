@@ -207,6 +207,8 @@ def test_the_site_has_every_page_and_public_name_and_loads_nothing_from_elsewher
         assert f'href="{page.stem}.html"' in index
     for name in sr.__all__:
         assert name.startswith("_") or f'id="spatial_replay.{name}"' in reference
+    for result in ("SpecResult", "Update", "Verified", "Tuning", "Automaton", "Step"):
+        assert re.search(rf'id="spatial_replay\.[\w.]+\.{result}"', reference), result
     for page in (tmp_path / "site").rglob("*.html"):
         text = page.read_text("utf-8")
         assert not re.findall(r'<(?:script|img|iframe|source)[^>]*src="(?:https?:)?//', text)

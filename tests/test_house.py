@@ -12,7 +12,6 @@ from importlib.metadata import packages_distributions
 from importlib.resources import files
 from itertools import chain
 from pathlib import Path
-from typing import get_args
 
 import pytest
 
@@ -89,44 +88,3 @@ def imported_modules(path: Path) -> set[str]:
         elif isinstance(node, ast.ImportFrom) and node.module is not None:
             modules.add(node.module.partition(".")[0])
     return modules
-
-
-def test_every_type_that_public_functions_return_is_public() -> None:
-    missing = {
-        f"{owner} returns {kind.__module__}.{kind.__qualname__}"
-        for name in spatial_replay.__all__
-        for owner, function in public_functions(name, getattr(spatial_replay, name))
-        for kind in types_in(return_annotation(function))
-        if kind.__module__.startswith("spatial_replay") and kind.__name__ not in spatial_replay.__all__
-    }
-    assert sorted(missing) == []
-
-
-def public_functions(name: str, value: object) -> list[tuple[str, object]]:
-    """A public function, or the public methods and properties of a public class."""
-    if not isinstance(value, type):
-        return [(name, value)] if callable(value) else []
-    functions = {
-        each: getattr(member, "func", getattr(member, "fget", getattr(member, "__func__", member)))
-        for each, member in vars(value).items()
-        if not each.startswith("_")
-    }
-    return [(f"{name}.{each}", function) for each, function in functions.items() if callable(function)]
-
-
-def return_annotation(function: object) -> object:
-    module = sys.modules[getattr(function, "__module__", "builtins")]
-    annotations = getattr(function, "__annotations__", {})
-    text = annotations.get("return")
-    if not isinstance(text, str):
-        return text
-    try:
-        return eval(text, vars(module))  # noqa: S307
-    except NameError:  # a type that is imported for the type checker only
-        return None
-
-
-def types_in(annotation: object) -> set[type]:
-    """The classes in an annotation, those in its arguments, too."""
-    found = {annotation} if isinstance(annotation, type) and not get_args(annotation) else set()
-    return found.union(*(types_in(each) for each in get_args(annotation)))

@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 
 from replay.runs import PiecewiseSource, content_of
-from spatial_replay import Automaton, Footprint, Recorder, Sample, Trace, automaton, parse_specification
+from spatial_replay import Footprint, Recorder, Sample, Trace, automaton, parse_specification
 from spatial_replay.annotate.specification import ReportedTree, encode_specification
 from spatial_replay.automata import stored_text
+from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.propositions import Propositions
 from spatial_replay.logs import Attachment, MemorySink
 from spatial_replay.logs.schemas import AutomatonState_pb2

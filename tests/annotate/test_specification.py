@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from spatial_replay import NamedSpec, Specification
+from spatial_replay import Specification
 from spatial_replay.annotate.specification import ReportedTree, encode_specification, unit_of
 from spatial_replay.logs.schemas.Specification_pb2 import Specification as SpecificationMessage
 from spatial_replay.spec import format_specification
@@ -13,6 +13,7 @@ from spatial_replay.spec.formula import (
     Boolean,
     Group,
     Misalignment,
+    NamedSpec,
     Number,
     Quantified,
     Signal,

@@ -8,7 +8,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from spatial_replay import Automaton, automaton, parse_specification
+from spatial_replay import automaton, parse_specification
+from spatial_replay.automata.automaton import Automaton
 
 FILE = Path(__file__).with_name("golden.json")
 FORMULAS = (

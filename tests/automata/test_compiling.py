@@ -8,8 +8,9 @@ import pytest
 
 import spatial_replay as sr
 from automata.golden import FILE, FORMULAS, as_values
-from spatial_replay import Automaton, NoAutomatonError, UsageError, automaton, parse_specification
+from spatial_replay import NoAutomatonError, UsageError, automaton, parse_specification
 from spatial_replay.automata import dot_text, hoa_text, stored_text, words_text
+from spatial_replay.automata.automaton import Automaton
 from spatial_replay.simulation.worlds import default_specification
 
 GOLDEN = json.loads(FILE.read_text())
@@ -26,7 +27,7 @@ def test_automata_are_those_that_mona_gives(text: str) -> None:
 
 def test_automata_are_available_from_the_package_root() -> None:
     machine = sr.automaton(sr.parse_specification("F p >= 0"))
-    assert isinstance(machine, sr.Automaton)
+    assert isinstance(machine, Automaton)
     assert machine.accepts([[False], [True]]) and not machine.accepts([[False], [False]])
 
 

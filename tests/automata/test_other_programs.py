@@ -17,7 +17,6 @@ from hypothesis import given, settings
 from automata.golden import FORMULAS
 from laws.strategies_automaton import compiled, formulas_with_automata
 from spatial_replay import (
-    Automaton,
     NoAutomatonError,
     OutputError,
     Recorder,
@@ -27,6 +26,7 @@ from spatial_replay import (
     parse_specification,
 )
 from spatial_replay.automata import automaton_from, stored_text, svg_text
+from spatial_replay.automata.automaton import Automaton
 
 needs_mona = pytest.mark.skipif(shutil.which("mona") is None, reason="MONA is not installed")
 needs_graphviz = pytest.mark.skipif(shutil.which("dot") is None, reason="Graphviz is not installed")

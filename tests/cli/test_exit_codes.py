@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from spatial_replay import Diagnostic, errors
+from spatial_replay import errors
 from spatial_replay.cli.application import (
     ExitCode,
     exit_code_from_error,
@@ -18,6 +18,7 @@ from spatial_replay.cli.application import (
     message_from_error,
     most_severe,
 )
+from spatial_replay.spec.diagnostics import Diagnostic
 
 FAULT = Diagnostic("error", "unknown relation 'ovlap'", "a.spatial", 1, 3, "a ovlap b", 5)
 ORDER = (130, 70, 2, 3, 1, 4, 0)

@@ -13,11 +13,12 @@ import pytest
 import spatial_replay as sr
 from falsification.crossings import APART, VARIED, crossing
 from pages import shown
+from spatial_replay.falsification.failures import Falsification
 
 pytest.importorskip("cma", reason="the search needs cma")
 
 
-def search(folder: Path, **options: object) -> sr.Falsification:
+def search(folder: Path, **options: object) -> Falsification:
     return sr.falsify(crossing, APART, output=folder, vary=VARIED, **{"budget": 30, **options})
 
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 from hypothesis import strategies as st
 
 from laws.strategies_monitor import LEAVES
-from spatial_replay import Automaton, NamedSpec, Specification, automaton
+from spatial_replay import Specification, automaton
 from spatial_replay.automata import Compiler
-from spatial_replay.spec.formula import Boolean, Bound, Formula, Temporal, Truth
+from spatial_replay.automata.automaton import Automaton
+from spatial_replay.spec.formula import Boolean, Bound, Formula, NamedSpec, Temporal, Truth
 
 _leaves = st.one_of(st.sampled_from(LEAVES), st.sampled_from(LEAVES), st.builds(Truth, st.booleans()))
 

@@ -14,15 +14,15 @@ from hypothesis import strategies as st
 from laws.reference import Prefix
 from laws.strategies_automaton import compiled, formulas_and_symbols, formulas_with_automata
 from laws.strategies_monitor import leaf_runs
-from spatial_replay import Automaton, NamedSpec, Specification, automaton
+from spatial_replay import Specification, automaton
 from spatial_replay.automata import TransitionTable, automaton_from, stored_text
-from spatial_replay.automata.automaton import automaton_of
+from spatial_replay.automata.automaton import Automaton, automaton_of
 from spatial_replay.automata.ltlf import Skeleton
 from spatial_replay.automata.minimise import least, merged
 from spatial_replay.automata.products import joined
 from spatial_replay.automata.progression import progressed
 from spatial_replay.automata.propositions import Propositions
-from spatial_replay.spec.formula import Boolean
+from spatial_replay.spec.formula import Boolean, NamedSpec
 
 known = st.booleans()
 perhaps_unknown = st.sampled_from([False, True, None])

@@ -10,9 +10,10 @@ from hypothesis import strategies as st
 
 import spatial_replay as sr
 from laws.strategies_monitor import formulas_of_leaves, leaf_runs, recordings, specifications
-from spatial_replay import NamedSpec, Specification
+from spatial_replay import Specification
 from spatial_replay.monitor.online.program import compile_formula
 from spatial_replay.monitor.online.step import OnlineRun
+from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.witness.path import End, deciding_path
 from spatial_replay.monitor.witness.unfinished import evaluate_unfinished
 from spatial_replay.spec.expressions import TrackedName
@@ -22,6 +23,7 @@ from spatial_replay.spec.formula import (
     Boolean,
     Bound,
     Formula,
+    NamedSpec,
     Quantified,
     Temporal,
     Truth,
@@ -44,7 +46,7 @@ def signal_runs(draw) -> sr.Trace:
     return sr.Trace.from_samples(samples)
 
 
-def evaluated(formula: Formula, trace: sr.Trace) -> sr.SpecResult:
+def evaluated(formula: Formula, trace: sr.Trace) -> SpecResult:
     return sr.evaluate(Specification((NamedSpec("s", formula),), "paper"), trace).result()
 
 

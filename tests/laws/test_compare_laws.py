@@ -13,14 +13,15 @@ from hypothesis import strategies as st
 import spatial_replay as sr
 from laws.strategies_monitor import HEADER, WORDS, Recording, recordings, specifications
 from laws.strategies_spec import formula_texts
-from spatial_replay import NamedSpec, Specification
+from spatial_replay import Specification
 from spatial_replay.compare.shared_names import unify_regions
-from spatial_replay.spec.formula import Formula
+from spatial_replay.monitor.result import SpecResult
+from spatial_replay.spec.formula import Formula, NamedSpec
 
 OTHER_HEADER = HEADER.replace("box(-2, -2, 3, 2)", "box(-1, -2, 3, 1)")
 
 
-def numbers_of(result: sr.SpecResult) -> tuple[object, ...]:
+def numbers_of(result: SpecResult) -> tuple[object, ...]:
     return result.verdict, *(None if x != x else x for x in (result.robustness, result.lower, result.upper))
 
 

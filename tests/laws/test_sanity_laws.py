@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 import spatial_replay as sr
 from laws.reference import Interval, Prefix
 from spatial_replay.sanity.linear import Inequality, solve
+from spatial_replay.spec.formula import NamedSpec
 
 NAMES = "abc"
 
@@ -214,7 +215,7 @@ def satisfying_lengths(formula: object) -> dict[bool, set[int]]:
     for length in range(1, LONGEST + 1):
         for word in product(SYMBOLS, repeat=length):
 
-            def leaf(atom: sr.NamedSpec, t: int, word: tuple[tuple[bool, bool], ...] = word) -> Interval:
+            def leaf(atom: NamedSpec, t: int, word: tuple[tuple[bool, bool], ...] = word) -> Interval:
                 name, operator, _ = atom.parameters
                 holds = word[t]["pq".index(name)] == (operator == ">=")
                 return Interval(1.0, 1.0) if holds else Interval(-1.0, -1.0)

@@ -15,6 +15,7 @@ import spatial_replay as sr
 from replay.runs import write_tracks
 from spatial_replay import UsageError
 from spatial_replay.cli import run
+from spatial_replay.learning.learned import Learned
 from spatial_replay.spec.format import format_formula
 
 STEP_NS = 200_000_000
@@ -45,7 +46,7 @@ GOOD = [delivery(each, 2.0 + index / 50) for index, each in enumerate(CLEAR)]
 BAD = [delivery(0.42, 2.03), delivery(0.43, 2.02), delivery(0.6, 1.2), delivery(0.7, cup_first=False)]
 
 
-def verdicts(learned: sr.Learned, traces: Sequence[sr.Trace]) -> list[str]:
+def verdicts(learned: Learned, traces: Sequence[sr.Trace]) -> list[str]:
     assert learned.specification is not None
     return [str(sr.evaluate(learned.specification, trace).verdict) for trace in traces]
 

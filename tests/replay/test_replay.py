@@ -17,7 +17,6 @@ from spatial_replay import (
     Footprint,
     LogError,
     OutputError,
-    Replayed,
     Sample,
     SpecificationError,
     Trace,
@@ -35,6 +34,7 @@ from spatial_replay.replay import (
     load_files,
     run_replay,
 )
+from spatial_replay.replay.engine import Replayed
 from spatial_replay.sources import open_source
 
 SPEC = parse_specification(SPECIFICATION, filename="blocks.spatial")

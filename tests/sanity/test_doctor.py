@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 import spatial_replay as sr
 from pages import shown
+from spatial_replay.sanity.examples import Example
 
 REGIONS = """
 region left_bin = box(0, 0, 1, 1)
@@ -244,7 +245,7 @@ def test_shortest_runs_show_what_has_to_hold_in_each_sample() -> None:
     assert len(spec.satisfied.rows) == 3
 
 
-def shown_runs(text: str) -> list[sr.Example]:
+def shown_runs(text: str) -> list[Example]:
     """The shortest runs of the one result of a text, each evaluated again from its samples."""
     specification = sr.parse_specification(text)
     (spec,) = sr.doctor(specification).specs

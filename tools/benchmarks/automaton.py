@@ -7,6 +7,7 @@ from concurrent.futures import ProcessPoolExecutor
 from typing import Any
 
 import spatial_replay as sr
+from spatial_replay.automata.automaton import Automaton
 from spatial_replay.simulation.worlds import default_specification
 
 
@@ -95,6 +96,6 @@ def bench_automata_at_once(measure: Any) -> None:
     measure(f"4 processes, {compiler}", run, per=100, unit="automaton", runs=3)
 
 
-def _compiled(job: tuple[str, Any]) -> sr.Automaton:
+def _compiled(job: tuple[str, Any]) -> Automaton:
     text, compiler = job
     return sr.automaton(sr.parse_specification(text), compiler=compiler)

@@ -16,6 +16,7 @@ from spatial_replay.logs.source import MemorySource
 from spatial_replay.recording import record_source
 from spatial_replay.replay import LoadedLog
 from spatial_replay.trace.trace import Trace
+from spatial_replay.tuning.tuned import Tuning
 
 LOGS, FEW_LOGS = 1_000, 50
 SEVERAL, FEW_SEVERAL = 100, 10
@@ -107,7 +108,7 @@ def bench_watch(measure: Any) -> None:
         )
 
 
-def _found(tuning: sr.Tuning) -> sr.Tuning:
+def _found(tuning: Tuning) -> Tuning:
     if not tuning.is_found:
         raise RuntimeError("the benchmark of five constants has values that fit, and they were not found")
     return tuning
