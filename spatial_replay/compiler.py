@@ -9,6 +9,7 @@ import ctypes
 import os
 import sys
 import threading
+import time
 from collections.abc import Callable, Sequence
 from functools import cached_property, partial
 from pathlib import Path
@@ -22,6 +23,9 @@ from spatial_replay.errors import UsageError
 
 ROW: Final = 32
 """So many neighbouring numbers are a row (see `row_code` in `compiled`)."""
+
+_PATIENCE_S: Final = 1.0
+"""Compiling that takes less is not announced."""
 
 
 class Lanes(Protocol):
@@ -44,6 +48,28 @@ class Lanes(Protocol):
 
     def spread(self, row: Any, at: int) -> Any:
         """Return a row of nothing but the number at a place."""
+
+
+class _Announcement:
+    """Says once, on standard error, that compiling takes longer than a second."""
+
+    def __init__(self) -> None:
+        self._open, self._since_s, self._spent_s, self._is_said = 0, 0.0, 0.0, False
+
+    def begin(self) -> None:
+        now_s = time.monotonic()
+        # what a kernel calls is compiled while it is
+        self._since_s = self._since_s if self._open else now_s
+        self._open += 1
+        if not self._is_said and self._spent_s + now_s - self._since_s > _PATIENCE_S:
+            self._is_said = True
+            remedy = "`spatial-replay warmup` does it beforehand"
+            sys.stderr.write(f"spatial-replay: compiling, once on this machine; {remedy}\n")
+
+    def end(self) -> None:
+        if self._open:
+            self._open -= 1
+            self._spent_s += 0.0 if self._open else time.monotonic() - self._since_s
 
 
 class Compiler:
@@ -238,14 +264,15 @@ class Compiler:
                 import numba
                 from numba.core import event
 
-                listeners = self.listeners
+                listeners, announcement = self.listeners, _Announcement()
 
                 class Listener(event.Listener):  # type: ignore[misc, unused-ignore]
                     def on_start(self, event: object) -> None:
-                        for hear in tuple(listeners):
+                        for hear in tuple(listeners) or (announcement.begin,):
                             hear()
 
-                    def on_end(self, event: object) -> None: ...
+                    def on_end(self, event: object) -> None:
+                        announcement.end()
 
                 cast(Any, event).register("numba:compile", Listener())
                 self._compiler = numba

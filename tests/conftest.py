@@ -40,6 +40,15 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
         terminalreporter.line("--forbid-skips was given, and tests were skipped: the run fails")
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _unannounced() -> Iterator[None]:
+    """What tests read from standard error does not depend on what the machine has compiled before."""
+    from spatial_replay.compiled import compilations
+
+    with compilations(lambda: None):
+        yield
+
+
 @pytest.fixture
 def data_folder() -> Path:
     """The folder of recordings to compare with; the test skips where there is none."""

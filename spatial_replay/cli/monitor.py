@@ -23,7 +23,6 @@ from spatial_replay.cli.options import (
     specs_option,
 )
 from spatial_replay.cli.output import change_line, ending_lines
-from spatial_replay.cli.progress import announcing_compilation
 from spatial_replay.cli.terminal import Line, StatusLine, show, show_diagnostics, show_file, warn
 from spatial_replay.cli.viewer_options import ServingArguments, serving_options
 from spatial_replay.errors import UsageError
@@ -209,23 +208,22 @@ def monitor(
     if output is not None:
         _refuse_inputs(output, specs, mapping_file)
     with ExitStack() as opened:
-        with announcing_compilation():
-            recorders = opened.enter_context(open_recorders(files, mapping, output, trigger, clips))
-            writers: list[SampleWriter] = [*recorders]
-            fire = next((each.trigger for each in recorders if trigger and each.is_triggered), None)
-            if fire is not None:
-                by_signal.attach(fire)
-            if serves:
-                writers.append(opened.enter_context(_viewing(files, mapping, serving, fire)))
-            session = LiveSession(
-                address,
-                files,
-                mapping,
-                recorders=writers,
-                topics=topics,
-                max_delay_s=max_delay_s,
-                dead_man_s=dead_man_s,
-            )
+        recorders = opened.enter_context(open_recorders(files, mapping, output, trigger, clips))
+        writers: list[SampleWriter] = [*recorders]
+        fire = next((each.trigger for each in recorders if trigger and each.is_triggered), None)
+        if fire is not None:
+            by_signal.attach(fire)
+        if serves:
+            writers.append(opened.enter_context(_viewing(files, mapping, serving, fire)))
+        session = LiveSession(
+            address,
+            files,
+            mapping,
+            recorders=writers,
+            topics=topics,
+            max_delay_s=max_delay_s,
+            dead_man_s=dead_man_s,
+        )
         run = _Run(session, recorders, length_s, until)
         asyncio.run(run.follow())
     run.show_remarks()

@@ -9,8 +9,6 @@ from contextlib import contextmanager
 from threading import Timer
 from typing import TYPE_CHECKING
 
-from spatial_replay.cli.terminal import show
-
 if TYPE_CHECKING:
     from rich.progress import Progress
 
@@ -23,23 +21,6 @@ _NOTEBOOK = "JPY_PARENT_PID"
 """What kernels of notebooks set for the programs that their cells run."""
 
 Advance = Callable[[int], None]
-
-
-@contextmanager
-def announcing_compilation() -> Iterator[None]:
-    """Print a line before the first kernel is compiled that no cache holds, where there is no bar."""
-    from spatial_replay.compiled import compilations
-
-    is_said = False
-
-    def say() -> None:
-        nonlocal is_said
-        if not is_said:
-            is_said = True
-            show(f"{COMPILING}: about a minute; `spatial-replay warmup` does it beforehand")
-
-    with compilations(say):
-        yield
 
 
 @contextmanager

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import gc
+import itertools
 import math
 import time
 from collections.abc import AsyncIterator, Sequence
@@ -34,6 +35,7 @@ from spatial_replay.monitor.monitor import Ending, Monitor
 from spatial_replay.recording.changes import VerdictChanges
 from spatial_replay.recording.recorder import Recorder, SampleWriter
 from spatial_replay.recording.recording import RunEvent
+from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.formula import Specification
 from spatial_replay.text import counted
 from spatial_replay.trace.sample import Sample
@@ -116,6 +118,7 @@ class LiveSession:
         self._inbox: Inbox | None = None
         self._early = Inbox()
         self._refused: set[str] = set()
+        self._remarked: set[Diagnostic] = set()
         self.remarks: tuple[str, ...] = ()
         self.failure: LogError | None = None
         """Why the run ended before it was stopped: time that jumped back."""
@@ -434,6 +437,10 @@ class LiveSession:
 
     def _update(self, sample: Sample, arrived_s: float) -> LiveUpdate:
         updates = tuple(monitor.update(sample) for monitor in self._monitors)
+        for each in itertools.chain.from_iterable(update.remarks for update in updates):
+            if each not in self._remarked:
+                self._remarked.add(each)
+                self._notes.append(f"{each.filename}:{each.line}:{each.column}: {each.message}; {each.hint}")
         self._samples += 1
         self._time_ns = sample.time_ns
         now_s = time.monotonic()

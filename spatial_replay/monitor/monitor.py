@@ -2,27 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from reprlib import repr as shortened
 from types import MappingProxyType
-from typing import NamedTuple, cast
+from typing import Final, Literal, NamedTuple, cast
 
 from spatial_replay.compiled import compile_ahead
-from spatial_replay.errors import TraceError, UsageError
+from spatial_replay.errors import SpecificationError, TraceError, UsageError
 from spatial_replay.geometry.arrays import Floats
+from spatial_replay.geometry.footprint import TrackedObject
 from spatial_replay.monitor.online.live_runs import ROOM
 from spatial_replay.monitor.result import no_such_node
 from spatial_replay.monitor.semantics import checked_semantics
 from spatial_replay.monitor.stream import LiveStream
 from spatial_replay.monitor.verdict import Verdict, final_verdict, online_verdict, worst_verdict
 from spatial_replay.monitor.violation import Settled, Violation, ViolationLog, rehearse
+from spatial_replay.spec.checks import check_names, object_names, signal_names
+from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.formula import NamedSpec, Specification, iter_nodes
 from spatial_replay.spec.load import require_specification
 from spatial_replay.spec.units import declared_unit
-from spatial_replay.text import times_apart
+from spatial_replay.text import counted, time_text, times_apart
 from spatial_replay.trace.declared_units import checked_units
 from spatial_replay.trace.sample import Sample, require_time
+from spatial_replay.trace.time_points import duration_ns_from_text
+
+_MOST_KNOWN: Final = 1000
+"""Names that a missing one is compared with, of each kind."""
 
 
 class NodeUpdate(NamedTuple):
@@ -100,6 +108,7 @@ class Update:
         monitored: what they are numbers of.
         settled: what `violations` are found from.
         satisfied: the specs that are satisfied whatever comes; why is found when asked for (`reason`).
+        remarks: a warning for each object and signal of the specification that is missing for too long.
     """
 
     time_ns: int
@@ -107,6 +116,7 @@ class Update:
     monitored: Monitored = field(repr=False)
     settled: tuple[Settled, ...] = field(repr=False, default=())
     satisfied: tuple[Settled, ...] = field(repr=False, default=())
+    remarks: tuple[Diagnostic, ...] = ()
 
     @property
     def specs(self) -> tuple[SpecUpdate, ...]:
@@ -192,6 +202,8 @@ class Monitor:
         semantics: str = "ltlf",
         start_ns: int | None = None,
         units: Mapping[str, str] | None = None,
+        missing_after: str | int | None = "5s",
+        strict_names: bool = False,
     ) -> None:
         """Start before the first sample, with everything compiled: the first time on a machine, that takes
         many seconds.
@@ -199,6 +211,9 @@ class Monitor:
         Args:
             start_ns: samples before this time are only there to be looked back at (`a[-3]`).
             units: for sentences: of signals by their names, of lengths by "".
+            missing_after: a time ("5s") or a number of samples; updates after it warn of each object and
+                signal that has never come so far. None for no warnings.
+            strict_names: a missing name is an error of `update` then.
 
         Raises:
             UsageError: something else than a specification, unknown semantics, a start that is no time, units
@@ -227,6 +242,7 @@ class Monitor:
             rehearse(specification)
         self._live = LiveStream(specification, checked, start_ns or 0)
         self._violations = ViolationLog(specification, start_ns or 0, known) if checked == "ltlf" else None
+        self._awaited = _AwaitedNames(specification, missing_after, strict=strict_names)
         self._last_ns = -1
         self._numbers: list[Floats | None] = [None] * len(self._specs)
 
@@ -241,6 +257,7 @@ class Monitor:
         Raises:
             TraceError: a time that does not come after the last one's.
             UsageError: not a sample; more objects in open groups than can be bound.
+            SpecificationError: with `strict_names`, a name that is missing for too long.
         """
         if not isinstance(sample, Sample):
             raise UsageError(f"{sample!r} is not a sample; give a Sample(time_ns, objects)")
@@ -250,6 +267,7 @@ class Monitor:
             raise TraceError(
                 f"a sample at {at} follows one at {last}; give samples in the order of their times"
             )
+        remarks = self._awaited.extend(sample) if self._awaited.is_open else ()
         self._last_ns = time_ns
         self._numbers = numbers = self._live.extend(sample)
         settled: tuple[Settled, ...] = ()
@@ -261,8 +279,71 @@ class Monitor:
         update = object.__new__(Update)
         own = update.__dict__
         own["time_ns"], own["numbers"], own["monitored"] = time_ns, numbers, self._monitored
-        own["settled"], own["satisfied"] = settled, satisfied
+        own["settled"], own["satisfied"], own["remarks"] = settled, satisfied, remarks
         return update
+
+
+class _AwaitedNames:
+    """The objects and signals of a specification that have not come yet."""
+
+    def __init__(self, specification: Specification, after: str | int | None, *, strict: bool) -> None:
+        is_count = isinstance(after, int) and not isinstance(after, bool) and after > 0
+        if not (is_count or after is None or isinstance(after, str)):
+            remedy = "give a time such as '5s', or a number of samples"
+            raise UsageError(f"missing_after is {shortened(after)}; {remedy}")
+        self._specification, self._strict = specification, strict
+        self._after = duration_ns_from_text(after) if isinstance(after, str) else after
+        self._is_time = isinstance(after, str)
+        self._first_ns: int | None = None
+        self._samples = 0
+        self._objects, self._signals = set(object_names(specification)), set(signal_names(specification))
+        self._known: tuple[set[str], set[str], set[str]] = (set(), set(), set())
+        self._remarks: tuple[Diagnostic, ...] = ()
+        self.is_open = after is not None and bool(self._objects or self._signals)
+        """Whether any is still to come."""
+
+    def extend(self, sample: Sample) -> tuple[Diagnostic, ...]:
+        """Return a warning for each that has not come by this sample, which is late by now."""
+        self._samples += 1
+        if self._first_ns is None:
+            self._first_ns = sample.time_ns
+        missing = len(self._objects) + len(self._signals)
+        objects, signals = {*sample.objects, *sample.unknown}, sample.signals.keys()
+        tracked = (each for each in sample.objects.values() if isinstance(each, TrackedObject))
+        self._learn(objects, signals, {each.class_name for each in tracked if each.class_name})
+        self._objects -= objects
+        self._signals -= signals
+        self.is_open = bool(self._objects or self._signals)
+        elapsed = sample.time_ns - self._first_ns if self._is_time else self._samples
+        if self._after is None or elapsed < self._after:
+            return ()
+        if not self._remarks or len(self._objects) + len(self._signals) < missing:
+            self._remarks = self._found()
+        if self._strict and self._remarks:
+            raise SpecificationError(self._remarks)
+        return self._remarks
+
+    def _learn(self, *names: Collection[str]) -> None:
+        """Keep names, for hints."""
+        if not self._remarks:
+            for known, new in zip(self._known, names, strict=True):
+                if len(known) < _MOST_KNOWN:
+                    known.update(new)
+
+    def _found(self) -> tuple[Diagnostic, ...]:
+        after = self._after or 0
+        during = time_text(after) if self._is_time else counted(after, "sample")
+        objects, signals, classes = self._known
+        found = check_names(
+            self._specification,
+            sorted(objects.union(object_names(self._specification)) - self._objects),
+            sorted(signals.union(signal_names(self._specification)) - self._signals),
+            where="run",
+            during=f"in its first {during}",
+            classes=sorted(classes),
+        )
+        severity: Literal["error", "warning"] = "error" if self._strict else "warning"
+        return tuple(replace(each, severity=severity) for each in found if each.severity == "error")
 
 
 def _places_of_names(names: tuple[tuple[str | None, ...], ...]) -> Mapping[str, tuple[int, int]]:

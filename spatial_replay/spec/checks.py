@@ -201,6 +201,7 @@ def check_names(
     signals: Iterable[str],
     *,
     where: str = "log",
+    during: str = "",
     classes: Iterable[str] = (),
     each: Mapping[str, str] = _NO_CHOICE,
 ) -> tuple[Diagnostic, ...]:
@@ -210,6 +211,7 @@ def check_names(
         known: names of the log's objects.
         signals: names of its numeric signals.
         where: what has them, if not a log.
+        during: the part of it that is known, such as "in its first 5.000 s"; "" for all.
         classes: of its objects.
         each: for parameters of templates, the objects that they stand for: "all", "class:NAME" or a name.
 
@@ -228,7 +230,7 @@ def check_names(
         source.diagnostic(
             "error",
             places.get(name, Span(0, 0)),
-            f"the {where} never has the {kind} {name!r}",
+            f"the {where} never has the {kind} {name!r}" + (during and f" {during}"),
             _class_hint(name, kind, known_classes)
             or " ".join(filter(None, (nearest_hint(name, candidates), _listing(kind, candidates)))),
         )

@@ -220,6 +220,41 @@ def test_the_bar_shows_that_code_is_being_compiled(tmp_path: Path) -> None:
     assert "compiling" not in said
 
 
+_LONG_COMPILED = """
+import os
+import spatial_replay.compiler as compiler
+from spatial_replay.compiled import compile_ahead, kernel
+
+@kernel
+def doubled(number):
+    return 2 * number
+
+@kernel
+def quadrupled(number):
+    return doubled(doubled(number))
+
+compile_ahead()
+if "HASTE" in os.environ:
+    compiler._PATIENCE_S = -1
+print(quadrupled(1))
+"""
+
+
+def test_compiling_that_takes_long_is_said_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "work.py").write_text(_LONG_COMPILED)
+
+    def said(**variables: str) -> str:
+        own = environment(SPATIAL_REPLAY_KERNELS="", NUMBA_CACHE_DIR=str(tmp_path / "cache"), **variables)
+        command = [sys.executable, "work.py"]
+        done = subprocess.run(command, cwd=tmp_path, env=own, capture_output=True, text=True, check=True)
+        assert done.stdout == "4\n"
+        return done.stderr
+
+    line = "spatial-replay: compiling, once on this machine; `spatial-replay warmup` does it beforehand\n"
+    assert said(HASTE="1") == line
+    assert said(HASTE="1") == ""
+
+
 _INTERRUPTED_IN_A_CALLBACK = """
 import ctypes, os, signal, sys, time
 from spatial_replay.cli.application import main

@@ -576,3 +576,13 @@ def test_messages_that_do_not_fit_are_said_once_and_counted_at_the_end(
         assert run(command) == 1
     said = [line for line in capsys.readouterr().out.splitlines() if ": /vase at " in line]
     assert len(said) == 2 and "and 29 more like this" in said[1]
+
+
+def test_a_name_that_the_robot_does_not_report_is_noted_once(tmp_path: Path) -> None:
+    mapped, spec = files(tmp_path, MAPPING, "spec clear = G (robto dist vase >= 0.5)")
+    with robot() as own:
+        driving = drive(own, range(0, 700, 50))
+        found = asyncio.run(updates_of(own.address, spec, mapped, lambda update: update.time_ns >= 6 * 10**9))
+        driving.join()
+    notes = [note for each in found for note in each.notes if "robto" in note]
+    assert len(notes) == 1 and "in its first 5.000 s; did you mean 'robot'?" in notes[0]

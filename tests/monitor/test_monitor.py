@@ -13,7 +13,15 @@ from math import inf
 import pytest
 
 from monitor.scenes import SECOND
-from spatial_replay import Footprint, Monitor, Sample, TraceError, UsageError, parse_specification
+from spatial_replay import (
+    Footprint,
+    Monitor,
+    Sample,
+    SpecificationError,
+    TraceError,
+    UsageError,
+    parse_specification,
+)
 
 
 def at(second, **signals):
@@ -83,6 +91,38 @@ def test_a_monitor_refuses_invalid_arguments_and_samples():
         Monitor(parse_specification("p >= 0"), start_ns=1.5)
 
 
+@pytest.mark.parametrize(("after", "during"), [("5s", "in its first 5.000 s"), (6, "in its first 6 samples")])
+def test_a_name_that_does_not_come_is_remarked_with_the_nearest_one(after: str | int, during: str) -> None:
+    specification = parse_specification("spec apart = G (cub dist vase >= 1)\nspec full = G charge >= 0.2")
+    monitor, strict = (
+        Monitor(specification, missing_after=after, strict_names=each) for each in (False, True)
+    )
+    objects = {name: Footprint.disc(place, 0, 0) for place, name in enumerate(("cube", "vase"))}
+    samples = [Sample(second * SECOND, objects, {"charg": 0.5}) for second in range(6)]
+    for sample in samples[:5]:
+        assert monitor.update(sample).remarks == strict.update(sample).remarks == ()
+    cube, charge = monitor.update(samples[5]).remarks
+    assert (cube.severity, cube.line, cube.column) == ("warning", 1, 17)
+    assert cube.message == f"the run never has the object 'cub' {during}"
+    assert cube.hint.startswith("did you mean 'cube'? its objects are cube, vase")
+    assert "did you mean 'charg'?" in charge.hint
+    with pytest.raises(SpecificationError, match="never has the object 'cub'"):
+        strict.update(samples[5])
+    came = Sample(6 * SECOND, {**objects, "cub": objects["vase"]})
+    assert [each.message for each in monitor.update(came).remarks] == [charge.message]
+    assert not monitor.update(at(7, charge=1)).remarks
+
+
+def test_names_are_awaited_for_a_time_or_a_number_of_samples() -> None:
+    specification = parse_specification("G p >= 0")
+    assert Monitor(specification, missing_after=None).update(at(99, q=1)).remarks == ()
+    for wrong in (0, True, 2.5):
+        with pytest.raises(UsageError, match="give a time such as '5s', or a number of samples"):
+            Monitor(specification, missing_after=wrong)  # type: ignore[arg-type]
+    with pytest.raises(UsageError, match="'5' is not a duration"):
+        Monitor(specification, missing_after="5")
+
+
 def test_the_first_violation_waits_for_no_code():
     # in a process of its own, where nothing has been compiled for others
     program = """
@@ -104,7 +144,7 @@ sys.exit(", ".join({each.__name__ for each in kernels() if each.is_compiled} - r
     done = subprocess.run(
         [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=False
     )
-    assert (done.returncode, done.stderr) == (0, "")
+    assert done.returncode == 0, done.stderr
     assert "cup is 0.5 too close to jug" in done.stdout
 
 
