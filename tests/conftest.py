@@ -10,11 +10,17 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+import spatial_replay
+
 # a law is about values, not about how busy the machine is
 settings.register_profile("default", deadline=None)
 settings.register_profile("ci", deadline=None, derandomize=True, print_blob=True)
 settings.load_profile("ci" if os.environ.get("CI") else "default")
 
+
+# programs under test run the package that these tests import, wherever they start
+if not os.environ.get("SPATIAL_REPLAY_INSTALLED"):
+    os.environ["PYTHONPATH"] = str(Path(spatial_replay.__file__).parents[1])
 
 # a shell may start the tests in the background with interruptions ignored, which programs under test inherit
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:

@@ -134,10 +134,15 @@ def test_hostile_definitions_are_refused(definition: str | bytes, reported: str)
     assert len(str(caught.value)) < 500
 
 
-@pytest.mark.parametrize("name", ["", "Pose", "a/b/c/d/e", "a/../b", "a/msg/B'", "a/msg/é", "a" * 300 + "/B"])
+@pytest.mark.parametrize("name", ["Pose", "a/b/c/d/e", "a/../b", "a/msg/B'", "a/msg/é", "a" * 300 + "/B"])
 def test_hostile_names_of_types_are_refused(name: str) -> None:
     with pytest.raises(LogError, match="is not a name of a message type"):
         ros_decoder(name, "cdr", Schema(name, "ros2msg", b"float64 x"))
+
+
+def test_a_message_without_a_type_is_refused_with_the_remedy() -> None:
+    with pytest.raises(LogError, match="no type of it; name a standard `type` in a mapping"):
+        ros_decoder("", "cdr", Schema("", "ros2msg", b"float64 x"))
 
 
 @pytest.mark.parametrize("word", ["class", "None", "self", "cls", "pos", "numpy"])

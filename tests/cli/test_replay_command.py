@@ -228,14 +228,20 @@ def test_a_template_requires_each(folder: Path) -> None:
     without = run_program(*replay, cwd=folder)
     assert (without.returncode, without.stdout) == (2, "")
     assert "near(ego) is a template: say what ego stands for, --each ego=class:NAME" in without.stderr
+    known = run_program(*replay, "--each", "ego=class:Block", cwd=folder)
+    assert known.returncode == 0
+    assert "near(cube)" in known.stdout
     unknown = run_program(*replay, "--each", "ego=class:dog", cwd=folder)
-    assert unknown.returncode == 0
+    assert unknown.returncode == 4
     assert "vacuous: `near(ego)` was never evaluated: no object stands for ego." in unknown.stdout
     assert "near.spatial:1:6: warning: the log never has the class 'dog'" in unknown.stderr
     assert "its classes are Block, dish" in unknown.stderr
     explained = run_program("explain", *replay[1:], "--each", "ego=class:dog", cwd=folder)
     assert explained.returncode == 0
-    assert explained.stdout == "`near(ego)` was never evaluated: no object stands for ego.\n"
+    assert (
+        explained.stdout
+        == "`near(ego)` was never evaluated: no object stands for ego. The log never has the class 'dog'.\n"
+    )
     gate = run_program(*replay, "--each", "ego=class:dog", "--fail-on", "vacuous", "--json", "-", cwd=folder)
     assert gate.returncode == 1
     assert json.loads(gate.stdout)["log"]["missing"] == ["the log never has the class 'dog'"]

@@ -515,12 +515,12 @@ def test_backquotes_in_names_leave_text_and_code_apart(tmp_path: Path, name: str
     assert f"{quoted} dist b <= -9" in parts
 
 
-def test_a_file_name_that_is_no_text_is_shown_as_far_as_it_is_one(tmp_path: Path) -> None:
+def test_a_file_name_that_is_no_text_is_shown_with_an_escape(tmp_path: Path) -> None:
     log = tmp_path / os.fsdecode(b"run\xff.jsonl")
     log.write_bytes((RECORDINGS / "table.jsonl").read_bytes())
     source = open_source(log)
     write_report(source, load_files([RECORDINGS / "table.spatial"], source), tmp_path / "run.html")
-    assert "run .jsonl" in page_of(tmp_path / "run.html").within("header#")
+    assert r"run\udcff.jsonl" in page_of(tmp_path / "run.html").within("header#")
 
 
 def test_nothing_is_loaded_and_nothing_else_may_run(violated: Page) -> None:
