@@ -14,7 +14,7 @@ Messages wait in the first stage until none that is earlier can arrive.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from itertools import compress, repeat
 from typing import Any, Final, NamedTuple
 
@@ -92,6 +92,7 @@ class Assembler:
             self._faults.add(f"{name}: {topic}: its transforms cannot be decoded: {what}")
         self._remarks = Remarks(name, plan.mapping)
         self._tree = FrameTree()
+        self._knows_static = False
         names, classes = Codes(), Codes()
         self._readers = {
             topic.name: TopicReader(
@@ -157,6 +158,26 @@ class Assembler:
                 traces.append(self._settle(self._newest_ns - self._plan.margin_ns))
         return traces[0] if len(traces) == 1 else Trace.concatenate(traces)
 
+    def know_static(self, messages: Iterable[Message]) -> None:
+        """Take the static transforms of the whole log, before any message is added."""
+        self._knows_static = True
+        for topic, log_ns, publish_ns, _, payload in messages:
+            reader = self._readers[topic]
+            good = np.ones(1, np.bool_)
+            contents = reader.decode([payload], [log_ns], good)
+            if good[0]:
+                times_ns = {"log": log_ns, "publish": publish_ns, "header": None}
+                self._add_transforms(reader, times_ns[reader.planned.clock], log_ns, contents[0])
+
+    def _add_transforms(self, reader: TopicReader, clock_ns: int | None, log_ns: int, message: Any) -> None:
+        if reader.transforms is None:
+            return
+        try:
+            is_static = reader.planned.is_static
+            reader.transforms.add(self._tree, message, clock_ns, log_ns=log_ns, is_static=is_static)
+        except MISFITS as error:
+            self._add_fault(reader.name, log_ns, f"its transforms cannot be read: {error}")
+
     def take_in(self, messages: Sequence[Message]) -> None:
         """Add messages in the order in which they came, without looking for samples; see `settle`.
 
@@ -213,6 +234,8 @@ class Assembler:
             UsageError: the mapping fits no message of a topic, or the log has no such fixed frame.
         """
         trace = self._settle(max(self._newest_ns, self._latest_ns))
+        for text in self._tree.remarks():
+            self._remarks.add(text)
         # of a system that runs, there is no log to cut
         if self.jump is not None and self._arrived is None:
             what_follows = ": the log is taken to end there; cut it to evaluate what comes after"
@@ -281,7 +304,9 @@ class Assembler:
         stamped: list[_Stamped] = []
         come = set(arrived.topics)
         for number, reader in enumerate(self._readers.values()):
-            if reader.name not in come:
+            if reader.name not in come or (
+                self._knows_static and reader.planned.is_static and not reader.is_mapped
+            ):
                 continue
             places = np.flatnonzero(number_of_message == number)
             if len(places):
@@ -301,6 +326,9 @@ class Assembler:
             contents = reader.decode(contents, log_times_ns, good)
             if clock == "header":
                 times_ns = reader.stamps(contents, log_times_ns, good)
+                if reader.planned.is_static:
+                    # many programs send static transforms without a stamp
+                    times_ns = np.where(times_ns == 0, arrived.log_time_ns[places], times_ns)
             contents = list(compress(contents, good.tolist()))
             places, times_ns = places[good], times_ns[good]
         return _Stamped(reader, places, times_ns, contents)
@@ -353,15 +381,11 @@ class Assembler:
         if self._arrived is not None and len(stamped.times_ns):
             self._arrived(reader, stamped.times_ns, stamped.contents)
         log_times_ns = arrived.log_time_ns[stamped.places]
-        if reader.transforms is not None:
-            is_static = reader.planned.is_static
-            for time_ns, log_time_ns, message in zip(
+        if reader.transforms is not None and not (self._knows_static and reader.planned.is_static):
+            for time_ns, log_ns, message in zip(
                 stamped.times_ns.tolist(), log_times_ns.tolist(), stamped.contents, strict=True
             ):
-                try:
-                    reader.transforms.add(self._tree, message, time_ns, is_static=is_static)
-                except MISFITS as error:
-                    self._add_fault(reader.name, log_time_ns, f"its transforms cannot be read: {error}")
+                self._add_transforms(reader, time_ns, log_ns, message)
         if reader.is_mapped or reader.name == self._plan.sampled_topic:
             # samples up to here are out already: a late message counts from now on
             times_ns = np.maximum(stamped.times_ns, self._settled_ns + 1)

@@ -122,6 +122,10 @@ class MappedSource:
         if len(files) > 1:
             what = f"one of the {len(files)} files of a bag; give its folder for all of them"
             blocks.remarks.append(f"{self.name}: it is {what}")
+        static = [each.name for each in plan.planned if each.is_static]
+        if static:
+            # they count from before a window, and the first of a frame before it was recorded, too
+            assembler.know_static(open_messages(self.path).iter_messages(static))
         as_recorded = self.on_time_jump == "split"
         columns = _columns(reader, plan, read, start_ns, end_ns, as_recorded=as_recorded)
         if not as_recorded and plan.late_ns < LATEST_NS:

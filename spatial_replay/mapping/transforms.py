@@ -2,13 +2,14 @@
 
 A transform places a child frame in its parent. Between two transforms of a child, translation is interpolated
 linearly and rotation along the shorter arc, as tf2 does; there is no extrapolation. A static transform holds
-at all times. Rotations are arrays of many at once: quaternions (x, y, z, w) and matrices.
+until another one replaces it. Rotations are arrays of many at once: quaternions (x, y, z, w) and matrices.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from math import hypot, isfinite
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,6 +26,7 @@ from spatial_replay.mapping.field_paths import (
     style_of,
     tuple_getter,
 )
+from spatial_replay.text import Instant, Sentence
 from spatial_replay.trace.sample import LATEST_NS
 
 _LEAST_NORM = 1e-6
@@ -114,9 +116,14 @@ def slerp(first: Floats, second: Floats, share: Floats) -> Floats:
 
 
 HISTORY_NS = 10 * 10**9
-"""How far the transforms before and after a time may lie from it."""
+"""How far two transforms may lie apart, at most, to place what is between them."""
 
 _LONGEST_CHAIN = 100
+_OFF_LENGTH = 0.01
+"""By how much the squared length of a rotation's quaternion may differ from 1, as in tf2."""
+_LEAST_JUMP = 0.1
+"""Of a frame, in metres and radians."""
+_MANY_JUMPS = 3
 
 
 class Transforms(NamedTuple):
@@ -163,30 +170,48 @@ class Transforms(NamedTuple):
         return Transforms(rotation, -np.einsum("nij,nj->ni", rotation, self.translation), self.known)
 
 
+class _Entry(NamedTuple):
+    """One transform of a child frame: its pose is x, y, z, then the quaternion x, y, z, w."""
+
+    stamp_ns: int
+    clock_ns: int
+    parent: str
+    pose: tuple[float, ...]
+
+
 @dataclass(slots=True)
 class _Child:
-    """The transforms of one child frame: stamp, clock, parent and pose of each; and the static one, if
-    any."""
+    """The transforms of one child frame; static ones, if it has any, count alone."""
 
-    entries: list[tuple[int, int, str, tuple[float, ...]]] = field(default_factory=list)
-    parents: dict[str, None] = field(default_factory=dict)
-    static: tuple[str, tuple[float, ...]] | None = None
+    moving: list[_Entry] = field(default_factory=list)
+    static: list[_Entry] = field(default_factory=list)
+
+    @property
+    def entries(self) -> list[_Entry]:
+        return self.static or self.moving
 
 
 class _Series(NamedTuple):
-    """The transforms of one child frame, ordered by stamp or by clock."""
+    """The transforms of one child frame, ordered by stamp or by clock; parents by number."""
 
     times_ns: Integers
+    clock_ns: Integers
     parents: list[str]
+    parent: Integers
     poses: Floats
 
 
 class FrameTree:
-    """The transforms of a log, added as they arrive."""
+    """The transforms of a log, added as they arrive; see `remarks` for those that contradict each other."""
 
     def __init__(self) -> None:
         self._children: dict[str, _Child] = {}
         self._series: dict[tuple[str, bool], _Series] = {}
+        self._ignored: dict[str, tuple[int, _Entry, str]] = {}
+        self._contradictions: dict[str, Sentence] = {}
+        self._jumps: dict[str, tuple[int, float, _Entry, _Entry]] = {}
+        self._holes: dict[str, tuple[int, int]] = {}
+        self._loops: dict[tuple[str, ...], None] = {}
 
     def add(
         self,
@@ -198,174 +223,297 @@ class FrameTree:
         clock_ns: int,
         is_static: bool,
     ) -> None:
-        """Add one transform.
+        """Add one transform; those that tf2 ignores are only counted.
+
+        A static transform counts from its stamp on, the first one of a frame before that, too. One that has
+        no stamp, or an older one than the transform that it replaces, counts from its clock on.
 
         Args:
             pose: x, y, z, then the quaternion x, y, z, w.
             stamp_ns: the time inside the message.
             clock_ns: the time of the message on the clock of the samples.
         """
-        entry = self._children.setdefault(child, _Child())
-        if is_static:
-            entry.static = (parent, pose)
+        entry = _Entry(stamp_ns, clock_ns, parent, pose)
+        if (reason := _why_ignored(child, entry)) is not None:
+            count, first, first_child = self._ignored.get(reason, (0, entry, child))
+            self._ignored[reason] = count + 1, first, first_child
             return
-        entry.entries.append((stamp_ns, clock_ns, parent, pose))
-        entry.parents.setdefault(parent)
+        known = self._children.setdefault(child, _Child())
+        if is_static:
+            if known.static and known.static[-1][2:] == entry[2:]:
+                return
+            last_ns = known.static[-1].stamp_ns if known.static else -1
+            if stamp_ns == 0 or stamp_ns < last_ns:
+                entry = entry._replace(stamp_ns=max(clock_ns, last_ns))
+        entries = known.static if is_static else known.moving
+        if entries and (entries[-1].parent != parent or is_static) and child not in self._contradictions:
+            self._contradict(child, entries[-1], entry)
+        entries.append(entry)
         for by_stamp in (False, True):
             self._series.pop((child, by_stamp), None)
 
     def forget_before(self, clock_ns: int) -> None:
-        """Drop the transforms of messages before a time, except the last one of each child."""
-        for child in self._children.values():
-            keep = [entry for entry in child.entries if entry[1] >= clock_ns]
-            if len(keep) < len(child.entries):
+        """Drop the moving transforms of messages before a time, except the last one of each child."""
+        for name, child in self._children.items():
+            keep = [entry for entry in child.moving if entry.clock_ns >= clock_ns]
+            if len(keep) < len(child.moving):
+                self._look_for_jumps(name, [entry for entry in child.moving if entry.clock_ns < clock_ns])
                 # the last one names the parent, and may be the start of the next interpolation
-                child.entries = keep or child.entries[-1:]
-                child.parents = dict.fromkeys(entry[2] for entry in child.entries)
+                child.moving = keep or child.moving[-1:]
         self._series.clear()
 
     def forget_moving(self) -> None:
         """Drop every transform but the static ones: nothing is known between those and what comes next."""
-        self._children = {name: child for name, child in self._children.items() if child.static is not None}
+        self._children = {
+            name: _Child(static=each.static) for name, each in self._children.items() if each.static
+        }
         self._series.clear()
 
     @property
     def names(self) -> frozenset[str]:
         """All frames that are a child or a parent of a transform."""
-        parents = {parent for child in self._children.values() for parent in child.parents}
-        static = {child.static[0] for child in self._children.values() if child.static is not None}
-        return frozenset(self._children) | parents | static
+        parents = {entry.parent for child in self._children.values() for entry in child.entries}
+        # the log has the frames of a transform that does not count, too
+        ignored = {name for _, entry, child in self._ignored.values() for name in (child, entry.parent)}
+        return frozenset(self._children) | parents | ignored
 
-    def between(self, target: str, source: str, times_ns: Integers, *, by_stamp: bool) -> Transforms:
+    def between(
+        self,
+        target: str,
+        source: str,
+        times_ns: Integers,
+        *,
+        by_stamp: bool,
+        longest_ns: int = HISTORY_NS,
+        holds: bool = False,
+    ) -> Transforms:
         """Return target_from_source at each of N times; unknown where the tree has no transforms.
 
         Args:
             times_ns: (N,) stamps, or times of messages on the clock of the samples (`by_stamp=False`).
+            longest_ns: between two transforms that are farther apart, nothing is known.
+            holds: whether a transform holds for `longest_ns` if none follows in that time.
         """
         if target == source or not len(times_ns):
             return Transforms.identity(len(times_ns))
-        parts = self._stretches(times_ns, by_stamp)
+        ask = _Question(times_ns, by_stamp, min(longest_ns, HISTORY_NS), holds)
+        parts = self._parts(ask)
         if len(parts) == 1:
-            return self._in_one_tree(target, source, times_ns, by_stamp)
+            return self._in_one_tree(target, source, ask)
         result = Transforms.unknown(len(times_ns))
         for part in parts:
-            result.put(part, self._in_one_tree(target, source, times_ns[part], by_stamp))
+            result.put(part, self._in_one_tree(target, source, ask._replace(times_ns=times_ns[part])))
         return result
 
-    def _stretches(self, times_ns: Integers, by_stamp: bool) -> list[Integers]:
-        """Return the indices of times in groups within which no frame changes its parent."""
-        breaks: set[int] = set()
-        for name, child in self._children.items():
-            if len(child.parents) > 1:
-                series = self._series_of(name, by_stamp)
-                breaks.update(
-                    int(series.times_ns[i])
-                    for i in range(1, len(series.parents))
-                    if series.parents[i] != series.parents[i - 1]
-                )
-        if not breaks:
-            return [np.arange(len(times_ns))]
-        group = np.searchsorted(np.array(sorted(breaks), np.int64), times_ns, "right")
-        return [np.flatnonzero(group == each) for each in np.unique(group)]
+    def _parts(self, ask: _Question) -> list[Integers]:
+        """Return the indices of times in groups in each of which every frame has one parent."""
+        keys = [np.zeros(len(ask.times_ns), np.int64)]
+        for name in self._children:
+            series = self._series_of(name, ask.by_stamp)
+            if len(series.parents) > 1:
+                at = np.searchsorted(series.times_ns, ask.times_ns, "right") - 1
+                keys.append(series.parent[np.maximum(at, 0)])
+        if len(keys) == 1:
+            return [np.arange(len(ask.times_ns))]
+        _, group = np.unique(np.stack(keys), axis=1, return_inverse=True)
+        group = group.reshape(-1)
+        return [np.flatnonzero(group == each) for each in range(int(group.max()) + 1)]
 
-    def _in_one_tree(self, target: str, source: str, times_ns: Integers, by_stamp: bool) -> Transforms:
-        up = self._ancestors(source, int(times_ns[0]), by_stamp)
-        down = self._ancestors(target, int(times_ns[0]), by_stamp)
+    def _in_one_tree(self, target: str, source: str, ask: _Question) -> Transforms:
+        up = self._ancestors(source, ask)
+        down = self._ancestors(target, ask)
         common = next((frame for frame in up if frame in down), None)
         if common is None:
-            return Transforms.identity(len(times_ns))._replace(known=np.zeros(len(times_ns), np.bool_))
-        common_from_source = self._climb(up[: up.index(common)], times_ns, by_stamp)
-        common_from_target = self._climb(down[: down.index(common)], times_ns, by_stamp)
+            return Transforms.unknown(len(ask.times_ns))
+        common_from_source = self._climb(up[: up.index(common)], ask)
+        common_from_target = self._climb(down[: down.index(common)], ask)
         return common_from_target.inverted().after(common_from_source)
 
-    def _ancestors(self, frame: str, time_ns: int, by_stamp: bool) -> list[str]:
-        """Return a frame, its parent, the parent of that and so on, at a time."""
+    def _ancestors(self, frame: str, ask: _Question) -> list[str]:
+        """Return a frame, its parent, the parent of that and so on, at the first time."""
         chain = [frame]
         while len(chain) < _LONGEST_CHAIN:
-            parent = self._parent(chain[-1], time_ns, by_stamp)
-            # a log may contain cycles
-            if parent is None or parent in chain:
+            parent = self._parent(chain[-1], int(ask.times_ns[0]), ask.by_stamp)
+            if parent is None:
+                break
+            if parent in chain:
+                loop = chain[chain.index(parent) :]
+                first = loop.index(min(loop))
+                self._loops.setdefault((*loop[first:], *loop[: first + 1]))
                 break
             chain.append(parent)
         return chain
 
     def _parent(self, frame: str, time_ns: int, by_stamp: bool) -> str | None:
-        child = self._children.get(frame)
-        if child is None:
+        if frame not in self._children:
             return None
-        if child.static is not None:
-            return child.static[0]
         series = self._series_of(frame, by_stamp)
         at = int(np.searchsorted(series.times_ns, time_ns, "right")) - 1
-        return series.parents[max(at, 0)]
+        return series.parents[int(series.parent[max(at, 0)])]
 
-    def _climb(self, frames: list[str], times_ns: Integers, by_stamp: bool) -> Transforms:
+    def _climb(self, frames: list[str], ask: _Question) -> Transforms:
         """Return the transform from the first frame of a chain into the parent of the last."""
-        total = Transforms.identity(len(times_ns))
+        total = Transforms.identity(len(ask.times_ns))
         for frame in frames:
-            total = self._step(frame, times_ns, by_stamp).after(total)
+            total = self._step(frame, ask).after(total)
         return total
 
-    def _step(self, frame: str, times_ns: Integers, by_stamp: bool) -> Transforms:
+    def _step(self, frame: str, ask: _Question) -> Transforms:
         """Return parent_from_child at each time."""
-        child = self._children[frame]
-        if child.static is not None:
-            poses = np.broadcast_to(np.array(child.static[1], np.float64), (len(times_ns), 7))
-            return _transforms(poses[:, :3], poses[:, 3:], np.ones(len(times_ns), np.bool_))
-        series = self._series_of(frame, by_stamp)
+        series, times_ns = self._series_of(frame, ask.by_stamp), ask.times_ns
         last = len(series.times_ns) - 1
+        if self._children[frame].static:
+            at = np.maximum(np.searchsorted(series.times_ns, times_ns, "right") - 1, 0)
+            poses = series.poses[at]
+            return _transforms(poses[:, :3], poses[:, 3:], np.ones(len(times_ns), np.bool_))
         after = np.searchsorted(series.times_ns, times_ns, "left")
         inside = after <= last
         after = np.minimum(after, last)
-        before = np.where(series.times_ns[after] == times_ns, after, after - 1)
-        known = inside & (before >= 0)
+        before = np.where(inside & (series.times_ns[after] == times_ns), after, after - inside)
+        known = before >= 0
         before = np.maximum(before, 0)
         start, end = series.times_ns[before], series.times_ns[after]
-        known &= (times_ns - start <= HISTORY_NS) & (end - times_ns <= HISTORY_NS)
+        is_hole = end - start > ask.longest_ns
+        if (known & inside & is_hole).any():
+            longest = int((end - start)[known & inside].max())
+            at_ns = int(series.clock_ns[before][known & inside & is_hole][0])
+            if longest > self._holes.get(frame, (0, 0))[0]:
+                self._holes[frame] = longest, at_ns
+        is_between = inside & ~is_hole
+        is_held = ask.holds & ~is_between & (times_ns - start <= ask.longest_ns)
+        known &= is_between | is_held
         span = np.where(end > start, end - start, 1)
-        share = np.where(end > start, (times_ns - start) / span, 0.0)
-        parents = series.parents
-        if len(set(parents)) > 1:
-            same = [parents[i] == parents[j] for i, j in zip(before.tolist(), after.tolist(), strict=True)]
-            # poses in different parents cannot be interpolated; the earlier one holds
-            share = np.where(same, share, 0.0)
+        # poses in different parents cannot be interpolated; the earlier one holds
+        moves = is_between & (end > start) & (series.parent[before] == series.parent[after])
+        share = np.where(moves, (times_ns - start) / span, 0.0)
         first, second = series.poses[before], series.poses[after]
         translation = first[:, :3] + share[:, None] * (second[:, :3] - first[:, :3])
-        rotation = np.where(
-            (share == 0.0)[:, None],
-            first[:, 3:],
-            slerp(_not_zero(first[:, 3:]), _not_zero(second[:, 3:]), share),
-        )
-        return _transforms(translation, rotation, known)
+        turned = slerp(first[:, 3:], second[:, 3:], share)
+        return _transforms(translation, np.where((share == 0.0)[:, None], first[:, 3:], turned), known)
 
     def _series_of(self, frame: str, by_stamp: bool) -> _Series:
         """Return the transforms of a child in order; of equal times, the later entry counts."""
         series = self._series.get((frame, by_stamp))
         if series is None:
-            child = self._children[frame]
-            times = np.array([entry[0 if by_stamp else 1] for entry in child.entries], np.int64)
+            entries = self._children[frame].entries
+            times = np.array([entry[0 if by_stamp else 1] for entry in entries], np.int64)
             order = np.argsort(times, kind="stable")
             ordered = times[order]
-            keep = order[np.append(ordered[1:] != ordered[:-1], True)[: len(ordered)]]
+            keep = order[np.append(ordered[1:] != ordered[:-1], True)]
+            kept = [entries[i] for i in keep.tolist()]
+            number = {parent: index for index, parent in enumerate(dict.fromkeys(e.parent for e in kept))}
             series = _Series(
                 times[keep],
-                [child.entries[i][2] for i in keep.tolist()],
-                np.array([child.entries[i][3] for i in keep.tolist()], np.float64).reshape(-1, 7),
+                np.array([entry.clock_ns for entry in kept], np.int64),
+                list(number),
+                np.array([number[entry.parent] for entry in kept], np.int64),
+                np.array([entry.pose for entry in kept], np.float64),
             )
             self._series[frame, by_stamp] = series
         return series
+
+    def _contradict(self, child: str, old: _Entry, new: _Entry) -> None:
+        """Note, once for each frame, a static transform that changes, or another parent."""
+        what = f"frame {child!r} has two parents, {old.parent!r} at {_place(old)} and {new.parent!r} at"
+        if old.parent == new.parent:
+            what = f"the static transform of {child!r} in {new.parent!r} changes from {_place(old)} to"
+        since = Instant(new.clock_ns, 0)
+        self._contradictions[child] = Sentence(
+            f"{what} {_place(new)}, the second from ", since, " on: the newest counts"
+        )
+
+    def _look_for_jumps(self, name: str, entries: list[_Entry]) -> None:
+        """Count the transforms of a child that lie far from the one before and the one after, which agree."""
+        for parent in {entry.parent for entry in entries}:
+            self._look_for_jumps_in(name, sorted(entry for entry in entries if entry.parent == parent))
+
+    def _look_for_jumps_in(self, name: str, entries: list[_Entry]) -> None:
+        if len(entries) < _MANY_JUMPS:
+            return
+        poses = np.array([entry.pose for entry in entries])
+
+        def apart(first: Floats, second: Floats) -> Floats:
+            cosine = np.abs(np.einsum("ij,ij->i", first[:, 3:], second[:, 3:]))
+            turn = 2 * np.arccos(np.minimum(cosine, 1.0))
+            return np.asarray(np.linalg.norm(first[:, :3] - second[:, :3], axis=1) + turn)
+
+        step, over = apart(poses[1:], poses[:-1]), apart(poses[2:], poses[:-2])
+        least = np.minimum(step[1:], step[:-1])
+        is_jump = least > max(_LEAST_JUMP, 10 * float(np.median(over)))
+        is_jump &= over < 0.1 * least
+        jumps = np.flatnonzero(is_jump)
+        if len(jumps):
+            at = int(jumps[0])
+            count, most, *example = self._jumps.get(name, (0, 0.0, entries[at], entries[at + 1]))
+            most = max(most, float(least[jumps].max()))
+            self._jumps[name] = count + len(jumps), most, example[0], example[1]
+
+    def remarks(self) -> list[str]:
+        """Return texts on the transforms that were ignored, that contradict each other, or that pause."""
+        for name, child in self._children.items():
+            self._look_for_jumps(name, child.moving)
+        texts: list[str] = []
+        for reason, (count, first, owner) in self._ignored.items():
+            were = "transform was" if count == 1 else "transforms were"
+            of = f", the first of {owner!r} in {first.parent!r} at "
+            texts.append(Sentence(f"{count} {were} left out{of}", Instant(first.clock_ns, 0), f": {reason}"))
+        texts += self._contradictions.values()
+        for name, (count, most, old, new) in sorted(self._jumps.items()):
+            if count < _MANY_JUMPS:
+                continue
+            texts.append(
+                Sentence(
+                    f"frame {name!r} jumps in {new.parent!r} by up to {most:.3g} and back, {count} times,"
+                    f" such as from {_place(old)} to {_place(new)} at ",
+                    Instant(new.clock_ns, 0),
+                    ": where two programs send it, the newest counts",
+                )
+            )
+        for loop in self._loops:
+            texts.append(f"frames form a loop, {' in '.join(map(repr, loop))}: what they place is unknown")
+        for name, (longest_ns, at_ns) in sorted(self._holes.items()):
+            remedy = "; a larger `max_age` interpolates over it" if longest_ns <= HISTORY_NS else ""
+            texts.append(
+                Sentence(
+                    f"the transforms of {name!r} pause for up to {longest_ns / 1e9:.3f} s, longest from ",
+                    Instant(at_ns, 0),
+                    f" on, longer than max_age: what they place is unknown there{remedy}",
+                )
+            )
+        return texts
+
+
+class _Question(NamedTuple):
+    """At which times transforms are wanted; see `FrameTree.between`."""
+
+    times_ns: Integers
+    by_stamp: bool
+    longest_ns: int
+    holds: bool
+
+
+def _why_ignored(child: str, entry: _Entry) -> str | None:
+    """Return why a transform does not count, as in tf2; None if it does."""
+    if not child or not entry.parent:
+        return "it has no name for the frame or its parent (child_frame_id, frame_id)"
+    if child == entry.parent:
+        return "a frame cannot be its own parent"
+    if not all(map(isfinite, entry.pose)):
+        return "not all of its numbers are finite"
+    length = hypot(*entry.pose[3:])
+    if abs(length * length - 1) > _OFF_LENGTH:
+        return f"its quaternion has the length {length:.3g}, so it is not a rotation"
+    return None
+
+
+def _place(entry: _Entry) -> str:
+    return f"({', '.join(f'{each:.4g}' for each in entry.pose[:3])})"
 
 
 def _transforms(translation: Floats, quaternions: Floats, known: NDArray[np.bool_]) -> Transforms:
     rotation, _ = matrices_from_quaternions(np.ascontiguousarray(quaternions))
     finite = np.isfinite(rotation).all(axis=(1, 2)) & np.isfinite(translation).all(axis=1)
     return Transforms(rotation, np.asarray(translation), known & finite)
-
-
-def _not_zero(quaternions: Floats) -> Floats:
-    """Replace quaternions of zeros by no rotation."""
-    zero = np.einsum("ij,ij->i", quaternions, quaternions) == 0.0
-    return np.where(zero[:, None], np.array([0.0, 0.0, 0.0, 1.0]), quaternions)
 
 
 _SECONDS = ("sec", "secs", "seconds")
@@ -379,20 +527,27 @@ class TransformReader:
         self._list: Get | None = None
         self._get: Get | None = None
 
-    def add(self, tree: FrameTree, message: object, clock_ns: int, *, is_static: bool) -> None:
+    def add(
+        self, tree: FrameTree, message: object, clock_ns: int | None, *, is_static: bool, log_ns: int = 0
+    ) -> None:
         """Add the transforms of a message to a tree.
+
+        Args:
+            clock_ns: of the message, on the clock of the samples; None for the stamp of each transform.
+            log_ns: when the message was recorded, for transforms without a stamp.
 
         Raises:
             FieldError, AttributeError, LookupError, TypeError, ValueError: the message holds no transforms.
         """
         for transform in self._each(message):
             child, parent, seconds, rest, *pose = self._values(transform)
+            stamp_ns = _nanoseconds(seconds, rest)
             tree.add(
                 str(child).removeprefix("/"),
                 str(parent).removeprefix("/"),
                 tuple(map(float, pose)),
-                stamp_ns=_nanoseconds(seconds, rest),
-                clock_ns=clock_ns,
+                stamp_ns=stamp_ns,
+                clock_ns=(stamp_ns or log_ns) if clock_ns is None else clock_ns,
                 is_static=is_static,
             )
 

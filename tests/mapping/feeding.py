@@ -180,6 +180,8 @@ def make(mapping: str, feed: Feed, *, batch: int = 1000, late_ns: int = SECOND, 
     plan = ReadingPlan.of(parse_mapping(mapping, "test.yaml"), feed.topics(), late_ns)
     assembler = Assembler(plan, feed.decoder, name="test.bag", **options)
     raw = [message for message in feed.raw() if message.topic in plan.topics]
+    static = {topic.name for topic in plan.planned if topic.is_static}
+    assembler.know_static([message for message in raw if message.topic in static])
     traces = [assembler.add(raw[begin : begin + batch]) for begin in range(0, len(raw), batch)]
     traces.append(assembler.finish())
     trace = Trace.concatenate(traces)

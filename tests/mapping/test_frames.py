@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import json
 from math import cos, pi, sin
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
+from bags.bag_files import write_mcap
 from mapping.feeding import SECOND, Feed, make, pose_stamped, tf, transform
+from spatial_replay import Trace
+from spatial_replay.mapping import MappedSource, parse_mapping
 from spatial_replay.mapping.transforms import FrameTree
 
 MS = 10**6
@@ -185,3 +192,154 @@ def test_old_transforms_are_dropped_except_the_last() -> None:
     assert known.tolist() == [False, True, True]
     tree.forget_before(1000)
     assert tree.between("map", "base", np.array([99]), by_stamp=True).known.tolist() == [True]
+
+
+def static(*at_ns: int, places: tuple[float, ...] = (10.0, 15.0), stamped: bool = True) -> Feed:
+    """Return a feed with static transforms of `odom` at some times, one place after the other."""
+    feed = Feed(latched=frozenset({"/tf_static"}))
+    for time_ns, x in zip(at_ns, places, strict=True):
+        feed.add("/tf_static", time_ns, tf(transform("map", "odom", (x, 0, 0), time_ns=time_ns * stamped)))
+    return feed
+
+
+@pytest.mark.parametrize("stamped", [True, False])
+def test_a_static_transform_counts_until_the_next_and_the_first_one_before_it_too(stamped: bool) -> None:
+    feed = static(2 * SECOND, 4 * SECOND, stamped=stamped)
+    for tick in range(1, 6):
+        feed.add("/p", tick * SECOND, pose_stamped(1, 0, "odom", time_ns=tick * SECOND))
+    feed.messages.sort(key=lambda message: message[1])
+    made = make("fixed_frame: map\ntopics: {/p: {}}", feed)
+    assert [made.centre(tick, "p")[0] for tick in range(5)] == [11, 11, 11, 16, 16]
+    assert made.remarks == (
+        "test.bag: the static transform of 'odom' in 'map' changes from (10, 0, 0) to (15, 0, 0), the second"
+        " from 4.000 s on: the newest counts",
+    )
+
+
+def test_a_static_transform_with_an_older_stamp_counts_from_its_arrival() -> None:
+    feed = static(2 * SECOND, 4 * SECOND)
+    late = transform("map", "odom", (20, 0, 0), time_ns=SECOND)
+    for tick in range(1, 8):
+        feed.add("/p", tick * SECOND, pose_stamped(0, 0, "odom", time_ns=tick * SECOND))
+    feed.add("/tf_static", 6 * SECOND, tf(late))
+    feed.messages.sort(key=lambda message: message[1])
+    made = make("fixed_frame: map\ntopics: {/p: {}}", feed)
+    assert [made.centre(tick, "p")[0] for tick in range(7)] == [10, 10, 10, 15, 15, 20, 20]
+
+
+def test_two_parents_are_remarked_with_both_places() -> None:
+    feed = Feed().add("/tf", 0, tf(transform("map", "odom", (0, 0, 0))))
+    for tick in range(1, 5):
+        at = tick * SECOND
+        feed.add("/tf", at, tf(transform("map", "odom", (0, 0, 0), time_ns=at)))
+        feed.add("/tf", at, tf(transform(("map", "odom")[tick % 2], "base", (50 * tick, 0, 0), time_ns=at)))
+        feed.add("/p", at, pose_stamped(0, 0, "base", time_ns=at))
+    made = make("fixed_frame: map\ntopics: {/p: {}}", feed)
+    assert [made.centre(n, "p")[0] for n in range(4)] == [50, 100, 150, 200]
+    assert made.remarks == (
+        "test.bag: frame 'base' has two parents, 'odom' at (50, 0, 0) and 'map' at (100, 0, 0), the second"
+        " from 2.000 s on: the newest counts",
+    )
+
+
+def test_two_publishers_of_a_frame_are_remarked_with_both_places() -> None:
+    feed = Feed()
+    for tick in range(20):
+        for x in (0.1 * tick, 50 + 0.1 * tick):
+            at = tick * SECOND // 10 + int(x >= 50)
+            feed.add("/tf", at, tf(transform("map", "base", (x, 0, 0), time_ns=at)))
+        feed.add("/p", at, pose_stamped(0, 0, "base", time_ns=at))
+    (remark,) = make("fixed_frame: map\ntopics: {/p: {}}", feed).remarks
+    assert "frame 'base' jumps in 'map' by up to 49.9 and back, 38 times" in remark
+    assert "from (0, 0, 0) to (50, 0, 0) at 0.000 s" in remark
+
+
+def test_a_frame_that_trembles_has_one_publisher() -> None:
+    feed, numbers = Feed(), np.random.default_rng(1)
+    for tick in range(300):
+        at = tick * SECOND // 10
+        place = (0.1 * tick, *(0.2 * numbers.normal(size=2)))
+        feed.add("/tf", at, tf(transform("map", "base", place, time_ns=at)))
+        feed.add("/p", at, pose_stamped(0, 0, "base", time_ns=at))
+    assert make("fixed_frame: map\ntopics: {/p: {}}", feed).remarks == ()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "reason"),
+    [
+        (transform("map", "base", (7, 0, 0), (0, 0, 0, 0)), "its quaternion has the length 0"),
+        (transform("map", "base", (7, 0, 0), (0, 0, 0, 0.5)), "its quaternion has the length 0.5"),
+        (transform("map", "base", (float("nan"), 0, 0)), "not all of its numbers are finite"),
+        (transform("base", "base", (7, 0, 0)), "a frame cannot be its own parent"),
+        (transform("", "base", (7, 0, 0)), "it has no name for the frame or its parent"),
+        (transform("map", "", (7, 0, 0)), "it has no name for the frame or its parent"),
+    ],
+)
+def test_transforms_that_tf2_ignores_are_counted(wrong: Any, reason: str) -> None:
+    feed = Feed()
+    for tick in range(3):
+        right = transform("map", "base", (1, 0, 0), time_ns=tick * SECOND)
+        wrong.header.stamp.sec = tick
+        feed.add("/tf", tick * SECOND, tf(right)).add("/tf", tick * SECOND, tf(wrong))
+        feed.add("/p", tick * SECOND, pose_stamped(0, 0, "base", time_ns=tick * SECOND))
+    made = make("fixed_frame: map\ntopics: {/p: {}}", feed)
+    assert [made.centre(n, "p") for n in range(3)] == [(1, 0)] * 3
+    (remark,) = made.remarks
+    assert "3 transforms were left out" in remark and reason in remark
+
+
+def test_a_loop_of_frames_is_remarked() -> None:
+    feed = Feed(latched=frozenset({"/tf_static"}))
+    feed.add("/tf_static", 0, tf(transform("a", "b", (1, 0, 0)), transform("b", "a", (1, 0, 0))))
+    feed.add("/tf_static", 0, tf(transform("map", "c", (1, 0, 0)))).add("/p", 0, pose_stamped(0, 0, "a"))
+    remarks = make("fixed_frame: map\ntopics: {/p: {}}", feed).remarks
+    assert any("frames form a loop, 'a' in 'b' in 'a'" in remark for remark in remarks)
+
+
+ticks = st.integers(10, 50)
+"""Tenths of a second."""
+
+
+@given(
+    statics=st.lists(st.tuples(ticks, st.integers(1, 3), st.booleans()), min_size=1, max_size=4),
+    moving=st.lists(st.tuples(ticks, st.integers(0, 9)), max_size=20),
+    delay=st.integers(0, 9),
+    window=st.tuples(ticks, ticks).map(sorted),
+)
+@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_a_window_of_a_log_with_frames_is_a_slice_of_the_whole(
+    tmp_path: Path,
+    statics: list[tuple[int, int, bool]],
+    moving: list[tuple[int, int]],
+    delay: int,
+    window: list[int],
+) -> None:
+    tenth = SECOND // 10
+
+    def moved(parent: str, child: str, x: float, stamp: int) -> dict[str, Any]:
+        pose = {"translation": {"x": x, "y": 0, "z": 0}, "rotation": {"x": 0, "y": 0, "z": 0, "w": 1}}
+        time = {"sec": stamp // SECOND, "nsec": stamp % SECOND}
+        return {"parent_frame_id": parent, "child_frame_id": child, "timestamp": time, **pose}
+
+    sent = [
+        ("/tf_static", t * tenth, moved("map", "odom", x, t * tenth * stamped)) for t, x, stamped in statics
+    ]
+    sent += [("/tf", (t + delay) * tenth, moved("odom", "base", x, t * tenth)) for t, x in moving]
+    for t in range(10, 51):
+        stamp = {"sec": t * tenth // SECOND, "nanosec": t * tenth % SECOND}
+        sent.append(("/p", t * tenth + 1, {"x": 1, "y": 0, "header": {"frame_id": "base", "stamp": stamp}}))
+    sent.sort(key=lambda message: message[1])
+    schemas = {"/p": "", "/tf": "foxglove.FrameTransform", "/tf_static": "foxglove.FrameTransform"}
+    channels = [(topic, "json", name, "jsonschema" if name else "", b"{}") for topic, name in schemas.items()]
+    messages = [(topic, at, json.dumps(content).encode()) for topic, at, content in sent]
+    log = write_mcap(tmp_path / "log.mcap", channels, messages, chunk_bytes=300)
+    mapping = parse_mapping("fixed_frame: map\nmax_age: 2s\ntopics: {/p: {shape: {disc: 1}}}", "m.yaml")
+    source = MappedSource(log, mapping, "MCAP")
+    whole = Trace.concatenate([block.trace for block in source.iter_blocks()])
+    start_ns, end_ns = (each * tenth for each in window)
+    part = Trace.concatenate([block.trace for block in source.iter_blocks(start_ns, end_ns)])
+    inside = np.flatnonzero((whole.times_ns >= start_ns) & (whole.times_ns < end_ns))
+    if len(inside):
+        assert part == whole.slice(int(inside[0]), int(inside[-1]) + 1)
+    else:
+        assert len(part) == 0
