@@ -35,32 +35,45 @@ from spatial_replay.text import counted, nearest_hint
 COMPLETION_VARIABLE = "_SPATIAL_REPLAY_COMPLETE"
 DEBUG_VARIABLE = "SPATIAL_REPLAY_DEBUG"
 
+GROUPS: dict[str, dict[str, str]] = {
+    "Start here": {
+        "record": "Record a run as a log.",
+        "replay": "Evaluate specifications over a log.",
+        "explain": "Explain a verdict.",
+        "report": "Write an HTML report of a run.",
+        "serve": "Replay live to a viewer, with constants to change.",
+    },
+    "Specifications": {
+        "check": "Check a specification and print its tree.",
+        "doctor": "Find faults of a specification before any run.",
+        "tune": "Find the constants that fit recorded runs.",
+        "learn": "Find a specification that distinguishes good runs from bad ones.",
+        "falsify": "Search for simulated runs that violate a specification.",
+    },
+    "Logs": {
+        "info": "Show the content of a log.",
+        "clip": "Cut the smallest part of a log that shows a verdict.",
+        "diff": "Compare two specifications over a log, or two logs.",
+        "verify": "Recompute a log's certificate and compare.",
+        "recover": "Save the readable part of a damaged log.",
+        "export": "Export the robustness of every node as a table.",
+        "tags": "Print AprilTags, and calibrate a camera.",
+    },
+    "Many logs": {
+        "batch": "Evaluate many logs, and show the failures.",
+        "results": "Show the results of a batch.",
+    },
+    "Live": {"monitor": "Monitor a running robot."},
+    "Planning": {"plan": "Plan a run in a simulated world."},
+}
+"""Commands by the headings of the help, with their summaries."""
+
 COMMANDS: dict[str, str] = {
-    "batch": "Evaluate many logs, and show what fails.",
-    "check": "Check a specification and print its tree.",
-    "clip": "Cut the smallest part of a log that shows a verdict.",
+    **{name: summary for group in GROUPS.values() for name, summary in group.items()},
     "completion": "Print a shell completion script.",
-    "diff": "Compare two specifications over a log, or two logs.",
-    "doctor": "Find what is wrong with a specification before any run.",
-    "explain": "Explain a verdict.",
-    "export": "Export the robustness of every node as a table.",
-    "falsify": "Search for simulated runs that violate a specification.",
-    "info": "Show what a log contains.",
-    "learn": "Find a specification that distinguishes good runs from bad ones.",
-    "monitor": "Monitor a running robot.",
-    "plan": "Plan a run in a simulated world.",
-    "record": "Record a run as a log.",
-    "recover": "Save all that can be read of a damaged log.",
-    "replay": "Evaluate specifications over a log.",
-    "report": "Write an HTML report of a run.",
-    "results": "Show what a batch found.",
-    "serve": "Replay live to a viewer, with constants to change.",
-    "tags": "Print AprilTags, and calibrate a camera.",
-    "tune": "Find the constants that fit recorded runs.",
-    "verify": "Recompute a log's certificate and compare.",
     "warmup": "Compile everything once, for images.",
 }
-"""Name and summary; `spatial_replay/cli/NAME.py` defines the command under its name."""
+"""Name and summary, also of commands that the help leaves out; `cli/NAME.py` defines the command NAME."""
 
 
 class LazyCommands(click.Group):
@@ -95,8 +108,10 @@ class LazyCommands(click.Group):
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        with formatter.section("Commands"):
-            formatter.write_dl(list(COMMANDS.items()))
+        width = max(map(len, COMMANDS))
+        for heading, commands in GROUPS.items():
+            with formatter.section(heading):
+                formatter.write_dl([(name.ljust(width), summary) for name, summary in commands.items()])
 
 
 @click.group(
