@@ -13,7 +13,6 @@ have only one of the two ways.
 
 from __future__ import annotations
 
-import ctypes
 import math
 import sys
 import time
@@ -25,17 +24,17 @@ from typing import Any, Final, Generic, Literal, ParamSpec, TypeAlias, TypeVar, 
 
 import numpy as np
 
-from spatial_replay.compiler import ROW, Compiler, Lanes
+from spatial_replay.compiler import Compiler
 
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 _Making: TypeAlias = Callable[[Callable[_Arguments, _Result]], Callable[_Arguments, _Result]]
 
+_PATIENCE_S: Final = 0.8
+"""How long a process interprets kernels in any case: loading the compiler and machine code takes as long."""
 _COLD_S: Final = 2.0
-_WARM_S: Final = 0.02
-"""How long a kernel may be interpreted before it is compiled, or loaded from the cache."""
-_COMPILER_S: Final = 0.25
-"""What loading the compiler costs besides, once in a process: as much as all kernels may take before."""
+_WARM_S: Final = 0.03
+"""How long each kernel may be interpreted after that before it is compiled, or loaded from the cache."""
 _GUESS_S: Final = 2e-6
 """For each element of its arrays, the time a kernel is expected to take when it was never run."""
 _LONG: Final = 3.0
@@ -135,17 +134,6 @@ def by_address(function: Callable[..., int]) -> Callable[[int, bytes, int], int]
     return cast(Callable[[int, bytes, int], int], cast("_Apart", function).entry())
 
 
-def releasing(function: Callable[..., int]) -> Callable[..., int]:
-    """Return a kernel compiled apart whose calls let other threads run (see `long_kernel`)."""
-    if _process.only == "interpreted":
-        return function
-    kernel = cast("_Apart", function)
-    count = cast(FunctionType, kernel.__wrapped__).__code__.co_argcount
-    address = kernel.entry().machine_code.address
-    entry = ctypes.CFUNCTYPE(ctypes.c_int64, *[ctypes.c_void_p] * count)(address)
-    return lambda *arguments: cast(int, entry(*kernel._taken(arguments)))
-
-
 def compile_ahead() -> None:
     """Interpret no kernel in this process from now on.
 
@@ -180,42 +168,6 @@ def compilations(hear: Callable[[], None]) -> Iterator[None]:
         yield
     finally:
         _process.listeners.remove(hear)
-
-
-def row_code(formula: Callable[..., Any]) -> Callable[..., None]:
-    """Return what fills a row, its last argument, with a formula of the rows and numbers before it.
-
-    All of these are read before anything is written, so that the row may be one of them. It has no loop: of
-    one over rows that may overlap, the compiler makes three times as many instructions.
-
-    Args:
-        formula: given `Lanes`, and rows of `ROW` numbers; a number stands for a row of nothing else.
-    """
-    return _RowCode(formula)
-
-
-def row_loop(*, backwards: bool = False, is_last_only: bool = False) -> _Making[..., Any]:
-    """Return what makes a loop over neighbouring rows, of which each follows from the one before.
-
-    It follows by a formula, which may return a second row, too, to be stored in place of what goes on.
-    The first argument is the row to begin with, and is replaced by the last one. The others are arrays of
-    rows, arrays of numbers, of which each stands for a row of nothing else, and single numbers. The last of
-    them receives the rows, and says how many there are.
-
-    Args:
-        backwards: whether the last row comes first.
-        is_last_only: whether there is no array to receive them, so that only the last row is kept.
-    """
-    return lambda formula: cast(Any, _RowLoop(formula, backwards=backwards, is_last_only=is_last_only))
-
-
-def row_fold(formula: Callable[..., Any]) -> Callable[[Any, float], float]:
-    """Return what joins all numbers of an array of rows, and another number, into one.
-
-    Args:
-        formula: joins two rows; in any order, it gives the same.
-    """
-    return cast(Callable[[Any, float], float], _RowFold(formula))
 
 
 class _Kernel(Generic[_Arguments, _Result]):
@@ -275,11 +227,11 @@ class _Kernel(Generic[_Arguments, _Result]):
         if not _process.interprets:
             return False
         guess = _GUESS_S * self.times if self._element_s is None else self._element_s
-        cost = self._spent_s + elements * guess
-        if not _process.has_compiler:
-            cost -= max(_COMPILER_S - _process.spent_s, 0.0)
+        cost = elements * guess
+        if _process.spent_s + cost <= _PATIENCE_S or self._spent_s + cost <= _WARM_S:
+            return True
         # asked last, since looking for the cache takes its time, too
-        return cost <= _WARM_S or (cost <= _COLD_S and not _process.holds(self.__module__, self.__name__))
+        return self._spent_s + cost <= _COLD_S and not _process.holds(self.__module__, self.__name__)
 
     def _taken(self, arguments: tuple[Any, ...]) -> tuple[Any, ...]:
         """Return what the interpreter runs the function with."""
@@ -327,12 +279,12 @@ def _names(function: FunctionType) -> set[str]:
 
 
 def _elements(values: object) -> int:
-    """Return how many doubles there is room for in arrays, also within tuples.
+    """Return how many numbers arrays have, also within tuples.
 
-    Kernels pass over bytes quickly: they compare or copy them, or jump from record to record.
+    Of bytes, which kernels copy at once or jump over from record to record, 64 take as long as a number.
     """
     if isinstance(values, np.ndarray):
-        return values.nbytes // 8
+        return values.size // (64 if values.itemsize == 1 else 1)
     if isinstance(values, tuple):
         return sum(map(_elements, values))
     return 0
@@ -399,108 +351,6 @@ class _ArrayAt(_Kernel[[int, Any], Any]):
     def compiled(self) -> Callable[[int, Any], Any]:
         if self._compiled is None:
             self._compiled = _process.array_at(self._kind)
-        return self._compiled
-
-
-class _Rows(Lanes):
-    """Formulas of rows, interpreted; `place` is that of a loop's row in its array."""
-
-    place = 0
-
-    def greater(self, first: Any, second: Any) -> Any:
-        return np.maximum(first, second)
-
-    def lesser(self, first: Any, second: Any) -> Any:
-        return np.minimum(first, second)
-
-    def parted(self, at: Any, before: Any, after: Any) -> Any:
-        return np.where(np.arange(ROW) < at, before, after)
-
-    def later(self, at: Any) -> Any:
-        return at + self.place
-
-    def moved(self, row: Any, by: int) -> Any:
-        places = np.arange(ROW)
-        return row[np.where((places + by >= 0) & (places + by < ROW), places + by, places)]
-
-    def spread(self, row: Any, at: int) -> Any:
-        return np.full(ROW, row[at])
-
-
-class _RowCode(_Kernel[..., None]):
-    """A formula of rows, as instructions within the kernel that calls it."""
-
-    def __init__(self, formula: Callable[..., Any]) -> None:
-        super().__init__(formula, {"no_cpython_wrapper": True})
-        # without `Lanes`
-        self._count = cast(FunctionType, formula).__code__.co_argcount - 1
-
-    def interpreted(self) -> Callable[..., None]:
-        formula = self.__wrapped__
-
-        def fill(*arguments: Any) -> None:
-            *rows, target = arguments
-            target[:] = formula(_Rows(), *rows)
-
-        return fill
-
-    def compiled(self) -> Callable[..., None]:
-        if self._compiled is None:
-            self._compiled = _process.row_code(self.__wrapped__, self._count)
-        return self._compiled
-
-
-class _RowLoop(_RowCode):
-    """A formula of rows, as a loop within the kernel that calls it."""
-
-    def __init__(self, formula: Callable[..., Any], *, backwards: bool, is_last_only: bool) -> None:
-        super().__init__(formula)
-        self._backwards, self._is_last_only = backwards, is_last_only
-
-    def interpreted(self) -> Callable[..., None]:
-        formula, is_last_only = self.__wrapped__, self._is_last_only
-
-        def loop(row: Any, *arguments: Any) -> None:
-            lanes, inputs = _Rows(), arguments if is_last_only else arguments[:-1]
-            count = len([each for each in arguments if isinstance(each, np.ndarray)][-1])
-            for k in reversed(range(count)) if self._backwards else range(count):
-                lanes.place = k
-                here = (each[k] if isinstance(each, np.ndarray) else each for each in inputs)
-                outcome = formula(lanes, row, *here)
-                result, stored = outcome if isinstance(outcome, tuple) else (outcome, outcome)
-                if not is_last_only:
-                    arguments[-1][k] = stored
-                row[:] = result
-
-        return loop
-
-    def compiled(self) -> Callable[..., None]:
-        if self._compiled is None:
-            self._compiled = _process.row_loop(
-                self.__wrapped__, self._count, backwards=self._backwards, is_last_only=self._is_last_only
-            )
-        return self._compiled
-
-
-class _RowFold(_Kernel[[Any, float], float]):
-    """A formula that joins rows, as a loop within the kernel that calls it, down to one number."""
-
-    def __init__(self, formula: Callable[..., Any]) -> None:
-        super().__init__(formula, {"no_cpython_wrapper": True})
-
-    def interpreted(self) -> Callable[[Any, float], float]:
-        formula: Any = self.__wrapped__
-
-        def fold(rows: Any, start: float) -> float:
-            for number in rows.ravel():
-                start = formula(_Rows(), start, number)
-            return start
-
-        return fold
-
-    def compiled(self) -> Callable[[Any, float], float]:
-        if self._compiled is None:
-            self._compiled = _process.row_fold(self.__wrapped__)
         return self._compiled
 
 

@@ -104,7 +104,7 @@ def signals():
     source = np.random.default_rng(44)
     noise = np.round(source.normal(size=(3, SAMPLES)), 2)
     slow = -np.arange(SAMPLES) / 1000
-    # the condition always holds, and what has to follow gets worse: positions matter until their windows close
+    # the condition always holds and the response gets worse: positions matter until their windows close
     falling = np.stack([np.full(SAMPLES, 1000.0), *(slow + source.normal(size=(2, SAMPLES)) * 0.3)])
     unknown = np.stack([noise, noise])
     lost = (source.random((3, SAMPLES)) < 0.02) & (np.arange(SAMPLES) > SAMPLES // 4)

@@ -1,11 +1,9 @@
-"""Windows over long runs: blocks of samples side by side say what the samples say one by one."""
+"""Windows over long runs: samples that come together say what they say one by one."""
 
 from __future__ import annotations
 
-from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from itertools import pairwise
-from unittest import mock
 
 import numpy as np
 import pytest
@@ -17,7 +15,7 @@ from laws.strategies_monitor import LEAVES, LeafRun, combinations_of, responses,
 from laws.test_monitor_laws import fewest
 from spatial_replay import UsageError
 from spatial_replay.compiled import only
-from spatial_replay.monitor.online import codes, operators, shares, state, step
+from spatial_replay.monitor.online import codes, operators, state
 from spatial_replay.monitor.online.program import compile_formula
 from spatial_replay.monitor.online.step import OnlineRun
 from spatial_replay.spec.formula import Boolean, Bound, Temporal
@@ -66,10 +64,6 @@ _beside = st.builds(Boolean, st.sampled_from(["and", "or", "xor", "<->"]), st.tu
 formulas = st.one_of(
     responses(_deep), responses(_over), responses(_beside), _deep, _behind(_below(2)), _below(3)
 )
-_cheap = responses(windows_of(_literals, _even_bounds))
-_roots = st.lists(st.one_of(_cheap, responses(_over), responses(_deep)), min_size=2, max_size=4)
-several = st.builds(Boolean, st.sampled_from(["and", "or"]), _roots.map(tuple))
-"""Some responses beside each other, of which some are made of signals."""
 _ends = st.one_of(
     st.builds(
         lambda low, more: Bound(low, low + more, "samples"),
@@ -122,57 +116,6 @@ wide_windows = st.one_of(
 )
 """Windows of some hundred samples over each other, and operators that never end above and below them."""
 
-
-def _of_one_kind(depth, operators):
-    """Formulas of which all that is open counts alike, over each other up to so often."""
-    if depth == 0:
-        return _literals
-    below = _of_one_kind(depth - 1, operators)
-    single, pair = operators
-    return st.one_of(
-        st.builds(Temporal, st.just(single), st.tuples(below), _bounds),
-        st.builds(Temporal, st.just(pair), st.tuples(_literals, below), _bounds),
-        st.builds(Boolean, st.sampled_from(["and", "or"]), st.tuples(below, _literals)),
-    )
-
-
-ending_kinds = st.builds(
-    Temporal,
-    st.sampled_from(["F", "G"]),
-    st.sampled_from(["FU", "GR"]).flatmap(lambda kind: st.tuples(_of_one_kind(2, kind))),
-    st.builds(Bound, st.just(0), st.integers(60, 250), st.just("samples")),
-)
-"""Roots with a window that ends well within a run, over one kind of operators."""
-
-_near = st.one_of(
-    st.builds(
-        lambda low, more: Bound(low, low + more, "samples"),
-        st.sampled_from([0, 0, 0, 1, 9]),
-        st.sampled_from([0, 1, 8, 15, 31, 40]),
-    ),
-    st.builds(
-        lambda low, more: Bound(low, low + more, "ns"),
-        st.sampled_from([0, 0, 0, 1, 100, 250]),
-        st.sampled_from([0, 50, 101, 800, 1600, 3200]),
-    ),
-)
-_nearby = st.one_of(windows_of(_below(0), _near), windows_of(combinations_of(_literals, _near), _near))
-_near_root = st.builds(
-    Temporal,
-    st.sampled_from(["F", "G"]),
-    st.tuples(
-        st.one_of(
-            _nearby,
-            st.builds(Temporal, st.sampled_from(["F", "G", "O", "H"]), st.tuples(_nearby), _near),
-            st.builds(Boolean, st.sampled_from(["and", "or", "->", "<->"]), st.tuples(_nearby, _nearby)),
-        )
-    ),
-)
-near_windows = st.one_of(
-    _near_root,
-    st.builds(Boolean, st.sampled_from(["and", "or", "<->"]), st.tuples(_near_root, _near_root)),
-)
-"""Unbounded roots over windows that look no further than some ten samples."""
 
 _conditioned = st.builds(Boolean, st.sampled_from(["and", "or", "->"]), st.tuples(_literals, _ahead))
 _several = st.builds(Boolean, st.sampled_from(["and", "or"]), st.tuples(_conditioned, _ahead))
@@ -264,7 +207,7 @@ _KINDS = ("ties", "random walk", "rising", "falling", "infinite", "rarely", "any
 
 @st.composite
 def long_runs(draw, min_size=100, max_size=400):
-    """Runs of many blocks, of which what is unknown or uncertain begins somewhere, and ends again."""
+    """Long runs, of which what is unknown or uncertain begins somewhere, and ends again."""
     size, channels = draw(st.integers(min_size, max_size)), draw(st.sampled_from([1, 2, 4]))
     source = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     steps = source.choice(draw(st.sampled_from(_STEPS)), size)
@@ -288,7 +231,7 @@ def long_runs(draw, min_size=100, max_size=400):
 
 @st.composite
 def stretches(draw, size):
-    """Ends of stretches: few long ones, or ones about as long as blocks."""
+    """Ends of stretches: few long ones, or many short ones."""
     if draw(st.booleans()):
         inside = draw(st.sets(st.integers(1, size - 1), max_size=4))
     else:
@@ -313,20 +256,20 @@ def program_of(formula):
 def leaving_out_nothing(program):
     """The same program, of which positions count until their windows close."""
     parts = program.parts.copy()
-    parts[:, [codes.PART_LIMIT, codes.PART_OUTDONE_BY]] = operators.NOTHING, codes.BY_NOTHING
+    parts[:, [codes.PART_LIMIT, codes.PART_IS_MONOTONE]] = operators.NOTHING, 0
     return replace(program, parts=parts)
 
 
 def both_ways(program, run, ends, **options):
     """What a run says in stretches, and sample by sample: (N, 4, T), and (N, 2) after each stretch."""
     leaves, times = run.values(program.leaves), np.array(run.times_ns)
-    blocks, single = OnlineRun(program, **options), OnlineRun(program, tile=1)
+    together, single = OnlineRun(program, **options), OnlineRun(program, tile=1)
     said, expected = ([], []), ([], [])
     for begin, end in pairwise(ends):
         # as few channels as each stretch needs: the others come up while windows are open
         part = fewest(leaves[:, :, begin:end])
-        said[0].append(blocks.extend(part, times[begin:end]))
-        said[1].append(blocks.final)
+        said[0].append(together.extend(part, times[begin:end]))
+        said[1].append(together.final)
         for k in range(end - begin):
             expected[0].append(single.extend(part[:, :, k : k + 1], times[begin + k : begin + k + 1]))
         expected[1].append(single.final)
@@ -346,144 +289,16 @@ widths = st.sampled_from([100, 256, 1024])
 
 @settings(max_examples=1000)
 @given(data=st.data(), formula=formulas, run=long_runs(), room=rooms, tile=tiles)
-def test_blocks_say_what_samples_say_one_by_one(data, formula, run, room, tile):
+def test_samples_together_say_what_they_say_one_by_one(data, formula, run, room, tile):
     ends = data.draw(stretches(len(run)))
     assert_same_bits(*both_ways(program_of(formula), run, ends, room=room, tile=tile))
 
 
 @settings(max_examples=200)
 @given(data=st.data(), formula=wide_windows, run=long_runs(min_size=500, max_size=900), tile=widths)
-def test_spans_of_open_positions_say_what_samples_say_one_by_one(data, formula, run, tile):
+def test_wide_windows_say_the_same_of_samples_together_and_one_by_one(data, formula, run, tile):
     ends = data.draw(stretches(len(run)))
     assert_same_bits(*both_ways(program_of(formula), run, ends, room=2048, tile=tile))
-
-
-@settings(max_examples=20)
-@given(formula=wide_windows, run=long_runs(min_size=500, max_size=900))
-def test_interpreted_spans_have_the_same_bits(formula, run):
-    program, leaves = program_of(formula), run.values
-    with only("interpreted"):
-        interpreted = OnlineRun(program, room=1024).extend(leaves(program.leaves), np.array(run.times_ns))
-    with only("compiled"):
-        compiled = OnlineRun(program, room=1024).extend(leaves(program.leaves), np.array(run.times_ns))
-    assert_same_bits([interpreted], [compiled])
-
-
-@settings(max_examples=500)
-@given(
-    data=st.data(),
-    formula=formulas,
-    run=long_runs(),
-    room=rooms,
-    tile=st.sampled_from([8, 20, 33, 40, 77]),
-    least=st.sampled_from([10, 50, 100]),
-    is_wide=st.booleans(),
-)
-def test_two_runs_that_share_a_stretch_say_what_one_does(data, formula, run, room, tile, least, is_wide):
-    ends = data.draw(stretches(len(run)))
-    with only("compiled"), wide_open(is_wide):  # the work is shared once there is machine code
-        options = {"room": room, "tile": tile, "least_shared": least, "threads": 2}
-        assert_same_bits(*both_ways(program_of(formula), run, ends, **options))
-
-
-@settings(max_examples=800)
-@given(
-    data=st.data(),
-    formula=near_windows,
-    run=long_runs(500, 900),
-    tile=st.sampled_from([20, 33, 64]),
-    least=st.sampled_from([200, 300]),
-    threads=st.integers(2, 6),
-)
-def test_runs_that_take_a_section_of_a_stretch_each_say_what_one_does(
-    data, formula, run, tile, least, threads
-):
-    ends, size = data.draw(stretches(len(run))), len(run)
-    # a stretch of several sections, and then others
-    ends = sorted({0, 4 * size // 5, *(end for end in ends if end > 4 * size // 5)})
-    with only("compiled"), wide_open():
-        options = {"room": tile, "tile": tile, "least_shared": least, "threads": threads}
-        assert_same_bits(*both_ways(program_of(formula), run, ends, **options))
-
-
-@pytest.mark.parametrize("threads", [2, 3, 5])
-def test_one_run_goes_on_where_sections_leave_positions_between_them(threads):
-    within = ahead("F", 0, 30, Temporal("G", (Q,), Bound(0, 300, "ns")))
-    program, found = leaving_out_nothing(compile_formula(Temporal("G", (Boolean("->", (P, within)),)))), set()
-    size = 600 * threads  # so that each section is worth it
-    names = [leaf.text for leaf in program.leaves]
-    options = {"room": 32, "tile": 32, "least_shared": 150, "threads": threads}
-    for seed in range(40):
-        rng, left = np.random.default_rng(seed), []
-        times = np.cumsum(np.where(rng.random(size) < 0.02, 3000, rng.integers(1, 4, size)))
-        leaves = np.zeros((1, 2, size))
-        leaves[0, names.index(Q.text)] = rng.normal(size=size)
-        leaves[0, names.index(P.text)] = -9 - rng.random(size)
-        with only("compiled"), wide_open(), between_sections(left):
-            OnlineRun(program, **options).extend(leaves, times)
-        for section, begin, end in left:
-            # nothing else is asked for
-            leaves[0, names.index(P.text), begin:end] = 9
-            found.add(section)
-        with only("compiled"), wide_open():
-            sections = OnlineRun(program, **options).extend(leaves, times)
-            assert sections.tobytes() == OnlineRun(program, threads=1).extend(leaves, times).tobytes()
-    assert found >= set(range(1, threads))
-
-
-@contextmanager
-def wide_open(is_so=True):
-    """Have the work shared however little is open."""
-    with mock.patch.object(step, "open_share", lambda *_: np.inf) if is_so else nullcontext():
-        yield
-
-
-@contextmanager
-def between_sections(left):
-    """Note the positions that the section before has not closed and one does not look at, and which one."""
-    starts = []
-
-    def started(*arguments):
-        found = shares.starts_of(*arguments)
-        starts[:] = enumerate(found, 1)
-        return found
-
-    def closed(*arguments):
-        end, (section, start) = shares.closed_up_to(*arguments), starts.pop(0)
-        left.extend([(section, end, start.seen)] if end < start.seen else [])
-        return end
-
-    with mock.patch.object(step, "starts_of", started), mock.patch.object(step, "closed_up_to", closed):
-        yield
-
-
-@settings(max_examples=200)
-@given(data=st.data(), formula=several, run=long_runs(200, 600), tile=st.sampled_from([20, 64]))
-def test_two_runs_that_share_several_roots_say_what_one_does(data, formula, run, tile):
-    ends, size = data.draw(stretches(len(run))), len(run)
-    # a long stretch, and then others
-    ends = sorted({0, size // 2, *(end for end in ends if end > size // 2)})
-    with only("compiled"), wide_open():
-        options = {"room": tile, "tile": tile, "least_shared": 60, "threads": 2}
-        assert_same_bits(*both_ways(program_of(formula), run, ends, **options))
-
-
-@settings(max_examples=250)
-@given(formula=ending_kinds, run=long_runs(280, 420), tile=st.sampled_from([16, 40]))
-def test_two_runs_that_share_a_root_say_what_one_does_once_it_is_over(formula, run, tile):
-    """Its bounds may be the value then, which only one of them computes."""
-    ends = [0, tile, len(run)]
-    with only("compiled"), wide_open():
-        options = {"room": tile, "tile": tile, "least_shared": 40, "threads": 2}
-        assert_same_bits(*both_ways(program_of(formula), run, ends, **options))
-
-
-@settings(max_examples=200)
-@given(data=st.data(), formula=formulas, run=long_runs(), most=st.sampled_from([9, 16, 33, 50, 80]))
-def test_where_more_is_open_than_there_are_rows_samples_run_one_by_one(data, formula, run, most):
-    ends = data.draw(stretches(len(run)))
-    with mock.patch.object(state, "MOST_POSITIONS", most):
-        assert_same_bits(*both_ways(program_of(formula), run, ends))
 
 
 @settings(max_examples=60)
@@ -494,7 +309,7 @@ def test_long_windows_equal_the_definitions(data, formula, run, room):
 
 
 def assert_as_defined(formula, program, run, ends, **options):
-    """Blocks, and samples one by one, say what the definitions do."""
+    """Samples together, and one by one, say what the definitions do."""
     ways = both_ways(program, run, ends, **options)
     wide_leaf = run.wide_leaf if run.channels == 4 else run.nominal_leaf
     expected = numbers_of(formula, run.times_ns, run.nominal_leaf, wide_leaf)
@@ -523,34 +338,26 @@ def test_leaving_out_what_matters_no_more_changes_nothing(data, case, tile):
         assert_same_bits([one], [other])
 
 
-# how wide such a window may be that is not made of signals
-briefs = st.sampled_from([(0, 0), operators.BRIEF])
-
-
 @settings(max_examples=300)
-@given(data=st.data(), formula=ending, run=long_runs(), room=rooms, tile=tiles, brief=briefs)
-def test_windows_from_the_first_sample_say_the_same_in_blocks(data, formula, run, room, tile, brief):
+@given(data=st.data(), formula=ending, run=long_runs(), room=rooms, tile=tiles)
+def test_windows_from_the_first_sample_say_the_same_together_and_one_by_one(data, formula, run, room, tile):
     ends = data.draw(stretches(len(run)))
-    with mock.patch.object(operators, "BRIEF", brief):
-        program = program_of(formula)
-    assert_same_bits(*both_ways(program, run, ends, room=room, tile=tile))
+    assert_same_bits(*both_ways(program_of(formula), run, ends, room=room, tile=tile))
 
 
 @settings(max_examples=100)
-@given(data=st.data(), formula=ending, run=long_runs(min_size=36, max_size=60), room=rooms, brief=briefs)
-def test_windows_from_the_first_sample_equal_the_definitions(data, formula, run, room, brief):
+@given(data=st.data(), formula=ending, run=long_runs(min_size=36, max_size=60), room=rooms)
+def test_windows_from_the_first_sample_equal_the_definitions(data, formula, run, room):
     ends = data.draw(stretches(len(run)))
-    with mock.patch.object(operators, "BRIEF", brief):
-        program = compile_formula(formula)
-    assert_as_defined(formula, program, run, ends, room=room)
+    assert_as_defined(formula, compile_formula(formula), run, ends, room=room)
 
 
 def test_memory_does_not_grow_with_a_window_from_the_first_sample():
     size, rng = 6000, np.random.default_rng(3)
     times = np.arange(size) * 100
     for body in (
-        ahead("F", 0, 20, Boolean("and", (P, ahead("F", 0, 20, Q)))),  # kept at open positions
-        Boolean("->", (P, ahead("F", 0, 20, Q))),  # made of signals
+        ahead("F", 0, 20, Boolean("and", (P, ahead("F", 0, 20, Q)))),
+        Boolean("->", (P, ahead("F", 0, 20, Q))),
         Temporal("F", (Boolean("and", (P, ahead("F", 0, 20, Q))),)),  # a table
     ):
         program = compile_formula(ahead("G", 0, 10**6, body))
@@ -562,7 +369,7 @@ def test_memory_does_not_grow_with_a_window_from_the_first_sample():
 
 @settings(max_examples=40)
 @given(data=st.data(), formula=formulas, run=long_runs(min_size=20, max_size=50))
-def test_interpreted_blocks_have_the_same_bits(data, formula, run):
+def test_interpreted_windows_have_the_same_bits(data, formula, run):
     ends, program = data.draw(stretches(len(run))), program_of(formula)
     with only("interpreted"):
         interpreted, _ = both_ways(program, run, ends)

@@ -182,12 +182,12 @@ def is_outdone(part: Integers, root: Integers, memory: Memory, channel: int, val
 
 
 @inlined
-def looks_for_outdone(part: Integers, memory: Memory, channels: int, by: int, last: int) -> bool:
-    """Return whether anything, `by` at least, says what is outdone of what a root joins.
+def looks_for_outdone(part: Integers, memory: Memory, channels: int, last: int) -> bool:
+    """Return whether the value says what is outdone of what a root joins.
 
     Nothing does once its window is over: what comes is joined no more then.
     """
-    is_said = part[codes.PART_OUTDONE_BY] >= by and part[codes.PART_NUMBERS] & 1 and channels <= 2
+    is_said = part[codes.PART_IS_MONOTONE] and part[codes.PART_NUMBERS] & 1 and channels <= 2
     is_begun = memory.cells[part[codes.PART_CELL_START]] > 0
     return bool(is_said and is_begun and not is_over(part, memory, last))
 

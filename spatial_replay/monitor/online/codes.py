@@ -17,8 +17,7 @@ SAMPLES, NANOSECONDS = 0, 1
 # columns of signals
 SIGNAL_CODE, SIGNAL_A, SIGNAL_B, SIGNAL_UNIT, SIGNAL_LOW, SIGNAL_HIGH, SIGNAL_WINDOW = range(7)
 SIGNAL_IS_KEPT = 7  # whether it is looked at behind the newest sample, too
-SIGNAL_SETTLED = 8  # the cell that says whether it matters no more, -1 if it always matters
-SIGNAL_WIDTH = 9
+SIGNAL_WIDTH = 8
 OFFLINE_TARGET = 6  # of finished stretches: the column that a row writes, in place of the window
 OFFLINE_WIDTH = 7
 # codes of signals
@@ -28,25 +27,9 @@ NOT, AND, OR = 2, 3, 4
 ONCE, HISTORICALLY, SINCE = 7, 8, 9
 WINDOW_MAX, WINDOW_MIN = 10, 11  # of a, over [low, high] back
 DELAY = 12  # a, low back; high times infinity where there is none
-# of conditions a at past positions and the extrema of b over the windows [low, high] ahead of them (see
-# `clauses`): over positions whose window has begun, and over those whose window has closed
-BEGUN_MIN, BEGUN_MAX = 13, 14  # min of max(a, max of b); max of min(a, min of b)
-CLOSED_MIN_OF_MAX, CLOSED_MIN_OF_MIN, CLOSED_MAX_OF_MAX, CLOSED_MAX_OF_MIN = 17, 18, 19, 20
-# of each position whose window has closed, at that position: max(a, max of b); min(a, min of b)
-CLOSED_EACH_MAX, CLOSED_EACH_MIN = 29, 30
-# over the positions whose window [low, high] ahead has begun and is open, of extrema over what has come of
-# it: min of max(min of a, max of b), max of min(max of a, min of b)
-CROSSING_MIN, CROSSING_MAX = 32, 33
-# of a, over the positions that have come to be low back with the sample; infinite if there are none
-ARRIVED_MIN, ARRIVED_MAX = 21, 22
 # high times infinity once the first sample is at least low behind, the negative of that before
 ELAPSED = 31
-DELAYED = (DELAY, ARRIVED_MIN, ARRIVED_MAX)
-BEGUN = (BEGUN_MIN, BEGUN_MAX)
-CLOSED_EACH = (CLOSED_EACH_MAX, CLOSED_EACH_MIN)
-CLOSED = (CLOSED_MIN_OF_MAX, CLOSED_MIN_OF_MIN, CLOSED_MAX_OF_MAX, CLOSED_MAX_OF_MIN, *CLOSED_EACH)
-CROSSING = (CROSSING_MIN, CROSSING_MAX)  # keep positions in two rings
-RINGS = (WINDOW_MAX, WINDOW_MIN, *BEGUN, *CLOSED, *CROSSING)  # keep positions in a ring
+RINGS = (WINDOW_MAX, WINDOW_MIN)  # keep positions in a ring
 AHEAD = 16  # added to a code from ONCE on: its mirror image in time (see `finished`)
 
 # columns of parts' nodes
@@ -55,8 +38,7 @@ NODE_CODE, NODE_A, NODE_B, NODE_WEAK, NODE_UNIT, NODE_LOW, NODE_HIGH = range(7)
 NODE_VARIABLE, NODE_TABLE, NODE_DEPENDS = 7, 8, 9  # the first two -1 for none
 NODE_TIMED = 10  # the number of a window or shift ahead in seconds, -1 for none
 NODE_CUTS = 11  # whether its windows cut a part's bound short (see `PART_IS_CUT`)
-NODE_ROWS = 12  # where its rows are in a block of samples, -1 for a literal (see `blocks.node_rows`)
-NODE_WIDTH = 13
+NODE_WIDTH = 12
 # codes of parts' nodes
 LITERAL = 0  # signal a, negated if b
 PART_AND, PART_OR = 2, 3
@@ -81,37 +63,33 @@ PART_FIRST, PART_END, PART_VARIABLES, PART_TABLES, PART_TABLE_START, PART_CELL_S
 # the kind; whether it says what it, or another part, is at the last sample; the corner that ends a run
 PART_KIND, PART_IS_REMEMBERING, PART_END_CORNER = 6, 7, 8
 PART_IS_NESTED = 9  # whether a node below the root depends on a variable, or any on a table
-# of clauses: signals, whether they join by minimum, and the part beside them, -1 for none
-PART_ENDING, PART_LOWER, PART_UPPER, PART_IS_MINIMUM, PART_BESIDE = 10, 11, 12, 13, 14
 # whether the bound that is not known at once is the value but for positions where a window of those nodes
 # is open that cut it
-PART_IS_CUT = 15
+PART_IS_CUT = 10
 # the part, itself or another, and its node that is what this one is at the last sample; -1 if not asked for
-PART_LAST_IN, PART_LAST_NODE = 16, 17
+PART_LAST_IN, PART_LAST_NODE = 11, 12
 # a bit for each bound: which follow from its table alone until its root has ended, since what may still come
 # outdoes all that is open; eight bits higher up, which do even once it has; again eight bits higher up, which
 # are the value once it has
-PART_KNOWN = 18
+PART_KNOWN = 13
 EVEN_IF_OVER, SAME_IF_OVER = 1 << 8, 1 << 16
 # the signal that what a root joins by the minimum is at least, by the maximum at most; -1 for none
-PART_LIMIT = 19
-# what says that what a root joins by the minimum falls no more, by the maximum rises no more, while windows
-# are open, the more the greater: nothing; the worst that may come, where spans are found (see
-# `blocks.spans`); or its value
-PART_OUTDONE_BY = 20
-BY_NOTHING, BY_WORST, BY_VALUE = 0, 1, 2
+PART_LIMIT = 14
+# 1 if the value of what a root joins by the minimum falls no more, by the maximum rises no more, while
+# windows are open
+PART_IS_MONOTONE = 15
 # the unit, and how far from the first sample on the root joins what its operand is; -1 if it never ends
-PART_END_UNIT, PART_ENDS_AT = 21, 22
+PART_END_UNIT, PART_ENDS_AT = 16, 17
 # which of its numbers a run computes, a bit for each: all but what a past operator is at first, where that is
-# its operand, and but where two runs share them (see `shares`)
-PART_NUMBERS = 23
-PART_WIDTH = 24
+# its operand
+PART_NUMBERS = 18
+PART_WIDTH = 19
 ALL_NUMBERS = (1 << 8) - 1
 LAST_NUMBERS = 1 << 2 | 1 << 3  # what a part is at the last sample
 FIRST_NUMBERS = ALL_NUMBERS ^ LAST_NUMBERS  # what it is at the first one
 LOWER, UPPER = 4, 5  # its bounds, with uncertainty
 # kinds of parts
-TABLE, WINDOWED, CLAUSES = 0, 1, 2  # see `tables`, `windows`, `clauses`
+TABLE, WINDOWED = 0, 1  # see `tables`, `windows`
 
 # columns of reports: the index is of the signal or part, the rule is for now
 REPORT_CODE, REPORT_INDEX, REPORT_RULE, REPORT_FIRST, REPORT_END = range(5)

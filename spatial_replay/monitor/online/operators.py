@@ -6,7 +6,7 @@ negation normal form over signals, so that its value is monotone in all its oper
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from functools import partial, reduce
 from itertools import islice
 
@@ -53,8 +53,7 @@ def _operands_of_row(row: Row) -> tuple[int, ...]:
     code, a, b, *_ = row
     if code in (codes.LEAF, codes.CONSTANT, codes.ELAPSED):
         return ()
-    binary = codes.AND, codes.OR, codes.SINCE, *codes.BEGUN, *codes.CLOSED, *codes.CROSSING
-    return (a, b) if code in binary else (a,)
+    return (a, b) if code in (codes.AND, codes.OR, codes.SINCE) else (a,)
 
 
 class SignalTable:
@@ -81,38 +80,26 @@ class SignalTable:
     @property
     def windows(self) -> int:
         """How many rings of positions the rows keep."""
-        return sum((row[0] in codes.RINGS) + (row[0] in codes.CROSSING) for row in self._rows)
+        return sum(row[0] in codes.RINGS for row in self._rows)
 
     @property
     def keeps_history(self) -> bool:
         """Whether any row looks at more than the newest sample."""
-        return any(row[0] in codes.RINGS or row[0] in codes.DELAYED for row in self._rows)
+        return any(row[0] in (*codes.RINGS, codes.DELAY) for row in self._rows)
 
-    def array(self, kept: Iterable[int], asked: Mapping[int, set[int]]) -> Integers:
-        """Return the table (S, SIGNAL_WIDTH), with its rings numbered: first those with numbers beside.
+    def array(self, kept: Iterable[int]) -> Integers:
+        """Return the table (S, SIGNAL_WIDTH), with its rings numbered.
 
         Args:
             kept: the rows that parts look at behind the newest sample.
-            asked: for rows, who looks at them: cells that say whether these still do, -1 for who always does.
         """
         rings = [row for row in self._rows if row[0] in codes.RINGS]
-        rings.sort(key=lambda row: (row[0] not in codes.BEGUN, row[0] in codes.CROSSING))
-        single = sum(row[0] not in codes.CROSSING for row in rings)
-        numbers = {row: number + max(number - single, 0) for number, row in enumerate(rings)}
-        looked_at, cells = set(kept), {number: set(asked.get(number, ())) for number in range(len(self))}
-        for number, row in reversed([*enumerate(self._rows)]):
-            operands = _operands_of_row(row)
-            if row[0] in codes.DELAYED or row[0] in codes.RINGS:
-                looked_at.update(operands)
-            for operand in operands:
-                cells[operand] |= cells[number]
+        looked_at = set(kept)
+        for row in self._rows:
+            if row[0] in (*codes.RINGS, codes.DELAY):
+                looked_at.update(_operands_of_row(row))
         rows = [
-            (
-                *row,
-                numbers.get(row, NOTHING),
-                int(number in looked_at),
-                min(cells[number]) if len(cells[number]) == 1 else NOTHING,
-            )
+            (*row, rings.index(row) if row in rings else NOTHING, int(number in looked_at))
             for number, row in enumerate(self._rows)
         ]
         return array_of_rows(rows, codes.SIGNAL_WIDTH)
@@ -139,10 +126,6 @@ class SignalTable:
     def row(self, code: int, a: int = 0, b: int = 0, unit: int = 0, low: int = 0, high: int = 0) -> int:
         """Return the place of a row, which is added unless there is one like it."""
         return self._rows.setdefault((code, a, b, unit, low, high), len(self._rows))
-
-    def drop(self, kept: int) -> None:
-        """Drop all rows but the first ones, after which none was added for a formula."""
-        self._rows = dict(islice(self._rows.items(), kept))
 
     def _leaf_number(self, formula: Atom | Quantified) -> int:
         key: tuple[object, ...]
@@ -211,9 +194,6 @@ MAX_VARIABLES = 12
 
 LAST = (1 << 63) - 1
 """No sample comes later, in samples or in ns."""
-
-BRIEF = (1000, 10 * 10**9)
-"""So wide a window of the root, in samples or in ns, is over soon; then it costs nothing any more."""
 
 _ANCHORED = (codes.ANCHORED_UNTIL, codes.ANCHORED_RELEASE)
 _RUNNING = (codes.UNTIL, codes.RELEASE)
@@ -307,18 +287,6 @@ class PartRows:
         """Whether the root joins a window that is counted from the first sample."""
         code, *_, high, is_variable = self.fields[-1]
         return code in _RUNNING and bool(is_variable) and high > 0
-
-    @property
-    def root_window(self) -> tuple[int, int, int]:
-        """The unit and the ends of the window that a root which `ends` joins."""
-        _, _, _, _, unit, low, high, _ = self.fields[-1]
-        return unit, low, high
-
-    @property
-    def is_brief(self) -> bool:
-        """Whether the root joins a window so short that what it costs until then matters little."""
-        unit, _, high = self.root_window
-        return self.ends and high <= BRIEF[unit]
 
     @property
     def end_corner(self) -> int:
@@ -466,15 +434,8 @@ class WindowedPart(PartRows):
 
     def _until_elapsed(self, left: int, unit: int, distance: int, sign: int) -> int:
         """Return the row of a root's left operand that is an infinity from a distance on."""
-        kind, signal, is_negated, *_ = self.fields[left] if left != NOTHING else (NOTHING, 0, 0)
-        if kind != codes.LITERAL:
-            end = self._elapsed(unit, distance, sign)
-            return end if left == NOTHING else self._join(left, end, is_both=sign < 0)
-        # a single signal, as clauses ask for
-        signal = self._signals.row(codes.NOT, signal) if is_negated else signal
-        either = codes.AND if sign < 0 else codes.OR
-        elapsed = self._signals.elapsed(unit, distance, sign)
-        return self.row(codes.LITERAL, self._signals.row(either, signal, elapsed))
+        end = self._elapsed(unit, distance, sign)
+        return end if left == NOTHING else self._join(left, end, is_both=sign < 0)
 
     def _elapsed(self, unit: int, distance: int, sign: int) -> int:
         """Return the row of an infinity that changes its sign a distance from the first sample on."""

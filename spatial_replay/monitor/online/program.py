@@ -5,7 +5,7 @@ A formula becomes three tables, each with operands first:
 - *signals*: every subformula without a future operator. Its robustness at a sample is final with that
   sample, so it is computed forwards, with a little state for past operators.
 - *parts*: one for each node that is a temporal operator and looks ahead, in negation normal form over
-  signals, so that its robustness is monotone in all its operands; or as clauses, which are signals.
+  signals, so that its robustness is monotone in all its operands.
 - *reports*: the tree as the user wrote it; Boolean nodes combine the numbers of their operands.
 
 `OnlineRun` runs samples through them.
@@ -20,10 +20,8 @@ import numpy as np
 
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.monitor.online import codes
-from spatial_replay.monitor.online.clauses import Clauses, clauses_of
 from spatial_replay.monitor.online.operators import (
     NOTHING,
-    PartRows,
     Row,
     SignalTable,
     array_of_rows,
@@ -34,9 +32,9 @@ from spatial_replay.monitor.online.rewriting import after_lasting, at_last, look
 from spatial_replay.monitor.online.root_bounds import (
     NEVER,
     cutting_windows,
+    is_monotone,
     known_bounds,
     limit_of,
-    outdone_by,
     root_end,
 )
 from spatial_replay.spec.formula import (
@@ -65,7 +63,6 @@ class Program:
         table_size: how many numbers the parts' tables hold for one channel.
         cells: how many rows of bookkeeping the parts need.
         timed: how many windows in seconds parts run over what is open.
-        rows: how many nodes of a part need rows at once, at most.
         keeps_history: whether any window, delay or part looks at more than the newest sample.
     """
 
@@ -79,7 +76,6 @@ class Program:
     table_size: int
     cells: int
     timed: int
-    rows: int
     keeps_history: bool
 
 
@@ -121,7 +117,7 @@ def compile_formula(formula: Formula) -> Program:
                 else:
                     is_operand = node.operator != "Y" and (node.bound is None or node.bound.lower == 0)
                     asked[number] = is_operand and asked.get(number, True)
-    node_rows, part_rows, most_rows = parts.finished(
+    part_rows = parts.finished(
         {number: is_operand and number not in others for number, is_operand in asked.items()}
     )
     reports = [
@@ -130,8 +126,8 @@ def compile_formula(formula: Formula) -> Program:
     ]
     return Program(
         leaves=tuple(signals.leaves),
-        signals=signals.array(parts.literals, _asked_signals(reports, node_rows, part_rows)),
-        nodes=array_of_rows(node_rows, codes.NODE_WIDTH),
+        signals=signals.array(parts.literals),
+        nodes=array_of_rows(parts.node_rows, codes.NODE_WIDTH),
         parts=array_of_rows(part_rows, codes.PART_WIDTH),
         reports=array_of_rows(reports, codes.REPORT_WIDTH),
         operands=np.array(operand_ids, np.int64),
@@ -139,7 +135,6 @@ def compile_formula(formula: Formula) -> Program:
         table_size=parts.table_size,
         cells=parts.cells,
         timed=parts.timed,
-        rows=most_rows,
         keeps_history=signals.keeps_history or parts.keeps_history,
     )
 
@@ -151,31 +146,12 @@ def _is_said_at_last_only(code: int, rest: Sequence[int], part_rows: Sequence[Ro
     return is_last and part_rows[number][codes.PART_NUMBERS] == codes.LAST_NUMBERS
 
 
-def _asked_signals(
-    reports: Sequence[Row], node_rows: Sequence[Row], part_rows: Sequence[Row]
-) -> dict[int, set[int]]:
-    """Return for signals who looks at them: the cells of parts made of signals, -1 for anything else."""
-    always = {
-        index
-        for code, index, rule, *_ in reports
-        if code == codes.REPORT_SIGNAL or (code == codes.REPORT_PAST and rule == codes.NOW_OF_SIGNAL)
-    }
-    always |= {row[codes.NODE_A] for row in node_rows if row[codes.NODE_CODE] == codes.LITERAL}
-    asked = dict[int, set[int]]()
-    for part in part_rows:
-        always.add(part[codes.PART_LIMIT])
-        for column in (codes.PART_ENDING, codes.PART_LOWER, codes.PART_UPPER):
-            asked.setdefault(part[column], set()).add(part[codes.PART_CELL_START])
-    for signal in always:
-        asked.setdefault(signal, set()).add(NOTHING)
-    return asked
-
-
 class _Parts:
     """The parts of a formula, one after the other; equal ones share a place.
 
     Attributes:
         literals: the signals that parts with windows look at.
+        node_rows: the rows of all nodes, part after part.
     """
 
     def __init__(self) -> None:
@@ -184,9 +160,9 @@ class _Parts:
         self.timed = 0
         self.keeps_history = False
         self.literals = set[int]()
-        self._built: dict[tuple[tuple[Row, ...], bool] | Row, int] = {}
+        self.node_rows: list[Row] = []
+        self._built: dict[tuple[tuple[Row, ...], bool], int] = {}
         self._part_rows: list[Row] = []
-        self._node_rows: list[Row] = []
         self._rows: list[tuple[Row, ...]] = []
         self._limits: list[int] = []
         self._root_ends: list[tuple[int, int]] = []
@@ -194,37 +170,13 @@ class _Parts:
     def add_node(self, node: Temporal, signals: SignalTable) -> int:
         """Add the part of a node that looks ahead, and return its number."""
         part = part_of(signals, node)
-        clauses = clauses_of(signals, part)
-        return self.add(part, signals) if clauses is None else self.add_clauses(clauses, signals)
-
-    def add_clauses(self, clauses: Clauses, signals: SignalTable) -> int:
-        """Add a part that is made of signals, after the part beside it, and return its number."""
-        beside = NOTHING if clauses.beside is None else self.add(clauses.beside, signals)
-        own = (clauses.ending, clauses.lower, clauses.upper, int(clauses.is_minimum), beside)
-        if own not in self._built:
-            self._built[own] = len(self._part_rows)
-            end = len(self._node_rows)
-            self._part_rows.append(
-                (end, end, 0, 0, self.table_size, self.cells, codes.CLAUSES, 0, 0, 0, *own, 0)
-            )
-            self._rows.append(())
-            self._limits.append(NOTHING)
-            self._root_ends.append(NEVER)
-            self.cells += 1
-        return self._built[own]
-
-    def add(self, part: PartRows, signals: SignalTable) -> int:
-        """Add a part and return its number.
-
-        Args:
-            signals: receives those that a part with windows looks at negated.
-        """
+        # with windows, what is negated is a signal of its own
         rows = part.rows() if part.is_flat else tuple(_looked_up(row, signals) for row in part.rows())
         key = rows, part.is_flat
         if key in self._built:
             return self._built[key]
         self._built[key] = len(self._part_rows)
-        first, cutting = len(self._node_rows), cutting_windows(rows)
+        first, cutting = len(self.node_rows), cutting_windows(rows)
         self._part_rows.append(
             (
                 first,
@@ -237,7 +189,6 @@ class _Parts:
                 0,
                 part.end_corner,
                 int(part.is_nested),
-                *[NOTHING] * 5,
                 int(cutting is not None),
             )
         )
@@ -249,7 +200,7 @@ class _Parts:
         for number, row in enumerate(rows):
             is_timed = row[codes.NODE_CODE] in codes.AHEAD_OF and row[codes.NODE_UNIT] != codes.SAMPLES
             cuts = cutting is not None and number in cutting
-            self._node_rows.append((*row, self.timed if is_timed else NOTHING, int(cuts)))
+            self.node_rows.append((*row, self.timed if is_timed else NOTHING, int(cuts)))
             if row[codes.NODE_CODE] == codes.LITERAL and not part.is_flat:
                 self.literals.add(row[codes.NODE_A])
             self.timed += is_timed
@@ -258,8 +209,8 @@ class _Parts:
         self.keeps_history |= not part.is_flat
         return self._built[key]
 
-    def finished(self, asked: Mapping[int, bool]) -> tuple[list[Row], list[Row], int]:
-        """Return the rows of all nodes, those of all parts, and how many nodes of a part need rows at once.
+    def finished(self, asked: Mapping[int, bool]) -> list[Row]:
+        """Return the rows of all parts.
 
         Args:
             asked: the parts of which it is asked what they are at the last sample, and whether that is all
@@ -268,7 +219,7 @@ class _Parts:
         last_in = self._nodes_at_last(asked)
         hosts = {number for number, _ in last_in.values()}
         beside = {number for number, (host, _) in last_in.items() if asked[number] and host != number}
-        parts = [
+        return [
             (
                 *row[: codes.PART_IS_REMEMBERING],
                 int(number in hosts),
@@ -276,17 +227,12 @@ class _Parts:
                 *last_in.get(number, (NOTHING, NOTHING)),
                 known_bounds(self._rows[number], is_bounded=self._root_ends[number] != NEVER),
                 self._limits[number],
-                codes.BY_NOTHING if row[codes.PART_IS_NESTED] else outdone_by(self._rows[number]),
+                int(not row[codes.PART_IS_NESTED] and is_monotone(self._rows[number])),
                 *self._root_ends[number],
                 codes.LAST_NUMBERS if number in beside else codes.ALL_NUMBERS,
             )
             for number, row in enumerate(self._part_rows)
         ]
-        places: list[int] = []
-        for number, rows in enumerate(self._rows):
-            places += _places_of_rows(rows, {node for host, node in last_in.values() if host == number})
-        nodes = [(*row, place) for row, place in zip(self._node_rows, places, strict=True)]
-        return nodes, parts, 1 + max(places, default=NOTHING)
 
     def _nodes_at_last(self, asked: Collection[int]) -> dict[int, tuple[int, int]]:
         """Return for parts that are asked for at the last sample the part, and the node of it, that say so.
@@ -330,33 +276,6 @@ def _looked_up(row: Row, signals: SignalTable) -> Row:
     if code != codes.LITERAL or not is_negated:
         return row
     return (code, signals.row(codes.NOT, signal), 0, *rest)
-
-
-def _places_of_rows(rows: tuple[Row, ...], kept: set[int]) -> list[int]:
-    """Return where the rows of each node are, in as few places as will do; -1 for literals.
-
-    A node takes the place of an operand that nothing else looks at again, unless it would replace what it is
-    still going to look at itself: windows that begin elsewhere than with their position do.
-
-    Args:
-        kept: nodes that are looked at after all others.
-    """
-    looked_at = {each: number for number, row in enumerate(rows) for each in operand_rows(*row[:3])}
-    looked_at |= dict.fromkeys(kept, len(rows))
-    places, free = list[int](), list[int]()
-    for number, (code, *operands) in enumerate(rows):
-        if code == codes.LITERAL:
-            places.append(NOTHING)
-            continue
-        below = operand_rows(code, *operands[:2])
-        ended = [places[each] for each in dict.fromkeys(below) if looked_at[each] == number]
-        ended = [place for place in ended if place != NOTHING]
-        is_window = code in (codes.PART_WINDOW_MAX, codes.PART_WINDOW_MIN)
-        if not ended or code in codes.PAST_WINDOWS or (is_window and operands[codes.NODE_LOW - 1] > 0):
-            ended = [free.pop() if free else 1 + max((*places, *free), default=NOTHING), *ended]
-        places.append(ended[0])
-        free += ended[1:]
-    return places
 
 
 def _nodes_with_operands(formula: Formula) -> list[tuple[Formula, list[int]]]:

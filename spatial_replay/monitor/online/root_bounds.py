@@ -147,27 +147,20 @@ def limit_of(rows: tuple[Row, ...], signals: SignalTable) -> int:
     return limits[-1]
 
 
-def outdone_by(rows: tuple[Row, ...]) -> int:
-    """Return what says that what a root joins by the minimum falls no more, or the other way round.
+def is_monotone(rows: tuple[Row, ...]) -> bool:
+    """Return whether what a root joins by the minimum falls no more, or the other way round.
 
-    What `F` finds remains, and what is still to come can only add to it, so that its value says so. Of `G`
-    only what has closed does: where it is open, the worst may still come.
+    What `F` finds remains, and what is still to come can only add to it.
     """
     way = _direction_of(rows)
     if way is None or not _joins_all(rows):
-        return codes.BY_NOTHING
+        return False
     free = (codes.LITERAL, codes.PART_AND, codes.PART_OR, codes.PAST_DELAY, *codes.PAST_WINDOWS)
     ahead = (way.window, way.until, codes.SHIFT)
-    found = codes.BY_VALUE
-    for row in rows[:-1]:
-        code, low = row[codes.NODE_CODE], row[codes.NODE_LOW]
-        if code in free or (code in ahead and row[codes.NODE_WEAK] == way.weak):
-            continue
-        # one that has not begun would be as good as can be
-        if code not in (codes.PART_WINDOW_MAX, codes.PART_WINDOW_MIN) or low > 0:
-            return codes.BY_NOTHING
-        found = codes.BY_WORST
-    return found
+    return all(
+        row[codes.NODE_CODE] in free or (row[codes.NODE_CODE] in ahead and row[codes.NODE_WEAK] == way.weak)
+        for row in rows[:-1]
+    )
 
 
 def cutting_windows(rows: tuple[Row, ...]) -> set[int] | None:

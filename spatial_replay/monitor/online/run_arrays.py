@@ -8,7 +8,7 @@ from typing import Any, Final, NamedTuple, cast
 import numpy as np
 
 from spatial_replay.compiled import floats_at, inlined_as, integers_at
-from spatial_replay.geometry.arrays import PLACE, Floats, Integers, places_of, shape_2, shape_3, shape_4
+from spatial_replay.geometry.arrays import PLACE, Floats, Integers, places_of, shape_2, shape_3
 from spatial_replay.monitor.online.program import Program
 from spatial_replay.monitor.online.state import Memory, Scratch
 
@@ -75,12 +75,10 @@ def arrays_at(table_at: int) -> RunArrays:
             wedges=integers_at(at[_MEMORY.wedges, 0], shape_3(at, _MEMORY.wedges)),
             wedge_ends=integers_at(at[_MEMORY.wedge_ends, 0], shape_3(at, _MEMORY.wedge_ends)),
             wedge_next=integers_at(at[_MEMORY.wedge_next, 0], at[_MEMORY.wedge_next, 1]),
-            heights=floats_at(at[_MEMORY.heights, 0], shape_4(at, _MEMORY.heights)),
             tables=floats_at(at[_MEMORY.tables, 0], shape_2(at, _MEMORY.tables)),
             cells=integers_at(at[_MEMORY.cells, 0], at[_MEMORY.cells, 1]),
             columns=floats_at(at[_MEMORY.columns, 0], shape_3(at, _MEMORY.columns)),
             known=integers_at(at[_MEMORY.known, 0], shape_2(at, _MEMORY.known)),
-            closed=integers_at(at[_MEMORY.closed, 0], shape_2(at, _MEMORY.closed)),
             unjoined=integers_at(at[_MEMORY.unjoined, 0], shape_2(at, _MEMORY.unjoined)),
             joined=floats_at(at[_MEMORY.joined, 0], shape_3(at, _MEMORY.joined)),
             lows=integers_at(at[_MEMORY.lows, 0], at[_MEMORY.lows, 1]),
@@ -103,22 +101,6 @@ def arrays_at(table_at: int) -> RunArrays:
             extrema=floats_at(at[_SCRATCH.extrema, 0], shape_2(at, _SCRATCH.extrema)),
             ends=integers_at(at[_SCRATCH.ends, 0], shape_2(at, _SCRATCH.ends)),
             series=floats_at(at[_SCRATCH.series, 0], shape_2(at, _SCRATCH.series)),
-            rows=floats_at(at[_SCRATCH.rows, 0], shape_3(at, _SCRATCH.rows)),
-            running=floats_at(at[_SCRATCH.running, 0], at[_SCRATCH.running, 1]),
-            points=floats_at(at[_SCRATCH.points, 0], shape_2(at, _SCRATCH.points)),
-            block=integers_at(at[_SCRATCH.block, 0], at[_SCRATCH.block, 1]),
-            begins=integers_at(at[_SCRATCH.begins, 0], at[_SCRATCH.begins, 1]),
-            next_begins=integers_at(at[_SCRATCH.next_begins, 0], at[_SCRATCH.next_begins, 1]),
-            closing=integers_at(at[_SCRATCH.closing, 0], at[_SCRATCH.closing, 1]),
-            spans=integers_at(at[_SCRATCH.spans, 0], shape_3(at, _SCRATCH.spans)),
-            span_counts=integers_at(at[_SCRATCH.span_counts, 0], at[_SCRATCH.span_counts, 1]),
-            cuts=integers_at(at[_SCRATCH.cuts, 0], at[_SCRATCH.cuts, 1]),
-            corner_columns=floats_at(at[_SCRATCH.corner_columns, 0], shape_3(at, _SCRATCH.corner_columns)),
-            corner=floats_at(at[_SCRATCH.corner, 0], at[_SCRATCH.corner, 1]),
-            sums=floats_at(at[_SCRATCH.sums, 0], shape_3(at, _SCRATCH.sums)),
-            wholes=floats_at(at[_SCRATCH.wholes, 0], shape_3(at, _SCRATCH.wholes)),
-            joints=floats_at(at[_SCRATCH.joints, 0], shape_2(at, _SCRATCH.joints)),
-            spare=floats_at(at[_SCRATCH.spare, 0], shape_2(at, _SCRATCH.spare)),
             parts=floats_at(at[_SCRATCH.parts, 0], shape_3(at, _SCRATCH.parts)),
             nodes=floats_at(at[_SCRATCH.nodes, 0], shape_3(at, _SCRATCH.nodes)),
         ),

@@ -7,12 +7,11 @@ instructions.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from spatial_replay.compiled import inlined, row_fold, uncounted
-from spatial_replay.compiler import ROW, Lanes
+from spatial_replay.compiled import inlined, uncounted
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.state import Memory, Scratch, behind, first_behind
@@ -86,31 +85,47 @@ def join_changed(
     return begin
 
 
-def greater(lanes: Lanes, row: Any, other: Any) -> Any:
-    """Return the formula of the greater numbers of two rows."""
-    return lanes.greater(row, other)
-
-
-def lesser(lanes: Lanes, row: Any, other: Any) -> Any:
-    """Return the formula of the lesser numbers of two rows."""
-    return lanes.lesser(row, other)
-
-
-_greatest, _least = row_fold(greater), row_fold(lesser)
-
-
 @uncounted
 def extremum(is_greatest: bool, source: Floats, start: float) -> float:
-    """Return the greatest or least number and `start`."""
-    value, count = start, len(source)
-    whole = count - count % ROW
-    if whole > 0:
-        rows = source[:whole].reshape((whole // ROW, ROW))
-        value = _greatest(rows, start) if is_greatest else _least(rows, start)
+    """Return the greatest or least number and `start`.
+
+    Eight numbers are joined side by side: one after the other, each would wait for the one before.
+    """
+    count = len(source)
+    whole = count - count % 8
+    value, v1, v2, v3, v4, v5, v6, v7 = start, start, start, start, start, start, start, start
     if is_greatest:
+        for k in range(0, whole, 8):
+            value, v1, v2, v3 = (
+                max(value, source[k]),
+                max(v1, source[k + 1]),
+                max(v2, source[k + 2]),
+                max(v3, source[k + 3]),
+            )
+            v4, v5, v6, v7 = (
+                max(v4, source[k + 4]),
+                max(v5, source[k + 5]),
+                max(v6, source[k + 6]),
+                max(v7, source[k + 7]),
+            )
+        value = max(max(max(value, v1), max(v2, v3)), max(max(v4, v5), max(v6, v7)))
         for k in range(whole, count):
             value = max(value, source[k])
     else:
+        for k in range(0, whole, 8):
+            value, v1, v2, v3 = (
+                min(value, source[k]),
+                min(v1, source[k + 1]),
+                min(v2, source[k + 2]),
+                min(v3, source[k + 3]),
+            )
+            v4, v5, v6, v7 = (
+                min(v4, source[k + 4]),
+                min(v5, source[k + 5]),
+                min(v6, source[k + 6]),
+                min(v7, source[k + 7]),
+            )
+        value = min(min(min(value, v1), min(v2, v3)), min(min(v4, v5), min(v6, v7)))
         for k in range(whole, count):
             value = min(value, source[k])
     return value

@@ -10,10 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from spatial_replay.compiled import inlined, uncounted
-from spatial_replay.compiler import ROW
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online.codes import (
-    BEGUN,
     CHANNELS,
     HISTORICALLY,
     ONCE,
@@ -32,21 +30,6 @@ stay in the processor's cache."""
 LONG_TILE = 1024
 """As many where a great many come together."""
 
-BLOCK = ROW
-"""So many samples are run side by side: numbers that fill the vector registers of a processor."""
-
-MOST_ROWS = 4096
-"""So many open positions at most are looked at for a block of samples."""
-
-MOST_POSITIONS = 1 << 15
-"""As many where most are looked at for many samples together (see `blocks.spans`)."""
-
-CORNER_BITS = 4
-"""So many rows at most are followed by the positions of a span."""
-
-MOST_SPANS = 48
-"""So many spans at most has a node."""
-
 NUMBERS = 8
 """Numbers of a node at a sample: low and high end of its value, of what it is now, of its value over every
 continuation, and of its value if the run ends there."""
@@ -62,10 +45,6 @@ POSITION, OFFSET, START_NS, KEEPS = range(4)
 CLOCK = 4
 """What the clock of a run holds."""
 
-BLOCK_SINCE, BLOCK_LAST, BLOCK_LOWEST, IS_FOLLOWED, BLOCK_NEWEST = range(5)
-"""What the numbers of a block stand for: see `SampleBlock` and `run_block` in `blocks`; and the last of the
-samples that are run together (see `blocks.spans`)."""
-
 
 class Memory(NamedTuple):
     """What is carried from sample to sample.
@@ -76,14 +55,12 @@ class Memory(NamedTuple):
         running: (CHANNELS, S), every signal at the last sample.
         firsts: (CHANNELS, S), every signal at the first sample.
         wedges: (W, CHANNELS, room), the positions in each ring of a signal.
-        wedge_ends: (W, CHANNELS, 4), how many ever left and entered it, and where its signal goes on.
+        wedge_ends: (W, CHANNELS, 2), how many ever left and entered it.
         wedge_next: (W,), the next position to enter a sliding window.
-        heights: (B, CHANNELS, 3, room), numbers beside the positions of the first rings.
         tables: (CHANNELS, ...), the parts' tables (see `tables`).
         cells: the parts' bookkeeping (see `windows`).
         columns: (LOOKS, D, room), the nodes of the parts with windows at the recent samples, for each number.
         known: (P, LOOKS), the last sample that each part's columns know, -1 for none.
-        closed: (P, LOOKS), the same where only those numbers are known that the next samples do not change.
         unjoined: (P, LOOKS), the first sample that is not yet in `joined`.
         joined: (LOOKS, P, room / JOINED), what the root of each part joins, so many positions at a time.
         lows: (D,), the first position of each of these nodes that matters.
@@ -101,12 +78,10 @@ class Memory(NamedTuple):
     wedges: Integers
     wedge_ends: Integers
     wedge_next: Integers
-    heights: Floats
     tables: Floats
     cells: Integers
     columns: Floats
     known: Integers
-    closed: Integers
     unjoined: Integers
     joined: Floats
     lows: Integers
@@ -129,22 +104,6 @@ class Scratch(NamedTuple):
         extrema: (2, 2 * room), extrema over windows of growing width.
         ends: (2, room), where windows start and end.
         series: (3, tile), what one part says in one channel.
-        rows: (R, positions, BLOCK), nodes of a part at open positions, for a block of samples (see
-            `blocks.node_rows`).
-        running: (BLOCK,), a row that others are joined with.
-        points: (16, BLOCK), a point at which a table is read, for each sample of a block.
-        block: (5,), where a block of samples is (see `BLOCK_SINCE`).
-        begins, next_begins: (D,), the first position of each node that has a row, in a block and in the next.
-        closing: (positions,), the samples with which windows close.
-        spans: (D, MOST_SPANS, 10), spans of neighbouring positions of each node (see `blocks.spans`).
-        span_counts: (D,), how many these are.
-        cuts: (2 * MOST_SPANS,), where spans begin.
-        corner_columns: (D, corners, positions), nodes at each corner, in spans with tables.
-        corner: (corners,), one position of these.
-        sums: (D, MOST_SPANS, corners), what each of the operand's spans holds.
-        wholes: (D, MOST_SPANS, BLOCK), the same as rows.
-        joints: (D * MOST_SPANS, BLOCK), the rows that spans follow.
-        spare: (2, BLOCK), rows.
         parts: (P, NUMBERS, tile), what each part says.
         nodes: (N, NUMBERS, tile), what each node of the tree says.
     """
@@ -163,22 +122,6 @@ class Scratch(NamedTuple):
     extrema: Floats
     ends: Integers
     series: Floats
-    rows: Floats
-    running: Floats
-    points: Floats
-    block: Integers
-    begins: Integers
-    next_begins: Integers
-    closing: Integers
-    spans: Integers
-    span_counts: Integers
-    cuts: Integers
-    corner_columns: Floats
-    corner: Floats
-    sums: Floats
-    wholes: Floats
-    joints: Floats
-    spare: Floats
     parts: Floats
     nodes: Floats
 
@@ -196,14 +139,12 @@ def first_memory(program: Program, room: int) -> Memory:
         running=np.zeros((CHANNELS, signals)),
         firsts=np.zeros((CHANNELS, signals)),
         wedges=np.zeros((program.windows, CHANNELS, room), np.int64),
-        wedge_ends=np.zeros((program.windows, CHANNELS, 4), np.int64),
+        wedge_ends=np.zeros((program.windows, CHANNELS, 2), np.int64),
         wedge_next=np.zeros(program.windows, np.int64),
-        heights=np.zeros((int(np.isin(program.signals[:, 0], BEGUN).sum()), CHANNELS, 3, room)),
         tables=np.zeros((CHANNELS, program.table_size)),
         cells=cells,
         columns=np.zeros((LOOKS, nodes, room)),
         known=np.full((len(program.parts), LOOKS), -1),
-        closed=np.full((len(program.parts), LOOKS), -1),
         unjoined=np.zeros((len(program.parts), LOOKS), np.int64),
         joined=np.zeros((LOOKS, len(program.parts), room // JOINED + 1)),
         lows=np.zeros(nodes, np.int64),
@@ -223,10 +164,8 @@ def scratch_for(program: Program, room: int, tile: int) -> Scratch:
     widest = max((int(end - first) for first, end, *_ in program.parts), default=0)
     largest = max(((1 << int(part[2])) * int(part[3]) for part in program.parts), default=1)
     most_tables = max((int(part[3]) for part in program.parts), default=1)
-    low, high, plain, changed, begins, next_begins = np.zeros((6, widest), np.int64)
+    low, high, plain, changed = np.zeros((4, widest), np.int64)
     open_room = room if has_windows(program) else 0
-    positions = min(open_room, MOST_POSITIONS) if tile > BLOCK else 0
-    wide, corners = widest if positions else 0, 1 << CORNER_BITS
     return Scratch(
         columns=np.zeros((widest, tile)),
         corners=np.empty((widest if program.parts[:, PART_IS_NESTED].any() else 0, room)),
@@ -242,41 +181,15 @@ def scratch_for(program: Program, room: int, tile: int) -> Scratch:
         extrema=np.empty((2, 2 * open_room)),
         ends=np.zeros((2, open_room), np.int64),
         series=np.zeros((3, tile)),
-        rows=_aligned((program.rows, positions, BLOCK)),
-        running=_aligned((BLOCK,)),
-        points=np.zeros((16, BLOCK)),
-        block=np.zeros(5, np.int64),
-        begins=begins,
-        next_begins=next_begins,
-        closing=np.zeros(positions, np.int64),
-        spans=np.zeros((wide, MOST_SPANS, 6 + CORNER_BITS), np.int64),
-        span_counts=np.zeros(wide, np.int64),
-        cuts=np.zeros(2 * MOST_SPANS, np.int64),
-        # corners of one position in places of the processor's cache that do not exclude each other
-        corner_columns=np.empty((wide, corners, positions + 40)),
-        corner=np.zeros(corners),
-        sums=np.empty((wide, MOST_SPANS, corners)),
-        wholes=_aligned((wide, MOST_SPANS, BLOCK)),
-        joints=_aligned((wide * MOST_SPANS, BLOCK)),
-        spare=_aligned((2, BLOCK)),
         parts=np.zeros((len(program.parts), NUMBERS, tile)),
         nodes=np.zeros((len(program.reports), NUMBERS, tile)),
     )
 
 
-def _aligned(shape: tuple[int, ...]) -> Floats:
-    """Return numbers, not set, that begin where a line of the processor's cache does."""
-    size, line = int(np.prod(shape)), 64
-    room = np.empty(size + line // 8)
-    begin = -room.ctypes.data % line // 8
-    return room[begin : begin + size].reshape(shape)
-
-
 def widen(memory: Memory, before: int) -> None:
     """Copy into each new channel the state of the one of the `before` channels that it was equal to."""
     by_channel = (memory.running, memory.firsts, memory.tables, memory.history)
-    rings = (memory.wedges, memory.wedge_ends, memory.heights)
-    by_window = (ring.swapaxes(0, 1) for ring in rings)
+    by_window = (ring.swapaxes(0, 1) for ring in (memory.wedges, memory.wedge_ends))
     for state in (*by_channel, *by_window):
         if before == 1:
             state[1] = state[0]
@@ -287,7 +200,6 @@ def widen(memory: Memory, before: int) -> None:
 def know_no_columns(memory: Memory) -> None:
     """Have the columns of parts with windows computed again: positions have moved, or there are more."""
     memory.known[:] = -1
-    memory.closed[:] = -1
     memory.window_next[:] = -1
 
 
@@ -303,12 +215,9 @@ def with_room(memory: Memory, room: int, channels: int, signals: Integers) -> Me
     for signal in np.flatnonzero(signals[:, SIGNAL_IS_KEPT]).tolist():
         history[:channels, signal, :old] = memory.history[:channels, signal]
     wedges = np.empty((*memory.wedges.shape[:2], room), np.int64)
-    heights = np.empty((*memory.heights.shape[:3], room))
     for window, channel in np.ndindex(len(wedges), channels):
         entries = np.arange(*memory.wedge_ends[window, channel, :2])
         wedges[window, channel, entries % room] = memory.wedges[window, channel, entries % old]
-        if window < len(heights):
-            heights[window, channel][:, entries % room] = memory.heights[window, channel][:, entries % old]
     know_no_columns(memory)
     return memory._replace(
         columns=np.empty((*memory.columns.shape[:2], room)),
@@ -317,7 +226,6 @@ def with_room(memory: Memory, room: int, channels: int, signals: Integers) -> Me
         stamps=np.concatenate((memory.stamps, np.zeros(room - old, np.int64))),
         history=history,
         wedges=wedges,
-        heights=heights,
     )
 
 

@@ -7,42 +7,19 @@ same bits, because the only arithmetic is minima, maxima and negation.
 
 from __future__ import annotations
 
-from copy import copy
-from dataclasses import replace
-from functools import partial
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 
-from spatial_replay.compiled import apart, floats_at, inlined, integers_at, releasing
-from spatial_replay.cores import cores
+from spatial_replay.compiled import apart, floats_at, inlined, integers_at
 from spatial_replay.geometry.arrays import Empty, Floats, Integers
-from spatial_replay.monitor.online import codes
-from spatial_replay.monitor.online.blocks.tile_run import run_in_blocks
 from spatial_replay.monitor.online.codes import in_channels
 from spatial_replay.monitor.online.node_numbers import Results, report
 from spatial_replay.monitor.online.program import Program
 from spatial_replay.monitor.online.run_arrays import RunArrays, Tables, arrays_at, table_of
-from spatial_replay.monitor.online.shares import (
-    NARROW,
-    RunAhead,
-    SectionStart,
-    begin_late,
-    bound_late,
-    bound_memory,
-    closed_up_to,
-    copied,
-    joined_memory,
-    numbers_of,
-    open_share,
-    sections_of,
-    shared_programs,
-    starts_of,
-)
 from spatial_replay.monitor.online.signals import step_signals
 from spatial_replay.monitor.online.state import (
     KEEPS,
-    LONG_TILE,
     OFFSET,
     POSITION,
     START_NS,
@@ -50,20 +27,12 @@ from spatial_replay.monitor.online.state import (
     Memory,
     first_memory,
     has_windows,
-    know_no_columns,
     scratch_for,
     widen,
     with_room,
 )
 from spatial_replay.monitor.online.tables import step_tables
-from spatial_replay.monitor.online.windows import forget
-
-_MANY_TILES = 8
-"""So many long tiles of samples that come together are worth more room to work in."""
-
-_WORTH_TWO_CORES = 16 * LONG_TILE
-"""So many samples that come together are worth two cores: more than a replay takes in at once, which has
-both of them busy."""
+from spatial_replay.monitor.online.windows import forget, run_windows
 
 
 @inlined
@@ -128,33 +97,9 @@ def step_with_windows(
 ) -> int:  # fmt: skip
     """`step` for any program; apart from it because windows are much more to compile and to load."""
     begin_step(table_at, leaves_at, channels, width, times_at, length, t, count)
-    run_in_blocks(table_at, channels, count)
+    run_windows(table_at, channels, count)
     end_step(table_at, channels, series_at, length, t, count)
     return 0
-
-
-_LATER_SECTIONS = 4
-"""So many later sections at most for each `least_shared` samples."""
-
-_MOST_THREADS = 8
-"""So many share the work at most: the one that enters the numbers of all nodes has enough to do by then."""
-
-_MOST_IN_SECTIONS = 1 << 18
-"""So many samples at most are run in sections at once: numbers of later ones wait for those of the first."""
-
-_TILES_ALONE = 8
-"""So many tiles are run before it is looked again whether several threads are worth it."""
-
-_TILES_AT_ONCE = 4
-"""So many tiles are handed over together: fewer, and waiting for each other takes longer."""
-
-
-class _Stretch(NamedTuple):
-    """Samples that come together, and what is said of them: see `OnlineRun.extend`."""
-
-    leaves: Floats
-    times_ns: Integers
-    series: Floats
 
 
 class OnlineRun:
@@ -166,29 +111,22 @@ class OnlineRun:
         step: the kernel that runs its samples.
     """
 
-    def __init__(
-        self, program: Program, *, room: int = 2 * TILE, tile: int = TILE,
-        least_shared: int = _WORTH_TWO_CORES, threads: int | None = None,
-    ) -> None:  # fmt: skip
+    def __init__(self, program: Program, *, room: int = 2 * TILE, tile: int = TILE) -> None:
         """Start before the first sample.
 
         Args:
             room: the number of recent samples there is room for at first (it doubles when needed).
             tile: how many samples are run together, at most. Samples that come one by one are faster with 1,
                 since the numbers worked with then lie closer together.
-            least_shared: from so many samples that come together on, several threads share the work.
-            threads: how many may; with None, as many as there are cores.
         """
         self._program = program
         self.step = step_with_windows if has_windows(program) else step
-        self._called = self.step
-        self._least_shared = least_shared
-        self._threads = min(cores(), _MOST_THREADS) if threads is None else threads
+        self._tile = tile
         if not program.keeps_history:
             room = tile
         self._tables = Tables.of(program)
         self._channels = 1
-        self._take(first_memory(program, room), np.zeros((len(program.reports), 2)), tile)
+        self._take(first_memory(program, room), np.zeros((len(program.reports), 2)))
 
     def __len__(self) -> int:
         """Return how many samples were added."""
@@ -223,198 +161,16 @@ class OnlineRun:
         if leaves.shape[1:] != wanted or len(leaves) not in (1, 2, 4):
             raise ValueError(f"leaves of shape {leaves.shape}; a run of these needs (1, 2 or 4, *{wanted})")
         self.widen(len(leaves))
-        if self._tile == TILE and len(times_ns) >= _MANY_TILES * LONG_TILE:
-            self._lengthen_tiles()
         leaves = np.ascontiguousarray(in_channels(leaves, self._channels), np.float64)
         times_ns = np.array(times_ns, np.int64)  # writable, since kernels are compiled for that
-        series = empty((len(self._program.reports), 4, len(times_ns)))
-        stretch, done = _Stretch(leaves, times_ns, series), 0
-        alone, was_narrow = 0, True
-        may_share = has_windows(self._program) and self._is_worth_sharing(len(times_ns))
-        while done < len(times_ns):
-            done += self._run_tile(stretch, done, len(times_ns))
-            # after a tile, the kernel is there, and what settles soon has
-            if may_share and alone <= done < len(times_ns) and self._is_compiled:
-                share = open_share(self._program, self._memory, len(times_ns) - done)
-                if share <= NARROW or (share <= 1 and was_narrow):
-                    # one position may have waited longer than usual
-                    alone, was_narrow = done + _TILES_ALONE * self._tile, share <= NARROW
-                    continue
-                before, done = done, self._run_in_sections(stretch, done)
-                if done == before:
-                    done = self._run_shared(stretch, done)
-                may_share = done > before and self._is_worth_sharing(len(times_ns) - done)
+        length, done = len(times_ns), 0
+        series = empty((len(self._program.reports), 4, length))
+        while done < length:
+            count = self.make_room(min(self._tile, length - done))
+            shape = leaves.shape[:2]
+            self.step(self._table_at, leaves, *shape, times_ns, series, length, done, count)
+            done += count
         return series
-
-    @property
-    def _is_compiled(self) -> bool:
-        return bool(getattr(self.step, "is_compiled", False))
-
-    def _is_worth_sharing(self, count: int) -> bool:
-        return count >= self._least_shared and self._threads > 1
-
-    def _run_tile(self, stretch: _Stretch, begin: int, end: int) -> int:
-        """Run the first samples of a stretch's number begin … end - 1; return how many."""
-        count = self.make_room(min(self._tile, end - begin))
-        self._run(stretch, begin, count)
-        return count
-
-    def _run(self, stretch: _Stretch, begin: int, count: int) -> None:
-        leaves, times_ns, series = stretch
-        arrays = leaves, *leaves.shape[:2], times_ns, series, len(times_ns)
-        self._called(self._table_at, *arrays, begin, count)
-
-    def _run_in_sections(self, stretch: _Stretch, begin: int) -> int:
-        """Run samples of a stretch from `begin` on in several sections at once (see `shares`).
-
-        All begin with copies of the state, which stays as it is until they are done.
-
-        Returns:
-            How many samples of the stretch are done: as before, if they cannot be run so.
-        """
-        sections = sections_of(self._program, self._memory)
-        if sections is None:
-            return begin
-        end = min(len(stretch.times_ns), begin + _MOST_IN_SECTIONS)
-        most = min(self._threads, 1 + _LATER_SECTIONS * (end - begin) // self._least_shared)
-        starts = starts_of(sections, stretch.times_ns, begin, end, most)
-        if not starts:
-            return begin
-        # twice what is looked at, so that samples are seldom moved to the front
-        room = 2 * max(own - seen for seen, own in starts) + self._tile
-        first, late_runs = self._share(self._program, room), dict[int, OnlineRun]()
-        which = numbers_of(sections.late)
-        of_none = stretch._replace(series=np.empty((0, 4, len(stretch.times_ns))))
-
-        def run_late(start: SectionStart, at: int, after: int) -> Floats:
-            if at == start.own:
-                late_runs[at] = self._late_run(sections.late, of_none, begin, start, room)
-            return late_runs[start.own]._run_ahead(of_none, which, at, after)
-
-        ends = [start.own for start in starts[1:]] + [end]
-        ahead = [
-            RunAhead(partial(run_late, start), self._pieces(start.own, after))
-            for start, after in zip(starts, ends, strict=True)
-        ]
-        try:
-            for each in ahead:
-                each.begin()
-            done = begin
-            while done < starts[0].own:
-                done += first._run_tile(stretch, done, starts[0].own)
-            memory = late = first._memory
-            for start, after, pieces in zip(starts, ends, ahead, strict=True):
-                if closed_up_to(sections.late, late) < len(self) + start.seen - begin:
-                    break  # as samples stand unevenly
-                if start is starts[0]:
-                    first._go_on_with(sections.early)
-                tables = late.tables.copy()
-                for at, numbers in pieces:
-                    bound_late(sections.late, tables, self._channels, which, numbers)
-                    first._run_behind(stretch, which, numbers, at)
-                late, done = late_runs[start.own]._memory, after
-                bound_memory(sections.late, late, tables, self._channels)
-        finally:
-            RunAhead.stop(ahead)
-        if done > starts[0].own:
-            memory = joined_memory((sections.early, sections.late), (first._memory, late))
-        else:
-            know_no_columns(memory)
-        self._take(memory, first._final, self._tile)
-        return done
-
-    def _late_run(
-        self, program: Program, stretch: _Stretch, begin: int, start: SectionStart, room: int
-    ) -> OnlineRun:
-        """Return a run of a later section, up to its own samples.
-
-        Args:
-            program: of later sections.
-            begin: the first sample of the first section.
-            room: for so many recent samples, at least.
-        """
-        # of its own, since the other sections that run must not find the parts set aside
-        run = self._share(replace(program, parts=program.parts.copy()), room)
-        begin_late(program, run._memory, self._channels, len(self) + start.seen - begin)
-        run._pass_over(stretch, begin, start.own)
-        return run
-
-    def _pieces(self, begin: int, end: int) -> list[tuple[int, int]]:
-        """Return what is handed from one run to another at a time, of samples `begin` to before `end`."""
-        length = _TILES_AT_ONCE * self._tile
-        return [(at, min(at + length, end)) for at in range(begin, end, length)]
-
-    def _pass_over(self, stretch: _Stretch, begin: int, end: int) -> None:
-        """Take in samples number begin … end - 1 of a stretch without running parts with windows."""
-        own = self._tables.parts[:, codes.PART_NUMBERS].copy()
-        while begin < end:
-            count = self.make_room(min(self._tile, end - begin))
-            self._tables.parts[:, codes.PART_NUMBERS] = 0
-            self._run(stretch, begin, count)
-            self._tables.parts[:, codes.PART_NUMBERS] = own
-            begin += count
-
-    def _run_shared(self, stretch: _Stretch, begin: int) -> int:
-        """Run the samples of a stretch from `begin` on by two runs at once (see `shares`).
-
-        They begin with copies of the state, which stays as it is until both are done.
-
-        Returns:
-            How many samples of the stretch are done: as before, if the work cannot be shared.
-        """
-        programs = shared_programs(self._program, self._memory, self._channels)
-        if programs is None:
-            return begin
-        first, second = map(self._share, programs)
-        which, end = numbers_of(second._program), len(stretch.times_ns)
-        of_none = stretch._replace(series=np.empty((0, 4, end)))
-        ahead = RunAhead(partial(second._run_ahead, of_none, which), self._pieces(begin, end))
-        try:
-            ahead.begin()
-            for at, numbers in ahead:
-                first._run_behind(stretch, which, numbers, at)
-        finally:
-            RunAhead.stop([ahead])
-        self._take(joined_memory(programs, (first._memory, second._memory)), first._final, self._tile)
-        return end
-
-    def _share(self, program: Program, room: int = 0) -> OnlineRun:
-        """Return a run that goes on from here, of the same program but for what it computes.
-
-        Args:
-            room: for so many recent samples, at least.
-        """
-        share = copy(self)
-        share._called = releasing(self.step)
-        share._memory = copied(self._memory)
-        share._go_on_with(program, room)
-        return share
-
-    def _go_on_with(self, program: Program, room: int = 0) -> None:
-        """Compute from here on what another program does, of the same nodes."""
-        self._program, self._tables = program, Tables.of(program)
-        self._final = np.zeros((len(program.reports), 2))
-        self._widen_room(room, self._tile)
-
-    def _run_ahead(self, stretch: _Stretch, which: tuple[Integers, Integers], begin: int, end: int) -> Floats:
-        """Run samples number begin … end - 1 of a stretch; return these numbers of its parts, (K, count)."""
-        numbers, done = np.empty((len(which[0]), end - begin)), 0
-        while done < end - begin:
-            count = self._run_tile(stretch, begin + done, end)
-            numbers[:, done : done + count] = self._scratch.parts[*which, :count]
-            done += count
-        return numbers
-
-    def _run_behind(
-        self, stretch: _Stretch, which: tuple[Integers, Integers], numbers: Floats, begin: int
-    ) -> None:
-        """Run samples of a stretch from `begin` on, given these numbers of its parts, (K, count)."""
-        done = 0
-        while done < numbers.shape[1]:
-            count = self.make_room(min(self._tile, numbers.shape[1] - done))
-            self._scratch.parts[*which, :count] = numbers[:, done : done + count]
-            self._run(stretch, begin + done, count)
-            done += count
 
     def widen(self, channels: int) -> None:
         """Have at least so many channels."""
@@ -422,27 +178,14 @@ class OnlineRun:
             widen(self._memory, self._channels)
             self._channels = channels
 
-    def _lengthen_tiles(self) -> None:
-        """Run more samples together from now on: with many, the calls cost more than what the cache saves."""
-        self._widen_room((2 if self._program.keeps_history else 1) * LONG_TILE, LONG_TILE)
-
-    def _widen_room(self, least: int, tile: int) -> None:
-        """Have room for so many recent samples, and run so many together: columns are computed again."""
-        memory, room = self._memory, len(self._memory.stamps)
-        while room < least:
-            room *= 2
-        if room > len(memory.stamps):
-            memory = with_room(memory, room, self._channels, self._program.signals)
-        self._take(memory, self._final, tile)
-
-    def _take(self, memory: Memory, final: Floats, tile: int) -> None:
-        """Go on with another memory, and other tiles, and the room to work in that these need."""
-        scratch = scratch_for(self._program, len(memory.stamps), tile)
+    def _take(self, memory: Memory, final: Floats) -> None:
+        """Go on with another memory, and the room to work in that it needs."""
+        scratch = scratch_for(self._program, len(memory.stamps), self._tile)
         arrays = RunArrays(self._tables, memory, scratch, final)
         table = table_of(arrays)
         at = table.ctypes.data
         # together, so that an interruption comes before all of these or after
-        self._memory, self._scratch, self._final, self._tile = memory, scratch, final, tile
+        self._memory, self._final = memory, final
         self._arrays, self._table, self._table_at = arrays, table, at
 
     def make_room(self, wanted: int) -> int:
@@ -454,9 +197,11 @@ class OnlineRun:
         used = position - offset
         if used + wanted > room:
             # given addresses, a kernel does not see how much there is to move, and is interpreted long
-            drop = cast(Any, forget).compiled() if self._is_compiled else forget
+            is_compiled = getattr(self.step, "is_compiled", False)
+            drop = cast(Any, forget).compiled() if is_compiled else forget
             if drop(self._table_at, self._channels):
                 offset = int(clock[OFFSET])
             elif used == room:
-                self._widen_room(2 * room, self._tile)
+                memory = with_room(self._memory, 2 * room, self._channels, self._program.signals)
+                self._take(memory, self._final)
         return min(wanted, len(self._memory.stamps) - (position - offset))

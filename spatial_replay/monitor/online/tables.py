@@ -216,46 +216,11 @@ def _step_simple(
 
 
 @uncounted
-def _read_clauses(
-    part: Integers, memory: Memory, scratch: Scratch, channels: int, begin: int, count: int, numbers: Floats
-) -> None:
-    """Fill a part's numbers from its signals, joined with the part beside it, which comes before it."""
-    nominal_high = 1 if channels > 1 else 0
-    wide_low = 2 if channels > 2 else 0
-    beside, is_minimum = part[codes.PART_BESIDE], part[codes.PART_IS_MINIMUM]
-    settled = part[codes.PART_CELL_START]
-    for number in (0, 1, 4, 5, 6, 7):
-        signal = part[codes.PART_ENDING]
-        if number in (4, 5):
-            signal = part[codes.PART_LOWER] if number == 4 else part[codes.PART_UPPER]
-        channel = (0 if number < 2 else wide_low) + (nominal_high if number % 2 else 0)
-        source, target = memory.history[channel, signal, begin : begin + count], numbers[number]
-        if memory.cells[settled]:
-            for k in range(count):
-                target[k] = memory.running[channel, signal]
-        else:
-            for k in range(count):
-                target[k] = source[k]
-        if beside < 0:
-            continue
-        other = scratch.parts[beside, number]
-        for k in range(count):
-            target[k] = min(target[k], other[k]) if is_minimum else max(target[k], other[k])
-    # what it is at least and at most only ever come closer
-    is_settled = True
-    for channel in range(channels):
-        least, most = part[codes.PART_LOWER], part[codes.PART_UPPER]
-        is_settled = is_settled and memory.running[channel, least] == memory.running[channel, most]
-    if is_settled:
-        memory.cells[settled] = 1
-
-
-@uncounted
 def step_tables(
     nodes: Integers, parts: Integers, memory: Memory, scratch: Scratch, channels: int, position: int,
     begin: int, count: int,
 ) -> None:  # fmt: skip
-    """Substitute samples into the tables of the parts without windows, and read those that are signals.
+    """Substitute samples into the tables of the parts without windows.
 
     Args:
         position: of the first of the `count` samples; they stand at `begin` in the history.
@@ -267,8 +232,6 @@ def step_tables(
         part, numbers = parts[p], scratch.parts[p]
         if not part[codes.PART_NUMBERS]:
             continue
-        if part[codes.PART_KIND] == codes.CLAUSES:
-            _read_clauses(part, memory, scratch, channels, begin, count, numbers)
         if part[codes.PART_KIND] != codes.TABLE:
             continue
         for channel in range(channels):

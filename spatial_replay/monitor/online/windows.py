@@ -7,8 +7,7 @@ columns of numbers (see `open_windows`), which are read into the table. A past o
 operator below it carries a table of its own from base to base.
 
 A part's cells hold: the base, as the next position to absorb; for each variable, its position in the table;
-for each table of a past operator, the position it belongs to (-1: before the first). A part made of signals
-has one cell, which is 1 once these matter no more.
+for each table of a past operator, the position it belongs to (-1: before the first).
 """
 
 from __future__ import annotations
@@ -46,7 +45,6 @@ from spatial_replay.monitor.online.open_windows import (
     runs_root,
 )
 from spatial_replay.monitor.online.run_arrays import arrays_at
-from spatial_replay.monitor.online.signals import matters_no_more
 from spatial_replay.monitor.online.sliding import (
     beyond,
     copy,
@@ -240,7 +238,7 @@ def run_part(table_at: int, number: int, channels: int, begin: int, end: int, co
                     )
         if last % CLOSING == CLOSING - 1:
             outdone = 0
-            if looks_for_outdone(part, memory, channels, codes.BY_VALUE, last):
+            if looks_for_outdone(part, memory, channels, last):
                 outdone = _outdone_up_to(tables.nodes, part, channels, memory, offset, last)
             absorb(table_at, number, channels, last, outdone)
     return 0
@@ -253,9 +251,7 @@ def _kept_from(table_at: int, last: int) -> int:
     signals, parts, offset, keep = tables.signals, tables.parts, memory.clock[OFFSET], last
     for s in range(signals.shape[0]):
         code, unit = signals[s, codes.SIGNAL_CODE], signals[s, codes.SIGNAL_UNIT]
-        if matters_no_more(signals[s], memory):
-            continue
-        if code in codes.DELAYED:
+        if code == codes.DELAY:
             keep = min(keep, behind(memory.stamps, offset, last, unit, signals[s, codes.SIGNAL_LOW]))
         elif code in codes.RINGS:
             keep = min(keep, first_behind(memory.stamps, offset, last, unit, signals[s, codes.SIGNAL_HIGH]))
@@ -294,7 +290,6 @@ def forget(table_at: int, channels: int) -> int:
                 copy(memory.history[channel, s, moved : moved + kept], memory.history[channel, s, :kept])
     # positions have moved
     memory.known[:] = -1
-    memory.closed[:] = -1
     memory.window_next[:] = -1
     memory.clock[OFFSET] = keep
     return 1
