@@ -1,39 +1,445 @@
-"""A search for failures: runs are simulated in rounds, those that violate are made smaller and cut."""
+"""A search for failures: runs are simulated in rounds, failing ones are made smaller and cut.
+
+A search continues from the file of its earlier runs. CMA-ES chooses the next cases by the robustness of
+earlier ones; this is the only module that knows the package `cma`.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final, Generic, TypeAlias, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from spatial_replay import __version__
 from spatial_replay.batch.result_files import LocalFolder
 from spatial_replay.batch.run import workers_of
 from spatial_replay.batch.workers import Progress, WorkerLost, Workers, no_progress
 from spatial_replay.compare.clips import cut_clip
-from spatial_replay.errors import LogError, UsageError
+from spatial_replay.errors import LogError, OutputError, UsageError
 from spatial_replay.falsification.failures import Failure, Falsification, SearchedRun
-from spatial_replay.falsification.optimiser import LARGEST_COST, Descents
-from spatial_replay.falsification.parameters import Case, Parameter, Space, key_of
-from spatial_replay.falsification.rounds import Rounds, lost, simulate_rounds, write_whole
-from spatial_replay.falsification.simulations import Simulation, own_simulation, scenario_simulation
+from spatial_replay.falsification.simulations import (
+    Case,
+    Parameter,
+    Simulation,
+    Space,
+    key_of,
+    own_simulation,
+    scenario_simulation,
+)
 from spatial_replay.logs.downloads import local_copy
-from spatial_replay.logs.output_file import refuse_addresses
+from spatial_replay.logs.output_file import output_error, refuse_addresses
+from spatial_replay.monitor.evaluate import evaluate
+from spatial_replay.monitor.verdict import worst_verdict
 from spatial_replay.replay.selection import DEFAULT_OPTIONS
 from spatial_replay.sanity import refuse_decided
 from spatial_replay.sources.open_log import open_source
 from spatial_replay.spec.format import format_specification
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.overrides import load_specifications
+from spatial_replay.spec.units import declared_unit
 from spatial_replay.text import json_number
 from spatial_replay.trace.sample import Sample
+
+# --------------------------------------------------------------------------------------------------- descents
+
+LARGEST_COST: Final = 1e9
+"""Stands for infinite costs, of which an optimiser can make nothing; impossible cases cost more."""
+_LOOK: Final = 10
+"""Points of a look around, spread over the whole space."""
+_STEP: Final = 0.2
+"""The standard deviation with which a descent begins, as a share of the ranges."""
+_NARROWEST: Final = 2e-3
+"""The standard deviation at which a descent has arrived."""
+_FLAT: Final = 3
+"""Generations of equal costs after which a descent is given up."""
+_STALLED: Final = 5
+_FALLS: Final = 1e-3
+"""Generations after which a descent is given up whose least cost does not fall by such a part of itself."""
+_PROPOSED: Final = 20
+"""Points that CMA-ES draws for each one that is asked for."""
+_PARTS: Final = 3
+"""Rounds of a generation: the model knows the costs of one when it picks the next."""
+_KNOWN: Final = 80
+"""Points that the model is fitted to: half of them the best, half the newest."""
+_LENGTHS: Final = (0.15, 0.3, 0.6)
+"""Over how much of the ranges costs vary; the likeliest length is taken."""
+_NOISE: Final = 1e-2
+"""The share of the costs' variance that points do not explain: contacts, and what else is drawn."""
+
+
+class Descents:
+    """Points of the unit cube, asked for in rounds, each of which gets its costs; a process for one search.
+
+    The seed decides all points, for equal costs: no state of other modules counts, nor does theirs change.
+    """
+
+    def __init__(self, size: int, seed: int) -> None:
+        """Begin with a look around.
+
+        Raises:
+            UsageError: `cma` is not installed.
+        """
+        try:
+            import cma
+        except ImportError:
+            remedy = "pip install 'spatial-replay[falsify]'"
+            raise UsageError(f"searching for failures needs cma, which is not installed: {remedy}") from None
+        self._cma: Any = cma
+        # CMA-ES takes no fewer than two dimensions: a second one that decides nothing does no harm
+        self._size, self._searched = size, max(size, 2)
+        self._random = np.random.default_rng([seed, 0])
+        self._strategy: Any = None
+        self._least, self._stalled = np.inf, 0
+        self._asked: list[NDArray[np.float64]] = []
+        # of the generation that is being asked for: what was drawn, and the points and costs so far
+        self._drawn: list[NDArray[np.float64]] = []
+        self._generation: list[tuple[NDArray[np.float64], float]] = []
+        self._points: list[NDArray[np.float64]] = []
+        self._costs: list[float] = []
+
+    def ask(self) -> list[NDArray[np.float64]]:
+        """Return the points of the next round, each (size,), from 0 to 1."""
+        self._asked = self._look() if self._strategy is None else self._promising()
+        return [point[: self._size] for point in self._asked]
+
+    def take(self, costs: Sequence[float], *, is_found: bool) -> None:
+        """Take the cost of each point of the last round.
+
+        Args:
+            is_found: whether one of them is what is searched for: the next descent then begins elsewhere.
+        """
+        self._remember(costs)
+        self._generation += zip(self._asked, costs, strict=True)
+        if is_found:
+            self._strategy = None
+        elif self._strategy is None:
+            self._strategy = self._descent(self._asked[int(np.argmin(costs))])
+            self._least, self._stalled = min(costs), 0
+        elif len(self._generation) < self._strategy.popsize:
+            return
+        else:
+            self._end_generation()
+        self._generation, self._drawn = [], []
+
+    def _look(self) -> list[NDArray[np.float64]]:
+        """Return points of which each tenth of each dimension has one."""
+        columns = [
+            (self._random.permutation(_LOOK) + self._random.random(_LOOK)) / _LOOK
+            for _ in range(self._searched)
+        ]
+        return list(np.array(columns).T)
+
+    def _end_generation(self) -> None:
+        points, costs = map(list, zip(*self._generation, strict=True))
+        self._strategy.tell(points, costs)
+        least = min(costs)
+        is_lower = least < self._least - _FALLS * abs(self._least)
+        self._stalled = 0 if is_lower else self._stalled + 1
+        self._least = min(self._least, least)
+        if self._strategy.stop() or self._stalled == _STALLED:
+            self._strategy = None
+
+    def _promising(self) -> list[NDArray[np.float64]]:
+        """Return those points of a generation that the model expects the least costs of, a part of it."""
+        size = self._strategy.popsize
+        if not self._drawn:
+            self._drawn = self._strategy.ask(_PROPOSED * size)
+        expected = expected_costs(
+            np.array(self._points),
+            np.array(self._costs),
+            np.array([each[: self._size] for each in self._drawn]),
+        )
+        count = min(-(-size // _PARTS), size - len(self._generation))
+        order = np.argsort(expected, kind="stable").tolist()
+        chosen = [self._drawn[place] for place in order[:count]]
+        self._drawn = [self._drawn[place] for place in sorted(order[count:])]
+        return chosen
+
+    def _remember(self, costs: Sequence[float]) -> None:
+        """Keep the newest points, and the best of those before them."""
+        self._points += [each[: self._size] for each in self._asked]
+        self._costs += costs
+        older = len(self._costs) - _KNOWN // 2
+        best = sorted(sorted(range(max(older, 0)), key=lambda place: self._costs[place])[: _KNOWN // 2])
+        kept = [*best, *range(max(older, 0), len(self._costs))]
+        self._points = [self._points[place] for place in kept]
+        self._costs = [self._costs[place] for place in kept]
+
+    def _descent(self, start: NDArray[np.float64]) -> Any:
+        options = {
+            "bounds": [0.0, 1.0],
+            # numbers of its own, in place of those of the whole process
+            "randn": lambda *shape: self._random.standard_normal(shape),
+            "seed": np.nan,
+            "tolx": _NARROWEST,
+            "tolflatfitness": _FLAT,
+            "verbose": -9,
+        }
+        return self._cma.CMAEvolutionStrategy(start, _STEP, options)
+
+
+def expected_costs(
+    points: NDArray[np.float64], costs: NDArray[np.float64], others: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return which costs are to be expected elsewhere, (M,), less their mean: those of a Gaussian process.
+
+    Rasmussen and Williams, Gaussian Processes for Machine Learning, algorithm 2.1, with a squared exponential
+    kernel whose length has the greatest likelihood.
+
+    Args:
+        points: (N, D), from 0 to 1, with their `costs`, (N,).
+        others: (M, D).
+    """
+    # a case that is impossible, or a cost that is infinite, is as bad as the worst one that is neither
+    finite = costs[costs < LARGEST_COST]
+    known = np.minimum(costs, finite.max()) if finite.size else np.zeros_like(costs)
+    known = known - known.mean()
+    among, between = _squares(points, points), _squares(others, points)
+    best, found = -np.inf, np.zeros(len(others))
+    for length in _LENGTHS:
+        scale = -0.5 / (length * length * points.shape[1])
+        lower = np.linalg.cholesky(np.exp(scale * among) + _NOISE * np.eye(len(points)))
+        weights = np.linalg.solve(lower.T, np.linalg.solve(lower, known))
+        # the variance of the costs is the likeliest one
+        variance = max(float(known @ weights) / len(points), np.finfo(float).tiny)
+        likelihood = -0.5 * len(points) * np.log(variance) - np.log(np.diag(lower)).sum()
+        if likelihood > best:
+            best, found = likelihood, np.exp(scale * between) @ weights
+    return found
+
+
+def _squares(some: NDArray[np.float64], others: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the squared distance of each of some points (N, D) from each of others (M, D), as (N, M)."""
+    return np.asarray(((some[:, None] - others[None]) ** 2).sum(axis=-1))
+
+
+# --------------------------------------------------------------------------------------------- runs in a file
+
+
+class RunFile:
+    """Runs by their cases, kept in a file; a process for one search, which must be the only one.
+
+    A line is written at once, and one that was not written to its end is dropped when the file is read again.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Read what an earlier search has left.
+
+        Raises:
+            LogError: a line cannot be read.
+            OutputError: the file cannot be written.
+        """
+        self._path = path
+        self._known: dict[str, SearchedRun] = {}
+        data = path.read_bytes() if path.exists() else b""
+        whole = data[: data.rfind(b"\n") + 1]
+        for number, line in enumerate(whole.splitlines(), start=1):
+            try:
+                run = SearchedRun.from_document(json.loads(line))
+            except (AttributeError, KeyError, TypeError, ValueError) as error:
+                raise LogError(
+                    f"{path}:{number}: this line is no run ({error}); delete the file, and search again"
+                ) from None
+            self._known[key_of(run.case)] = run
+        try:
+            self._stream = path.open("ab")
+            # what a killed search has begun to write
+            self._stream.truncate(len(whole))
+        except OSError as error:
+            raise output_error(path, error) from error
+
+    def get(self, case: Case) -> SearchedRun | None:
+        """Return the run of a case, if it is known."""
+        return self._known.get(key_of(case))
+
+    def __contains__(self, case: Case) -> bool:
+        return key_of(case) in self._known
+
+    def add(self, run: SearchedRun) -> None:
+        """Keep a run.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        line = json.dumps(run.document, allow_nan=False).encode() + b"\n"
+        try:
+            self._stream.write(line)
+            self._stream.flush()
+        except OSError as error:
+            raise output_error(self._path, error) from error
+        self._known[key_of(run.case)] = run
+
+    def close(self) -> None:
+        """Close the file."""
+        self._stream.close()
+
+
+# ----------------------------------------------------------------------------------------------------- rounds
+
+_Result = TypeVar("_Result")
+
+Rounds: TypeAlias = Generator[Sequence[Case], Sequence[SearchedRun], _Result]
+"""Yields the cases of a round, and is sent their runs."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Task:
+    """A case to simulate; `log` is written if it violates."""
+
+    number: int
+    case: Case
+    log: Path | None
+
+
+def simulate_rounds(
+    rounds: Rounds[_Result],
+    simulation: Simulation,
+    workers: Workers,
+    file: Path,
+    advance: Callable[[int], None],
+    logs: Path | None = None,
+) -> _Result:
+    """Simulate the cases of each round that are not in a file yet, and return what the rounds return.
+
+    Args:
+        file: gets a line for each run, in the order of the cases.
+        advance: called with the number of runs that are there.
+        logs: the folder for the logs of those that violate; None for none.
+
+    Raises:
+        LogError: the file is damaged.
+        OutputError: a file cannot be written, or a worker died.
+    """
+    with closing(RunFile(file)) as known:
+        queue = _Queue(rounds, known, advance, logs)
+        for task, run in workers.results(partial(_simulate, simulation), queue):
+            if isinstance(run, WorkerLost):
+                raise lost(run)
+            queue.take(task, run)
+        return queue.result
+
+
+class _Queue(Generic[_Result]):
+    """The tasks of one round after the other: none while runs of a round are missing, more when it is whole.
+
+    An iterator of this kind has an end several times, as workers ask again after each result.
+
+    Attributes:
+        result: what the rounds have returned, once the last one is whole.
+    """
+
+    result: _Result
+
+    def __init__(
+        self, rounds: Rounds[_Result], known: RunFile, advance: Callable[[int], None], logs: Path | None
+    ) -> None:
+        self._rounds, self._known, self._advance, self._logs = rounds, known, advance, logs
+        self._waiting: deque[_Task] = deque()
+        self._round: Sequence[Case] = ()
+        self._arrived: dict[int, SearchedRun] = {}
+        # numbers of the first case of the round, and of the next one whose run is to be written
+        self._first = self._next = 1
+        self._begin(None)
+
+    def __iter__(self) -> Iterator[_Task]:
+        return self
+
+    def __next__(self) -> _Task:
+        if not self._waiting:
+            raise StopIteration
+        return self._waiting.popleft()
+
+    def take(self, task: _Task, run: SearchedRun) -> None:
+        """Take the run of a task; runs are written in the order of the tasks, whichever ends first."""
+        self._arrived[task.number] = run
+        self._write()
+        if all(case in self._known for case in self._round):
+            self._begin([self._of(case) for case in self._round])
+
+    def _begin(self, runs: Sequence[SearchedRun] | None) -> None:
+        """Begin the next round of which something is not known."""
+        while True:
+            self._first = self._next = self._first + len(self._round)
+            try:
+                self._round = next(self._rounds) if runs is None else self._rounds.send(runs)
+            except StopIteration as end:
+                self._round, self.result = (), end.value
+                return
+            missing = 0
+            for number, case in enumerate(self._round, start=self._first):
+                if case not in self._known:
+                    missing += 1
+                    log = None if self._logs is None else self._logs / f"run-{number:04d}.mcap"
+                    self._waiting.append(_Task(number, case, log))
+            self._advance(len(self._round) - missing)
+            if missing:
+                return
+            runs = [self._of(case) for case in self._round]
+
+    def _write(self) -> None:
+        while self._next < self._first + len(self._round):
+            case = self._round[self._next - self._first]
+            if case not in self._known:
+                if self._next not in self._arrived:
+                    return
+                self._known.add(self._arrived.pop(self._next))
+                self._advance(1)
+            self._next += 1
+
+    def _of(self, case: Case) -> SearchedRun:
+        run = self._known.get(case)
+        assert run is not None
+        return run
+
+
+def _simulate(simulation: Simulation, task: _Task) -> SearchedRun:
+    """Simulate and evaluate a case; write its log if it violates."""
+    try:
+        simulated = simulation.run(task.case)
+    except Exception as error:
+        error.add_note(f"in the case {key_of(task.case)}")
+        raise
+    results = [result for file in simulation.files for result in evaluate(file, simulated.trace)]
+    worst = min(results, key=lambda result: result.upper)
+    verdict = worst_verdict(result.verdict for result in results)
+    times_ns = simulated.trace.times_ns
+    run = SearchedRun(
+        task.number,
+        task.case,
+        verdict,
+        worst.upper,
+        worst.title,
+        declared_unit(worst.formula, {"": simulated.unit}),
+        int(times_ns[-1] - times_ns[0]) / 1e9,
+    )
+    if run.is_violated and task.log is not None:
+        write_whole(simulated.write, task.log)
+    return run
+
+
+def write_whole(write: Callable[[Path], None], log: Path) -> None:
+    """Write a log under another name first, so that it is whole or not there."""
+    unfinished = log.with_name(f".{log.name}.partial")
+    write(unfinished)
+    unfinished.replace(log)
+
+
+def lost(worker: WorkerLost) -> OutputError:
+    """Return the error about a worker that died."""
+    return OutputError(f"a run could not be simulated: {worker}; the same command goes on from there")
+
+
+# ------------------------------------------------------------------------------------------------- the search
 
 FORMAT: Final = 2
 MOST_RUNS: Final = 1_000_000
@@ -44,8 +450,6 @@ _BARREN: Final = 50
 """Rounds without a new case after which there is nothing else to try."""
 _DRAWN: Final = 10
 """Runs of a round where nothing but seeds is varied."""
-
-_Result = TypeVar("_Result")
 
 
 def falsify(

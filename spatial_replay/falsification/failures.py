@@ -1,4 +1,4 @@
-"""What a search has found: runs, failures with the worst first, and what was covered."""
+"""Results of a search: runs, failures with the worst first, and the coverage of parameters."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
-from spatial_replay.falsification.parameters import TENTHS, Case, Parameter
+from spatial_replay.falsification.simulations import TENTHS, Case, Parameter
 from spatial_replay.lazy import Displayed
 from spatial_replay.monitor.verdict import Verdict
-from spatial_replay.text import json_number
+from spatial_replay.notebook import html
+from spatial_replay.notebook.figures import Html, element, folded, quiet, table, verdict_mark
+from spatial_replay.text import counted, json_number, number_text
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,3 +246,43 @@ class Falsification(Displayed):
 
 def _relative(path: Path) -> str:
     return f"{path.parent.name}/{path.name}"
+
+
+# ----------------------------------------------------------------------------------------------- in notebooks
+
+_MOST_ROWS: Final = 20
+"""The most failures that are shown."""
+
+
+@html.register(Falsification)
+def falsification_html(found: Falsification) -> Html:
+    """Return the failures, the worst first, or the lowest run; and what of each parameter was tried."""
+    runs, failures = counted(len(found.runs), "run"), counted(len(found.failures), "failure")
+    title = element("div", verdict_mark(found.verdict), f" {found.name}: {failures} in {runs}")
+    lowest = found.lowest
+    text = f"lowest: {number_text(lowest.robustness)} of {lowest.spec} with {found.text_of(lowest.case)}"
+    notes = [f"{len(found.failures) - _MOST_ROWS} more failures"] if len(found.failures) > _MOST_ROWS else []
+    notes += ["the search ended early: there was nothing else to try"] if found.is_exhausted else []
+    rows = [_row(found, each) for each in found.failures[:_MOST_ROWS]]
+    headings = ["robustness", "spec", "with", "made smaller", "clip"]
+    covered = [
+        (
+            each.parameter,
+            f"{each.low:g} to {each.high:g} {each.unit}".strip(),
+            " ".join(map(str, each.tenths)),
+        )
+        for each in found.coverage
+    ]
+    return element(
+        "div",
+        title,
+        table(headings, rows) if rows else element("div", text),
+        *(element("div", quiet(note)) for note in notes),
+        folded("what was tried", table(["parameter", "range", "runs in each tenth"], covered)),
+    )
+
+
+def _row(found: Falsification, failure: Failure) -> tuple[str, ...]:
+    run, smaller = failure.run, failure.smaller
+    least = found.text_of(smaller.case) if failure.is_smaller else "as it is"
+    return number_text(run.robustness), run.spec, found.text_of(run.case), least, failure.clip.name

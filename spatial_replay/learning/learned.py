@@ -1,19 +1,28 @@
-"""Specifications learned from runs: their text, the evidence for each line, and a check on runs left out."""
+"""Specifications learned from runs: their lines, the evidence for each, and a check on runs left out."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any, Final, NamedTuple
+
+import numpy as np
 
 from spatial_replay.errors import UsageError
 from spatial_replay.lazy import Displayed
-from spatial_replay.learning.choose import chosen_lines
-from spatial_replay.learning.facts import Line, Pattern
-from spatial_replay.learning.fit import FittedLimits
-from spatial_replay.learning.observed import Observed, robustness_of
-from spatial_replay.learning.quantities import scope_of
+from spatial_replay.learning.fit import (
+    ALWAYS,
+    EVENTUALLY,
+    FINALLY,
+    PATTERNS,
+    FittedLimits,
+    LimitedRelation,
+    Line,
+    Pattern,
+)
+from spatial_replay.learning.quantities import Observed, Party, Quantity, robustness_of, scope_of
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.spec import parse_specification
 from spatial_replay.spec.format import format_formula
@@ -24,6 +33,348 @@ from spatial_replay.text import counted, json_number, number_text, printable
 from spatial_replay.trace.other_units import require_same_units
 from spatial_replay.tuning.margins import LabelledRun
 from spatial_replay.tuning.tuned import MOST_RUNS, MOST_SAMPLES
+
+# -------------------------------------------------------------------------------------------------- selection
+
+_LEAST_BITS: Final = 0.25
+_LEAST_BITS_NEAR: Final = 1.5
+"""Bits that a line needs; one that says that something always stays near, or inside."""
+_ALIKE: Final = 1.25
+_ALIKE_ALWAYS: Final = 2.0
+"""The greatest ratio of limits that are written as one of a class: at the end, and of what always holds."""
+_NEXT_LINE: Final = 0.6
+"""What a second line about an object is worth, and so on."""
+_LEAST_GAIN: Final = 0.25
+_LESS: Final = 0.5
+"""The bad runs that a further line has to distinguish; by how much less a run counts after that."""
+_NEVER: Final = 0.3
+"""How surely an event that never comes distinguishes a bad run; how the run ends says more."""
+_DISTANCES: Final = 2
+"""How many distances from landmarks say where one object is put: two leave two places in the plane."""
+_LEAST_BITS_PLACED: Final = 2.0
+"""What the distance of an object from the nearest landmark is worth at least."""
+_SHARE_OF_ALWAYS: Final = 1 / 3
+"""The most of all lines without bad runs that say what always holds, and that say orders."""
+_PLAIN_BEFORE: Final = 0.8
+_PLAIN_UNTIL: Final = 0.6
+"""What it is worth to distinguish a bad run in lines about orders; see `_plainness`."""
+_DIRECTIONS: Final = frozenset({"leftof", "below", "prec"})
+
+
+def chosen_lines(fit: FittedLimits, most: int) -> tuple[Line, ...]:
+    """Return the lines to write, the most distinctive ones first: at most `most`."""
+    found = _distinctive(fit, most) if fit.bad else _characteristic(fit, most)
+    return tuple(_joined(found))
+
+
+def _distinctive(fit: FittedLimits, most: int) -> list[Line]:
+    """Return lines by how many bad runs they distinguish that the lines before them have not."""
+    where = np.argwhere((fit.apart > 0.0).any(axis=-1))
+    events = fit.events()
+    lengths = np.array([len(each.trace) for each in fit.bad])
+    never = dict(zip(events, fit.times(events, fit.bad)[1] >= lengths, strict=True))
+    orders = [(line, violating) for line, _, violating in fit.orders(events) if violating.any()]
+    weights = [fit.apart[tuple(each)] for each in where]
+    weights += [
+        np.where(violating, np.where(never[line.fact], _NEVER, 1.0), 0.0) for line, violating in orders
+    ]
+    plain = [_plainness(fit, *each) for each in where.tolist()]
+    plain += [_PLAIN_BEFORE if line.pattern == "before" else _PLAIN_UNTIL for line, _ in orders]
+    bits = [round(float(fit.bits[tuple(each)]), 3) for each in where] + [0.0 for _ in orders]
+    apart = np.array(weights).reshape(len(weights), len(fit.bad))
+    rows = {tuple(each): row for row, each in enumerate(where.tolist())}
+    still = np.ones(len(fit.bad))
+    result: list[Line] = []
+    while len(result) < min(most, len(weights)):
+        gains = np.round(apart @ still * plain, 3)
+        best = max(range(len(weights)), key=lambda each: (gains[each], bits[each], -each))
+        if gains[best] < _LEAST_GAIN:
+            break
+        if best < len(where):
+            pattern, direction, quantity = where[best].tolist()
+            result.append(Line(PATTERNS[pattern], fit.fact(pattern, direction, quantity)))
+            # what is said of a class is said of its members
+            own = [rows.get((pattern, direction, each)) for each in fit.members[quantity]]
+            apart[[row for row in own if row is not None]] = 0.0
+        else:
+            result.append(orders[best - len(where)][0])
+        still = still * (1.0 - apart[best] * _LESS)
+        apart[best] = 0.0
+    return result
+
+
+def _plainness(fit: FittedLimits, pattern: int, direction: int, quantity: int) -> float:
+    """Return what it is worth to distinguish a bad run in a line that people write often, or seldom."""
+    relation = fit.quantities[quantity].relation
+    if pattern == ALWAYS and relation == "dist" and not direction:
+        return 1.0
+    if pattern == FINALLY and not direction and relation in ("enclosedin", "oriented"):
+        return 1.0
+    if pattern == ALWAYS and relation == "dist":
+        return 0.4
+    worth = (
+        0.9 if pattern == FINALLY and (relation in _DIRECTIONS or (relation == "dist" and direction)) else 0.7
+    )
+    return worth * (0.7 if pattern == EVENTUALLY else 1.0)
+
+
+@dataclass
+class _Groups:
+    """Objects joined by the distances that are written: one of two that are joined already says little."""
+
+    group: dict[Party, Party] = field(default_factory=dict)
+
+    def join(self, a: Party, b: Party) -> bool:
+        """Join two, and return whether they were apart."""
+        one, other = self._of(a), self._of(b)
+        self.group[one] = other
+        return one != other
+
+    def _of(self, party: Party) -> Party:
+        while (above := self.group.setdefault(party, party)) != party:
+            party = above
+        return party
+
+
+def _characteristic(fit: FittedLimits, most: int) -> list[Line]:
+    """Return lines of what good runs have in common: goals first, then what always holds, then orders."""
+    share = max(1, int(most * _SHARE_OF_ALWAYS))
+    always = _invariants(fit)[:share]
+    goals = _goals(fit)[: max(1, most - len(always))]
+    orders = list(_chain(fit, [line.fact for line in goals if line.pattern == "finally"]))
+    return [*goals, *always, *orders[: max(0, min(share, most - len(goals) - len(always)))]]
+
+
+def _goals(fit: FittedLimits) -> list[Line]:
+    """Return how good runs end: a distance for each object, and relations that began otherwise."""
+    scored: list[tuple[float, int, Line]] = []
+    joined, placed = _Groups(), Counter[Party]()
+    pairs = set()
+    of_class: set[int] = set()
+    centre = _centre(fit)
+    for _, index in sorted(_distances(fit), key=lambda each: (-each[0], each[1])):
+        quantity = fit.quantities[index]
+        if index not in of_class and (
+            _places(fit, quantity, placed, centre) if fit.landmarks else joined.join(*quantity.parties)
+        ):
+            of_class.update(fit.members[index])
+            fact = near = fit.fact(FINALLY, 1, index)
+            if fit.limits[FINALLY, 0, index] > 0.0:
+                fact = replace(fit.fact(FINALLY, 0, index), other_limit=near.limit)
+            bit = fit.bits_between(index)
+            if centre in quantity.parties or any(placed[each] == 1 for each in quantity.parties):
+                # the nearest landmark says most, whatever the way there was
+                bit = max(bit, _LEAST_BITS_PLACED)
+            scored.append((bit, index, Line("finally", fact)))
+            pairs |= {quantity.pair, *(fit.quantities[each].pair for each in fit.members[index])}
+    before: dict[tuple[str, Party], set[Party]] = {}
+    relations = [
+        (bit, index)
+        for index, quantity in enumerate(fit.quantities)
+        if quantity.relation not in ("dist", "signal")
+        and (not fit.landmarks or fit.landmarks.intersection(quantity.parties))
+        and (bit := _said_at_end(fit, index)) >= _LEAST_BITS
+        and fit.moves[index]
+        and _agrees(fit, FINALLY, 0, index)
+    ]
+    for bit, index in sorted(relations, key=lambda each: _by_worth(fit, *each)):
+        quantity = fit.quantities[index]
+        began = _begins_otherwise(fit, index)
+        if index in of_class or not (began or quantity.pair in pairs):
+            continue
+        if quantity.relation == "ovlp" and quantity.pair in pairs:
+            # what is inside overlaps, too
+            continue
+        of_class.update(fit.members[index])
+        if quantity.relation in _DIRECTIONS:
+            one, other = quantity.parties
+            if _leads(before, quantity.relation, one, other):
+                continue
+            before.setdefault((quantity.relation, one), set()).add(other)
+        scored.append((bit, index, Line("finally", fit.fact(FINALLY, 0, index))))
+        pairs |= {quantity.pair, *(fit.quantities[each].pair for each in fit.members[index])}
+    scored += _visits(fit, pairs)
+    ordered = sorted(scored, key=lambda each: (-each[0], each[1]))
+    return _spread([(bit, line) for bit, _, line in ordered], fit.landmarks)
+
+
+def _begins_otherwise(fit: FittedLimits, index: int) -> bool:
+    """Return whether what holds at the end holds in no good run's first sample."""
+    return bool(max(run.first[0, 1, index] for run in fit.good) < fit.limits[FINALLY, 0, index])
+
+
+def _said_at_end(fit: FittedLimits, index: int) -> float:
+    """Return how much it says that a relation holds at the end."""
+    quantity, bits = fit.quantities[index], float(fit.bits[FINALLY, 0, index])
+    is_put = quantity.relation == "enclosedin" and quantity.parties[1] in fit.landmarks
+    if is_put and _begins_otherwise(fit, index):
+        # what is put into a landmark is there on purpose, also where that is done early in each run
+        return max(bits, _LEAST_BITS_PLACED)
+    return bits
+
+
+def _centre(fit: FittedLimits) -> Party | None:
+    """Return the landmark next to which most objects end, such as a plate; None if no two end by the same."""
+    nearest: dict[Party, tuple[float, Party]] = {}
+    for index, quantity in enumerate(fit.quantities):
+        still = [each for each in quantity.parties if each in fit.landmarks and not each.is_class]
+        moved = [each for each in quantity.parties if each not in fit.landmarks and not each.is_class]
+        if quantity.relation == "dist" and len(still) == len(moved) == 1 and fit.moves[index]:
+            found = float(fit.lowest[FINALLY, 0, index]), still[0]
+            nearest[moved[0]] = min(nearest.get(moved[0], found), found)
+    counts = Counter(landmark for _, landmark in nearest.values())
+    return max(
+        (each for each in counts if counts[each] > 1), key=lambda each: (counts[each], each), default=None
+    )
+
+
+def _places(fit: FittedLimits, quantity: Quantity, placed: Counter[Party], centre: Party | None) -> bool:
+    """Return whether a distance says where something is put by what stays, as no two others do yet.
+
+    That from the centre always does.
+    """
+    moved = [each for each in quantity.parties if each not in fit.landmarks]
+    if len(moved) != 1 or (placed[moved[0]] >= _DISTANCES and centre not in quantity.parties):
+        return False
+    placed.update(moved)
+    return True
+
+
+def _by_worth(fit: FittedLimits, bits: float, index: int) -> tuple[bool, float, bool, int]:
+    """Return what orders relations: overlaps last, the rarest first, classes before their members."""
+    return fit.quantities[index].relation == "ovlp", -round(bits, 1), not fit.members[index], index
+
+
+def _spread(scored: list[tuple[float, Line]], landmarks: frozenset[Party]) -> list[Line]:
+    """Return lines by their bits, each counting for less the more lines there are about what it moves."""
+    counts = Counter[Party]()
+    result = []
+    left = [(bit, line, set(line.fact.quantity.parties) - landmarks) for bit, line in scored]
+    while left:
+        worth = [
+            bit * _NEXT_LINE ** min((counts[each] for each in moved), default=0) for bit, _, moved in left
+        ]
+        _, line, moved = left.pop(worth.index(max(worth)))
+        result.append(line)
+        counts.update(moved)
+    return result
+
+
+def _agrees(fit: FittedLimits, pattern: int, direction: int, index: int) -> bool:
+    """Return whether all members of a class, where a quantity is about one, keep about the same limit.
+
+    Then the class is written in place of its members.
+    """
+    limit = abs(float(fit.limits[pattern, direction, index]))
+    alike = _ALIKE_ALWAYS if pattern == ALWAYS else _ALIKE
+    for each in fit.members[index]:
+        own = abs(float(fit.limits[pattern, direction, each]))
+        if not fit.bits[pattern, direction, each] >= _LEAST_BITS or max(own, limit) > alike * min(own, limit):
+            return False
+    return True
+
+
+def _distances(fit: FittedLimits) -> Iterator[tuple[float, int]]:
+    """Yield the distances at the end by how well they place something; with landmarks, the least first."""
+    for index, quantity in enumerate(fit.quantities):
+        far, near = fit.limits[FINALLY, :, index]
+        if quantity.relation != "dist" or not near < 0.0 or not fit.moves[index]:
+            continue
+        bits = fit.bits_between(index)
+        is_apart = len(quantity.pair) == 2 and fit.lowest[FINALLY, 0, index] >= 0.0
+        if fit.landmarks:
+            if is_apart and not fit.members[index]:
+                yield near, index
+        elif is_apart and bits >= _LEAST_BITS and _agrees(fit, FINALLY, 1, index):
+            spread = -near - (far if np.isfinite(far) else 0.0)
+            travel = max(float(each.travel[index]) for each in fit.good)
+            exact = np.log2(travel / max(spread, 1e-3 * travel))
+            close = np.log2(fit.scale / max(-near, 0.02 * fit.scale))
+            yield float(min(bits, 3.0) + min(exact, 4.0) + close), index
+
+
+def _leads(before: dict[tuple[str, Party], set[Party]], relation: str, one: Party, other: Party) -> bool:
+    """Return whether a chain of directions that are written leads from one object to another."""
+    reached, left = {one}, [one]
+    while left:
+        for each in before.get((relation, left.pop()), ()):
+            if each not in reached:
+                reached.add(each)
+                left.append(each)
+    return other in reached
+
+
+def _visits(fit: FittedLimits, pairs: set[frozenset[Party]]) -> Iterator[tuple[float, int, Line]]:
+    """Yield what holds at some time in good runs, but neither at their beginning nor at their end."""
+    for index, quantity in enumerate(fit.quantities):
+        if quantity.relation not in ("enclosedin", "dist") or quantity.pair in pairs or fit.members[index]:
+            continue
+        direction = 1 if quantity.relation == "dist" else 0
+        limit, bits = fit.limits[EVENTUALLY, direction, index], float(fit.bits[EVENTUALLY, direction, index])
+        ends = [
+            max(float(run.first[direction, 1, index]), float(run.last[direction, 1, index]))
+            for run in fit.good
+        ]
+        travel = max(float(run.travel[index]) for run in fit.good)
+        if np.isfinite(limit) and bits >= 2.0 and fit.moves[index] and max(ends) < limit - travel / 4.0:
+            yield bits / 2.0, index, Line("eventually", fit.fact(EVENTUALLY, direction, index))
+
+
+def _invariants(fit: FittedLimits) -> list[Line]:
+    """Return what always holds, by how near it comes to not holding; classes in place of their members."""
+    scored = []
+    for direction, index in np.argwhere(fit.bits[ALWAYS] >= _LEAST_BITS).tolist():
+        fact, bits = fit.fact(ALWAYS, direction, index), float(fit.bits[ALWAYS, direction, index])
+        is_distance = fact.quantity.relation == "dist"
+        is_said = fact.limit > 0.0 if is_distance and not direction else bits >= _LEAST_BITS_NEAR
+        is_written = is_distance or fact.quantity.relation == "enclosedin"
+        if is_said and is_written and _agrees(fit, ALWAYS, direction, index):
+            scored.append((-round(bits, 3), index, Line("always", fact)))
+    scored.sort(key=lambda each: each[:2])
+    hidden = {(line.fact.direction, each) for _, index, line in scored for each in fit.members[index]}
+    return [line for _, index, line in scored if (line.fact.direction, index) not in hidden]
+
+
+def _chain(fit: FittedLimits, goals: Sequence[LimitedRelation]) -> Iterator[Line]:
+    """Yield the order in which goals are reached, each before the next."""
+    goals = [each.near for each in goals]
+    times, _ = fit.times(goals, fit.good)
+    gaps = {(line.fact, line.later): (line, gap) for line, gap, _ in fit.orders(goals)}
+    # what holds from the beginning is not reached
+    reached = [
+        goals[index]
+        for index in np.argsort(np.median(times, axis=1), kind="stable").tolist()
+        if times[index].min() > 0
+    ]
+    last: LimitedRelation | None = None
+    for first, later in pairwise(reached):
+        key = last or first, later
+        if key in gaps:
+            yield gaps[key][0]
+            last = None
+        else:
+            # at the same time: what comes after both comes after the first
+            last = last or first
+
+
+def _joined(lines: Sequence[Line]) -> Iterator[Line]:
+    """Yield lines with the two limits of one distance in one."""
+    limits: dict[tuple[str, Quantity, int], LimitedRelation] = {
+        (line.pattern, line.fact.quantity, line.fact.direction): line.fact
+        for line in lines
+        if line.fact.quantity.relation == "dist" and line.pattern in ("always", "finally")
+    }
+    done = set()
+    for line in lines:
+        least, greatest = (limits.get((line.pattern, line.fact.quantity, each)) for each in (0, 1))
+        if line.later is not None or least is None or greatest is None or least.other_limit is not None:
+            yield line
+        elif (line.pattern, line.fact.quantity) not in done:
+            done.add((line.pattern, line.fact.quantity))
+            yield Line(line.pattern, replace(least, other_limit=greatest.limit))
+
+
+# ------------------------------------------------------------------------------------------ the specification
 
 MOST_LINES: Final = 100
 DEFAULT_LINES: Final = 20

@@ -19,7 +19,7 @@ _VIEWS: Mapping[str, str] = MappingProxyType(
         "spatial_replay.automata.automaton": "automaton_view",
         "spatial_replay.compare.runs": "diff_view",
         "spatial_replay.compare.specifications": "diff_view",
-        "spatial_replay.falsification.failures": ".falsification.failures_view",
+        "spatial_replay.falsification.failures": ".falsification.failures",
         "spatial_replay.learning.learned": "learned_view",
         "spatial_replay.monitor.evaluate": "evaluation_view",
         "spatial_replay.monitor.result": "evaluation_view",

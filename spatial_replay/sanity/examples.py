@@ -1,33 +1,489 @@
-"""Shortest runs by example: in words, and as samples that evaluate to the verdict."""
+"""Shortest runs by example: in words, and as samples that evaluate to the verdict.
+
+Objects are boxes along the axes. Boxes make every relation a few linear inequalities between their sides, or
+a choice among some. A placement is a proposal that is evaluated before it is shown.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Final, Literal
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import product
+from typing import Any, Final, Literal, NamedTuple, TypeAlias
+
+import numpy as np
 
 from spatial_replay.errors import SpatialReplayError
-from spatial_replay.geometry.footprint import TrackedObject
+from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
 from spatial_replay.monitor.evaluate import Evaluation, evaluate
-from spatial_replay.sanity.conditions import Fact
-from spatial_replay.sanity.placement import MAX_TURNED, CannotPlaceError, Placements, Setting
-from spatial_replay.sanity.readings import conjuncts
+from spatial_replay.sanity.conditions import Fact, Quantity, plain, radius_of, without_radius
+from spatial_replay.sanity.linear import Inequality, solve
+from spatial_replay.sanity.relaxations import conjuncts
 from spatial_replay.sanity.shortest_words import Word, WordSearch
 from spatial_replay.spec.checks import object_names, signal_names
 from spatial_replay.spec.formula import (
     Atom,
+    Axis,
+    CentroidProjection,
+    Earlier,
     Formula,
     Misalignment,
     NamedSpec,
+    Outline,
     Projection,
+    Protrusion,
     RegionName,
+    Signal,
+    SignedDistance,
     Specification,
+    Term,
     TrackedName,
 )
 from spatial_replay.spec.walks import base_of, iter_expressions, iter_formulas, measured_terms, terms_of
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
+
+# ------------------------------------------------------------------------------------------- regions as boxes
+
+
+def footprint_of(outline: Outline) -> Footprint:
+    """Return the area of a region."""
+    if outline.is_disc:
+        (x, y), *_ = outline.vertices
+        return Footprint.disc(x, y, outline.radius)
+    return Footprint.polygon(np.array(outline.vertices, np.float64))
+
+
+def around(outline: Outline) -> tuple[tuple[float, float], ...]:
+    vertices, radius = np.array(outline.vertices, np.float64), outline.radius
+    limits = zip(vertices.min(axis=0) - radius, vertices.max(axis=0) + radius, strict=True)
+    return tuple((float(low), float(high)) for low, high in limits)
+
+
+def inside(footprint: Footprint) -> tuple[tuple[float, float], ...]:
+    """Return the largest box, among some, that a footprint encloses."""
+    boxes = [_box_in(part) for part in footprint.parts]
+    return max(boxes, key=lambda box: math.prod(high - low for low, high in box))
+
+
+def _box_in(part: ConvexPart) -> tuple[tuple[float, float], ...]:
+    """Return a box around a part's centroid, of the proportions of the box around the part."""
+    x, y = centroid(part)
+    if len(part.vertices) < 3:
+        half = part.radius / math.sqrt(2.0)
+        return (x - half, x + half), (y - half, y + half)
+    width, height = np.ptp(part.vertices, axis=0).tolist()
+    after = np.roll(part.vertices, -1, axis=0)
+    # corners are counter-clockwise: normals point outwards
+    normals = np.column_stack([after[:, 1] - part.vertices[:, 1], part.vertices[:, 0] - after[:, 0]])
+    room = (normals * (part.vertices - (x, y))).sum(axis=1)
+    share = float((room / (np.abs(normals) @ (width / 2.0, height / 2.0))).min())
+    return (x - share * width / 2.0, x + share * width / 2.0), (
+        y - share * height / 2.0,
+        y + share * height / 2.0,
+    )
+
+
+def centroid(part: ConvexPart) -> tuple[float, float]:
+    """Return the centroid of a part's polygon; of a point or segment, the mean."""
+    vertices = part.vertices - part.vertices[0]
+    after = np.roll(vertices, -1, axis=0)
+    cross = vertices[:, 0] * after[:, 1] - after[:, 0] * vertices[:, 1]
+    if len(vertices) < 3:
+        x, y = vertices.mean(axis=0).tolist()
+    else:
+        x, y = (((vertices + after) * cross[:, None]).sum(axis=0) / (3.0 * cross.sum())).tolist()
+    return x + float(part.vertices[0, 0]), y + float(part.vertices[0, 1])
+
+
+# -------------------------------------------------------------------------------------------------- placement
+
+MAX_SOLUTIONS: Final = 300
+"""How many systems of inequalities one placement tries."""
+
+MAX_TURNED: Final = 5
+"""How many objects are turned towards each other at most."""
+
+_TOLERANCE: Final = 1e-9
+"""By how much a bound may be missed."""
+
+_DIGITS: Final = 9
+"""Significant digits of coordinates, so that a file says the same."""
+
+_SHARES: Final = {2: 0.7, 3: 0.57}
+"""Gaps along two or three axes that are each less than such a share are less than 1 together."""
+
+Ways: TypeAlias = list[list[Inequality]]
+"""Inequalities of which those of one list have to hold."""
+
+
+class CannotPlaceError(Exception):
+    """Why no placement is possible, as part of a sentence."""
+
+
+class _Amount(NamedTuple):
+    """A weighted sum of unknowns plus a constant."""
+
+    weights: dict[Any, float]
+    constant: float = 0.0
+
+    def plus(self, other: _Amount, factor: float = 1.0) -> _Amount:
+        weights = dict(self.weights)
+        for key, value in other.weights.items():
+            weights[key] = weights.get(key, 0.0) + factor * value
+        return _Amount(weights, self.constant + factor * other.constant)
+
+    def at_most(self, bound: float) -> Inequality:
+        return Inequality(
+            tuple((key, value) for key, value in self.weights.items() if value), bound - self.constant
+        )
+
+    def at_least(self, bound: float) -> Inequality:
+        return _Amount({}).plus(self, -1.0).at_most(-bound)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What there is to place.
+
+    Attributes:
+        objects: names of tracked objects.
+        signals: names.
+        regions: by name.
+        upright: whether objects have heights.
+        turned: names of the objects that have an orientation.
+    """
+
+    objects: Sequence[str]
+    signals: Sequence[str]
+    regions: Mapping[str, Outline]
+    upright: bool = False
+    turned: Sequence[str] = ()
+    _boxes: dict[tuple[str, bool], tuple[tuple[float, float], ...]] = field(default_factory=dict)
+
+    @property
+    def axes(self) -> tuple[Axis, ...]:
+        """Along which objects are placed."""
+        return ("x", "y", "z") if self.upright else ("x", "y")
+
+    def region_box(self, name: str, *, outer: bool) -> tuple[tuple[float, float], ...]:
+        """Return limits along x, y and, if it has a height, z: of a box around a region, or inside it."""
+        key = (name, outer)
+        if key not in self._boxes:
+            outline = self.regions[name]
+            limits = around(outline) if outer else inside(footprint_of(outline))
+            self._boxes[key] = limits if outline.height is None else (*limits, outline.height)
+        return self._boxes[key]
+
+
+class Placements:
+    """Placements in which facts have some values, sample by sample; the roomiest first.
+
+    Attributes:
+        core: where there is none with the least room: facts, by sample and place, that exclude each other.
+            None before that is known, or if it takes too long.
+    """
+
+    core: frozenset[tuple[int, int]] | None = None
+
+    def __init__(
+        self, setting: Setting, facts: Sequence[Sequence[tuple[Fact, bool]]], period_ns: int
+    ) -> None:
+        """Begin.
+
+        Args:
+            facts: of each sample, with their values.
+        """
+        self._setting, self._facts, self._period_ns = setting, facts, period_ns
+
+    def __iter__(self) -> Iterator[tuple[Sample, ...]]:
+        """Yield placements.
+
+        Raises:
+            CannotPlaceError: a fact is about something that is not placed.
+        """
+        setting, facts = self._setting, self._facts
+        unit = _unit(setting, facts)
+        turns = [_turns(setting, each) for each in facts]
+        places = [(index, place) for index, sample in enumerate(facts) for place in range(len(sample))]
+        for margin, spread in ((0.2, 2.0), (0.04, 4.0), (0.04, 20.0), (0.005, 50.0)):
+            attempt = _Attempt(setting, unit, margin * unit, spread)
+            required: list[Inequality] = list(attempt.sizes())
+            choices: list[Ways] = []
+            for label, (index, place) in enumerate(places):
+                fact, value = facts[index][place]
+                ways = [
+                    [each._replace(label=label) for each in way] for way in attempt.ways(fact, value, index)
+                ]
+                if len(ways) == 1:
+                    required += ways[0]
+                elif ways:
+                    choices.append(ways)
+            found = attempt.solve(required, choices, len(facts))
+            self.core = None
+            if not isinstance(found, frozenset):
+                yield tuple(
+                    attempt.sample(found, index, turns[index], self._period_ns) for index in range(len(facts))
+                )
+            elif attempt.is_finished:
+                self.core = frozenset(places[label] for label in found)
+
+
+def _unit(setting: Setting, facts: Sequence[Sequence[tuple[Fact, bool]]]) -> float:
+    """Return a length that fits what the facts are about."""
+    lengths = [
+        high - low for name in setting.regions for low, high in setting.region_box(name, outer=False)[:2]
+    ]
+    if lengths:
+        return min(lengths) / 4.0 or 1.0
+    thresholds = [
+        abs(float(fact.threshold))
+        for sample in facts
+        for fact, _ in sample
+        if any(isinstance(quantity, (SignedDistance, Protrusion)) for quantity, _ in fact.weights)
+    ]
+    return max(thresholds, default=0.0) or 1.0
+
+
+class _Attempt:
+    """One placement in the making: unknowns are the least sides of boxes in each sample, and their sizes."""
+
+    def __init__(self, setting: Setting, unit: float, margin: float, spread: float) -> None:
+        self._setting = setting
+        self._unit = unit
+        self._margin = margin
+        self._spread = spread
+        self._left = MAX_SOLUTIONS
+
+    def sizes(self) -> Iterator[Inequality]:
+        """Yield that no box is too small or too large to be looked at."""
+        for name, axis in product(self._setting.objects, self._setting.axes):
+            size = _Amount({("size", name, axis): 1.0})
+            yield size.at_least(self._unit / self._spread)
+            yield size.at_most(self._unit * self._spread)
+
+    def ways(self, fact: Fact, value: bool, index: int) -> Ways:
+        """Return what makes a fact true, or false, in a sample.
+
+        Raises:
+            CannotPlaceError: it is about something that is not placed.
+        """
+        if not fact.weights:
+            # objects are placed without a class
+            if fact.alone is value:
+                return []
+            raise CannotPlaceError(f"objects are not placed for `{fact.texts[0]}`")
+        rises = (fact.side != "<=") == value
+        margin = 0.0 if value and fact.side != ">" else self._margin
+        bound = float(fact.threshold) + (margin if rises else -margin)
+        quantities = [quantity for quantity, _ in fact.weights]
+        if isinstance(quantities[0], Misalignment):
+            # turned before anything is placed
+            return []
+        if all(isinstance(each, (Projection, CentroidProjection, Signal)) for each in quantities):
+            total = _Amount({})
+            for quantity, weight in fact.weights:
+                total = total.plus(self._amount(quantity, index), float(weight))
+            return [[total.at_least(bound) if rises else total.at_most(bound)]]
+        if len(quantities) == 1:
+            return self._relation(quantities[0], rises, bound, index)
+        if len(quantities) == 2 and fact.weights[1][1] == -1:
+            # one is beyond some middle value, the other is not
+            return [
+                [*one, *other]
+                for middle in (0.0, self._unit, 3.0 * self._unit)
+                for one in self._relation(quantities[0], rises, middle + bound, index)
+                for other in self._relation(quantities[1], not rises, middle, index)
+            ]
+        raise CannotPlaceError(f"`{fact.texts[0]}` compares several distances")
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether all ways were tried that matter."""
+        return self._left > 0
+
+    def solve(
+        self, required: list[Inequality], choices: Sequence[Ways], samples: int
+    ) -> Mapping[Any, float] | frozenset[int]:
+        """Return values of the unknowns, or the labels of what excludes each other.
+
+        Of the choices, the first is made that the values so far do not keep. Where what excludes each other
+        is not about a choice, another way does not help.
+        """
+        self._left -= 1
+        start = self._start(samples)
+        solution = solve(required, exact=False, start=start)
+        if solution.values is None:
+            if solution.conflict is None:
+                self._left = 0
+            return solution.conflict or frozenset()
+        values = {**start, **{key: float(value) for key, value in solution.values.items()}}
+        ways = next((ways for ways in choices if not any(_all_hold(way, values) for way in ways)), None)
+        if ways is None:
+            return values
+        label = ways[0][0].label
+        conflicts: frozenset[int] = frozenset()
+        for way in sorted(ways, key=lambda way: _missing(way, values)):
+            if self._left <= 0:
+                break
+            found = self.solve([*required, *way], choices, samples)
+            if not isinstance(found, frozenset) or label not in found:
+                return found
+            conflicts |= found
+        return conflicts
+
+    def sample(
+        self, values: Mapping[Any, float], index: int, turns: Mapping[str, float], period_ns: int
+    ) -> Sample:
+        """Return a sample of a solution."""
+        objects: dict[str, TrackedObject | Footprint] = {}
+        for name in self._setting.objects:
+            limits = []
+            for axis in self._setting.axes:
+                low = values["at", name, axis, index]
+                limits.append((_rounded(low), _rounded(low + values["size", name, axis])))
+            (xmin, xmax), (ymin, ymax), *height = limits
+            objects[name] = TrackedObject(
+                Footprint.box(xmin, ymin, xmax, ymax),
+                yaw=turns.get(name),
+                height=height[0] if height else None,
+            )
+        signals = {name: _rounded(values["signal", name, index]) for name in self._setting.signals}
+        return Sample(index * period_ns, objects, signals)
+
+    def _start(self, samples: int) -> dict[Any, float]:
+        """Return where objects stay unless a fact moves them: in a row below all regions."""
+        boxes = [self._setting.region_box(name, outer=True) for name in self._setting.regions]
+        left = min((box[0][0] for box in boxes), default=0.0)
+        bottom = min((box[1][0] for box in boxes), default=0.0) - 2.0 * self._unit
+        start: dict[Any, float] = {}
+        for number, name in enumerate(self._setting.objects):
+            place = {"x": left + 2.0 * number * self._unit, "y": bottom, "z": 0.0}
+            for axis in self._setting.axes:
+                start["size", name, axis] = self._unit
+                start.update({("at", name, axis, index): place[axis] for index in range(samples)})
+        start.update(
+            {("signal", name, index): 0.0 for name in self._setting.signals for index in range(samples)}
+        )
+        return start
+
+    def _relation(self, quantity: Quantity, rises: bool, bound: float, index: int) -> Ways:
+        """Return what makes a distance or a protrusion at least, or at most, a bound."""
+        if isinstance(quantity, SignedDistance):
+            one, other = plain(quantity.first), plain(quantity.second)
+            bound += float(radius_of(one) + radius_of(other))
+        elif isinstance(quantity, Protrusion):
+            one, other = plain(quantity.inner), plain(quantity.outer)
+            bound += float(radius_of(other) - radius_of(one))
+        else:
+            raise CannotPlaceError("it compares quantities of several kinds")
+        # a region is taken for a box that makes it harder: around it to be away, inside it to be near
+        outers = (rises, rises) if isinstance(quantity, SignedDistance) else (not rises, rises)
+        a = self._sides(one, index, outer=outers[0])
+        b = self._sides(other, index, outer=outers[1])
+        gaps: list[_Amount] = []
+        for (a_low, a_high), (b_low, b_high) in zip(a, b, strict=False):
+            if isinstance(quantity, SignedDistance):
+                gaps += [b_low.plus(a_high, -1.0), a_low.plus(b_high, -1.0)]
+            else:
+                gaps += [a_high.plus(b_high, -1.0), b_low.plus(a_low, -1.0)]
+        if rises:
+            return [[gap.at_least(bound)] for gap in gaps]
+        share = _SHARES[min(len(a), len(b))] if bound > 0.0 else 1.0
+        return [[gap.at_most(share * bound) for gap in gaps]]
+
+    def _sides(self, term: Term, index: int, *, outer: bool) -> list[tuple[_Amount, _Amount]]:
+        """Return the least and the greatest coordinates of a term along its axes."""
+        term = without_radius(term)
+        if isinstance(term, RegionName):
+            limits = self._setting.region_box(term.name, outer=outer)
+            return [(_Amount({}, low), _Amount({}, high)) for low, high in limits]
+        name, at = _object(term, index)
+        sides = []
+        for axis in self._setting.axes:
+            low = _Amount({("at", name, axis, at): 1.0})
+            sides.append((low, low.plus(_Amount({("size", name, axis): 1.0}))))
+        return sides
+
+    def _amount(self, quantity: Quantity, index: int) -> _Amount:
+        if isinstance(quantity, Signal):
+            return _Amount({("signal", quantity.name, index): 1.0})
+        assert isinstance(quantity, (Projection, CentroidProjection))
+        axis = "xyz".index(quantity.axis)
+        if isinstance(quantity, CentroidProjection) and isinstance(quantity.term, RegionName):
+            footprint = footprint_of(self._setting.regions[quantity.term.name])
+            centres = [centroid(part)[axis] for part in footprint.parts]
+            return _Amount({}, min(centres) if quantity.side == "min" else max(centres))
+        sides = self._sides(quantity.term, index, outer=True)
+        if axis >= len(sides):
+            raise CannotPlaceError("a region without a height is compared along z")
+        low, high = sides[axis]
+        if isinstance(quantity, CentroidProjection):
+            return _Amount({}).plus(low, 0.5).plus(high, 0.5)
+        return low if quantity.side == "min" else high
+
+
+def _object(term: Term, index: int) -> tuple[str, int]:
+    """Return the object that a term is, and the sample in which it is meant."""
+    if isinstance(term, Earlier):
+        if term.samples is None or not isinstance(term.term, TrackedName) or term.samples > index:
+            raise CannotPlaceError("it looks back over a time, or before the first sample")
+        return term.term.name, index - term.samples
+    if isinstance(term, TrackedName):
+        return term.name, index
+    raise CannotPlaceError("a group of a class, or of all objects, is not placed")
+
+
+def _turns(setting: Setting, facts: Sequence[tuple[Fact, bool]]) -> dict[str, float]:
+    """Return orientations, by quarters, for which facts about orientations have their values.
+
+    Raises:
+        CannotPlaceError: there are none, or too many objects.
+    """
+    asked = [
+        (fact, value)
+        for fact, value in facts
+        if fact.weights and isinstance(fact.weights[0][0], Misalignment)
+    ]
+    if len(setting.turned) > MAX_TURNED:
+        raise CannotPlaceError(f"more than {MAX_TURNED} objects have orientations")
+    for quarters in product(range(4), repeat=len(setting.turned)):
+        turns = {name: math.pi / 2.0 * each for name, each in zip(setting.turned, quarters, strict=True)}
+        if all(_is_turned(fact, value, turns) for fact, value in asked):
+            return turns
+    raise CannotPlaceError("no turns by quarters fit")
+
+
+def _is_turned(fact: Fact, value: bool, turns: Mapping[str, float]) -> bool:
+    total = 0.0
+    for quantity, weight in fact.weights:
+        if not isinstance(quantity, Misalignment):
+            raise CannotPlaceError("it compares quantities of several kinds")
+        (one, first), (other, second) = _object(quantity.first, 0), _object(quantity.second, 0)
+        if first or second:
+            raise CannotPlaceError("it compares orientations over time")
+        total += float(weight) * (1.0 - math.cos(turns[one] - turns[other]))
+    rises = (fact.side != "<=") == value
+    return total > float(fact.threshold) if rises else total < float(fact.threshold)
+
+
+def _all_hold(way: Sequence[Inequality], values: Mapping[Any, float]) -> bool:
+    return _missing(way, values) <= _TOLERANCE
+
+
+def _missing(way: Sequence[Inequality], values: Mapping[Any, float]) -> float:
+    """Return by how much values miss the bounds of inequalities."""
+    sums = (sum(weight * values[key] for key, weight in each.coefficients) - each.bound for each in way)
+    return float(max(0.0, *sums)) if len(way) > 1 else float(max(0.0, next(sums)))
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.{_DIGITS}g}")
+
+
+# --------------------------------------------------------------------------------------------------- examples
 
 MAX_SAMPLES: Final = 40
 """Longer runs are shown in words only."""

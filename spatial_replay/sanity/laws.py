@@ -10,8 +10,7 @@ from fractions import Fraction
 from itertools import combinations
 from typing import TypeVar
 
-from spatial_replay.sanity.linear import Inequality
-from spatial_replay.sanity.sums import (
+from spatial_replay.sanity.conditions import (
     Quantity,
     exact,
     is_flat,
@@ -20,6 +19,7 @@ from spatial_replay.sanity.sums import (
     terms_in,
     without_radius,
 )
+from spatial_replay.sanity.linear import Inequality
 from spatial_replay.spec.formula import (
     Axis,
     CentroidProjection,

@@ -8,8 +8,7 @@ from typing import Literal
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.compile import automaton
 from spatial_replay.errors import NoAutomatonError
-from spatial_replay.sanity.bounded_words import Side
-from spatial_replay.sanity.shortest_words import Runs
+from spatial_replay.sanity.shortest_words import Runs, Side
 from spatial_replay.spec.formula import (
     PAST_OPERATORS,
     Boolean,
