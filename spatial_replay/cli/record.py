@@ -35,7 +35,7 @@ from spatial_replay.trace.time_points import duration_ns_from_text
 
 if TYPE_CHECKING:
     from spatial_replay.logs.output_file import Durability
-    from spatial_replay.simulation.injection import Injection, Start
+    from spatial_replay.simulation.world import Injection, Start
 
 SCENARIOS: Mapping[str, str] = MappingProxyType(
     {
@@ -123,7 +123,7 @@ def parse_injections(texts: Sequence[str]) -> list[Injection]:
     Raises:
         UsageError: an unknown one.
     """
-    from spatial_replay.simulation.injection import Injection
+    from spatial_replay.simulation.world import Injection
 
     return [Injection.parse(text) for text in texts]
 
@@ -134,7 +134,7 @@ def parse_starts(texts: Sequence[str]) -> list[Start]:
     Raises:
         UsageError: one that is none, or two of one object.
     """
-    from spatial_replay.simulation.injection import Start
+    from spatial_replay.simulation.world import Start
 
     starts = [Start.parse(text) for text in texts]
     names = [start.name for start in starts]

@@ -23,10 +23,9 @@ from spatial_replay.recording.recording import refuse_templates
 from spatial_replay.runs.planned import record_plan
 from spatial_replay.runs.run_log import run_log
 from spatial_replay.runs.scripted import about_run, refuse_unknown_names, simulate_script
-from spatial_replay.simulation.injection import Injection, Kind, Start
-from spatial_replay.simulation.scenario import Placement
-from spatial_replay.simulation.scene import least_distance, rectangle
-from spatial_replay.simulation.shapes import Box
+from spatial_replay.simulation.arm import least_distance, rectangle
+from spatial_replay.simulation.tabletop import Placement
+from spatial_replay.simulation.world import Box, Injection, Kind, Start
 from spatial_replay.simulation.worlds import default_specification, make_world, scenario_of
 from spatial_replay.sources.open_log import read_trace
 from spatial_replay.spec.formula import Specification

@@ -20,9 +20,8 @@ from spatial_replay.perception.frame import Frame
 from spatial_replay.perception.opencv import Camera, enlarge
 from spatial_replay.perception.rendering import Backdrop, Flaws, Plate, render
 from spatial_replay.perception.video import VideoWriter
-from spatial_replay.simulation.shapes import Box, Pose
 from spatial_replay.simulation.tabletop import SAMPLES_PER_S, Tabletop
-from spatial_replay.simulation.world import Body
+from spatial_replay.simulation.world import Body, Box, Pose
 from spatial_replay.trace.sample import Sample
 
 FAMILY: Final = "36h11"

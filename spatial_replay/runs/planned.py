@@ -38,9 +38,8 @@ from spatial_replay.runs.filmed import open_film
 from spatial_replay.runs.run_log import RunLog, run_log
 from spatial_replay.runs.scripted import about_run, refuse_unknown_names
 from spatial_replay.sanity import refuse_unsatisfiable
-from spatial_replay.simulation.injection import Injection, Start
 from spatial_replay.simulation.tabletop import SAMPLES_PER_S
-from spatial_replay.simulation.world import TreeTick, World
+from spatial_replay.simulation.world import Injection, Start, TreeTick, World
 from spatial_replay.simulation.worlds import default_specification, make_world
 from spatial_replay.spec import parse_specification
 from spatial_replay.spec.formula import Atom, Formula, Misalignment, Specification

@@ -12,9 +12,8 @@ from spatial_replay.errors import SpecificationError, UsageError
 from spatial_replay.logs.output_file import Durability
 from spatial_replay.runs.filmed import Film, open_film
 from spatial_replay.runs.run_log import RunLog, run_log
-from spatial_replay.simulation.injection import Injection, Start
 from spatial_replay.simulation.tabletop import Tabletop
-from spatial_replay.simulation.world import Execution
+from spatial_replay.simulation.world import Execution, Injection, Start
 from spatial_replay.simulation.worlds import default_specification, make_world
 from spatial_replay.spec import check_names
 from spatial_replay.spec.formula import Specification

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Generator, Sequence
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import TypeVar
 
@@ -12,17 +13,80 @@ import numpy as np
 
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
-from spatial_replay.simulation.arm import STEPS_PER_TICK, TICKS_PER_S, WIDEST, Arm
+from spatial_replay.simulation.arm import STEPS_PER_TICK, TICKS_PER_S, WIDEST, Arm, Scene
 from spatial_replay.simulation.bullet import Engine
-from spatial_replay.simulation.injection import Injection, Start
-from spatial_replay.simulation.picking import let_go, put_back
-from spatial_replay.simulation.pushing import pushing
-from spatial_replay.simulation.scenario import Scenario
-from spatial_replay.simulation.scene import Scene
-from spatial_replay.simulation.shapes import Box, Pose, footprint, height
-from spatial_replay.simulation.world import Body, Execution, ReachableArea, Skill, TreeTick
+from spatial_replay.simulation.motions import Point, let_go, picking, pushing, put_back
+from spatial_replay.simulation.world import (
+    Body,
+    Box,
+    Execution,
+    Injection,
+    Pose,
+    ReachableArea,
+    Skill,
+    Start,
+    TreeTick,
+    footprint,
+    height,
+)
 from spatial_replay.text import nearest_hint
 from spatial_replay.trace.sample import Sample
+
+# -------------------------------------------------------------------------------------------------- scenarios
+
+Placing = Callable[[Scene, str, Point, float | None, Sequence[Point]], Generator[None, None, Execution]]
+"""How the robot picks a body up, carries it along some points and places it: `picking`, or a behaviour tree
+around it."""
+
+Script = Callable[[Scene], Generator[None, None, Execution]]
+"""The motion of the robot without a planner."""
+
+
+@dataclass(frozen=True, slots=True)
+class Placement:
+    """The initial state of a body.
+
+    Attributes:
+        x, y, yaw: the pose of its centre, in metres and radians.
+        mass_kg: 0 for a fixed body.
+        bottom: the height of its support, in metres.
+        colour: red, green, blue from 0 to 1.
+    """
+
+    body: Body
+    x: float
+    y: float
+    yaw: float
+    mass_kg: float
+    colour: tuple[float, float, float]
+    bottom: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """The definition of a world.
+
+    Attributes:
+        name: as on the command line.
+        placements: the bodies in their initial poses.
+        workspace: where the robot can put bodies.
+        skill: what the robot does with bodies.
+        script: the motion of the robot without a planner.
+        placing: how it picks and places, if that is its skill.
+        scatter_m, scatter_rad: the maximum shift and rotation of each body by the seed.
+    """
+
+    name: str
+    placements: tuple[Placement, ...]
+    workspace: ReachableArea
+    skill: Skill
+    script: Script
+    placing: Placing = picking
+    scatter_m: float = 0.01
+    scatter_rad: float = 0.2
+
+
+# -------------------------------------------------------------------------------------------------- the table
 
 SAMPLES_PER_S = 30
 """Samples per simulated second."""

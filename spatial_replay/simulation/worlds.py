@@ -6,9 +6,8 @@ from collections.abc import Sequence
 from importlib import import_module, resources
 
 from spatial_replay.errors import UsageError
-from spatial_replay.simulation.injection import Injection, Start
-from spatial_replay.simulation.scenario import Scenario
-from spatial_replay.simulation.tabletop import Tabletop
+from spatial_replay.simulation.tabletop import Scenario, Tabletop
+from spatial_replay.simulation.world import Injection, Start
 from spatial_replay.spec import parse_specification
 from spatial_replay.spec.formula import Specification
 

@@ -6,7 +6,7 @@ import pytest
 
 from simulation.worlds import world
 from spatial_replay import UsageError
-from spatial_replay.simulation.injection import Injection
+from spatial_replay.simulation.world import Injection
 
 GOAL = (0.36, -0.2)
 

@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from spatial_replay.simulation.kinematics import LOWER, REST, UPPER, downwards, joints_for, tool_frame
+from spatial_replay.simulation.bullet import LOWER, REST, UPPER, downwards, joints_for, tool_frame
 
 
 @given(st.floats(0.35, 0.7), st.floats(-2, 2), st.floats(0.01, 0.3), st.floats(-1.5, 1.5))

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from shapely import MultiPoint, Polygon
 
 from spatial_replay import Footprint
-from spatial_replay.simulation.shapes import Box, Cylinder, Pose, footprint, height
+from spatial_replay.simulation.world import Box, Cylinder, Pose, footprint, height
 
 SIZES = st.floats(0.01, 0.5)
 ANGLES = st.floats(-math.pi, math.pi)

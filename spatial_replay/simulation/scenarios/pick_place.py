@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Generator
 
-from spatial_replay.simulation.picking import picking
-from spatial_replay.simulation.scenario import Placement, Scenario
-from spatial_replay.simulation.scene import Scene
-from spatial_replay.simulation.shapes import Box, Cylinder, Shape
-from spatial_replay.simulation.world import Body, Execution, ReachableArea
+from spatial_replay.simulation.arm import Scene
+from spatial_replay.simulation.motions import picking
+from spatial_replay.simulation.tabletop import Placement, Scenario
+from spatial_replay.simulation.world import Body, Box, Cylinder, Execution, ReachableArea, Shape
 
 
 def _thing(

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Generator
 
-from spatial_replay.simulation.pushing import pushing
-from spatial_replay.simulation.scenario import Placement, Scenario
-from spatial_replay.simulation.scene import Scene
-from spatial_replay.simulation.shapes import Box
-from spatial_replay.simulation.world import Body, Execution, ReachableArea
+from spatial_replay.simulation.arm import Scene
+from spatial_replay.simulation.motions import pushing
+from spatial_replay.simulation.tabletop import Placement, Scenario
+from spatial_replay.simulation.world import Body, Box, Execution, ReachableArea
 
 _BLOCK = Box(0.04, 0.04, 0.04)
 
