@@ -110,7 +110,7 @@ def show_film(simulation: SimulationArguments) -> None:
     """Print how to read the video of a run, if there is one."""
     videos = simulation["cameras"]
     if videos:
-        from spatial_replay.runs.filmed import tags_of_film
+        from spatial_replay.runs.virtual_camera import tags_of_film
 
         listed = " ".join(str(video) for video in videos)
         tags = tags_of_film(videos)

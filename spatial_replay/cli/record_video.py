@@ -30,7 +30,7 @@ from spatial_replay.trace.time_points import duration_ns_from_text
 if TYPE_CHECKING:
     from spatial_replay.logs.output_file import Durability
     from spatial_replay.recording.changes import VerdictChange
-    from spatial_replay.runs.seen import FrameSource, KeepVideo
+    from spatial_replay.runs.record_video import FrameSource, KeepVideo
 
 
 def duration_ns(context: click.Context, parameter: click.Parameter, text: str | None) -> int | None:
@@ -128,9 +128,9 @@ def video(
       spatial-replay record video --camera 0 --tags tags.yaml --spec table.spatial -o run.mcap --for 60s
     """
     # imported here so that --help stays fast
-    from spatial_replay.perception.simultaneous import camera_names
+    from spatial_replay.perception.observer import camera_names
     from spatial_replay.perception.tags_file import load_tags
-    from spatial_replay.runs.seen import record_seen
+    from spatial_replay.runs.record_video import record_seen
 
     if bool(sources) == (camera is not None):
         raise UsageError("give either videos or a log, or --camera N")
@@ -182,8 +182,7 @@ def _opened(
     rate: float | None,
     length_ns: int | None,
 ) -> list[FrameSource]:
-    from spatial_replay.perception.camera_frames import CameraFrames
-    from spatial_replay.perception.image_topics import open_frames
+    from spatial_replay.perception.image_sources import CameraFrames, open_frames
 
     if camera is None:
         if len(sources) > 1 and topics:

@@ -94,7 +94,7 @@ def print_tags(family: str, ids: tuple[int, ...], size: float, paper: str, outpu
       spatial-replay tags print --family 25h9 --ids 0-34 --size 30mm --paper letter -o tags.pdf
     """
     # imported here so that --help stays fast
-    from spatial_replay.perception.tag_sheet import TagSheet
+    from spatial_replay.perception.calibration import TagSheet
 
     if output.suffix.lower() != ".pdf":
         raise UsageError(f"-o {output.name}: sheets are written as PDF; give a name that ends in .pdf")
@@ -141,9 +141,8 @@ def calibrate(
     """
     # imported here so that --help stays fast
     from spatial_replay.logs.output_file import refuse_inputs
-    from spatial_replay.perception.calibration import calibrate_camera, camera_text
-    from spatial_replay.perception.image_topics import open_frames
-    from spatial_replay.perception.tag_sheet import TagSheet
+    from spatial_replay.perception.calibration import TagSheet, calibrate_camera, camera_text
+    from spatial_replay.perception.image_sources import open_frames
     from spatial_replay.perception.tags_file import load_tags
 
     if output is not None:

@@ -1,18 +1,29 @@
-"""Calibration of a camera from frames of tags whose places on a sheet or a table are known."""
+"""Sheets of tags to print in true size, and the calibration of a camera from frames of known tags.
+
+This is the only module that knows fpdf2.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from types import MappingProxyType
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from spatial_replay.errors import LogError, UsageError
+from spatial_replay.errors import LogError, OutputError, UsageError, importing
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.perception.frame import Frame
-from spatial_replay.perception.opencv import Calibration, Camera, TagDetector, calibrate
+from spatial_replay.perception.opencv import Calibration, Camera, TagDetector, calibrate, tag_cells
 from spatial_replay.perception.tags_file import ReferenceTag
 from spatial_replay.text import counted
+
+# ------------------------------------------------------------------------------------------------ calibration
 
 _LEAST_TAGS: Final = 4
 _LEAST_VIEWS: Final = 6
@@ -138,3 +149,142 @@ def camera_text(camera: Camera) -> str:
     if camera.distortion:
         lines.append(f"  distortion: [{', '.join(f'{each:.6g}' for each in camera.distortion)}]")
     return "\n".join(lines) + "\n"
+
+
+# ----------------------------------------------------------------------------------------------------- sheets
+
+PAPERS: Final[Mapping[str, tuple[float, float]]] = MappingProxyType(
+    {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}
+)
+"""Width and height in millimetres."""
+
+MOST_TAGS: Final = 1000
+_MARGIN: Final = 12.0
+_FOOT: Final = 14.0
+"""Millimetres that are left free around a page, and above its lower margin for the ruler."""
+
+_CAPTION: Final = 5.0
+_RULER: Final = 100.0
+
+
+@dataclass(frozen=True, slots=True)
+class TagSheet:
+    """Tags side by side on pages, in rows from the top.
+
+    Attributes:
+        ids: in their order.
+        size: edge of the black squares in metres.
+        paper: one of `PAPERS`.
+
+    Raises:
+        UsageError: no tag or too many, a tag twice, a size that does not fit the paper.
+    """
+
+    family: str
+    ids: tuple[int, ...]
+    size: float
+    paper: str = "a4"
+
+    def __post_init__(self) -> None:
+        if not 0 < len(self.ids) <= MOST_TAGS:
+            raise UsageError(f"give 1 to {MOST_TAGS} tags; these are {len(self.ids)}")
+        twice = [number for number, count in Counter(self.ids).items() if count > 1]
+        if twice:
+            raise UsageError(f"tag {twice[0]} is given more than once; name each tag once")
+        if self.paper not in PAPERS:
+            raise UsageError(f"there is no paper {self.paper!r}; known are {', '.join(PAPERS)}")
+        if not (math.isfinite(self.size) and self.size > 0) or not self._columns or not self._rows:
+            raise UsageError(
+                f"tags of {self.size * 1e3:g} mm do not fit on {self.paper}; give a smaller --size, above 0"
+            )
+
+    @property
+    def per_page(self) -> int:
+        """How many tags a page holds."""
+        return self._columns * self._rows
+
+    def references(self) -> tuple[ReferenceTag, ...]:
+        """Return the tags of the first page at their places, in metres from its lower left corner, y up."""
+        _, height = PAPERS[self.paper]
+        return tuple(
+            ReferenceTag(number, self.size, x / 1e3, (height - y) / 1e3)
+            for number, (x, y) in zip(self.ids[: self.per_page], self._centres(), strict=False)
+        )
+
+    def write(self, output: Path) -> int:
+        """Write the sheets as PDF, and return the number of pages; equal sheets give equal bytes.
+
+        Raises:
+            UsageError: fpdf2 is not installed, or the family lacks a tag.
+            OutputError: the file cannot be written.
+        """
+        with importing("sheets of tags need fpdf2", extra="vision"):
+            from fpdf import FPDF
+        width, height = PAPERS[self.paper]
+        pdf = FPDF(unit="mm", format=(width, height))
+        pdf.set_auto_page_break(False)
+        pdf.set_creation_date(datetime(2000, 1, 1, tzinfo=UTC))
+        pdf.set_title(f"AprilTags {self.family}, {self._millimetres:g} mm")
+        pdf.set_font("helvetica", size=8)
+        pages = [self.ids[at : at + self.per_page] for at in range(0, len(self.ids), self.per_page)]
+        for page in pages:
+            pdf.add_page()
+            for number, (x, y) in zip(page, self._centres(), strict=False):
+                left, top, edge = x - self._millimetres / 2, y - self._millimetres / 2, self._millimetres
+                cells = tag_cells(self.family, number)
+                cell = edge / len(cells)
+                for row, values in enumerate(cells):
+                    for begin, end in _runs(values.tolist()):
+                        pdf.rect(left + begin * cell, top + row * cell, (end - begin) * cell, cell, "F")
+                caption = f"{self.family}   {number}   {edge:g} mm"
+                pdf.text(left, top + edge + edge / len(cells) + _CAPTION - 1.5, caption)
+            y = height - _MARGIN
+            pdf.line(_MARGIN, y, _MARGIN + _RULER, y)
+            for tick in range(11):
+                pdf.line(_MARGIN + 10 * tick, y, _MARGIN + 10 * tick, y - (4 if tick % 5 == 0 else 2))
+            pdf.text(_MARGIN + _RULER + 3, y, "100 mm: print at 100 %, and measure")
+        try:
+            output.write_bytes(bytes(pdf.output()))
+        except OSError as error:
+            raise OutputError(f"{output}: {(error.strerror or str(error)).lower()}") from None
+        return len(pages)
+
+    @property
+    def _millimetres(self) -> float:
+        return round(self.size * 1e3, 6)
+
+    @property
+    def _pitch(self) -> tuple[float, float]:
+        """From tag to tag: the black square, its white rim on both sides, and a caption below."""
+        side = self._millimetres * 1.4
+        return side, side + _CAPTION
+
+    @property
+    def _columns(self) -> int:
+        return int((PAPERS[self.paper][0] - 2 * _MARGIN) // self._pitch[0])
+
+    @property
+    def _rows(self) -> int:
+        return int((PAPERS[self.paper][1] - 2 * _MARGIN - _FOOT) // self._pitch[1])
+
+    def _centres(self) -> Sequence[tuple[float, float]]:
+        """Return the centres of the places of a page, in millimetres from its upper left corner."""
+        across, down = self._pitch
+        return [
+            (_MARGIN + (column + 0.5) * across, _MARGIN + row * down + across / 2)
+            for row in range(self._rows)
+            for column in range(self._columns)
+        ]
+
+
+def _runs(values: Sequence[int]) -> list[tuple[int, int]]:
+    """Return from where to where cells in a row are black."""
+    runs: list[tuple[int, int]] = []
+    for place, value in enumerate(values):
+        if value:
+            continue
+        if runs and runs[-1][1] == place:
+            runs[-1] = runs[-1][0], place + 1
+        else:
+            runs.append((place, place + 1))
+    return runs

@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.perception.camera_pose import rotations
+from spatial_replay.perception.opencv import rotations
 from spatial_replay.perception.plane import CameraPlane, HomographyPlane, Plane
 from spatial_replay.perception.tags_file import MountedTag
 

@@ -1,12 +1,13 @@
-"""Detection of tags, camera geometry and single images: the only module that knows OpenCV.
+"""Detection of tags, camera poses and geometry, and single images: the only module that knows OpenCV.
 
 Pixels are those of OpenCV: the centre of the first pixel of an image is (0, 0), y points down. Detectors of
-the AprilTag family count from that pixel's outer corner, half a pixel further; `corners_from_apriltag` brings
-theirs here.
+the AprilTag family count from that pixel's outer corner, half a pixel further; `corners_from_apriltag`
+converts these.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -18,8 +19,167 @@ from numpy.typing import NDArray
 
 from spatial_replay.errors import LogError, UsageError, importing
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.perception.corners import refined_corners
 from spatial_replay.perception.frame import LARGEST_PICTURE, Detection, Image, encoded_size
+
+# ----------------------------------------------------------------------------------------------- camera poses
+
+
+def pose_looking_at(eye: Floats, target: Floats, up: Floats) -> Floats:
+    """Return the pose (6,), rotation vector and translation from the plane's frame to that of a camera.
+
+    Args:
+        eye, target: (3,), where the camera is, and a point in the middle of its image.
+        up: (3,), what points up in the image.
+
+    Raises:
+        UsageError: the camera is at the target, or `up` is where it looks.
+    """
+    forward = target - eye
+    right = np.cross(forward, up)
+    if not np.linalg.norm(forward) > 0 or not np.linalg.norm(right) > 1e-9 * np.linalg.norm(forward):
+        raise UsageError(
+            "the camera's pose is not determined: give another look_at than its position, and an up that is"
+            " not where it looks, such as up: [0, 1, 0] for a camera that looks straight down"
+        )
+    forward, right = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return np.concatenate([rotation_vector(rotation), -rotation @ eye])
+
+
+def rotation_vector(rotation: Floats) -> Floats:
+    """Return the rotation vector (3,) of a rotation matrix (3, 3)."""
+    # through the quaternion, whose largest component is never small
+    xx, yy, zz = np.diag(rotation)
+    four = np.array([1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz])
+    index = int(four.argmax())
+    part = math.sqrt(max(four[index], 0.0)) / 2
+    antisymmetric = np.array(
+        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
+    )
+    symmetric = rotation + rotation.T
+    if index == 0:
+        w, vector = part, antisymmetric / (4 * part)
+    else:
+        axis = index - 1
+        w = antisymmetric[axis] / (4 * part)
+        vector = symmetric[axis] / (4 * part)
+        vector[axis] = part
+    if w < 0:
+        w, vector = -w, -vector
+    sine = float(np.linalg.norm(vector))
+    angle = 2 * math.atan2(sine, w)
+    turn: Floats = vector * (angle / sine if sine > 1e-12 else 2.0)
+    return turn
+
+
+def rotations(vectors: Floats) -> Floats:
+    """Return the rotation matrices (N, 3, 3) of rotation vectors (N, 3)."""
+    angle = np.linalg.norm(vectors, axis=1)
+    safe = np.where(angle > 1e-12, angle, 1.0)
+    x, y, z = (vectors / safe[:, None]).T
+    zero = np.zeros_like(x)
+    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
+    sine, versine = np.sin(angle)[:, None, None], (1 - np.cos(angle))[:, None, None]
+    matrices: Floats = np.eye(3) + sine * cross + versine * (cross @ cross)
+    return matrices
+
+
+# --------------------------------------------------------------------------- corners to a fraction of a pixel
+
+_ALONG: Final = 24
+"""Places along an edge at which its step is measured."""
+
+_MARGIN: Final = 0.1
+"""The share of an edge that is left out at each end, where the other edges are."""
+
+_APART: Final = 0.25
+"""Pixels between two places across an edge."""
+
+_CELLS: Final = 0.6
+"""How far the step is searched across an edge, in cells of the tag: further, there are other edges."""
+
+_WIDEST: Final = 3.0
+_SECOND: Final = 0.5
+"""How far at most, in pixels; and which share of it the second time, when the first has been close."""
+
+
+def refined_corners(grey: Image, corners: Floats, cells: int) -> Floats:
+    """Return corners closer to where they are; those of a tag whose edges are not found stay.
+
+    Args:
+        corners: (N, 4, 2) in pixels, in the order of a `Detection`, no more than two pixels off.
+        cells: along the edge of the black square.
+    """
+    if not len(corners):
+        return corners
+    for share in (1.0, _SECOND):
+        corners = _refined(grey, corners, cells, share)
+    return corners
+
+
+def _refined(grey: Image, corners: Floats, cells: int, share: float) -> Floats:
+    ahead = np.roll(corners, -1, axis=1) - corners
+    length = np.linalg.norm(ahead, axis=2)
+    along = ahead / length[..., None]
+    # image coordinates run down: this is out of a tag whose corners are in our order
+    outward = np.stack([-along[..., 1], along[..., 0]], axis=-1)
+    reach = np.minimum(_CELLS * length.min(axis=1) / cells, _WIDEST) * share
+    shares = np.linspace(_MARGIN, 1 - _MARGIN, _ALONG)
+    on_edge = corners[:, :, None] + shares[:, None] * ahead[:, :, None]
+    steps = np.arange(-round(_WIDEST / _APART), round(_WIDEST / _APART) + 1) * _APART
+    # one pixel further on each side, for differences
+    wide = np.arange(steps[0] - 1.0, steps[-1] + 1.0 + _APART / 2, _APART)
+    points = on_edge[..., None, :] + wide[:, None] * outward[:, :, None, None]
+    values = _bilinear(grey, points)
+    two = round(2.0 / _APART)
+    rise = values[..., two:] - values[..., :-two]
+    weight = np.where(np.abs(steps) <= reach[:, None, None, None], np.square(np.maximum(rise, 0.0)), 0.0)
+    total = weight.sum(axis=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        at = (weight * steps).sum(axis=-1) / total
+    total = np.where(np.isfinite(at), total, 0.0)
+    # the line through the steps of each edge: offset = a + b * share, with little weight on faint ones
+    found = np.minimum(total, np.median(total, axis=-1, keepdims=True))
+    sums = [(found * shares**power).sum(axis=-1) for power in range(3)]
+    at = np.nan_to_num(at)
+    moments = [(found * at * shares**power).sum(axis=-1) for power in range(2)]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        slope = (sums[0] * moments[1] - sums[1] * moments[0]) / (sums[0] * sums[2] - sums[1] ** 2)
+        begin = (moments[0] - slope * sums[1]) / sums[0]
+    start = corners + begin[..., None] * outward
+    direction = ahead + slope[..., None] * outward
+    met = _meeting(np.roll(start, 1, axis=1), np.roll(direction, 1, axis=1), start, direction)
+    is_sound = np.isfinite(met).all(axis=(1, 2)) & (
+        np.linalg.norm(met - corners, axis=2).max(axis=1) <= 2 * reach + 1.0
+    )
+    return np.where(is_sound[:, None, None], met, corners)
+
+
+def _bilinear(grey: Image, points: Floats) -> Floats:
+    """Return the values of an image between its pixels; beyond its border, those at the border."""
+    height, width = grey.shape
+    x = np.clip(points[..., 0], 0, width - 1.001)
+    y = np.clip(points[..., 1], 0, height - 1.001)
+    column, row = x.astype(np.int64), y.astype(np.int64)
+    u, v = x - column, y - row
+    flat, at = grey.ravel(), row * width + column
+    above = (1 - u) * flat[at] + u * flat[at + 1]
+    below = (1 - u) * flat[at + width] + u * flat[at + width + 1]
+    values: Floats = (1 - v) * above + v * below
+    return values
+
+
+def _meeting(first: Floats, along: Floats, second: Floats, across: Floats) -> Floats:
+    """Return where lines (…, 2) meet, each given by a point and a direction."""
+    cross = along[..., 0] * across[..., 1] - along[..., 1] * across[..., 0]
+    between = second - first
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = (between[..., 0] * across[..., 1] - between[..., 1] * across[..., 0]) / cross
+    met: Floats = first + share[..., None] * along
+    return met
+
+
+# ----------------------------------------------------------------------------------------------------- OpenCV
 
 _Number = TypeVar("_Number", np.uint8, np.float64)
 

@@ -16,8 +16,7 @@ import numpy as np
 
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.perception.camera_pose import rotations
-from spatial_replay.perception.opencv import Camera, fit_homography, fit_pose, projection
+from spatial_replay.perception.opencv import Camera, fit_homography, fit_pose, projection, rotations
 from spatial_replay.perception.tags_file import ReferenceTag, TagsFile
 
 LEAST_CORNER_ERROR: Final = 0.1

@@ -20,8 +20,7 @@ from spatial_replay.geometry.arrays import Floats
 from spatial_replay.geometry.footprint import Footprint
 from spatial_replay.logs.remote import log_file
 from spatial_replay.mapping.yaml_document import Document, Place, checked_document, read_yaml_text
-from spatial_replay.perception.camera_pose import pose_looking_at
-from spatial_replay.perception.opencv import FAMILY_SIZES, Camera
+from spatial_replay.perception.opencv import FAMILY_SIZES, Camera, pose_looking_at
 from spatial_replay.trace.time_points import duration_ns_from_text
 
 SCHEMA_FILE: Final = "tags.schema.json"

@@ -14,7 +14,7 @@ from spatial_replay.logs.remote import LogFile
 from spatial_replay.logs.source import Source
 from spatial_replay.logs.topics import CAMERA_VIDEO, is_image_type
 from spatial_replay.perception.frame import Image
-from spatial_replay.perception.image_topics import ImageTopic
+from spatial_replay.perception.image_sources import ImageTopic
 from spatial_replay.perception.opencv import encode_jpeg
 
 MOST_PICTURES: Final = 60

@@ -34,9 +34,9 @@ from spatial_replay.planning.planner import Planner
 from spatial_replay.planning.settings import Settings, Skill, changed_settings
 from spatial_replay.planning.workspace import Grid, Workspace
 from spatial_replay.recording.plan_loop import run_plan
-from spatial_replay.runs.filmed import open_film
 from spatial_replay.runs.run_log import RunLog, run_log
 from spatial_replay.runs.scripted import about_run, refuse_unknown_names
+from spatial_replay.runs.virtual_camera import open_film
 from spatial_replay.sanity import refuse_unsatisfiable
 from spatial_replay.simulation.tabletop import SAMPLES_PER_S
 from spatial_replay.simulation.world import Injection, Start, TreeTick, World

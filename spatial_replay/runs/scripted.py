@@ -10,8 +10,8 @@ from pathlib import Path
 
 from spatial_replay.errors import SpecificationError, UsageError
 from spatial_replay.logs.output_file import Durability
-from spatial_replay.runs.filmed import Film, open_film
 from spatial_replay.runs.run_log import RunLog, run_log
+from spatial_replay.runs.virtual_camera import Film, open_film
 from spatial_replay.simulation.tabletop import Tabletop
 from spatial_replay.simulation.world import Execution, Injection, Start
 from spatial_replay.simulation.worlds import default_specification, make_world

@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from spatial_replay.perception import Frame, TagsFile, parse_tags
-from spatial_replay.perception.camera_pose import pose_looking_at
-from spatial_replay.perception.opencv import Camera
-from spatial_replay.perception.rendering import Flaws, Plate, render
+from spatial_replay.perception.opencv import Camera, pose_looking_at
 from spatial_replay.perception.video import VideoWriter
+from spatial_replay.runs.virtual_camera import Flaws, Plate, render
 
 PERIOD_NS = 40_000_000
 CAMERA = "camera: {size: [480, 360], focal: [640, 640]}"

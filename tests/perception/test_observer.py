@@ -21,9 +21,14 @@ from perception.filmed import (
 )
 from spatial_replay import TrackedObject, UsageError
 from spatial_replay.perception import Frame, TagObserver, observe_frames, parse_tags
-from spatial_replay.perception.camera_pose import pose_looking_at, rotations
-from spatial_replay.perception.opencv import Camera, TagDetector, corners_from_apriltag
-from spatial_replay.perception.rendering import Flaws, Plate, render
+from spatial_replay.perception.opencv import (
+    Camera,
+    TagDetector,
+    corners_from_apriltag,
+    pose_looking_at,
+    rotations,
+)
+from spatial_replay.runs.virtual_camera import Flaws, Plate, render
 
 pytest.importorskip("cv2")
 

@@ -447,7 +447,7 @@ def test_a_camera_that_is_unplugged_leaves_a_whole_log(folder: Path) -> None:
     cv2 = pytest.importorskip("cv2")
 
     from spatial_replay.perception import CameraFrames, parse_tags
-    from spatial_replay.runs.seen import record_seen
+    from spatial_replay.runs.record_video import record_seen
 
     # for OpenCV, an unplugged camera is a capture that ends: here of a pipe whose other end stops in a frame
     _write_streamed(folder / "table.mp4", folder / "plugged.ts")

@@ -25,7 +25,7 @@ from perception.filmed import (
 from spatial_replay import UsageError, read_trace
 from spatial_replay.cli import run
 from spatial_replay.perception import Frame, TagObserver, observe_cameras, parse_tags
-from spatial_replay.perception.simultaneous import simultaneous
+from spatial_replay.perception.observer import simultaneous
 from spatial_replay.perception.video import VideoWriter
 
 for each in ("av", "cv2"):

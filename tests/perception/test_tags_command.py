@@ -12,11 +12,10 @@ import pytest
 from perception.filmed import TABLE, plate
 from spatial_replay.cli import run
 from spatial_replay.perception import Frame, parse_tags
-from spatial_replay.perception.camera_pose import pose_looking_at
-from spatial_replay.perception.opencv import Camera, TagDetector
-from spatial_replay.perception.rendering import render
-from spatial_replay.perception.tag_sheet import TagSheet
+from spatial_replay.perception.calibration import TagSheet
+from spatial_replay.perception.opencv import Camera, TagDetector, pose_looking_at
 from spatial_replay.perception.video import VideoWriter
+from spatial_replay.runs.virtual_camera import render
 
 for each in ("av", "cv2", "fpdf"):
     pytest.importorskip(each)

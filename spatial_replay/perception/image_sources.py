@@ -1,8 +1,9 @@
-"""Topics of MCAP files and ROS bags with images, or with the tags in them, as frames of their own stamps."""
+"""Frames of cameras, and of topics with images or tags in MCAP files and ROS bags."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from os import PathLike
 from types import MappingProxyType
@@ -18,10 +19,15 @@ from spatial_replay.logs.downloads import local_copy
 from spatial_replay.logs.remote import LogFile, log_file
 from spatial_replay.logs.topics import is_image_type
 from spatial_replay.mapping.message_types import short_type
-from spatial_replay.perception.decoder import H264Decoder, Shown, Untrue, has_key
 from spatial_replay.perception.frame import LARGEST_PICTURE, NO_IMAGE, Detection, Frame, Image
-from spatial_replay.perception.opencv import FAMILIES, convert, corners_from_apriltag, decode_image
-from spatial_replay.perception.video import VideoFile
+from spatial_replay.perception.opencv import (
+    FAMILIES,
+    convert,
+    corners_from_apriltag,
+    decode_image,
+    open_camera,
+)
+from spatial_replay.perception.video import H264Decoder, Shown, Untrue, VideoFile, has_key
 from spatial_replay.text import nearest_hint, time_text
 
 _CHANNELS: Final[Mapping[str, tuple[int, tuple[int, ...]]]] = MappingProxyType(
@@ -310,3 +316,54 @@ def open_frames(
     if topic is not None:
         raise UsageError(f"{path.name} is not a log of messages; leave out --topic")
     return VideoFile(local_copy(path), rate=rate)
+
+
+# ---------------------------------------------------------------------------------------------------- cameras
+
+
+class CameraFrames:
+    """Frames of a camera until it is unplugged; times count from the first one. A process for one run.
+
+    Attributes:
+        name: such as "camera 0".
+        channel: None, since it is no topic.
+        faults: what was lost so far.
+    """
+
+    channel = None
+    copy_fault = "a camera's frames are not compressed"
+
+    def __init__(
+        self, number: int, *, length_ns: int | None = None, opened: Callable[[int], Any] = open_camera
+    ) -> None:
+        """Open the camera.
+
+        Args:
+            length_ns: end after so much time.
+            opened: opens it; what it returns has `read` and `release`, as OpenCV's captures.
+
+        Raises:
+            UsageError: there is no such camera; OpenCV is not installed.
+        """
+        self.name = f"camera {number}"
+        self.faults: list[str] = []
+        self._capture, self._length_ns = opened(number), length_ns
+
+    def __iter__(self) -> Iterator[Frame]:
+        first, last_ns = None, -1
+        try:
+            while self._length_ns is None or last_ns < self._length_ns:
+                is_there, image = self._capture.read()
+                if not is_there:
+                    if first is None:
+                        raise LogError(f"{self.name} gives no picture; another program may be using it")
+                    self.faults.append(
+                        f"{self.name} gives no more pictures after {last_ns / 1e9:.3f} s; is it unplugged?"
+                    )
+                    return
+                now = time.monotonic_ns()
+                first = now if first is None else first
+                last_ns = max(now - first, last_ns + 1)
+                yield Frame(last_ns, image)
+        finally:
+            self._capture.release()
