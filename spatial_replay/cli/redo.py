@@ -20,7 +20,7 @@ from spatial_replay.text import counted, counted_from, time_text
 if TYPE_CHECKING:
     from spatial_replay.logs.schemas.PlanDecision_pb2 import PlanCandidate, PlanDecision
     from spatial_replay.logs.source import Source
-    from spatial_replay.planning.redo import Redone
+    from spatial_replay.planning.read import Replanned
 
 
 def redo(
@@ -35,7 +35,7 @@ def redo(
 ) -> int:
     """Decide again on the samples of a log, and show the first decision that differs."""
     # imported here so that --help stays fast
-    from spatial_replay.planning.redo import RedoneSource, redo_decisions
+    from spatial_replay.planning.read import ReplannedSource, redo_decisions
     from spatial_replay.replay import ReplayOptions, known_start_ns, load_files, run_replay
     from spatial_replay.sources.open_log import open_source
 
@@ -49,7 +49,7 @@ def redo(
     warn(*counted_from(redone.faults, known_start_ns(source) if redone.faults else 0))
     if output is not None:
         files = load_files((), source) if file is None else [file]
-        beside = RedoneSource(source, redone.messages)
+        beside = ReplannedSource(source, redone.messages)
         run_replay(beside, files, ReplayOptions(), output=output, inputs=local_files([log, *named]))
     if as_json:
         show_json(_document(redone))
@@ -68,7 +68,7 @@ def _recorded(source: Source) -> Any:
     return planner_of(source).specification
 
 
-def _document(redone: Redone) -> dict[str, Any]:
+def _document(redone: Replanned) -> dict[str, Any]:
     sides = {
         side: None if step is None else decision_rows([step.message])[0]
         for side, step in (("recorded", redone.recorded), ("redone", redone.redone))
@@ -85,7 +85,7 @@ def _document(redone: Redone) -> dict[str, Any]:
     }
 
 
-def _lines(redone: Redone) -> Iterator[str]:
+def _lines(redone: Replanned) -> Iterator[str]:
     yield f"{redone.name}: {counted(redone.decisions, 'decision')}, redone with {_changes(redone)}"
     if redone.same:
         yield f"{_first(redone.same, redone.decisions)} the same, byte for byte, with all maps"
@@ -109,7 +109,7 @@ def _lines(redone: Redone) -> Iterator[str]:
         yield f"            at {time_text(new.lost.time_ns)}: {new.lost.text}"
 
 
-def _changes(redone: Redone) -> str:
+def _changes(redone: Replanned) -> str:
     return ", ".join(redone.changes) if redone.changes else "nothing changed"
 
 
@@ -119,7 +119,7 @@ def _first(count: int, of: int) -> str:
     return f"the first {counted(count, 'decision')} are" if count > 1 else "the first decision is"
 
 
-def _maps_side_by_side(redone: Redone, column: int) -> Iterator[str]:
+def _maps_side_by_side(redone: Replanned, column: int) -> Iterator[str]:
     """Yield what the maps of the last edges say, of each object in two columns.
 
     Args:

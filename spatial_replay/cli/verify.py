@@ -72,7 +72,7 @@ def verify(
     # imported here so that --help stays fast
     from spatial_replay.logs.output_file import replacing
     from spatial_replay.logs.read_options import ReadOptions
-    from spatial_replay.planning.recompute import recompute_decisions
+    from spatial_replay.planning.read import recompute_decisions
     from spatial_replay.replay import known_start_ns
     from spatial_replay.replay.signatures import sign_certificate, signer_of
     from spatial_replay.replay.verification import recorded_reading, verify_certificate

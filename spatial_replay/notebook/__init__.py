@@ -26,7 +26,6 @@ _VIEWS: Mapping[str, str] = MappingProxyType(
         "spatial_replay.planning.decisions": "planning_view",
         "spatial_replay.planning.maps": "planning_view",
         "spatial_replay.planning.read": "planning_view",
-        "spatial_replay.planning.redo": "planning_view",
         "spatial_replay.sanity.examine": "examination_view",
         "spatial_replay.spec.formula": "specification_view",
         "spatial_replay.trace.trace": "trace_view",

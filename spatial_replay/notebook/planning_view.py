@@ -26,8 +26,7 @@ from spatial_replay.notebook.figures import (
 )
 from spatial_replay.planning.decisions import Candidate, Consideration, Step
 from spatial_replay.planning.maps import FREE, REASONS, GradientMap
-from spatial_replay.planning.read import LoggedStep
-from spatial_replay.planning.redo import Redone
+from spatial_replay.planning.read import LoggedStep, Replanned
 from spatial_replay.text import counted
 from spatial_replay.trace.sample import Sample
 
@@ -299,8 +298,8 @@ def logged_step_html(logged: LoggedStep) -> Html:
     return element("div", *parts)
 
 
-@html.register(Redone)
-def redone_html(redone: Redone) -> Html:
+@html.register(Replanned)
+def redone_html(redone: Replanned) -> Html:
     """Return what was changed, how many decisions are the same, and the first that differs, as both are."""
     changes = ", ".join(redone.changes) or "nothing changed"
     lines = [

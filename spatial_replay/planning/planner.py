@@ -14,7 +14,6 @@ from spatial_replay.automata.ltlf import bounds_in_samples, counts_seconds
 from spatial_replay.errors import TraceError, UsageError
 from spatial_replay.geometry.footprint import TrackedObject
 from spatial_replay.geometry.poses import centre_of, moved_object
-from spatial_replay.planning.candidates import Movables, with_choice
 from spatial_replay.planning.decisions import (
     Consideration,
     Edge,
@@ -38,10 +37,10 @@ from spatial_replay.planning.edges import (
     why_no_path,
     worst_state,
 )
-from spatial_replay.planning.foresight import Foresight
+from spatial_replay.planning.lookahead import Lookahead
 from spatial_replay.planning.maps import refuse_delays, refuse_unknown
-from spatial_replay.planning.settings import Settings
-from spatial_replay.planning.workspace import Workspace, kind_faults, refuse_faults
+from spatial_replay.planning.motions import Movables, with_choice
+from spatial_replay.planning.settings import Settings, Workspace, kind_faults, refuse_faults
 from spatial_replay.spec.formula import Specification
 from spatial_replay.text import counted, times_apart
 from spatial_replay.trace.sample import Sample
@@ -317,9 +316,9 @@ class Planner:
     def _movables(self, attempts: Attempts) -> Movables:
         return Movables(self._formulas, self._regions, self._newest(), self.settings, attempts)
 
-    def _foresight(self, attempts: Attempts) -> Foresight | None:
+    def _foresight(self, attempts: Attempts) -> Lookahead | None:
         about = self.automaton, self._formulas, self._regions, self.settings
-        return Foresight(*about, attempts) if self.settings.motions > 1 else None
+        return Lookahead(*about, attempts) if self.settings.motions > 1 else None
 
     def _may_repeat(self, edge: Edge) -> bool:
         exhausted = self._attempts.why_exhausted(edge, self.settings.attempts)
@@ -330,7 +329,7 @@ class Planner:
         consideration: Consideration,
         path: tuple[Transition, ...],
         movables: Movables,
-        foresight: Foresight | None,
+        foresight: Lookahead | None,
     ) -> Consideration:
         """Return an edge with its candidates, or pruned."""
         exhausted = self._attempts.why_exhausted(consideration.edge, self.settings.attempts)

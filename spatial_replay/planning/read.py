@@ -1,37 +1,53 @@
-"""Decisions in logs: read as messages, or repeated from the samples as values."""
+"""Decisions in logs: read as messages, repeated from the samples and compared, or with other settings."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from itertools import groupby
 from os import PathLike
-from typing import Final, NamedTuple, get_args
+from types import MappingProxyType
+from typing import Any, Final, NamedTuple, get_args
 
-from spatial_replay.errors import LogError, UsageError
+import numpy as np
+
+from spatial_replay.errors import LogError, SpatialReplayError, UsageError
 from spatial_replay.lazy import Displayed
 from spatial_replay.logs.mcap.reader import McapSource
-from spatial_replay.logs.messages import Block, Messages
+from spatial_replay.logs.messages import Block, Messages, merge, select
 from spatial_replay.logs.schemas.PlanDecision_pb2 import PlanDecision
-from spatial_replay.logs.source import Source, read_blocks
+from spatial_replay.logs.source import Source, SourceOf, read_blocks
 from spatial_replay.logs.topics import (
+    ENDING,
     GRADIENT_MAP,
+    METADATA,
     PLAN_DECISION,
     PLAN_METADATA,
     PLAN_PATH,
     RECORDED_PREFIX,
+    REDONE_DECISION,
+    REDONE_MAP,
+    REDONE_PATH,
 )
 from spatial_replay.planning.decision_log import (
     PLAN_VERSION,
     BlackBox,
     decision_from_payload,
+    explained_decision,
     latest_decisions,
+    maps_of,
 )
 from spatial_replay.planning.decisions import Outcome, Stage, Step
 from spatial_replay.planning.planner import Planner
-from spatial_replay.planning.settings import settings_from_text
+from spatial_replay.planning.settings import changed_settings, changes_text, settings_from_text
 from spatial_replay.sources.open_log import open_source
 from spatial_replay.spec import parse_specification
+from spatial_replay.spec.format import format_specification
+from spatial_replay.spec.formula import Specification
+from spatial_replay.text import counted
 from spatial_replay.trace.sample import Sample
+from spatial_replay.trace.trace import window_of
 
 PLANNER_TOPICS: Final = (PLAN_DECISION, GRADIENT_MAP, PLAN_PATH)
 
@@ -297,3 +313,436 @@ def _outcome(decision: PlanDecision) -> Outcome:
     if at and stage is None:
         raise LogError(f"the outcome of decision {decision.number} is at {at!r:.40}, not pick, way or place")
     return Outcome(decision.outcome.succeeded, decision.outcome.reason, stage)
+
+
+# ----------------------------------------------------------------------------------------------- verification
+
+
+@dataclass(frozen=True, slots=True)
+class Recomputed:
+    """The result of recomputing the decisions of a log.
+
+    Attributes:
+        decisions: how many decisions were recomputed.
+        maps: how many gradient maps were recomputed, one for each orientation of an object.
+        differences: what differs from the log, each with its place.
+        faults: the parts of the log that could not be read.
+    """
+
+    decisions: int
+    maps: int
+    differences: tuple[str, ...]
+    faults: tuple[str, ...] = ()
+
+
+def recompute_decisions(source: Source, advance: Callable[[int], None] = lambda samples: None) -> Recomputed:
+    """Recompute every decision of a planned run from its samples alone, and compare all messages' bytes.
+
+    Outcomes come from the controller, so they are taken from the log. A complete log with no decision, or
+    with none after a motion, differs too.
+
+    Args:
+        advance: called with the number of samples after each block.
+
+    Raises:
+        UsageError: the log holds no plan, or begins within the run.
+        LogError: the settings or the specification of the plan cannot be read.
+    """
+    extent, comparison = _run_extent(source), _Comparison(rerun_of(source))
+    faults: list[str] = []
+    samples = 0
+
+    def iter_blocks() -> Iterator[Block]:
+        for block in read_blocks(source):
+            faults.extend(block.trace.faults)
+            yield block
+            advance(len(block.trace))
+
+    for sample, messages in iter_moments(iter_blocks()):
+        if sample is not None:
+            comparison.rerun.box.observe(sample)
+            samples += 1
+        comparison.compare(messages)
+    # a log of which parts are missing has other differences than that it is incomplete
+    if not faults and extent.is_part(samples) and (extent.is_cut or comparison.began_within):
+        raise UsageError(
+            f"{source.name} begins within the run, and decisions depend on all samples before; verify the "
+            "log that it was made from, or name that one: --source SOURCE"
+        )
+    if not faults and extent.is_whole(samples):
+        comparison.compare_end()
+    return Recomputed(comparison.decisions, comparison.maps, tuple(comparison.differences), tuple(faults))
+
+
+class _Comparison:
+    """The recorded and the recomputed messages of one run.
+
+    Attributes:
+        rerun: the run that is repeated.
+        began_within: whether the log lacks the first decisions.
+        decisions, maps: how many were recomputed.
+        differences: between the messages; after the first ones, nothing more is compared.
+    """
+
+    def __init__(self, rerun: Rerun) -> None:
+        self.rerun = rerun
+        self.began_within = False
+        self.decisions = self.maps = 0
+        self.differences: list[str] = []
+
+    def compare(self, recorded: list[PlannerMessage]) -> None:
+        """Compare the messages that follow the newest sample."""
+        # they all have its time, unless the log has lost samples
+        for time_ns, messages in groupby(recorded, key=lambda each: each.time_ns):
+            self._compare_at(time_ns, list(messages))
+
+    def _compare_at(self, time_ns: int, recorded: list[PlannerMessage]) -> None:
+        # a planner that took another decision is in another state, so all later messages would differ
+        if self.differences:
+            return
+        is_first = self.rerun.last is None
+        self.began_within |= is_first and not any(each.topic == PLAN_DECISION for each in recorded)
+        recomputed: list[PlannerMessage] = []
+        for message in recorded:
+            if message.topic == PLAN_DECISION:
+                try:
+                    recomputed += self._recomputed(decision_from_payload(message.payload))
+                except SpatialReplayError as error:
+                    self.differences.append(f"at {_seconds(time_ns)}: {error}")
+                    return
+        for topic in PLANNER_TOPICS:
+            old, new = ([m.payload for m in each if m.topic == topic] for each in (recorded, recomputed))
+            self.differences += (f"at {_seconds(time_ns)}: {what}" for what in _differences(topic, old, new))
+
+    def _recomputed(self, recorded: PlanDecision) -> Iterator[PlannerMessage]:
+        has_outcome = recorded.HasField("outcome")
+        self.began_within |= self.rerun.last is None and bool(has_outcome or recorded.number)
+        messages = self.rerun.repeat(recorded)
+        if not has_outcome and self.rerun.last is not None:
+            self.decisions += 1
+            self.maps += len(maps_of(self.rerun.last))
+        return iter(()) if messages is None else planner_messages(messages)
+
+    def compare_end(self) -> None:
+        """Add what a log lacks that goes on to the end of its run."""
+        if not self.differences and (missing := self._missing()):
+            self.differences.append(missing)
+
+    def _missing(self) -> str:
+        last = self.rerun.last
+        if last is None:
+            return "the log has no decision, and a planned run has at least one"
+        which = f"decision {last.number} at {_seconds(last.time_ns)}"
+        if self.rerun.is_moving:
+            return f"the log has no outcome of {which}"
+        if not _can_end_run(last, self.rerun.box.planner):
+            return f"the log has no decision after {which}, which did not end the run"
+        return ""
+
+
+def _can_end_run(step: Step, planner: Planner) -> bool:
+    """Return whether a decision can be the last one of a complete run."""
+    if step.kind == "hold":
+        return planner.is_accepting or planner.is_doubtful
+    return step.kind == "no path" or (step.kind == "wait" and planner.next_step() is step)
+
+
+def _differences(topic: str, recorded: list[bytes], recomputed: list[bytes]) -> Iterator[str]:
+    if len(recorded) != len(recomputed):
+        yield f"{counted(len(recorded), 'message')} on {topic}, {len(recomputed)} recomputed"
+    for old, new in zip(recorded, recomputed, strict=False):
+        if old != new:
+            yield f"{topic} differs{_differing_fields(old, new) if topic == PLAN_DECISION else ''}"
+
+
+def _differing_fields(recorded: bytes, recomputed: bytes) -> str:
+    one, other = map(decision_from_payload, (recorded, recomputed))
+    names = (field.name for field in PlanDecision.DESCRIPTOR.fields)
+    fields = [name for name in names if getattr(one, name) != getattr(other, name)]
+    return f" in {', '.join(fields)} of decision {one.number}" if fields else ""
+
+
+def _seconds(time_ns: int) -> str:
+    return f"{time_ns / 1e9:.3f} s"
+
+
+class _RunExtent(NamedTuple):
+    """How much of a run a log has, by its metadata.
+
+    Attributes:
+        samples: of the run; None if it did not come to its end.
+        was_interrupted: whether the run was ended from outside.
+        is_copy: whether a replay wrote the log.
+        is_cut: whether that replay began after the source's first sample.
+    """
+
+    samples: int | None
+    was_interrupted: bool
+    is_copy: bool
+    is_cut: bool
+
+    def is_whole(self, samples: int) -> bool:
+        """Return whether a log of so many samples goes on to the regular end of the run."""
+        return samples == self.samples and not self.was_interrupted
+
+    def is_part(self, samples: int) -> bool:
+        """Return whether a log of so many samples may lack some of the run."""
+        return self.is_copy if self.samples is None else samples < self.samples
+
+
+def _run_extent(source: Source) -> _RunExtent:
+    metadata = dict(source.metadata())
+    ending, about = metadata.get(ENDING, {}), metadata.get(METADATA, {})
+    is_copy = about.get("written_by") == "replay"
+    options = _value(about, "options", {}) if is_copy else {}
+    samples = _value(ending, "samples", None)
+    if not isinstance(options, dict) or not isinstance(samples, int | None):
+        raise LogError(f"the metadata of {source.name} has {samples!r} samples and options {options!r}")
+    was_interrupted = _value(ending, "interrupted", False) is not False
+    return _RunExtent(samples, was_interrupted, is_copy, "start_ns" in options)
+
+
+def _value(texts: Mapping[str, str], key: str, default: object) -> object:
+    try:
+        return json.loads(texts[key]) if key in texts else default
+    except ValueError as error:
+        raise LogError(f"{key!r} in the log's metadata cannot be read: {error}") from error
+
+
+# --------------------------------------------------------------------------------------------- other settings
+
+_REDONE: Final = MappingProxyType(
+    {PLAN_DECISION: REDONE_DECISION, GRADIENT_MAP: REDONE_MAP, PLAN_PATH: REDONE_PATH}
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReplannedStep:
+    """A decision as value and as message, which says what its maps are made of and has no outcome."""
+
+    step: Step
+    message: PlanDecision
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Replanned(Displayed):
+    """What a planner would have decided on the samples of a log.
+
+    After the first decision by which something else is done, the recorded samples say nothing more: they are
+    what followed on the recorded one.
+
+    Attributes:
+        name: of the log.
+        changes: what was changed, each as a sentence; empty if nothing was.
+        decisions: how many the log has.
+        same: how many, from the first on, are the same byte for byte, with all their maps.
+        alike: how many in all, from the first on, do the same.
+        sample: of the first decision that differs; None if all do the same.
+        recorded, redone: that decision; `recorded` is None where the log has none at that sample.
+        messages: of what was redone, the decision that differs included.
+        faults: the parts of the log that could not be read.
+    """
+
+    name: str
+    changes: tuple[str, ...]
+    decisions: int
+    same: int
+    alike: int
+    sample: Sample | None = field(repr=False)
+    recorded: ReplannedStep | None = field(repr=False)
+    redone: ReplannedStep | None = field(repr=False)
+    messages: Messages = field(repr=False)
+    faults: tuple[str, ...] = ()
+
+    @property
+    def is_different(self) -> bool:
+        """Whether something else would have been done."""
+        return self.redone is not None
+
+
+def redo_decisions(
+    source: Source,
+    specification: Specification | None = None,
+    changes: Mapping[str, Any] = MappingProxyType({}),
+    *,
+    name: str | None = None,
+    advance: Callable[[int], None] = lambda samples: None,
+) -> Replanned:
+    """Decide again on the samples of a planned run, with another specification or other settings.
+
+    As long as the same is done, outcomes are those of the log. While both planners wait, the new one is asked
+    at every sample, as `plan` does.
+
+    Args:
+        specification: to plan for instead of the recorded one.
+        changes: to the recorded settings, by the keys of settings files.
+        name: the spec to plan for, if there are several.
+        advance: called with the number of samples after each block.
+
+    Raises:
+        UsageError: the log holds no plan; settings that do not go together; a specification that cannot be
+            planned for.
+        LogError: the settings or the specification of the plan cannot be read, or the recorded decisions do
+            not follow from the samples.
+    """
+    old = planner_of(source)
+    settings = changed_settings(old.settings, changes)
+    if name is None and specification is None:
+        name = old.automaton.name
+    planner = Planner(
+        old.specification if specification is None else specification,
+        settings,
+        name=name,
+        rate_hz=old.rate_hz,
+    )
+    changed = (*_specification_changes(old, planner), *changes_text(old.settings, settings))
+    faults: list[str] = []
+
+    def iter_blocks() -> Iterator[Block]:
+        for block in read_blocks(source):
+            faults.extend(block.trace.faults)
+            yield block
+            advance(len(block.trace))
+
+    redoing = _Redoing(source, planner, changed)
+    for sample, messages in iter_moments(iter_blocks()):
+        redoing.take(sample, messages)
+    return redoing.redone(tuple(faults))
+
+
+def _specification_changes(old: Planner, new: Planner) -> Iterator[str]:
+    texts = [format_specification(each.specification) for each in (old, new)]
+    names = [f"{each.specification.filename}, {each.automaton.name}" for each in (old, new)]
+    if texts[0] != texts[1] or old.automaton.name != new.automaton.name:
+        yield f"specification {names[0]} -> {names[1]}"
+
+
+class _Redoing:
+    """A run whose decisions are repeated as recorded, and redone beside."""
+
+    def __init__(self, source: Source, planner: Planner, changes: tuple[str, ...]) -> None:
+        self._source, self._changes = source, changes
+        self._old = rerun_of(source)
+        self._new = Rerun(planner, self._old.box.version)
+        self._decisions = self._same = self._alike = 0
+        self._sample: Sample | None = None
+        self._recorded: ReplannedStep | None = None
+        self._redone: ReplannedStep | None = None
+        self._messages: list[Messages] = []
+
+    def take(self, sample: Sample | None, recorded: list[PlannerMessage]) -> None:
+        """Take a sample and the recorded messages that follow it."""
+        decisions = [decision_from_payload(each.payload) for each in recorded if each.topic == PLAN_DECISION]
+        made = [each for each in decisions if not each.HasField("outcome")]
+        self._decisions += len(made)
+        if self._redone is not None or sample is None:
+            return
+        self._old.box.observe(sample)
+        self._new.box.observe(sample)
+        waiting = self._new.last is not None and self._new.last.kind == "wait"
+        if self._changes and waiting and not made:
+            # what it decides now comes before anything in the log
+            step, messages = self._new.box.decide()
+            if step is not self._new.last:
+                self._differ(sample, None, step, messages)
+            return
+        for decision in decisions:
+            if not self._repeat(sample, decision, recorded):
+                return
+
+    def _repeat(self, sample: Sample, decision: PlanDecision, recorded: list[PlannerMessage]) -> bool:
+        """Repeat a decision or its outcome; return whether the same was done."""
+        before = self._new.last
+        self._old.repeat(decision)
+        messages = self._new.repeat(decision)
+        if messages is None or decision.HasField("outcome"):
+            if messages is not None:
+                self._messages.append(_on_redone_topics(messages))
+            return True
+        old, new = self._old.last, self._new.last
+        if old is None or new is None:
+            return True
+        refuse_other(self._source, old, decision)
+        if new is before or not _does_the_same(old, new):
+            first = min(
+                (m.number for e in decision.considered for c in e.candidates for m in c.maps), default=0
+            )
+            explained = explained_decision(old, self._old.box.planner, first)
+            self._differ(sample, ReplannedStep(old, explained), new, messages)
+            return False
+        self._messages.append(_on_redone_topics(messages))
+        if self._same == self._alike and _has_all(recorded, messages):
+            self._same += 1
+        self._alike += 1
+        return True
+
+    def _differ(self, sample: Sample, recorded: ReplannedStep | None, step: Step, messages: Messages) -> None:
+        self._sample, self._recorded = sample, recorded
+        self._redone = ReplannedStep(step, explained_decision(step, self._new.box.planner))
+        self._messages.append(_on_redone_topics(messages))
+
+    def redone(self, faults: tuple[str, ...]) -> Replanned:
+        """Return what was found.
+
+        Raises:
+            LogError: nothing was changed, and another decision was made nevertheless.
+        """
+        if self._redone is not None and not self._changes and not faults:
+            raise LogError(
+                f"the decisions in {self._source.name} do not follow from its samples; "
+                "`spatial-replay verify --decisions` shows what differs"
+            )
+        return Replanned(
+            self._source.name,
+            self._changes,
+            self._decisions,
+            self._same,
+            self._alike,
+            self._sample,
+            self._recorded,
+            self._redone,
+            merge(self._messages),
+            faults,
+        )
+
+
+def _does_the_same(old: Step, new: Step) -> bool:
+    """Return whether two decisions have the robot do the same."""
+    if old.kind != new.kind or (old.target is None) != (new.target is None):
+        return False
+    if old.target is None or new.target is None:
+        return True
+    return replace(old.target, robustness=0.0) == replace(new.target, robustness=0.0)
+
+
+def _has_all(recorded: list[PlannerMessage], redone: Messages) -> bool:
+    """Return whether the log has messages byte for byte."""
+    payloads = {(each.topic, each.payload) for each in recorded}
+    return all((each.topic, each.payload) in payloads for each in planner_messages(redone))
+
+
+def _on_redone_topics(messages: Messages) -> Messages:
+    channels = {
+        number: replace(channel, topic=_REDONE[channel.topic])
+        for number, channel in messages.channels.items()
+    }
+    return replace(messages, channels=channels)
+
+
+@dataclass(frozen=True)
+class ReplannedSource(SourceOf):
+    """A planned log with what would have been decided beside what was."""
+
+    beside: Messages
+
+    def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
+        """See `Source.iter_blocks`."""
+        done, _ = window_of(self.beside.log_time_ns, start_ns or 0, np.iinfo(np.int64).max)
+        for block in self.source.iter_blocks(start_ns, end_ns):
+            if not len(block.trace):
+                yield block
+                continue
+            _, end = window_of(self.beside.log_time_ns, 0, int(block.trace.times_ns[-1]) + 1)
+            own = select(self.beside, np.arange(done, max(done, end)))
+            done = max(done, end)
+            yield replace(block, messages=merge([block.messages, own]))

@@ -17,19 +17,18 @@ from spatial_replay.geometry.arrays import Booleans, Floats
 from spatial_replay.geometry.footprint import TrackedObject
 from spatial_replay.geometry.poses import centre_of, radius_of
 from spatial_replay.planning.decisions import Target
-from spatial_replay.planning.map_layers import avoided_cells
 from spatial_replay.planning.maps import (
     CONSTRAINED,
     FREE,
     OUT_OF_REACH,
     REASONS,
     GradientMap,
+    avoided_cells,
     danger_of,
     proposition_maps,
 )
 from spatial_replay.planning.paths import Path, shortest_path
-from spatial_replay.planning.settings import Settings
-from spatial_replay.planning.workspace import Grid
+from spatial_replay.planning.settings import Grid, Settings
 
 _COARSEST: Final = 0.5
 """The first distance between places, in cells."""

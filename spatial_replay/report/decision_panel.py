@@ -22,9 +22,8 @@ from spatial_replay.logs.schemas.PlanDecision_pb2 import (
     PlanGuard,
     PlanTarget,
 )
-from spatial_replay.planning.decision_log import decision_from_payload, latest_decisions
+from spatial_replay.planning.decision_log import decision_from_payload, latest_decisions, map_fields
 from spatial_replay.planning.decisions import Reason, candidate_lines, cause_text
-from spatial_replay.planning.map_messages import map_fields
 from spatial_replay.report.compact import Packing, singles
 from spatial_replay.text import number_text
 

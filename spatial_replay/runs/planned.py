@@ -31,8 +31,7 @@ from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.planning.decision_log import BlackBox, plan_metadata
 from spatial_replay.planning.decisions import Kind, Outcome, Step, sentence_of
 from spatial_replay.planning.planner import Planner
-from spatial_replay.planning.settings import Settings, Skill, changed_settings
-from spatial_replay.planning.workspace import Grid, Workspace
+from spatial_replay.planning.settings import Grid, Settings, Skill, Workspace, changed_settings
 from spatial_replay.recording.plan_loop import run_plan
 from spatial_replay.runs.run_log import RunLog, run_log
 from spatial_replay.runs.scripted import about_run, refuse_unknown_names

@@ -28,7 +28,7 @@ from spatial_replay.planning import (
     settings_from_text,
     text_from_settings,
 )
-from spatial_replay.planning.map_messages import map_fields
+from spatial_replay.planning.decision_log import map_fields
 from spatial_replay.replay import ReplayOptions, Window, load_files, run_replay, verify_certificate
 from spatial_replay.sources import open_source
 

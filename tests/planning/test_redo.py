@@ -123,7 +123,7 @@ def test_the_log_and_the_page_of_it_have_both_decisions(tidied, tmp_path):
     (layout,) = (each.data for each in source.attachments() if each.name == "layout.json")
     assert {"3D!scene", "3D!redone"} <= json.loads(layout)["configById"].keys()
     write_report(source, [], page)
-    assert "Redone" in page.read_text()
+    assert "Replanned" in page.read_text()
 
 
 def test_a_copy_with_both_decisions_keeps_the_units_of_lengths_and_signals(tmp_path):

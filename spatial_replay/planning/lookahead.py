@@ -1,0 +1,959 @@
+"""Lookahead: the motions from a sample to acceptance, tried out in samples that the planner expects.
+
+A motion is expected to bring its object to the target, at once. Objects are moved one at a time where that is
+possible. Otherwise, or where a later motion would have to move something again, they are arranged together.
+
+An arrangement gives cells to several objects at once: a constraint satisfaction problem over the cells of a
+grid. The demands on one object are a map. The demands on two depend on the way from one to the other alone,
+and are a stencil. The object with the fewest cells left comes first; its cells are tried by their robustness,
+and by the number of cells that they leave to the others.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import combinations, islice, product
+from typing import Final, TypeAlias
+
+import numpy as np
+
+from spatial_replay.automata.automaton import Automaton
+from spatial_replay.automata.guards import Transition
+from spatial_replay.geometry.arrays import Booleans, Floats
+from spatial_replay.geometry.footprint import TrackedObject
+from spatial_replay.geometry.poses import centre_of, moved_object, radius_of
+from spatial_replay.planning.decisions import Candidate, Consideration, Edge, Reason, Target
+from spatial_replay.planning.edges import (
+    LATER,
+    Attempts,
+    Budget,
+    Demand,
+    Pose,
+    Symbol,
+    alternatives,
+    consideration_of,
+    demands_of,
+    equivalent_edges,
+    idle_transitions,
+    moved_later,
+    surplus,
+    values_in,
+    with_moved,
+)
+from spatial_replay.planning.maps import AVOIDED_CELLS, concerns, gradient_map, proposition_maps
+from spatial_replay.planning.motions import Expectations, MotionOrder, Movables, PredictedState, by_cost
+from spatial_replay.planning.settings import Grid, Settings, Workspace
+from spatial_replay.planning.targets import cell_hint
+from spatial_replay.spec.format import format_formula
+from spatial_replay.spec.formula import Atom, Formula, Outline, Quantified, SignedDistance, TrackedName
+from spatial_replay.spec.walks import base_of, iter_formulas, terms_of
+from spatial_replay.trace.sample import Sample
+
+# ----------------------------------------------------------------------------------------------- arrangements
+
+_MOST_SETS: Final = 24
+"""The most sets of objects that are tried for one conjunction."""
+_MOST_VISITS: Final = 200
+"""The most cells tried for one set of objects."""
+_MOST_SOLUTIONS: Final = 6
+"""The most arrangements of one set of objects."""
+_WIDEST: Final = 150_000
+"""The most cells of a stencil, over all orientations; pairs with a larger one are compared at the end."""
+_MOST_NAMED: Final = 3
+"""The most things that a sentence names."""
+_ENOUGH: Final = 0.5
+"""The share of its cells that each other object keeps after a choice by robustness."""
+
+Cell: TypeAlias = tuple[int, int, int]
+"""A turn of an object, by its number, and the row and column of its centre."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Field:
+    """What the cells of one object are like, with everything that cannot be moved where it is.
+
+    Attributes:
+        turns: (A,) angles in radians.
+        open: (A, rows, columns), whether the robot reaches a cell and nothing immovable stands there.
+        clearance: (A, rows, columns), distance to what cannot be moved.
+        standing: for each thing that cannot be moved, "" for the workspace's obstacles, the distance to it.
+        apart: for each other movable object in the way, the distance to it less the clearance needed.
+        surplus: for each demand about the object, that with everything else where it is.
+    """
+
+    turns: Floats
+    open: Booleans
+    clearance: Floats
+    standing: Mapping[str, Floats]
+    apart: Mapping[str, Floats]
+    surplus: Mapping[Demand, Floats]
+
+
+class Arranger:
+    """The arrangements of movable objects in one sample that meet demands.
+
+    Attributes:
+        is_tight: whether an object was found that has a place between cells only.
+    """
+
+    def __init__(
+        self,
+        sample: Sample,
+        regions: Mapping[str, Outline],
+        settings: Settings,
+        demands: Iterable[Demand],
+        budget: Budget,
+    ) -> None:
+        self._sample, self._regions, self._settings, self._budget = sample, regions, settings, budget
+        self._demands = tuple(dict.fromkeys(demands))
+        self._grid = settings.workspace.grid
+        present = {name: each for name, each in sample.objects.items() if isinstance(each, TrackedObject)}
+        order = sorted(present) if settings.movable is None else settings.movable
+        self._movable = {name: present[name] for name in order if name in present}
+        self._about = {each: self._names(each) for each in self._demands}
+        self._fields: dict[str, _Field] = {}
+        self._visits = 0
+        self.is_tight = False
+
+    def _names(self, demand: Demand) -> tuple[str, ...]:
+        return tuple(name for name in self._movable if concerns(demand.formula, name))
+
+    @cached_property
+    def _unmet(self) -> tuple[Demand, ...]:
+        values = values_in(self._sample, [each.formula for each in self._demands], self._regions)
+        columns = zip(self._demands, *values, strict=True)
+        return tuple(each for each, low, high in columns if surplus(low, high, each) < 0.0)
+
+    def why_hopeless(self) -> str:
+        """Return why no arrangement at all meets the demands, if one object's cells show that; else ""."""
+        for demand in self._unmet:
+            if not self._about[demand]:
+                return "no object that can be moved matters to it"
+        for name in self._movable:
+            own = [each for each in self._demands if self._about[each] == (name,)]
+            if own and any(each in self._unmet for each in own) and (field := self._field(name)) is not None:
+                met = np.minimum.reduce([field.surplus[each] for each in own])
+                if not (field.open & (met >= 0.0)).any() and not self._fits_between(name, field, own):
+                    if self._settings.rules > 3 and (met >= 0.0).any():
+                        stands = _listed(self._standing(field, met >= 0.0))
+                        return f"{stands or 'the robot does not reach'} wherever {name} would have to be"
+                    best = max(float(met[field.open].max(initial=-math.inf)), -math.inf)
+                    hint = cell_hint(-best, self._settings)
+                    return f"{name}: nowhere would all of it hold, {-best:.4g} is missing at best{hint}"
+        return ""
+
+    def _fits_between(self, name: str, field: _Field, own: Sequence[Demand]) -> bool:
+        """Return whether an object has a place between cells where demands hold, if targets are refined."""
+        workspace, tracked = self._settings.workspace, self._movable[name]
+        if self._settings.rules < 4 or not self._settings.refine or self._settings.skill == "push":
+            return False
+        met = np.minimum.reduce([field.surplus[each] for each in own])
+        score = np.where(
+            workspace.within_reach(self._grid),
+            np.minimum(met, field.clearance - workspace.clearance),
+            -np.inf,
+        )
+        turn, row, column = np.unravel_index(int(np.argmax(score)), score.shape)
+        if score[turn, row, column] < -self._grid.cell_size or not self._budget.spend():
+            return False
+        x, y = self._grid.centre(int(row), int(column))
+        size, yaw = self._grid.cell_size / 8.0, (tracked.yaw or 0.0) + float(field.turns[turn])
+        supports = workspace.supports | {each for each in self._movable if each != name}
+        yaws = (yaw,) if workspace.yaws else ()
+        free = replace(workspace, supports=supports, yaws=yaws, keeps_yaw=False)
+        grid = Grid(x - 8.5 * size, y - 8.5 * size, size, 17, 17)
+        formulas = [each.formula for each in own]
+        maps = proposition_maps(formulas, self._regions, self._sample, name, free, grid)
+        good = (maps.clearance > workspace.clearance) & workspace.grid.contains(grid.centres()).reshape(
+            grid.shape
+        )
+        for each, low, high in zip(own, maps.lower, maps.upper, strict=True):
+            good &= ((low if each.wanted else -high) - each.least) >= 0.0
+        self.is_tight |= bool(good.any())
+        return bool(good.any())
+
+    def what_stands(self) -> str:
+        """Return what cannot be moved and stands where objects could go, as a sentence; "" for nothing."""
+        names: dict[str, None] = {}
+        for name, field in self._fields.items():
+            wanted = self._met(field, name, tuple(self._movable))
+            if not wanted.all():
+                names |= dict.fromkeys(self._standing(field, wanted))
+        return f"{_listed(list(names))} there" if names else ""
+
+    def _standing(self, field: _Field, wanted: Booleans) -> list[str]:
+        """Return what cannot be moved and stands in some cells, what is in most of them first."""
+        clearance = self._settings.workspace.clearance
+        counts = {each: int((wanted & (away <= clearance)).sum()) for each, away in field.standing.items()}
+        return sorted((each for each in counts if counts[each]), key=lambda each: -counts[each])
+
+    def arrangements(self, most: int) -> Iterator[dict[str, Cell]]:
+        """Yield arrangements of the least sets of objects first.
+
+        Args:
+            most: the most objects that are moved.
+        """
+        queue = [(len(each), number, each) for number, each in enumerate(self._bases(most))]
+        heapq.heapify(queue)
+        seen = {each for *_, each in queue}
+        count = len(queue)
+        for _ in range(_MOST_SETS):
+            if not queue:
+                return
+            *_, chosen = heapq.heappop(queue)
+            domains = self._domains(chosen)
+            if domains is not None and all(each.any() for each in domains.values()):
+                self._visits = 0
+                stencils = self._stencils(chosen, domains)
+                found = 0
+                for cells in self._placed({}, domains, stencils):
+                    if self.meets(self.sample_with(cells)):
+                        yield cells
+                        found += 1
+                    if found >= _MOST_SOLUTIONS:
+                        break
+            if len(chosen) < most and chosen:
+                for name in self._in_the_way(chosen):
+                    wider = tuple(each for each in self._movable if each in chosen or each == name)
+                    if wider not in seen:
+                        seen.add(wider)
+                        count += 1
+                        heapq.heappush(queue, (len(wider), count, wider))
+
+    def _bases(self, most: int) -> list[tuple[str, ...]]:
+        """Return the least sets of objects that matter to every unmet demand."""
+        sets: dict[tuple[str, ...], None] = {(): None}
+        for demand in self._unmet:
+            wider: dict[tuple[str, ...], None] = {}
+            for each in sets:
+                if any(name in each for name in self._about[demand]):
+                    wider[each] = None
+                    continue
+                for name in self._about[demand]:
+                    both = tuple(one for one in self._movable if one in each or one == name)
+                    if len(both) <= most:
+                        wider[both] = None
+            sets = dict(list(wider.items())[:_MOST_SETS])
+        return list(sets)
+
+    def _in_the_way(self, chosen: tuple[str, ...]) -> list[str]:
+        """Return other objects, those first that stand where the chosen ones could go."""
+        counts = dict.fromkeys((each for each in self._movable if each not in chosen), 0)
+        for name in chosen:
+            if (field := self._field(name)) is None:
+                return []
+            wanted = field.open & self._met(field, name, chosen)
+            if not wanted.any():
+                # nothing that is moved away would make room; a demand about two may be met by the other one
+                wanted = field.open
+            for other, apart in field.apart.items():
+                if other in counts:
+                    counts[other] += int((wanted & (apart <= 0.0)).sum())
+        tied = {name for each in self._unmet for name in self._about[each]}
+        useful = [each for each, count in counts.items() if count or each in tied]
+        return sorted(useful, key=lambda each: (each not in tied, -counts[each]))[:4]
+
+    def _field(self, name: str) -> _Field | None:
+        if name not in self._fields:
+            if not self._budget.spend():
+                return None
+            self._fields[name] = self._measured(name)
+        return self._fields[name]
+
+    def _measured(self, name: str) -> _Field:
+        workspace = self._settings.workspace
+        others = [each for each in self._movable if each != name and each not in workspace.supports]
+        about = [each for each in self._demands if name in self._about[each]]
+        distances = [
+            Atom("", "dist", SignedDistance(TrackedName(name), TrackedName(each))) for each in others
+        ]
+        formulas = [*(each.formula for each in about), *distances]
+        free = replace(workspace, supports=workspace.supports | set(others))
+        maps = proposition_maps(formulas, self._regions, self._sample, name, free)
+        met = {
+            each: (low if each.wanted else -high) - each.least
+            for each, low, high in zip(about, maps.lower, maps.upper, strict=False)
+        }
+        measured = zip(others, maps.lower[len(about) :], strict=True)
+        apart = {other: low - workspace.clearance for other, low in measured}
+        is_open = (maps.clearance > workspace.clearance) & workspace.within_reach(maps.grid)
+        standing = dict(zip(maps.obstacles, maps.distances, strict=True))
+        return _Field(maps.turns, is_open, maps.clearance, standing, apart, met)
+
+    def _met(self, field: _Field, name: str, chosen: tuple[str, ...]) -> Booleans:
+        """Return the cells where the demands hold that no other chosen object matters to."""
+        met = np.ones(field.open.shape, np.bool_)
+        for demand, values in field.surplus.items():
+            if all(each == name or each not in chosen for each in self._about[demand]):
+                met &= values >= 0.0
+        return met
+
+    def _domains(self, chosen: tuple[str, ...]) -> dict[str, Booleans] | None:
+        """Return the cells of each chosen object, as far as the others do not matter."""
+        domains = {}
+        for name in chosen:
+            if (field := self._field(name)) is None:
+                return None
+            domain = field.open & self._met(field, name, chosen)
+            for other, apart in field.apart.items():
+                if other not in chosen:
+                    domain = domain & (apart > 0.0)
+            domains[name] = domain
+        return domains
+
+    # ------------------------------------------------------------------------------------ two objects
+
+    def _stencils(
+        self, chosen: tuple[str, ...], domains: Mapping[str, Booleans]
+    ) -> dict[tuple[str, str], Booleans]:
+        """Return for each pair the conflicts by the way from one to the other: (A, B, rows, columns)."""
+        stencils = {}
+        # turns without any cell need not be measured
+        used = {name: np.asarray(cells.any(axis=(1, 2))) for name, cells in domains.items()}
+        if self._settings.rules < 3:
+            used = {name: np.ones_like(each) for name, each in used.items()}
+        for first, second in product(chosen, chosen):
+            if first != second and (found := self._stencil(first, second, chosen, used)) is not None:
+                stencils[first, second] = found
+        return stencils
+
+    def _stencil(
+        self, first: str, second: str, chosen: tuple[str, ...], used: Mapping[str, Booleans]
+    ) -> Booleans | None:
+        demands = [
+            each
+            for each in self._demands
+            if set(self._about[each]) & set(chosen) == {first, second}
+            and _is_of(each.formula, (first, second))
+        ]
+        one, two = self._movable[first], self._movable[second]
+        size, grid = self._grid.cell_size, self._grid
+        supports = self._settings.workspace.supports
+        apart = first not in supports and second not in supports
+        reach = (radius_of(one) + radius_of(two) + self._settings.workspace.clearance) / size + 1.0
+        half = max(grid.shape) - 1 if demands else min(math.ceil(reach), max(grid.shape) - 1)
+        turns, side = self._fields[first].turns, 2 * half + 1
+        cells = side * side * int(used[first].sum()) * int(used[second].sum())
+        if not (demands or apart) or cells > _WIDEST:
+            return None
+        local = Grid(-(half + 0.5) * size, -(half + 0.5) * size, size, side, side)
+        formulas = [each.formula for each in demands]
+        workspace, measured = self._turned_in(local, used[second])
+        conflicts = np.ones((len(turns), len(used[second]), side, side), np.bool_)
+        for number in np.flatnonzero(used[first]).tolist():
+            turn = float(turns[number])
+            objects = {first: moved_object(one, 0.0, 0.0, turn), second: two}
+            sample = Sample(self._sample.time_ns, objects, self._sample.signals)
+            maps = proposition_maps(formulas, self._regions, sample, second, workspace)
+            bad = np.zeros(maps.clearance.shape, np.bool_)
+            if apart:
+                bad |= maps.clearance <= self._settings.workspace.clearance
+            for each, low, high in zip(demands, maps.lower, maps.upper, strict=True):
+                bad |= ((low if each.wanted else -high) - each.least) < 0.0
+            conflicts[number, measured] = bad
+        return conflicts
+
+    def _turned_in(self, grid: Grid, used: Booleans) -> tuple[Workspace, list[int]]:
+        """Return a workspace without obstacles for those turns that are used, and their numbers."""
+        yaws, keeps = self._settings.workspace.yaws, self._settings.workspace.keeps_yaw
+        if len(used) == 1:
+            return Workspace(grid, () if keeps else yaws), [0]
+        first = int(keeps)
+        numbers = [number for number in range(first, len(used)) if used[number]]
+        chosen = tuple(yaws[number - first] for number in numbers)
+        return Workspace(grid, chosen, keeps_yaw=keeps), [*range(first), *numbers]
+
+    # ----------------------------------------------------------------------------------------- search
+
+    def _placed(
+        self,
+        cells: dict[str, Cell],
+        domains: Mapping[str, Booleans],
+        stencils: Mapping[tuple[str, str], Booleans],
+    ) -> Iterator[dict[str, Cell]]:
+        if not domains:
+            yield cells
+            return
+        name = min(domains, key=lambda each: int(domains[each].sum()))
+        others = {each: domain for each, domain in domains.items() if each != name}
+        for cell in self._choices(name, domains[name], others, stencils):
+            if self._visits >= _MOST_VISITS:
+                return
+            self._visits += 1
+            left = {
+                each: domain & ~_conflicts(stencils.get((name, each)), cell, domain.shape)
+                for each, domain in others.items()
+            }
+            if all(each.any() for each in left.values()):
+                yield from self._placed({**cells, name: cell}, left, stencils)
+
+    def _choices(
+        self,
+        name: str,
+        domain: Booleans,
+        others: Mapping[str, Booleans],
+        stencils: Mapping[tuple[str, str], Booleans],
+    ) -> Iterator[Cell]:
+        """Yield some cells: the most robust one, the one that leaves most to the others, and corners."""
+        score = self._score(name)
+        left = np.ones(domain.shape)
+        for other, cells in others.items():
+            if (stencil := stencils.get((name, other))) is not None:
+                left = np.minimum(left, 1.0 - _lost(cells, stencil) / max(int(cells.sum()), 1))
+        ranked = [(domain & (left >= _ENOUGH), score), (domain & (left > 0.0), left), (domain, score)]
+        chosen: dict[Cell, None] = {}
+        for among, values in ranked:
+            if among.any():
+                chosen[_best(among, values, score)] = None
+        rows, columns = np.indices(domain.shape)[1:]
+        among = domain & (left > 0.0)
+        for direction in (rows, -rows, columns, -columns) if among.any() else ():
+            chosen[_best(among, direction.astype(np.float64), left)] = None
+        yield from chosen
+
+    def _score(self, name: str) -> Floats:
+        """Return how good each cell of an object is, the other ones aside."""
+        field, settings = self._fields[name], self._settings
+        room = np.minimum.reduce([field.clearance, *field.apart.values()])
+        own = [field.surplus[each] for each in field.surplus if self._about[each] == (name,)]
+        if own:
+            score: Floats = np.minimum.reduce(own)
+            # cells with too little room come after all others, and so do turns of what is pushed
+            is_last = room < settings.room
+            is_last[1:] |= settings.workspace.keeps_yaw
+            behind = 2.0 * float(abs(score[np.isfinite(score)]).max(initial=1.0))
+            return score - np.where(is_last, behind, 0.0)
+        if settings.skill == "place":
+            return np.asarray(np.minimum(room, 1e9))
+        here = np.array(centre_of(self._movable[name].footprint))
+        away = np.hypot(*(self._grid.centres() - here).T).reshape(self._grid.shape)
+        return np.asarray(np.broadcast_to(-away, field.open.shape))
+
+    # ------------------------------------------------------------------------------------------ poses
+
+    def pose(self, name: str, cell: Cell) -> tuple[float, float, float]:
+        """Return x, y and turn of an object in a cell."""
+        x, y = self._grid.centre(cell[1], cell[2])
+        return x, y, float(self._fields[name].turns[cell[0]])
+
+    def sample_with(self, cells: Mapping[str, Cell]) -> Sample:
+        """Return the sample with objects in cells."""
+        return with_moved(self._sample, {name: self.pose(name, cell) for name, cell in cells.items()})
+
+    def meets(self, sample: Sample) -> bool:
+        """Return whether a sample meets all demands."""
+        values = values_in(sample, [each.formula for each in self._demands], self._regions)
+        columns = zip(self._demands, *values, strict=True)
+        return all(surplus(low, high, each) >= 0.0 for each, low, high in columns)
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Return the first of some things as the beginning of a sentence about what cannot be moved."""
+    said = [each or "an obstacle of the workspace" for each in names[:_MOST_NAMED]]
+    verb = "stand" if len(said) > 1 else "stands"
+    return f"{' and '.join(said)}, which cannot be moved, {verb}" if said else ""
+
+
+def _best(among: Booleans, values: Floats, then: Floats) -> Cell:
+    """Return the cell with the greatest value; of equal ones, the greatest of `then`."""
+    best = np.where(among, values, -np.inf)
+    ties = best == best.max()
+    place = int(np.argmax(np.where(ties, then, -np.inf)))
+    turn, row, column = np.unravel_index(place, among.shape)
+    return int(turn), int(row), int(column)
+
+
+def _conflicts(stencil: Booleans | None, cell: Cell, shape: tuple[int, ...]) -> Booleans:
+    """Return the cells (B, rows, columns) of the second object in conflict with a cell of the first."""
+    conflicts = np.zeros(shape, np.bool_)
+    if stencil is None:
+        return conflicts
+    turn, *place = cell
+    half = stencil.shape[2] // 2
+    inside, of_stencil = [], []
+    for at, size in zip(place, shape[1:], strict=True):
+        low, high = max(at - half, 0), min(at + half + 1, size)
+        inside.append(slice(low, high))
+        of_stencil.append(slice(low - at + half, high - at + half))
+    conflicts[:, inside[0], inside[1]] = stencil[turn][:, of_stencil[0], of_stencil[1]]
+    return conflicts
+
+
+def _lost(cells: Booleans, stencil: Booleans) -> Floats:
+    """Return (A, rows, columns): how many cells of the second object each cell of the first takes away."""
+    half = stencil.shape[2] // 2
+    rows, columns = cells.shape[1:]
+    padded = np.fft.rfft2(np.pad(cells.astype(np.float64), ((0, 0), (half, half), (half, half))))
+    shape = (rows + 2 * half, columns + 2 * half)
+    kernels = np.fft.rfft2(stencil.astype(np.float64), s=shape)
+    lost = np.fft.irfft2((padded[None] * kernels.conj()).sum(axis=1), s=shape)
+    # the counts are whole numbers, so rounding takes away what transforms add
+    return np.rint(lost[:, :rows, :columns])
+
+
+def _is_of(formula: Formula, names: Sequence[str]) -> bool:
+    """Return whether a formula is about some objects alone, whatever stands elsewhere."""
+    for each in iter_formulas(formula):
+        if isinstance(each, Quantified):
+            return False
+        terms = terms_of(each.expression) if isinstance(each, Atom) else ()
+        for term in terms:
+            base = base_of(term)
+            if not (isinstance(base, TrackedName) and base.name in names):
+                return False
+    return True
+
+
+# ---------------------------------------------------------------------------------------------- motions ahead
+
+MOST_MAPS: Final = 150
+"""The most maps that looking ahead computes for one decision."""
+_MOST_WHY_NOT: Final = 60
+"""The most maps that are computed to say what cannot be done."""
+_MOST_EDGES: Final = 12
+"""The most edges that are tried from one state that is foreseen."""
+_MOST_ORDERED: Final = 6
+"""The most arrangements of which the order of motions is looked for."""
+_STILL_TURN: Final = math.radians(1.0)
+"""The widest turn of an object that stays as it is."""
+_STRICTLY: Final = 1e-12
+"""What a constraint has to stay away from holding at least: at 0 it does."""
+
+
+class Lookahead:
+    """What can be done from one sample on; made for one decision."""
+
+    def __init__(
+        self,
+        automaton: Automaton,
+        formulas: Sequence[Formula],
+        regions: Mapping[str, Outline],
+        settings: Settings,
+        attempts: Attempts,
+    ) -> None:
+        """Begin with what is known about a run.
+
+        Args:
+            attempts: the motions so far.
+        """
+        self._expected = Expectations(automaton, formulas, regions, settings, attempts, Budget(MOST_MAPS))
+        self._automaton, self._formulas, self._regions = automaton, formulas, regions
+        self._settings, self._attempts = settings, attempts
+        self._pruned: set[Edge] = set()
+        self._known: dict[tuple[int, tuple[tuple[str, Pose], ...]], tuple[Target, ...] | None] = {}
+        self._first: PredictedState | None = None
+        self._why: dict[str, None] = {}
+        self._unordered = ""
+        self._ruled_out: frozenset[Edge] = frozenset()
+
+    def decide(
+        self,
+        consideration: Consideration,
+        path: tuple[Transition, ...],
+        movables: Movables,
+        pruned: Collection[Edge],
+    ) -> Consideration:
+        """Return an edge with the candidate with which acceptance can be reached, or pruned.
+
+        Args:
+            consideration: the edge with the candidates that can take it by one motion, or pruned.
+            path: that begins with the edge.
+            movables: of the newest sample.
+            pruned: the edges given up so far.
+        """
+        self._first = scene = self._expected.begin(movables)
+        self._pruned = set(pruned)
+        self._why.clear()
+        state = path[0].source
+        second_best: Consideration | None = None
+        for number in by_cost(consideration.candidates, self._settings):
+            target = consideration.candidates[number].target
+            if target is None or (rest := self._after(scene, state, (target,), path[0].target)) is None:
+                continue
+            found = _chosen(consideration, number, (target, *rest))
+            names = [each.name for each in found.motions]
+            if len(set(names)) == len(names):
+                return found
+            second_best = second_best or found
+        for motions, after in islice(self._joint(scene, path, consideration), 4):
+            rest = self._ahead(*after)
+            if rest is not None:
+                return self._begun(consideration, motions, rest, movables)
+        if second_best is not None:
+            return second_best
+        if not by_cost(consideration.candidates, self._settings):
+            return consideration
+        why = "; ".join(islice(self._why, 3)) or "no sequence of motions was found"
+        unmarked = tuple(replace(each, is_chosen=False) for each in consideration.candidates)
+        reason = Reason(LATER, why)
+        return replace(consideration, candidates=unmarked, pruned=reason)
+
+    # ------------------------------------------------------------------------------------ one at a time
+
+    def _ahead(self, scene: PredictedState, state: int) -> tuple[Target, ...] | None:
+        """Return motions from a state to acceptance; None if there are none, or none were found."""
+        if state in self._automaton.accepting:
+            return ()
+        key = state, scene.moved
+        if key not in self._known:
+            self._known[key] = None
+            self._known[key] = self._found(scene, state)
+        return self._known[key]
+
+    def _found(self, scene: PredictedState, state: int) -> tuple[Target, ...] | None:
+        automaton, symbol = self._automaton, self._expected.symbol(scene)
+        idle = idle_transitions(automaton, state, symbol)
+        pruned = self._pruned - idle.edges
+        for _ in range(_MOST_EDGES):
+            pruned |= self._ruled_out
+            path = next(automaton.paths(state, pruned), None)
+            if path is None or self._expected.budget.left <= 0:
+                return None
+            if ahead := idle.along(path):
+                return self._ahead(scene, ahead[-1])
+            consideration = consideration_of(automaton, path, pruned, symbol)
+            for motions, after in self._ways(scene, path, consideration):
+                if (rest := self._ahead(*after)) is not None:
+                    return (*motions, *rest)
+            # what is hopeless is worked out when something has failed
+            self._ruled_out = self._hopeless
+            pruned.add(consideration.edge)
+            pruned |= set(equivalent_edges(automaton, consideration, idle, pruned, symbol))
+        return None
+
+    def _ways(
+        self, scene: PredictedState, path: tuple[Transition, ...], consideration: Consideration
+    ) -> Iterator[tuple[tuple[Target, ...], tuple[PredictedState, int]]]:
+        """Yield motions that take the first edge of a path, and where they lead."""
+        movables = self._expected.movables(scene)
+        candidates: list[Candidate] = []
+        later = moved_later(path, self._expected.symbol(scene), self._formulas, movables.names)
+        for name in movables.names_for(consideration.progress):
+            if not self._expected.budget.spend():
+                return
+            candidates.append(movables.candidate(name, consideration, self._attempts.places_of(name), later))
+        for number in by_cost(candidates, self._settings):
+            target = candidates[number].target
+            if target is not None:
+                after = scene.after(target)
+                states = self._automaton.step_set({path[0].source}, self._expected.symbol(after))
+                if states == {path[0].target}:
+                    yield (target,), (after, path[0].target)
+        if not any(each.target for each in candidates):
+            causes = "; ".join(f"{each.name}: {each.rejected}" for each in candidates)
+            self._why[f"{consideration.progress}: {causes or 'nothing that can be moved matters to it'}"] = (
+                None
+            )
+        yield from islice(self._joint(scene, path, consideration), 2)
+
+    def _after(
+        self, scene: PredictedState, state: int, motions: tuple[Target, ...], aim: int
+    ) -> tuple[Target, ...] | None:
+        """Return the motions that follow some others to acceptance; none if what is seen does not say."""
+        for target in motions:
+            scene = scene.after(target)
+        states = self._automaton.step_set({state}, self._expected.symbol(scene))
+        if len(states) > 1:
+            return ()
+        return self._ahead(scene, aim if aim in states else min(states))
+
+    # ------------------------------------------------------------------------------------ all together
+
+    def _joint(
+        self, scene: PredictedState, path: tuple[Transition, ...], consideration: Consideration
+    ) -> Iterator[tuple[tuple[Target, ...], tuple[PredictedState, int]]]:
+        """Yield motions of several objects that lead along a path, or take its first edge."""
+        if self._settings.motions < 2:
+            return
+        for length in dict.fromkeys((len(path), 1)):
+            if length == 1 and not self._can_be_taken_in_turns(scene, path[0]):
+                continue
+            aims = path[:length]
+            if any((each.source, each.target) in self._ruled_out for each in aims):
+                continue
+            for demands in self._demands_of(scene, aims):
+                about = Arranger(scene.sample, self._regions, self._settings, demands, self._expected.budget)
+                if self._expected.budget.left <= 0 or about.why_hopeless():
+                    continue
+                near_failures = []
+                for cells in islice(about.arrangements(self._settings.motions), _MOST_ORDERED):
+                    if self._is_near_failure(about, cells):
+                        near_failures.append(cells)
+                    else:
+                        yield from self._ordered_from(scene, aims, consideration, about, cells)
+                # a motion may fail by chance: places where one did come again, after all others
+                for cells in near_failures if self._settings.rules > 1 else ():
+                    yield from self._ordered_from(scene, aims, consideration, about, cells)
+
+    def _demands_of(self, scene: PredictedState, aims: Sequence[Transition]) -> Iterator[tuple[Demand, ...]]:
+        """Yield what has to hold for some edges to be taken, as conjunctions: all progress, no trap."""
+        never = self._expected.traps(aims[0].source)
+        kept: list[Demand] = []
+        least = self._settings.constraint_margin * (1.0 + 1e-9) + _STRICTLY
+        for cube in never:
+            if len(cube) == 1:
+                ((number, wanted),) = cube
+                ways = alternatives(self._formulas[number], not wanted)
+                if len(ways) == 1:
+                    kept += (Demand(*each, least) for each in ways[0])
+        for cubes in islice(product(*(each.guard for each in aims)), 8):
+            literals = tuple(dict.fromkeys(literal for cube in cubes for literal in cube))
+            if any((number, not wanted) in literals for number, wanted in literals):
+                continue
+            for demands in demands_of(literals, self._formulas, self._settings.margin):
+                yield (*demands, *kept)
+
+    def _can_be_taken_in_turns(self, scene: PredictedState, edge: Transition) -> bool:
+        """Return whether moving one object after the other can take an edge, and no other one before.
+
+        This looks at propositions alone: each motion may change those about one object.
+        """
+        symbol = self._expected.symbol(scene)
+        movables = self._expected.movables(scene)
+        for cube in edge.guard:
+            false = [number for number, wanted in cube if symbol[number] is not wanted]
+            wanted = {number: value for number, value in cube if number in false}
+            if None in (symbol[number] for number in false) or len(false) > 8:
+                continue
+            groups = [
+                {number for number in false if concerns(self._formulas[number], name)}
+                for name in movables.names
+            ]
+            if self._turns_lead(symbol, wanted, groups, edge):
+                return True
+        return False
+
+    def _turns_lead(
+        self, symbol: Symbol, wanted: Mapping[int, bool], groups: Sequence[set[int]], edge: Transition
+    ) -> bool:
+        open_sets, seen = [frozenset[int]()], set[frozenset[int]]()
+        while open_sets:
+            done = open_sets.pop()
+            if done in seen:
+                continue
+            seen.add(done)
+            now = tuple(wanted[n] if n in done else value for n, value in enumerate(symbol))
+            states = self._automaton.step_set({edge.source}, now)
+            if edge.target in states:
+                return True
+            if states != {edge.source} and done:
+                continue
+            for group in groups:
+                left = sorted(group - done)
+                for size in range(1, len(left) + 1):
+                    open_sets += (done | frozenset(each) for each in combinations(left, size))
+        return False
+
+    def _is_near_failure(self, about: Arranger, cells: Mapping[str, Cell]) -> bool:
+        """Return whether an arrangement brings an object near a place where that failed."""
+        near = AVOIDED_CELLS * self._settings.workspace.grid.cell_size
+        poses = ((name, about.pose(name, cell)) for name, cell in cells.items())
+        return any(
+            (x - u) ** 2 + (y - v) ** 2 <= near**2
+            for name, (x, y, _) in poses
+            for u, v in self._attempts.places_of(name)
+        )
+
+    def _ordered_from(
+        self,
+        scene: PredictedState,
+        aims: Sequence[Transition],
+        consideration: Consideration,
+        about: Arranger,
+        cells: Mapping[str, Cell],
+    ) -> Iterator[tuple[tuple[Target, ...], tuple[PredictedState, int]]]:
+        """Yield the motions to an arrangement, in an order in which each is possible."""
+        if self._settings.rules > 3:
+            cells = self._without_staying(scene, about, cells)
+        poses = {name: about.pose(name, cell) for name, cell in cells.items()}
+        robustness = self._expected.robustness(about.sample_with(cells), aims[0].guard)
+        order = MotionOrder(self._expected, scene, aims, consideration, poses, robustness)
+        if (found := order.found()) is not None:
+            yield found.motions, (found.scene, found.state)
+        elif scene is self._first and len(poses) > 1 and not self._unordered:
+            self._unordered = " and ".join(sorted(poses))
+
+    def _without_staying(
+        self, scene: PredictedState, about: Arranger, cells: Mapping[str, Cell]
+    ) -> Mapping[str, Cell]:
+        """Return an arrangement without the objects that may as well stay where they are."""
+        for name in list(cells):
+            tracked, (x, y, turn) = scene.sample.objects[name], about.pose(name, cells[name])
+            others = {other: cell for other, cell in cells.items() if other != name}
+            if not isinstance(tracked, TrackedObject) or abs(turn) > _STILL_TURN:
+                continue
+            away = math.dist((x, y), centre_of(tracked.footprint))
+            is_near = away <= self._settings.workspace.grid.cell_size
+            if is_near and about.meets(about.sample_with(others)):
+                cells = others
+        return cells
+
+    def _begun(
+        self,
+        consideration: Consideration,
+        motions: tuple[Target, ...],
+        rest: tuple[Target, ...],
+        movables: Movables,
+    ) -> Consideration:
+        """Return an edge with the first of several motions as its chosen candidate."""
+        first = motions[0]
+        # what is parked first goes to its own place later
+        poses = {each.name: (each.x, each.y, each.turn) for each in motions[1:] if each.name != first.name}
+        sample = movables.sample
+        settings, now = self._settings, movables.maps_of(first.name)
+        then = proposition_maps(
+            self._formulas,
+            self._regions,
+            with_moved(sample, poses),
+            first.name,
+            settings.workspace,
+            now.grid,
+        )
+        cubes = consideration.progress.cubes, consideration.constraints.cubes
+        gradient = gradient_map(now, *cubes, settings.workspace, settings.constraint_margin, then)
+        place = gradient.cell_of(first.x, first.y, first.turn)
+        target = replace(first, robustness=float(gradient.robustness[place]))
+        if all(each.name != first.name for each in motions[1:]):
+            target = self._refined(target, consideration, movables, poses, (*motions[1:], *rest))
+        candidate = Candidate(first.name, gradient, target, is_chosen=True)
+        others = tuple(replace(each, is_chosen=False) for each in consideration.candidates)
+        planned = (target, *motions[1:], *rest)
+        return replace(
+            consideration, candidates=(*others, candidate), pruned=None, motions=planned, is_joint=True
+        )
+
+    def _refined(
+        self,
+        target: Target,
+        consideration: Consideration,
+        movables: Movables,
+        poses: Mapping[str, Pose],
+        rest: tuple[Target, ...],
+    ) -> Target:
+        """Return the first of several motions with a refined target, if the others lead on as before."""
+        here, *way, there = target.waypoints
+        way = way if self._settings.skill == "push" else []
+        found = movables.refined(replace(target, waypoints=(here, *way, there)), consideration, None, poses)
+        ways = movables.with_way(found, consideration.constraints.cubes)
+        if isinstance(ways, str) or movables.is_repeated(ways) or found.robustness <= target.robustness:
+            return target
+        state = consideration.edge[0]
+        before, after = (self._states_along((each, *rest), state) for each in (target, ways))
+        return ways if before == after else target
+
+    def _states_along(self, motions: Sequence[Target], state: int) -> list[frozenset[int]]:
+        """Return the states after each of some motions, from the newest sample on."""
+        scene, states, visited = self._first, frozenset({state}), []
+        for each in motions:
+            scene = scene.after(each) if scene is not None else None
+            if scene is not None:
+                states = self._automaton.step_set(states, self._expected.symbol(scene))
+                visited.append(states)
+        return visited
+
+    # --------------------------------------------------------------------------------------- what is seen
+
+    @cached_property
+    def _hopeless(self) -> frozenset[Edge]:
+        """The edges that need what no arrangement of the objects can bring about."""
+        return self._needing(self._hopeless_literals)
+
+    def _needing(self, literals: Collection[tuple[int, bool]]) -> frozenset[Edge]:
+        """Return the edges that cannot be taken without some of these values of propositions."""
+        if not self._automaton.is_listable:
+            return frozenset()
+        return frozenset(
+            (each.source, each.target)
+            for each in self._automaton.transitions
+            if all(any(literal in literals for literal in cube) for cube in each.guard)
+        )
+
+    @cached_property
+    def _hopeless_literals(self) -> tuple[tuple[int, bool], ...]:
+        """The values of propositions that no arrangement of the objects can bring about."""
+        if self._first is None or not self._automaton.is_listable:
+            return ()
+        symbol = self._expected.symbol(self._first)
+        literals = {
+            literal for each in self._automaton.transitions for cube in each.guard for literal in cube
+        }
+        hopeless: list[tuple[int, bool]] = []
+        budget = Budget(MOST_MAPS)
+        for number, wanted in sorted(literals):
+            if symbol[number] is (not wanted) and budget.left > 0:
+                why = self._why_hopeless(self._first.sample, number, wanted, budget)
+                if why:
+                    hopeless.append((number, wanted))
+                    self._why[f"{self._automaton.propositions[number].literal(wanted)}: {why}"] = None
+        return tuple(hopeless)
+
+    def why_not(self, state: int) -> str:
+        """Return what every path to acceptance needs and cannot hold, and what stands there.
+
+        Or else, which objects have places to which no order of motions was found; "" without either.
+        """
+        if self._first is None or self._settings.rules < 4:
+            return ""
+        for literal in self._hopeless_literals:
+            if next(self._automaton.paths(state, self._needing({literal})), None) is None:
+                return self._why_never(self._first.sample, literal)
+        if not self._unordered:
+            return ""
+        return f"{self._unordered}: there are places for all, but no order of motions to them was found"
+
+    def _why_never(self, sample: Sample, literal: tuple[int, bool]) -> str:
+        """Return what of a proposition cannot hold in any arrangement, and what stands there."""
+        budget = Budget(_MOST_WHY_NOT)
+        every = demands_of((literal,), self._formulas, self._settings.margin)
+        demands = next(iter(every), ())
+        # without any of those that are left, the others could hold
+        core = list(demands)
+        for each in reversed(demands):
+            fewer = tuple(other for other in core if other != each)
+            if fewer and budget.left > 0 and not self._is_possible(sample, fewer, budget):
+                core = list(fewer)
+        about = Arranger(sample, self._regions, self._settings, core, budget)
+        what = " and ".join(_text_of(each) for each in core)
+        if why := about.why_hopeless():
+            return f"{what}: {why}"
+        stands = about.what_stands()
+        said = "no places were found for all at once", stands, "smaller cells (cell_size) may help"
+        return f"{what}: {'; '.join(filter(None, said))}"
+
+    def _is_possible(self, sample: Sample, demands: Sequence[Demand], budget: Budget) -> bool:
+        """Return whether demands hold in some arrangement, as far as that is looked for."""
+        about = Arranger(sample, self._regions, self._settings, demands, budget)
+        why = about.why_hopeless()
+        return about.is_tight or (
+            not why and next(about.arrangements(self._settings.motions), None) is not None
+        )
+
+    def _why_hopeless(self, sample: Sample, number: int, wanted: bool, budget: Budget) -> str:
+        why = "it never holds"
+        for demands in demands_of(((number, wanted),), self._formulas, self._settings.margin):
+            about = Arranger(sample, self._regions, self._settings, demands, budget)
+            why = about.why_hopeless()
+            if about.is_tight:
+                return ""
+            if not why:
+                found = next(about.arrangements(self._settings.motions), None)
+                if found is not None or budget.left <= 0:
+                    return ""
+                why = "no arrangement of objects brings it about"
+        return why
+
+
+def _text_of(demand: Demand) -> str:
+    text = format_formula(demand.formula)
+    return text if demand.wanted else f"not ({text})"
+
+
+def _chosen(consideration: Consideration, number: int, motions: tuple[Target, ...]) -> Consideration:
+    marked = tuple(
+        replace(each, is_chosen=place == number) for place, each in enumerate(consideration.candidates)
+    )
+    return replace(consideration, candidates=marked, motions=motions)

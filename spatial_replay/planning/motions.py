@@ -1,0 +1,844 @@
+"""Motions: objects that could be moved to take an edge, samples expected after that, and orders of several.
+
+An object that is in the way of another one is parked: it goes aside first, and to its own place, if any,
+later. So two objects change places, and a pushed one gets past others.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from spatial_replay.automata.automaton import Automaton
+from spatial_replay.automata.guards import Transition
+from spatial_replay.errors import TraceError
+from spatial_replay.geometry.arrays import Booleans, Floats
+from spatial_replay.geometry.footprint import Footprint, TrackedObject
+from spatial_replay.geometry.poses import centre_of, moved_object, radius_of
+from spatial_replay.planning.decisions import Candidate, Consideration, Guards, Reason, Target
+from spatial_replay.planning.edges import (
+    BESIDE,
+    Attempts,
+    Budget,
+    Demand,
+    IdleTransitions,
+    Pose,
+    Symbol,
+    demands_of,
+    idle_transitions,
+    values_in,
+    with_moved,
+    with_objects,
+)
+from spatial_replay.planning.maps import (
+    FREE,
+    OCCUPIED,
+    Cubes,
+    GradientMap,
+    MapParts,
+    PropositionMaps,
+    concerns,
+    danger_of,
+    distance_to,
+    gradient_map,
+    most_dangerous,
+    proposition_maps,
+)
+from spatial_replay.planning.paths import reachable, shortest_path
+from spatial_replay.planning.settings import Grid, Settings, Workspace
+from spatial_replay.planning.targets import (
+    Measured,
+    begins_as,
+    between_cells,
+    can_turn_in,
+    find_target,
+    is_repeated,
+    nearest_target,
+    points_along,
+    refined,
+    target_in,
+)
+from spatial_replay.spec.formula import Atom, Formula, Outline, SignedDistance, TrackedName
+from spatial_replay.trace.sample import Sample
+
+# ------------------------------------------------------------------------------------------------- candidates
+
+_MOST_NAMED: Final = 2
+"""The most constraints that a reason names."""
+_LONGEST_NAME: Final = 60
+"""The most characters of one of them."""
+
+
+class Movables:
+    """The movable objects of one sample.
+
+    An object's propositions are measured over the grid once and used for every edge.
+    """
+
+    def __init__(
+        self,
+        propositions: Sequence[Formula],
+        regions: Mapping[str, Outline],
+        sample: Sample,
+        settings: Settings,
+        attempts: Attempts,
+    ) -> None:
+        self._propositions, self._regions = propositions, regions
+        self._sample, self._settings, self._attempts = sample, settings, attempts
+        self._maps: dict[str, PropositionMaps] = {}
+
+    @property
+    def sample(self) -> Sample:
+        """The sample."""
+        return self._sample
+
+    @property
+    def names(self) -> list[str]:
+        """The movable objects, in the order of the settings."""
+        movable, present = self._settings.movable, self._sample.objects
+        return [name for name in (sorted(present) if movable is None else movable) if name in present]
+
+    def names_for(self, progress: Guards) -> list[str]:
+        """Return the movable objects that a progress set depends on, in the order of the settings."""
+        about = {number for cube in progress.cubes for number, _ in cube}
+        return [
+            name for name in self.names if any(concerns(self._propositions[number], name) for number in about)
+        ]
+
+    def candidate(
+        self,
+        name: str,
+        consideration: Consideration,
+        failed: Collection[tuple[float, float]] = (),
+        later: Collection[str] = (),
+        *,
+        refine: bool = False,
+    ) -> Candidate:
+        """Return an object with its map for an edge, and its target or why it has none.
+
+        Args:
+            failed: places (x, y) where earlier attempts failed.
+            later: objects that may still have to be moved after this motion.
+            refine: refine the target, if the settings want that.
+
+        Raises:
+            TraceError: the sample has no footprint for the object.
+        """
+        tracked = self._tracked(name)
+        settings, maps = self._settings, self.maps_of(name)
+        cubes = consideration.progress.cubes, consideration.constraints.cubes
+        gradient = gradient_map(maps, *cubes, settings.workspace, settings.constraint_margin)
+        keeps_all = settings.room_from == "all" or name in later or self._attempts.needs_room(name)
+        room_from = None if keeps_all else later
+        if self._attempts.failed_pick(name, self._sample, settings):
+            # no other target helps
+            rejected = "it could not be picked up where it lies"
+            return Candidate(
+                name, gradient, None, rejected, failed=tuple(failed), room_from=_tuple(room_from)
+            )
+        target = find_target(
+            gradient, tracked, settings, maps.room(room_from), failed, self.failed_here(name)
+        )
+        if isinstance(target, str) and settings.refine and settings.rules > 3:
+            measured = self._measures(name, consideration, room_from)
+            target = between_cells(gradient, tracked, settings, measured, self.failed_here(name)) or target
+        if isinstance(target, Target) and refine:
+            target = self.refined(target, consideration, room_from)
+        if isinstance(target, Target):
+            target = self.with_way(target, consideration.constraints.cubes)
+        if isinstance(target, Target) and self.is_repeated(target):
+            target = "it was tried wherever it would hold, and nothing has changed since"
+        found, why = (None, target) if isinstance(target, str) else (target, "")
+        return Candidate(name, gradient, found, why, failed=tuple(failed), room_from=_tuple(room_from))
+
+    def failed_places(self, name: str) -> tuple[tuple[float, float], ...]:
+        """Return the places (x, y) where moving an object failed, whatever it was for."""
+        return self._attempts.places_of(name)
+
+    def failed_here(self, name: str) -> tuple[Target, ...]:
+        """Return the targets for which motions of an object failed while everything stood as it does."""
+        return self._attempts.failed_here(name, self._sample, self._settings)
+
+    def is_repeated(self, target: Target) -> bool:
+        """Return whether a motion to a target would repeat one that failed while everything stood as now."""
+        failures = self.failed_here(target.name)
+        if self._settings.skill == "place":
+            if self._attempts.failed_pick(target.name, self._sample, self._settings):
+                return True
+            return is_repeated(target, failures, self._settings)
+        return begins_as(target, failures, self._tracked(target.name))
+
+    def refined(
+        self,
+        target: Target,
+        consideration: Consideration,
+        room_from: Collection[str] | None,
+        then: Mapping[str, Pose] | None = None,
+    ) -> Target:
+        """Return a target of a placed object with more robustness nearby, if the settings want that.
+
+        Args:
+            room_from: the objects to keep room from; None for everything.
+            then: where other objects are moved to later, for the robustness, and as obstacles.
+        """
+        settings, name = self._settings, target.name
+        if not settings.refine or (settings.skill == "push" and settings.rules < 3):
+            return target
+        failures = () if settings.skill == "push" else self.failed_here(name)
+        measured = self._measures(name, consideration, room_from, then)
+        found = refined(target, self._tracked(name), settings, measured, failures)
+        is_kept = settings.skill == "place" or self._is_pushed_to(found, consideration.constraints.cubes)
+        return found if is_kept else target
+
+    def _measures(
+        self,
+        name: str,
+        consideration: Consideration,
+        room_from: Collection[str] | None,
+        then: Mapping[str, Pose] | None = None,
+    ) -> Measured:
+        """Return what measures maps of an object for an edge over any grid; see `refined`."""
+        settings = self._settings
+        progress, constraints = consideration.progress.cubes, consideration.constraints.cubes
+        later = self._sample if then is None else with_moved(self._sample, then)
+
+        def measured(grid: Grid, yaws: tuple[float, ...]) -> tuple[GradientMap, Floats]:
+            workspace = replace(settings.workspace, yaws=yaws, keeps_yaw=False)
+            about = self._propositions, self._regions
+            now = proposition_maps(*about, self._sample, name, workspace, grid)
+            after = now if then is None else proposition_maps(*about, later, name, workspace, grid)
+            gradient = gradient_map(
+                now, progress, constraints, settings.workspace, settings.constraint_margin, after
+            )
+            gradient.blocked[after.clearance <= settings.workspace.clearance] = OCCUPIED
+            return gradient, np.minimum(now.room(room_from), after.room(room_from))
+
+        return measured
+
+    def _is_pushed_to(self, target: Target, constraints: Cubes) -> bool:
+        """Return whether nothing is in the way on the last stretch of a path, and while turning there."""
+        settings, maps = self._settings, self.maps_of(target.name)
+        gradient = gradient_map(maps, ((),), constraints, settings.workspace, settings.constraint_margin)
+        last = (
+            gradient.grid.cell(*each)
+            for each in points_along(target.waypoints[-2:], gradient.grid.cell_size / 2)
+        )
+        if any(gradient.blocked[0][cell] != FREE for cell in last):
+            return False
+        size = gradient.grid.cell_size
+        spot = Grid(target.x - size / 2, target.y - size / 2, size, 1, 1)
+        return bool(can_turn_in(spot, gradient, target.turn, settings).all())
+
+    def _tracked(self, name: str) -> TrackedObject:
+        tracked = self._sample.objects[name]
+        if not isinstance(tracked, TrackedObject):
+            raise TraceError(f"object {name!r} is {tracked!r}; give a TrackedObject")
+        return tracked
+
+    def with_way(self, target: Target, constraints: Cubes) -> Target | str:
+        """Return the target of a carried object with a way that keeps the constraints, or why there is none.
+
+        Where no constraint is about the object, its way does not matter. On the way, constraints stay away
+        from holding by the margin and half a cell; where there is no such way, by the margin; else at all.
+        """
+        settings, name = self._settings, target.name
+        about = sorted({number for cube in constraints for number, _ in cube})
+        is_bound = any(concerns(self._propositions[number], name) for number in about)
+        if settings.skill == "push" or settings.lift is None or not is_bound:
+            return target
+        danger, grid, parts = self._danger_on_the_way(target, constraints, about)
+        away = np.hypot(*(grid.centres() - np.array(settings.workspace.base)).T).reshape(grid.shape)
+        reached = (away >= settings.workspace.nearest) & (away <= settings.workspace.farthest)
+        (here, there), goals = target.waypoints, np.zeros(grid.shape, np.bool_)
+        goals[grid.cell(*there)] = True
+        margin = settings.constraint_margin
+        for distance in (margin + grid.cell_size / math.sqrt(2.0), margin, 0.0):
+            path = shortest_path(reached & (danger < -distance), grid.cell(*here), goals)
+            if path is not None:
+                turns = [grid.centre(*each) for each in path.cells[1:-1].tolist()]
+                # a way of two points is one that does not matter
+                middle = ((here[0] + there[0]) / 2.0, (here[1] + there[1]) / 2.0)
+                return replace(target, waypoints=(here, *(turns or [middle]), there))
+        if settings.rules < 4:
+            return "on every way there a constraint would hold"
+        # what is crossed by the shortest way of all
+        path = shortest_path(reached, grid.cell(*here), goals)
+        if path is None:
+            return "the robot does not reach all of any way there"
+        centres = [grid.centre(*each) for each in path.cells.tolist()]
+        crossed = [grid.cell(*each) for each in points_along(centres, grid.cell_size)]
+        texts, which = most_dangerous(parts, (1, *grid.shape))
+        numbers = dict.fromkeys(int(which[0][each]) for each in crossed if danger[each] >= 0.0)
+        named = sorted((texts[number] for number in numbers), key=len)
+        said = " and ".join(each for each in named[:_MOST_NAMED] if len(each) <= _LONGEST_NAME)
+        return f"on every way there a constraint would hold{said and ', on the shortest one ' + said}"
+
+    def _danger_on_the_way(
+        self, target: Target, constraints: Cubes, about: Sequence[int]
+    ) -> tuple[np.ndarray, Grid, MapParts]:
+        """Return (rows, columns): the constraints' robustness with the object carried there.
+
+        Also return the grid, and the maps that this was computed from, with the object turned last.
+        """
+        settings, tracked = self._settings, self._tracked(target.name)
+        if tracked.height is not None and settings.lift:
+            low, high = tracked.height
+            tracked = replace(tracked, height=(low + settings.lift, high + settings.lift))
+        here = centre_of(tracked.footprint)
+        grid = settings.workspace.grid.reaching(*here)
+        # nothing that is carried over stands in the way
+        free = Workspace(grid, supports=frozenset(self._sample.objects))
+        formulas = [self._propositions[number] for number in about]
+        places = {number: place for place, number in enumerate(about)}
+        cubes = tuple(tuple((places[n], wanted) for n, wanted in cube) for cube in constraints)
+        moved = (moved_object(tracked, *here, turn) for turn in dict.fromkeys((0.0, target.turn)))
+        samples = (with_objects(self._sample, {target.name: each}) for each in moved)
+        maps = [proposition_maps(formulas, self._regions, each, target.name, free) for each in samples]
+        danger = np.maximum.reduce([danger_of(each, cubes)[0] for each in maps])
+        return danger, grid, MapParts(maps[-1], maps[-1], (), cubes)
+
+    def maps_of(self, name: str) -> PropositionMaps:
+        """Return the maps of all propositions over the cells of an object.
+
+        Raises:
+            TraceError: the sample has no footprint for the object.
+        """
+        tracked = self._tracked(name)
+        if name not in self._maps:
+            workspace = self._settings.workspace
+            pushes = self._settings.skill == "push"
+            # a pushed object crosses all cells from where it lies, which may be outside the workspace
+            grid = workspace.grid.reaching(*centre_of(tracked.footprint)) if pushes else workspace.grid
+            about = self._propositions, self._regions, self._sample, name
+            self._maps[name] = proposition_maps(*about, workspace, grid)
+        return self._maps[name]
+
+
+def _tuple(names: Collection[str] | None) -> tuple[str, ...] | None:
+    return None if names is None else tuple(names)
+
+
+def with_choice(
+    consideration: Consideration, candidates: Sequence[Candidate], settings: Settings
+) -> Consideration:
+    """Return an edge with its candidates, the best one chosen; pruned if no candidate has a target.
+
+    The best candidate has the shortest path if it is pushed, the greatest robustness if it is placed; the
+    first one wins a tie.
+    """
+    order = by_cost(candidates, settings)
+    if not order:
+        causes = "; ".join(f"{each.name}: {each.rejected}" for each in candidates)
+        kind = "no object can do it" if causes else "no object that can be moved matters to it"
+        return replace(consideration, candidates=tuple(candidates), pruned=Reason(kind, causes))
+    chosen = order[0]
+    marked = (replace(each, is_chosen=number == chosen) for number, each in enumerate(candidates))
+    return replace(consideration, candidates=tuple(marked))
+
+
+def by_cost(candidates: Sequence[Candidate], settings: Settings) -> list[int]:
+    """Return the candidates that have a target, by number, the best first."""
+    costs = {
+        number: each.target.length if settings.skill == "push" else -each.target.robustness
+        for number, each in enumerate(candidates)
+        if each.target is not None
+    }
+    return sorted(costs, key=costs.__getitem__)
+
+
+# ----------------------------------------------------------------------------------------------- expectations
+
+_MOST_ASIDE: Final = 80
+"""The most maps that are computed to bring objects aside for one decision."""
+
+
+class PredictedState(NamedTuple):
+    """A sample that is expected after motions.
+
+    Attributes:
+        moved: the poses of the objects moved, by name and in order, each with all its turns.
+    """
+
+    sample: Sample
+    moved: tuple[tuple[str, Pose], ...] = ()
+
+    def after(self, target: Target) -> PredictedState:
+        """Return the scene after a motion."""
+        pose = target.x, target.y, target.turn
+        moved = dict(self.moved)
+        *_, turned = moved.get(target.name, (0.0, 0.0, 0.0))
+        moved[target.name] = target.x, target.y, turned + target.turn
+        return PredictedState(with_moved(self.sample, {target.name: pose}), tuple(sorted(moved.items())))
+
+
+class Expectations:
+    """The samples that one decision expects, each looked at once.
+
+    Attributes:
+        automaton, formulas, regions, settings: of the planner; `formulas` are the automaton's propositions.
+        attempts: the motions of the run so far.
+        budget, aside_budget: the maps that may still be computed, those for what goes aside apart.
+    """
+
+    def __init__(
+        self,
+        automaton: Automaton,
+        formulas: Sequence[Formula],
+        regions: Mapping[str, Outline],
+        settings: Settings,
+        attempts: Attempts,
+        budget: Budget,
+    ) -> None:
+        """Begin with no scene."""
+        self.automaton, self.formulas, self.regions = automaton, formulas, regions
+        self.settings, self.attempts, self.budget = settings, attempts, budget
+        self.aside_budget = Budget(_MOST_ASIDE)
+        self._movables: dict[tuple[tuple[str, Pose], ...], Movables] = {}
+        self._symbols: dict[tuple[tuple[str, Pose], ...], Symbol] = {}
+
+    def begin(self, movables: Movables) -> PredictedState:
+        """Return the scene of the newest sample, of which some maps are known."""
+        self._movables[()] = movables
+        return PredictedState(movables.sample)
+
+    def symbol(self, scene: PredictedState) -> Symbol:
+        """Return the value of each proposition in a scene."""
+        if scene.moved not in self._symbols:
+            bounds = zip(*self.values(scene.sample), strict=True)
+            self._symbols[scene.moved] = tuple(
+                None if low < 0.0 <= high else low >= 0.0 for low, high in bounds
+            )
+        return self._symbols[scene.moved]
+
+    def values(self, sample: Sample, more: Sequence[Formula] = ()) -> tuple[list[float], list[float]]:
+        """Return the lower and the upper robustness of all propositions, and more formulas, in a sample."""
+        return values_in(sample, [*self.formulas, *more], self.regions)
+
+    def movables(self, scene: PredictedState) -> Movables:
+        """Return the movable objects of a scene."""
+        if scene.moved not in self._movables:
+            about = self.formulas, self.regions, scene.sample, self.settings, self.attempts
+            self._movables[scene.moved] = Movables(*about)
+        return self._movables[scene.moved]
+
+    def idle(self, scene: PredictedState, state: int) -> IdleTransitions:
+        """Return the transitions that time alone takes from a state while a scene stays as it is."""
+        return idle_transitions(self.automaton, state, self.symbol(scene))
+
+    def states_after(self, scene: PredictedState, state: int) -> frozenset[int]:
+        """Return the states that the automaton can be in after a sample like a scene."""
+        return self.automaton.step_set({state}, self.symbol(scene))
+
+    def robustness(self, sample: Sample, cubes: Cubes) -> float:
+        """Return the robustness of a disjunction of cubes in a sample."""
+        lower, upper = self.values(sample)
+        return max(min((lower[n] if w else -upper[n] for n, w in cube), default=0.0) for cube in cubes)
+
+    def traps(self, state: int) -> Cubes:
+        """Return the guards of the transitions by which acceptance is lost."""
+        lost = (self.automaton.transition(state, each) for each in self.automaton.successors[state])
+        return tuple(
+            cube
+            for each in lost
+            if each is not None and each.target not in self.automaton.can_accept
+            for cube in each.guard
+        )
+
+
+# ---------------------------------------------------------------------------------------- an order of several
+
+_MOST_PARKED: Final = 2
+"""The most objects that stand aside for others at once."""
+_MOST_PLACES: Final = 4
+"""The most places that are tried for an object that is brought aside."""
+_MOST_MAPS: Final = 40
+"""The most maps that are computed to bring objects aside for one arrangement."""
+
+
+class Ordered(NamedTuple):
+    """Motions in an order in which each is possible, and where they lead."""
+
+    motions: tuple[Target, ...]
+    scene: PredictedState
+    state: int
+
+
+class MotionOrder:
+    """The search for an order of the motions that bring objects to their places."""
+
+    def __init__(
+        self,
+        expected: Expectations,
+        scene: PredictedState,
+        aims: Sequence[Transition],
+        consideration: Consideration,
+        places: Mapping[str, Pose],
+        robustness: float,
+    ) -> None:
+        """Begin in a scene.
+
+        Args:
+            aims: the transitions that the motions are to take: a whole path to acceptance, or one edge.
+            consideration: the first of them, with what must not hold on the way.
+            places: where each object is to go.
+            robustness: of the progress set with all objects there.
+        """
+        self._expected, self._begin, self._aims = expected, scene, aims
+        self._constraints, self._places = consideration.constraints.cubes, places
+        self._robustness = robustness
+        self._dead: set[tuple[frozenset[str], tuple[tuple[str, Pose], ...]]] = set()
+        self._idle = set(expected.idle(scene, aims[0].source).states)
+        self._is_careful = expected.settings.rules > 3
+        self._targets: dict[tuple[tuple[tuple[str, Pose], ...], int, str], Target | None] = {}
+        self._most_parked = _MOST_PARKED
+        self._aside_maps = Budget(_MOST_MAPS)
+
+    def found(self) -> Ordered | None:
+        """Return the first order found, with as few objects brought aside as possible; None without one."""
+        if not self._is_careful:
+            return self._motions(self._begin, self._aims[0].source, frozenset(self._places))
+        for self._most_parked in range(_MOST_PARKED + 1):
+            self._dead.clear()
+            found = self._motions(self._begin, self._aims[0].source, frozenset(self._places))
+            if found is not None:
+                return found
+        return None
+
+    def _motions(
+        self, scene: PredictedState, state: int, left: frozenset[str], parked: tuple[str, ...] = ()
+    ) -> Ordered | None:
+        """Return the motions of the objects left, and the scene and the state after them."""
+        if not left:
+            return Ordered((), scene, state) if self._is_done(state) else None
+        if (left, scene.moved) in self._dead:
+            return None
+        is_first = len(left) == len(self._places)
+        for name in sorted(left):
+            key = scene.moved, state, name
+            if key not in self._targets:
+                self._targets[key] = self._target(scene, state, name, parked, is_first)
+            target = self._targets[key]
+            still = tuple(each for each in parked if each != name) if self._is_careful else parked
+            if (found := self._on(scene, state, target, left - {name}, still, is_first)) is not None:
+                return found
+        if self._expected.settings.rules > 1 and len(parked) < self._most_parked:
+            for name in sorted(left):
+                for other, target in self._aside(scene, state, name, left, parked, is_first):
+                    more = (*parked, other)
+                    if other not in parked and (
+                        found := self._on(scene, state, target, left, more, is_first)
+                    ):
+                        return found
+        self._dead.add((left, scene.moved))
+        return None
+
+    def _on(
+        self,
+        scene: PredictedState,
+        state: int,
+        target: Target | None,
+        left: frozenset[str],
+        parked: tuple[str, ...],
+        is_first: bool,
+    ) -> Ordered | None:
+        """Return a motion and those of the objects left after it; None if either is not possible."""
+        if target is None:
+            return None
+        after = scene.after(target)
+        if (reached := self._reached(after, state, is_first)) is None:
+            return None
+        rest = self._motions(after, reached, left, parked)
+        return None if rest is None else Ordered((target, *rest.motions), rest.scene, rest.state)
+
+    def _is_done(self, state: int) -> bool:
+        automaton = self._expected.automaton
+        if len(self._aims) > 1:
+            return state in automaton.accepting
+        return state == self._aims[0].target or (state in automaton.can_accept and state not in self._idle)
+
+    def _reached(self, scene: PredictedState, state: int, is_first: bool) -> int | None:
+        """Return the state after a motion; None if that is not one on the way."""
+        aim, is_strict = self._aims[0].target, is_first or len(self._aims) == 1
+        for _ in range(len(self._aims)):
+            states = self._expected.states_after(scene, state)
+            (after,) = states if len(states) == 1 else (-1,)
+            if after not in self._expected.automaton.can_accept:
+                return None
+            if is_strict and after != aim and after not in self._idle:
+                return None
+            if after == state:
+                break
+            state = after
+            # once the edge is taken, time alone may lead on
+            is_strict = is_strict and state != aim
+        return state
+
+    def _place_of(self, scene: PredictedState, name: str) -> Pose:
+        """Return where an object is to go, with the turn from how it is oriented in a scene."""
+        (x, y, turn), still = self._places[name], (0.0, 0.0, 0.0)
+        turned = dict(scene.moved).get(name, still)[2] - dict(self._begin.moved).get(name, still)[2]
+        return x, y, turn - turned
+
+    def _constraints_at(self, state: int, is_first: bool) -> Cubes:
+        """Return what must not hold on the way of the next motion."""
+        is_strict = is_first or len(self._aims) == 1
+        return self._constraints if is_strict else self._expected.traps(state)
+
+    def _spend(self, parked: Sequence[str], maps: int = 1) -> bool:
+        """Count maps; return whether there are any left. Those for what goes aside are counted apart."""
+        if not (self._is_careful and parked):
+            return self._expected.budget.spend(maps)
+        return self._aside_maps.spend(maps) and self._expected.aside_budget.spend(maps)
+
+    def _target(
+        self, scene: PredictedState, state: int, name: str, parked: tuple[str, ...], is_first: bool
+    ) -> Target | None:
+        """Return the motion of an object to its place; None if it is not possible now."""
+        settings, constraints = self._expected.settings, self._constraints_at(state, is_first)
+        tracked = scene.sample.objects[name]
+        if not isinstance(tracked, TrackedObject):
+            return None
+        if settings.skill == "place" and not is_first:
+            return self._placed(scene, name, tracked, constraints)
+        if not self._spend(parked):
+            return None
+        movables = self._expected.movables(scene)
+        cubes = self._aims[0].guard, constraints
+        gradient = gradient_map(
+            movables.maps_of(name), *cubes, settings.workspace, settings.constraint_margin
+        )
+        found = target_in(
+            gradient, tracked, settings, self._place_of(scene, name), movables.failed_here(name)
+        )
+        if isinstance(found, Target):
+            found = movables.with_way(found, constraints)
+        if isinstance(found, str) or movables.is_repeated(found):
+            return None
+        return replace(found, robustness=self._robustness)
+
+    def _placed(
+        self, scene: PredictedState, name: str, tracked: TrackedObject, constraints: Cubes
+    ) -> Target | None:
+        """Return the motion of an object that is carried, if there is room for it at its place."""
+        settings, (x, y, turn) = self._expected.settings, self._place_of(scene, name)
+        there = with_moved(scene.sample, {name: (x, y, turn)})
+        others = [each for each in there.objects if each != name and each not in settings.workspace.supports]
+        apart = [Atom("", "dist", SignedDistance(TrackedName(name), TrackedName(each))) for each in others]
+        lower, upper = self._expected.values(there, apart)
+        if any(each <= settings.workspace.clearance for each in lower[len(self._expected.formulas) :]):
+            return None
+        for cube in constraints:
+            danger = min((upper[n] if w else -lower[n] for n, w in cube), default=0.0)
+            if danger >= -settings.constraint_margin:
+                return None
+        yaw = None if tracked.yaw is None else tracked.yaw + turn
+        target = Target(name, x, y, turn, yaw, (centre_of(tracked.footprint), (x, y)), self._robustness)
+        found = self._expected.movables(scene).with_way(target, constraints)
+        return None if isinstance(found, str) else found
+
+    # ---------------------------------------------------------------------------------------- in the way
+
+    def _aside(
+        self,
+        scene: PredictedState,
+        state: int,
+        name: str,
+        left: frozenset[str],
+        parked: tuple[str, ...],
+        is_first: bool,
+    ) -> Iterator[tuple[str, Target]]:
+        """Yield motions that bring aside what is in the way of an object, or on its place."""
+        constraints, settings = self._constraints_at(state, is_first), self._expected.settings
+        names = [each for each in self._expected.movables(scene).names if each != name]
+        if self._is_careful:
+            names = [each for each in names if each in left or each not in {*parked, *self._places}]
+        aside = (*parked, name)
+        if settings.skill == "push" and not self._spend(aside):
+            return
+        way = self._way_past(scene, name, names, constraints)
+        if way is None:
+            return
+        bound = self._bound_by(scene, {name: way}, constraints) if self._is_careful else set()
+        beside = self._beside(scene, name, names)
+        for other in names:
+            if not isinstance(scene.sample.objects[other], TrackedObject):
+                continue
+            clearance = self._clearance(scene, {name: way}, other)
+            in_way = other in bound | beside or clearance <= settings.workspace.clearance
+            if in_way and self._spend(aside, 3 if self._is_careful else 2):
+                for target in self._parked(scene, state, other, {name: way}, left, is_first, other in beside):
+                    yield other, target
+
+    def _way_past(
+        self, scene: PredictedState, name: str, others: Sequence[str], constraints: Cubes
+    ) -> TrackedObject | None:
+        """Return all that an object covers on its way as if none of some others was in it."""
+        settings, tracked = self._expected.settings, scene.sample.objects[name]
+        place = self._place_of(scene, name)
+        if not isinstance(tracked, TrackedObject):
+            return None
+        if settings.skill == "place":
+            return moved_object(tracked, *place)
+        formulas, workspace = self._expected.formulas, settings.workspace
+        if self._is_careful:
+            ways = [each for each in self._ways_to_hold(constraints) if not _concerned(each, others)]
+            formulas, constraints = _cubes_of(ways)
+        free = replace(workspace, supports=workspace.supports.union(others))
+        about = formulas, self._expected.regions, scene.sample, name, free
+        maps = proposition_maps(*about, self._expected.movables(scene).maps_of(name).grid)
+        gradient = gradient_map(maps, ((),), constraints, workspace, settings.constraint_margin)
+        target = target_in(gradient, tracked, settings, place)
+        if isinstance(target, str):
+            return None
+        step = workspace.grid.cell_size
+        if self._is_careful:
+            # footprints that overlap by half leave no gap in which another object could stand
+            step = max(step, radius_of(tracked) / 2.0)
+        parts = [
+            part
+            for x, y in points_along(target.waypoints, step)
+            for part in moved_object(tracked, x, y).footprint.parts
+        ]
+        parts += moved_object(tracked, target.x, target.y, target.turn).footprint.parts
+        return replace(tracked, footprint=Footprint(tuple(parts)))
+
+    def _ways_to_hold(self, constraints: Cubes) -> list[tuple[Demand, ...]]:
+        """Return relations of which no conjunction must hold."""
+        return [each for cube in constraints for each in demands_of(cube, self._expected.formulas, 0.0)]
+
+    def _bound_by(
+        self, scene: PredictedState, covered: Mapping[str, TrackedObject], constraints: Cubes
+    ) -> set[str]:
+        """Return the objects because of which a constraint would hold with another one where it is to go."""
+        ((name, way),) = covered.items()
+        ways = [each for each in self._ways_to_hold(constraints) if _concerned(each, [name])]
+        relations = list(dict.fromkeys(each.formula for one in ways for each in one))
+        lower, upper = self._expected.values(with_objects(scene.sample, {name: way}), relations)
+        first = len(self._expected.formulas)
+        numbers = {each: first + place for place, each in enumerate(relations)}
+        bound: set[str] = set()
+        for one in ways:
+            ends = ((numbers[each.formula], each.wanted) for each in one)
+            danger = min((upper[n] if wanted else -lower[n] for n, wanted in ends), default=0.0)
+            if danger >= -self._expected.settings.constraint_margin:
+                bound |= _concerned(one, scene.sample.objects)
+        return bound
+
+    def _beside(self, scene: PredictedState, name: str, others: Sequence[str]) -> set[str]:
+        """Return the objects so near to one that could not be moved that they may be why."""
+        tracked = scene.sample.objects[name]
+        if not (isinstance(tracked, TrackedObject) and self._expected.movables(scene).failed_here(name)):
+            return set()
+        near = BESIDE * radius_of(tracked)
+        return {each for each in others if self._clearance(scene, {name: tracked}, each) <= near}
+
+    def _clearance(self, scene: PredictedState, covered: Mapping[str, TrackedObject], other: str) -> float:
+        """Return the distance of an object to what another one covers."""
+        (name,) = covered
+        apart = Atom("", "dist", SignedDistance(TrackedName(name), TrackedName(other)))
+        return self._expected.values(with_objects(scene.sample, covered), [apart])[0][-1]
+
+    def _formulas_about(self, name: str, constraints: Cubes) -> tuple[Sequence[Formula], Cubes]:
+        """Return relations with an object, and the conjunctions of them that must not hold."""
+        if not self._is_careful:
+            return (), ()
+        return _cubes_of([each for each in self._ways_to_hold(constraints) if _concerned(each, [name])])
+
+    def _is_kept(
+        self, sample: Sample, name: str, grid: Grid, formulas: Sequence[Formula], constraints: Cubes
+    ) -> tuple[Booleans, PropositionMaps]:
+        """Return (A, rows, columns) where an object is clear and no constraint holds, and its maps."""
+        settings = self._expected.settings
+        maps = proposition_maps(formulas, self._expected.regions, sample, name, settings.workspace, grid)
+        is_kept = danger_of(maps, constraints) < -settings.constraint_margin
+        return np.asarray(is_kept & (maps.clearance > settings.workspace.clearance)), maps
+
+    def _parked(
+        self,
+        scene: PredictedState,
+        state: int,
+        name: str,
+        covered: Mapping[str, TrackedObject],
+        left: frozenset[str],
+        is_first: bool,
+        is_beside: bool,
+    ) -> Iterator[Target]:
+        """Yield motions of an object to places where it is in no one's way, the nearest first.
+
+        There, nothing that must not hold does, neither now nor with the others where they are to go. What
+        stands beside an object that could not be moved goes away from it.
+        """
+        settings, constraints = self._expected.settings, self._constraints_at(state, is_first)
+        tracked = scene.sample.objects[name]
+        if not isinstance(tracked, TrackedObject):
+            return
+        movables = self._expected.movables(scene)
+        now, workspace = movables.maps_of(name), settings.workspace
+        gradient = gradient_map(now, self._aims[0].guard, constraints, workspace, settings.constraint_margin)
+        places = {each: self._place_of(scene, each) for each in left if each != name}
+        there = with_moved(scene.sample, places)
+        later = self._formulas_about(name, self._constraints_at(state, is_first=False))
+        clear, maps = self._is_kept(with_objects(there, covered), name, now.grid, *later)
+        good = (gradient.blocked == FREE) & clear
+        after = np.ones_like(good)
+        if self._is_careful and settings.skill == "push":
+            after, _ = self._is_kept(there, name, now.grid, *later)
+            onwards = _reachable_from(centre_of(tracked.footprint), now.grid, gradient.blocked == FREE)
+            if name in self._places:
+                # behind those that are at their places by then, it would stay away from its own
+                onwards &= _reachable_from(self._place_of(scene, name)[:2], now.grid, after)
+            after &= onwards
+            good &= after
+        # what is picked up or pushed again needs room
+        room = np.minimum(maps.clearance, gradient.clearance)
+        roomy = good & (room >= settings.room)
+        if settings.skill == "push" and not self._is_careful:
+            roomy = good
+        (blocked,) = covered
+        beside = scene.sample.objects[blocked]
+        if is_beside and isinstance(beside, TrackedObject):
+            good &= distance_to([centre_of(tracked.footprint)], now.grid) > 2.0 * now.grid.cell_size
+            far = good & (now.room([blocked]) > BESIDE * radius_of(beside))
+            roomy = roomy & far if (roomy & far).any() else far
+        free = np.ones_like(good)
+        for is_at_edge in (False, True) if self._is_careful and settings.skill == "push" else (False,):
+            if is_at_edge:
+                # in a corridor no place is clear of a way through its middle: others give way at its edges
+                if is_beside:
+                    return
+                good = roomy = (gradient.blocked == FREE) & after & free
+            for _ in range(_MOST_PLACES if self._is_careful else 1):
+                among = roomy if roomy.any() else good
+                if is_at_edge and among.any():
+                    among = among & (maps.clearance >= maps.clearance[among].max() - now.grid.cell_size / 2.0)
+                target = nearest_target(gradient, among, tracked, settings, movables.failed_here(name))
+                if isinstance(target, str):
+                    break
+                found = movables.with_way(target, constraints)
+                if isinstance(found, Target) and not movables.is_repeated(found):
+                    yield found
+                away = distance_to([(target.x, target.y)], gradient.grid) > 2.0 * radius_of(tracked)
+                free = free & away
+                good, roomy = good & away, roomy & away
+
+
+def _reachable_from(point: tuple[float, float], grid: Grid, free: Booleans) -> Booleans:
+    """Return (rows, columns) the cells that are joined to a point's by free ones (A, rows, columns); all if
+    that is not free itself."""
+    cell = grid.cell(*point)
+    return reachable(free[0], cell) if free[0][cell] else np.ones(grid.shape, np.bool_)
+
+
+def _cubes_of(ways: Sequence[tuple[Demand, ...]]) -> tuple[list[Formula], Cubes]:
+    """Return the relations of conjunctions, and these as cubes over them."""
+    formulas = list(dict.fromkeys(each.formula for way in ways for each in way))
+    return formulas, tuple(tuple((formulas.index(each.formula), each.wanted) for each in way) for way in ways)
+
+
+def _concerned(demands: Sequence[Demand], names: Iterable[str]) -> set[str]:
+    """Return which of some objects demands are about."""
+    return {name for name in names if any(concerns(each.formula, name) for each in demands)}
