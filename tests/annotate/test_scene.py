@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 
+from examples import examples
 from spatial_replay import ConvexPart, Footprint, Sample, Trace, TrackedObject, parse_specification
 from spatial_replay.annotate.leaf_pairs import leaf_pairs
 from spatial_replay.annotate.requirements import requirements_of
@@ -111,7 +112,7 @@ def runs(draw: st.DrawFn) -> Trace:
     return Trace.from_samples(samples)
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(runs(), st.data())
 def test_cutting_a_run_into_blocks_changes_no_byte(trace, data):
     said = says(near("a", "goal"), trace, np.linspace(-1.0, 1.0, len(trace)))
@@ -130,7 +131,7 @@ def test_cutting_a_run_into_blocks_changes_no_byte(trace, data):
     assert payloads == whole.payloads
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(runs())
 def test_a_viewer_shows_exactly_the_objects_of_the_sample(trace):
     encoded = SceneEncoder({}).encode(trace)
@@ -149,7 +150,7 @@ def test_a_viewer_shows_exactly_the_objects_of_the_sample(trace):
             assert (each.frame_id, each.HasField("lifetime")) == ("world", False)
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(runs())
 def test_messages_keep_their_distance_in_time(trace):
     times = SceneEncoder({}).encode(trace).times_ns

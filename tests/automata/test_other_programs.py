@@ -12,9 +12,10 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 
 from automata.golden import FORMULAS
+from examples import examples
 from laws.strategies_automaton import compiled, formulas_with_automata
 from spatial_replay import (
     NoAutomatonError,
@@ -33,7 +34,7 @@ needs_graphviz = pytest.mark.skipif(shutil.which("dot") is None, reason="Graphvi
 
 
 @needs_mona
-@settings(max_examples=60)
+@examples(60)
 @given(formulas_with_automata)
 def test_both_compilers_give_equal_automata(formula) -> None:
     assert compiled(formula, "own") == compiled(formula, "mona")

@@ -10,11 +10,12 @@ from xml.etree import ElementTree
 import pyarrow as pa
 import pytest
 import xmlschema
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import spatial_replay as sr
 from batch.fleet import batch, write_fleet
+from examples import examples
 from spatial_replay.batch.baseline import Tolerance
 from spatial_replay.batch.data_set import run_columns
 from spatial_replay.batch.junit import write_junit
@@ -62,7 +63,7 @@ def test_a_report_that_would_be_too_large_leaves_out_what_passes(run: Path, tmp_
 
 
 @given(st.lists(st.text(max_size=20), min_size=6, max_size=6))
-@settings(max_examples=20)
+@examples(20)
 def test_any_name_and_text_makes_a_valid_report(texts: list[str]) -> None:
     log, spec, case, failure, reason, requirement = texts
     row = {

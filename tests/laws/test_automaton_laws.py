@@ -8,9 +8,10 @@ from itertools import product
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
+from examples import examples
 from laws.reference import Prefix
 from laws.strategies_automaton import compiled, formulas_and_symbols, formulas_with_automata
 from laws.strategies_monitor import leaf_runs
@@ -171,7 +172,7 @@ def test_reading_an_automaton_gives_back_what_was_stored(formula):
     assert automaton_from(text.encode(), specification, spec) == machine
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(formulas_with_automata, formulas_with_automata, st.sampled_from(["and", "or"]))
 def test_joining_the_automata_of_operands_gives_that_of_the_whole(first, second, operator) -> None:
     formula = Boolean(operator, (first, second))

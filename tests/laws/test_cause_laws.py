@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 import spatial_replay as sr
+from examples import examples
 from laws.strategies_monitor import formulas_of_leaves, leaf_runs, recordings, specifications
 from spatial_replay import Specification
 from spatial_replay.monitor.online.program import compile_formula
@@ -62,7 +63,7 @@ def rebuilt(formula: Formula, node: int, change) -> Formula:
     return replace(formula, operands=tuple(operands))
 
 
-@settings(max_examples=200)
+@examples(200)
 @given(formula=formulas_of_leaves, run=leaf_runs(max_size=8))
 def test_a_log_that_may_go_on_has_the_intervals_of_a_monitor(formula, run):
     program = compile_formula(formula)
@@ -75,7 +76,7 @@ def test_a_log_that_may_go_on_has_the_intervals_of_a_monitor(formula, run):
             assert (low[0], high[0]) == tuple(series[node, 2:, count - 1])
 
 
-@settings(max_examples=200)
+@examples(200)
 @given(formula=formulas_of_leaves, run=leaf_runs(max_size=8))
 def test_what_settled_a_violation_has_the_number_of_that_moment(formula, run):
     program = compile_formula(formula)
@@ -93,7 +94,7 @@ def test_what_settled_a_violation_has_the_number_of_that_moment(formula, run):
         assert number == upper[node, count - 1]
 
 
-@settings(max_examples=150)
+@examples(150)
 @given(parts=st.lists(formulas_of_leaves, min_size=2, max_size=4), trace=signal_runs(), data=st.data())
 def test_causes_are_the_conjuncts_that_fail_and_the_settled_ones_come_first(parts, trace, data):
     named = [replace(part, name=f"part{k}") for k, part in enumerate(parts)]
@@ -118,7 +119,7 @@ def test_causes_are_the_conjuncts_that_fail_and_the_settled_ones_come_first(part
             assert result.nodes[cause.node].upper[at] == cause.witness.upper
 
 
-@settings(max_examples=200)
+@examples(200)
 @given(formula=formulas_of_leaves, trace=signal_runs())
 def test_a_vacuous_part_can_be_replaced_by_true(formula, trace):
     result = evaluated(formula, trace)
@@ -158,7 +159,7 @@ def without_end(formula: Formula) -> Formula:
     return formula
 
 
-@settings(max_examples=300)
+@examples(300)
 @given(formula=formulas_of_leaves.map(without_end), trace=signal_runs(), later=signal_runs())
 def test_no_later_sample_changes_a_verdict_that_no_cut_window_decides(formula, trace, later):
     result = evaluated(formula, trace)
@@ -170,7 +171,7 @@ def test_no_later_sample_changes_a_verdict_that_no_cut_window_decides(formula, t
         assert evaluated(formula, longer).verdict is result.verdict
 
 
-@settings(max_examples=300)
+@examples(300)
 @given(formula=formulas_of_leaves, trace=signal_runs(), data=st.data())
 def test_no_value_changes_a_verdict_that_nothing_tested(formula, trace, data):
     result = evaluated(formula, trace)
@@ -183,7 +184,7 @@ def test_no_value_changes_a_verdict_that_nothing_tested(formula, trace, data):
     assert evaluated(formula, sr.Trace.from_samples(other)).verdict is result.verdict
 
 
-@settings(max_examples=200)
+@examples(200)
 @given(formula=formulas_of_leaves, trace=signal_runs())
 def test_no_infinite_pass_is_silent(formula, trace):
     assume(not any(isinstance(node, Truth) for _, _, node in iter_nodes(formula)))
@@ -192,7 +193,7 @@ def test_no_infinite_pass_is_silent(formula, trace):
         assert result.vacuous
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(specification=specifications(), recording=recordings())
 def test_the_body_over_an_empty_group_can_be_replaced_by_true(specification, recording):
     trace = recording.trace()

@@ -7,10 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from hypothesis import HealthCheck, assume, example, given, settings
+from hypothesis import HealthCheck, assume, example, given
 from hypothesis import strategies as st
 
 import spatial_replay as sr
+from examples import examples
 from laws.strategies_monitor import HEADER, WORDS, Recording, recordings, specifications
 from laws.strategies_spec import formula_texts
 from spatial_replay import Specification
@@ -39,7 +40,7 @@ def versions(draw) -> tuple[sr.Specification, sr.Specification]:
     return old, new
 
 
-@settings(max_examples=40, suppress_health_check=[HealthCheck.too_slow])
+@examples(40, suppress_health_check=[HealthCheck.too_slow])
 @given(pair=versions(), recording=recordings(), semantics=st.sampled_from(["ltlf", "ltlf", "paper"]))
 def test_the_cause_of_a_change_undone_undoes_it(pair, recording, semantics):
     old, new = pair
@@ -106,7 +107,7 @@ def edited_texts(draw) -> tuple[str, str]:
     return DECLARED.format(**old), DECLARED.format(**new)
 
 
-@settings(max_examples=25, suppress_health_check=[HealthCheck.too_slow])
+@examples(25, suppress_health_check=[HealthCheck.too_slow])
 @given(texts=edited_texts(), recording=recordings())
 def test_the_lines_that_a_diff_names_are_those_that_were_edited_and_undone_they_undo_it(texts, recording):
     old, new = texts
@@ -137,7 +138,7 @@ def test_the_lines_that_a_diff_names_are_those_that_were_edited_and_undone_they_
         assert outcome[compared] == numbers_of(wanted)[compared]
 
 
-@settings(max_examples=30)
+@examples(30)
 @given(text=formula_texts(WORDS), recording=recordings())
 def test_equal_specifications_differ_in_nothing(text, recording):
     one, other = (sr.parse_specification(f"{HEADER}{line} = {text}\n") for line in ("spec s", "  spec  s"))
@@ -147,7 +148,7 @@ def test_equal_specifications_differ_in_nothing(text, recording):
     assert diff.spec("s").first is None
 
 
-@settings(max_examples=30)
+@examples(30)
 @given(recording=recordings(), other=recordings(), text=formula_texts(WORDS))
 def test_runs_differ_unless_they_are_equal(recording, other, text):
     specification = sr.parse_specification(f"{HEADER}spec s = {text}\n")
@@ -172,7 +173,7 @@ ONE_AFTER_THE_OTHER = Recording(
 )
 
 
-@settings(max_examples=40, suppress_health_check=[HealthCheck.too_slow])
+@examples(40, suppress_health_check=[HealthCheck.too_slow])
 @example(sr.parse_specification("spec s(ego) = ego ovlp ego"), ONE_AFTER_THE_OTHER)
 @given(specification=specifications(), recording=recordings(max_size=7))
 def test_a_clip_has_the_verdicts_the_robustness_and_the_witnesses_of_the_log(specification, recording):

@@ -8,9 +8,10 @@ from itertools import pairwise
 
 import numpy as np
 from foxglove_schemas_protobuf.Event_pb2 import Event
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
+from examples import examples
 from laws.strategies_monitor import Recording, cuts, recordings, specifications
 from spatial_replay import Specification, UsageError, evaluate, parse_specification
 from spatial_replay.annotate.deciding_leaf import NewestSamples
@@ -113,7 +114,7 @@ def _facts(event: EncodedEvent) -> dict[str, str]:
     return {pair.key: pair.value for pair in Event.FromString(event.event).metadata}
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(specifications(), recordings(max_size=12), st.data())
 def test_how_a_run_is_cut_changes_no_event(
     spec: Specification, recording: Recording, data: st.DataObject
@@ -124,7 +125,7 @@ def test_how_a_run_is_cut_changes_no_event(
     assert _all_events(spec, recording, data.draw(cuts(count))) == whole
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(specifications(), recordings(max_size=12), st.sampled_from(["ltlf", "paper"]))
 def test_the_last_event_of_a_result_is_its_verdict(
     spec: Specification, recording: Recording, semantics: Semantics
@@ -137,7 +138,7 @@ def test_the_last_event_of_a_result_is_its_verdict(
         assert last == {(each.name, each.object): each.verdict for each in result.results}
 
 
-@settings(max_examples=40)
+@examples(40)
 @given(recordings(max_size=12))
 def test_the_witness_of_a_change_has_its_number(recording: Recording) -> None:
     spec = parse_specification("spec s = F battery >= 0.5\nspec t = G not battery >= 0.75")

@@ -7,9 +7,10 @@ import math
 import numpy as np
 import pytest
 import shapely
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
+from examples import examples
 from laws.strategies_geometry import (
     angles,
     convex_parts,
@@ -104,7 +105,7 @@ def round_parts(draw):
 near = st.integers(-48, 48).map(lambda value: value / 16)
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(round_parts(), round_parts())
 def test_outlines_of_many_corners_are_measured_like_others(first, second):
     measured, expected = (
@@ -118,7 +119,7 @@ def test_outlines_of_many_corners_are_measured_like_others(first, second):
     assert protrusion(sharp(first), sharp(second)) == pytest.approx(max(corners), abs=TOLERANCE)
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(
     round_parts(),
     st.sampled_from([1.0, 1.0 - 1e-6, 0.999, 0.5]),
@@ -149,7 +150,7 @@ def separation_by_all(first, second):
     )
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(
     st.integers(66, 400),
     st.sampled_from([1.0, 0.4]),

@@ -11,10 +11,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, reject, settings
+from hypothesis import given, reject
 from hypothesis import strategies as st
 
 import spatial_replay as sr
+from examples import examples
 from laws.strategies_monitor import recordings, specifications
 from spatial_replay.compiled import only
 from spatial_replay.monitor.instances import find_instances
@@ -25,7 +26,7 @@ RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
 FORMS = ("interpreted", "compiled")
 
 
-@settings(max_examples=40)
+@examples(40)
 @given(specifications(), recordings(), st.sampled_from(["ltlf", "paper"]))
 def test_an_evaluation_has_the_same_bits(specification, recording, semantics):
     each = {"ego": "all"} if specification.specs[0].parameter else None

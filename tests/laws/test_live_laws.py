@@ -6,9 +6,10 @@ from dataclasses import replace
 from random import Random
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
+from examples import examples
 from laws.strategies_monitor import NAMES, WORDS, specifications, tracked_objects
 from spatial_replay import Footprint, Monitor, Sample, Trace, TrackedObject, evaluate, parse_specification
 
@@ -57,13 +58,13 @@ def assert_monitor_agrees(specification, samples):
         assert live.tobytes() == result.series.tobytes()
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(specification=specifications_looking_back(), samples=crowds())
 def test_a_monitor_equals_an_evaluation_while_objects_appear_and_disappear(specification, samples):
     assert_monitor_agrees(specification, samples)
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(
     specification=specifications(words=replace(WORDS, objects=(*NAMES, "p0")), templates=False),
     samples=crowds(),
@@ -100,7 +101,7 @@ spec met = F (exists x, y in everyone: {met})
 """
 
 
-@settings(max_examples=40)
+@examples(40)
 @given(
     samples=crowds(max_size=4),
     distance=st.integers(-8, 40).map(lambda value: value / 8),

@@ -14,12 +14,13 @@ from pathlib import Path
 
 import numpy as np
 import zstandard
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.records import Chunk, Message, MessageIndex
 from mcap.stream_reader import StreamReader, breakup_chunk
 
+from examples import examples
 from laws.strategies_trace import traces
 from spatial_replay import LogError, Sample, Trace, read_trace
 from spatial_replay.compiled import only
@@ -99,7 +100,7 @@ def test_messages_are_what_the_protobuf_library_writes(trace):
 
 
 @given(traces(max_samples=3))
-@settings(max_examples=50)
+@examples(50)
 def test_a_template_reads_what_the_protobuf_library_reads(trace):
     for payload in encode_objects(trace):
         message = ObjectStates.FromString(payload)
@@ -113,7 +114,7 @@ def test_a_template_reads_what_the_protobuf_library_reads(trace):
 
 
 @given(traces(max_samples=3), st.data())
-@settings(max_examples=50)
+@examples(50)
 def test_fields_in_any_order_mean_the_same(trace, data):
     """Other encoders may write the fields of a message in another order."""
     payloads = []
@@ -140,7 +141,7 @@ def test_dividing_samples_among_calls_does_not_change_the_bytes(trace, cuts):
 
 
 @given(traces(), st.integers(0, 2**62), st.integers(0, 2**62))
-@settings(max_examples=50)
+@examples(50)
 def test_a_window_of_a_log_is_a_window_of_its_trace(trace, one, other):
     times = trace.times_ns.tolist()
     start, end = sorted([one, other] if not times else [times[one % len(times)], times[other % len(times)]])
@@ -165,7 +166,7 @@ def is_subset(part, whole):
 
 
 @given(traces(max_samples=5), st.data())
-@settings(max_examples=40)
+@examples(40)
 def test_a_truncated_log_gives_a_prefix_and_says_so(trace, data):
     content = write([trace])
     for end in data.draw(st.lists(st.integers(0, len(content) - 1), min_size=5, max_size=5)):
@@ -175,7 +176,7 @@ def test_a_truncated_log_gives_a_prefix_and_says_so(trace, data):
 
 
 @given(traces(max_samples=5), st.data())
-@settings(max_examples=60)
+@examples(60)
 def test_flipped_bytes_only_take_samples_away(trace, data):
     content = write([trace])
     for _ in range(5):
@@ -194,7 +195,7 @@ def test_any_bytes_after_the_magic_are_at_worst_an_error(content):
 
 
 @given(traces().filter(len), st.lists(st.integers(1, 9), min_size=1, max_size=4), st.data(), FORMS)
-@settings(max_examples=80)
+@examples(80)
 def test_samples_in_columns_are_what_their_messages_hold(trace, repeats, data, form):
     """Some samples of each of a few layouts, one of whose bytes may be another."""
     chosen = data.draw(st.lists(st.integers(0, len(trace) - 1), min_size=len(repeats), max_size=len(repeats)))
@@ -230,7 +231,7 @@ def columns_of(trace):
 
 
 @given(traces(max_samples=3).filter(len), st.data())
-@settings(max_examples=60)
+@examples(60)
 def test_logs_of_many_chunks_are_read_alike_in_machine_code(trace, data):
     """Whole, changed, and cut off."""
     samples = [
@@ -252,7 +253,7 @@ def test_logs_of_many_chunks_are_read_alike_in_machine_code(trace, data):
 
 
 @given(traces(max_samples=3).filter(len), st.lists(st.integers(0, 4), min_size=1, max_size=9), FORMS)
-@settings(max_examples=30)
+@examples(30)
 def test_chunks_that_are_named_several_times_are_read_as_often(trace, named, form):
     first = next(trace.samples())
     samples = [replace(first, time_ns=k * 10**9) for k in range(5)]
@@ -344,7 +345,7 @@ def test_a_copy_has_each_message_where_the_index_says(written, form):
                 assert (number, log_time_ns) == (record.channel_id, time_ns)
 
 
-@settings(max_examples=30)
+@examples(30)
 @given(
     st.lists(
         st.tuples(

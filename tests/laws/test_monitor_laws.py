@@ -10,9 +10,10 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from examples import examples
 from laws.reference import Interval, Observed, numbers_of
 from laws.strategies_monitor import (
     LEAVES,
@@ -50,7 +51,7 @@ from spatial_replay.trace.sample import FOREVER
 
 VALUE, NOW, LOWER, UPPER = range(4)
 
-few = settings(max_examples=50)
+few = examples(50)
 """For laws whose examples are whole evaluations."""
 
 
@@ -107,38 +108,38 @@ def assert_as_defined(data, formula, run, room):
     assert_same((series, final), (expected.series, expected.final))
 
 
-@settings(max_examples=500)
+@examples(500)
 @given(data=st.data(), formula=formulas_of_leaves, run=leaf_runs(), room=st.integers(2, 8))
 def test_every_node_on_every_prefix_equals_the_definitions(data, formula, run, room):
     assert_as_defined(data, formula, run, room)
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(data=st.data(), formula=nested_windows, run=leaf_runs(max_size=40), room=st.integers(2, 64))
 def test_windows_below_windows_equal_the_definitions(data, formula, run, room):
     """On runs so long that windows close while others are open."""
     assert_as_defined(data, formula, run, room)
 
 
-@settings(max_examples=120)
+@examples(120)
 @given(data=st.data(), formula=alternative_windows, run=leaf_runs(max_size=30), room=st.integers(2, 64))
 def test_windows_beside_windows_equal_the_definitions(data, formula, run, room):
     assert_as_defined(data, formula, run, room)
 
 
-@settings(max_examples=200)
+@examples(200)
 @given(data=st.data(), formula=alike_windows, run=leaf_runs(max_size=40), room=st.integers(2, 64))
 def test_windows_that_begin_and_end_alike_equal_the_definitions(data, formula, run, room):
     assert_as_defined(data, formula, run, room)
 
 
-@settings(max_examples=150)
+@examples(150)
 @given(data=st.data(), formula=untils_of_lasting, run=leaf_runs(max_size=24), room=st.integers(2, 32))
 def test_untils_whose_left_operand_never_falls_equal_the_definitions(data, formula, run, room):
     assert_as_defined(data, formula, run, room)
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(data=st.data(), formula=alike_windows, run=ramps(), room=st.integers(2, 16))
 def test_windows_alike_over_signals_that_go_one_way_equal_the_definitions(data, formula, run, room):
     assert_as_defined(data, formula, run, room)
@@ -164,7 +165,7 @@ def test_windows_alike_equal_the_definitions_where_they_do_not_cross_for_long(ou
     assert_same(run_of(formula, run, room=room), (expected.series, expected.final))
 
 
-@settings(max_examples=200)
+@examples(200)
 @given(data=st.data(), formula=past_over_windows, run=leaf_runs(max_size=30), room=st.integers(2, 64))
 def test_past_operators_over_windows_equal_the_definitions(data, formula, run, room):
     assert_as_defined(data, formula, run, room)
@@ -180,13 +181,13 @@ def test_what_implies_a_window_ahead_has_its_own_number_now(outer, past, run):
     assert_same([root_of(formula, run)[0]], [root_of(Temporal(outer, (first,)), run)[0]])
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(data=st.data(), formula=lasting_windows, run=leaf_runs(max_size=20), room=st.integers(2, 64))
 def test_windows_that_recur_or_begin_later_equal_the_definitions(data, formula, run, room):
     assert_as_defined(data, formula, run, room)
 
 
-@settings(max_examples=150)
+@examples(150)
 @given(data=st.data(), specification=specifications(), recording=recordings())
 def test_specifications_over_recordings_equal_the_definitions(data, specification, recording):
     times = [sample.time_ns for sample in recording.samples]
@@ -289,7 +290,7 @@ def test_a_monitor_equals_an_evaluation_sample_by_sample(data, specification, re
 # ------------------------------------------------------------------------------------------- equivalences
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(data=st.data(), shape=responses(st.sampled_from(LEAVES)), run=leaf_runs(max_size=30))
 def test_windows_at_a_constant_cost_equal_windows_run_backwards(data, shape, run):
     wide = st.integers(0, 9).flatmap(
@@ -303,7 +304,7 @@ def test_windows_at_a_constant_cost_equal_windows_run_backwards(data, shape, run
     assert_same(*(root_of(with_window(shape, leaf, window), run) for window in (ahead, slow)))
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(data=st.data(), seed=st.integers(0, 2**32 - 1), channels=st.sampled_from([1, 2]))
 def test_windows_in_samples_equal_windows_in_seconds_of_even_samples(data, seed, channels):
     """Wide ones, below each other, for which there are other rules in samples."""

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
+from examples import examples
 from laws.reference import Prefix
 from laws.strategies_monitor import formulas_of_leaves, leaf_runs
 from spatial_replay.monitor.offline import evaluate_offline, full_signal, window_signal
@@ -26,7 +27,7 @@ def stretch(run, leaf, begin, end):
     return Prefix(run.times_ns[begin:end], lambda formula, t: leaf(formula, begin + t), goes_on=False)
 
 
-@settings(max_examples=400)
+@examples(400)
 @given(formula=formulas_of_leaves, run=leaf_runs())
 def test_every_node_at_every_sample_equals_the_definitions(formula, run):
     order, times = compile_formula(formula).leaves, np.array(run.times_ns)
@@ -45,7 +46,7 @@ def test_every_node_at_every_sample_equals_the_definitions(formula, run):
     np.testing.assert_array_equal(full_signal(formula, order, leaves, times), signal)
 
 
-@settings(max_examples=200)
+@examples(200)
 @given(formula=formulas_of_leaves, run=leaf_runs(), width_ns=st.sampled_from([1, 100, 101, 300, 10**6]))
 def test_a_window_equals_a_run_of_its_own(formula, run, width_ns):
     order, times = compile_formula(formula).leaves, np.array(run.times_ns)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from xml.etree import ElementTree
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import spatial_replay as sr
+from examples import examples
 from laws.strategies_spec import specification_texts
 from pages import shown
 from spatial_replay.notebook.figures import element
@@ -22,7 +23,7 @@ def test_any_text_is_shown_as_text(text):
     assert len(page) == 0
 
 
-@settings(max_examples=50)
+@examples(50)
 @given(specification_texts())
 def test_a_page_shows_every_node_of_a_small_specification(text):
     specification = sr.parse_specification(text)

@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from examples import examples
 from laws.strategies_monitor import LEAVES, WORDS, bounds, cuts, recordings, specifications
 from spatial_replay import Monitor, UsageError, evaluate
 from spatial_replay.monitor.paper.evaluator import PaperRun
@@ -152,7 +153,7 @@ def series_of(formula, run, ends):
     return np.concatenate(series, axis=2)
 
 
-@settings(max_examples=300)
+@examples(300)
 @given(formulas, runs(), st.data())
 def test_every_node_on_every_prefix_equals_the_definition(formula, run, data):
     size = len(run.times_ns)
@@ -171,7 +172,7 @@ def test_the_size_of_blocks_changes_no_bit(formula, run, data):
         assert series_of(formula, run, ends).tobytes() == whole.tobytes()
 
 
-@settings(max_examples=50)
+@examples(50)
 @given(specifications(words=replace(WORDS, past=False), templates=False), recordings(), st.data())
 def test_a_monitor_equals_an_evaluation_sample_by_sample(specification, recording, data):
     assume(not recording.unreadable)

@@ -7,10 +7,11 @@ from dataclasses import replace
 from itertools import count, pairwise
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import spatial_replay as sr
+from examples import examples
 from spatial_replay import Planner, Settings
 from spatial_replay.planning import (
     MOST_MOTIONS,
@@ -67,7 +68,7 @@ def scenes(draw):
 
 
 @given(scenes(), st.sampled_from(TEXTS), st.sampled_from([(), (0.5,), (-1.0, 2.0)]), st.data())
-@settings(max_examples=60)
+@examples(60)
 def test_a_cell_is_the_robustness_of_the_sample_with_the_object_moved_there(sample, text, yaws, data):
     specification = sr.parse_specification(f"{REGION}spec s = {text}")
     workspace = Workspace(Grid(-4.0, -4.0, 1.7, 5, 4), yaws)
@@ -91,7 +92,7 @@ def test_a_cell_is_the_robustness_of_the_sample_with_the_object_moved_there(samp
     st.sampled_from([(), (0.5,), (-1.0, 2.0)]),
     st.booleans(),
 )
-@settings(max_examples=30)
+@examples(30)
 def test_many_cells_have_the_bits_that_few_have(sample, text, yaws, is_obstructed):
     # 4,480 cells are measured in three tiles, a quarter of them in one; corners of cells are exact numbers
     specification = sr.parse_specification(f"{REGION}spec s = {text}")
@@ -175,7 +176,7 @@ def settings_of_planners(draw):
 
 
 @given(tasks(), settings_of_planners(), st.integers(0, 2**32 - 1))
-@settings(max_examples=60)
+@examples(60)
 def test_a_planner_terminates_with_a_reason_for_each_pruned_edge(specification, options, seed):
     random = np.random.default_rng(seed)
     planner = Planner(specification, options)
@@ -218,7 +219,7 @@ def easy_tasks(draw):
 
 
 @given(st.one_of(easy_tasks(), tasks()), settings_of_planners(), st.integers(0, 2**32 - 1))
-@settings(max_examples=60)
+@examples(60)
 def test_a_target_is_free_and_has_the_robustness_that_it_states(specification, options, seed):
     random = np.random.default_rng(seed)
     shape = sr.TrackedObject(sr.Footprint.box(0, 0, 1, 1))
@@ -271,7 +272,7 @@ def test_a_target_is_free_and_has_the_robustness_that_it_states(specification, o
     st.sampled_from(["F", "F[0,1]", "F[0,40]", "F[3,40]", "X X F"]),
     st.sampled_from(["a leftof b", "a dist c <= 1", "a above b and a above c"]),
 )
-@settings(max_examples=60)
+@examples(60)
 def test_a_pushed_object_touches_nothing_whatever_the_deadline(seed, when, goal):
     random = np.random.default_rng(seed)
     workspace = Workspace(Grid(-6.0, -6.0, 0.5, 24, 24), farthest=7.0, clearance=0.25)

@@ -6,9 +6,10 @@ import math
 
 from foxglove_schemas_protobuf.Event_pb2 import Event
 from foxglove_schemas_protobuf.Log_pb2 import Log
-from hypothesis import given, reject, settings
+from hypothesis import given, reject
 from hypothesis import strategies as st
 
+from examples import examples
 from laws.strategies_monitor import HEADER, WORDS, Recording, formula_texts, recordings, specifications
 from spatial_replay import Specification, SpecificationError, parse_specification
 from spatial_replay.annotate.scene.scene_frames import DrawnViolation, SceneFrames
@@ -93,7 +94,7 @@ def _node(result: SpecResult, node: int) -> Formula:
     return next(each for identifier, _, each in iter_nodes(result.formula) if identifier == node)
 
 
-@settings(max_examples=80)
+@examples(80)
 @given(SPECIFICATIONS, recordings(max_size=8))
 def test_json_headline_and_the_last_event_name_what_settled_the_verdict(
     spec: Specification, recording: Recording
@@ -124,7 +125,7 @@ def test_json_headline_and_the_last_event_name_what_settled_the_verdict(
         assert event["witness"].startswith(tuple(f"`{text}`" for text in texts))
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(SPECIFICATIONS, recordings(max_size=8))
 def test_the_log_is_calm_about_what_is_pending_and_about_parts_that_need_not_hold(
     spec: Specification, recording: Recording
@@ -140,7 +141,7 @@ def test_the_log_is_calm_about_what_is_pending_and_about_parts_that_need_not_hol
         assert level == Log.INFO or (is_late and facts["verdict"] == "violated")
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(SPECIFICATIONS, recordings(max_size=8))
 def test_the_arrow_names_what_the_first_cause_names_and_no_pending_goal(
     spec: Specification, recording: Recording

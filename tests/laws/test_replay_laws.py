@@ -12,9 +12,10 @@ from tempfile import TemporaryDirectory
 
 from foxglove_schemas_protobuf.Event_pb2 import Event
 from foxglove_schemas_protobuf.Log_pb2 import Log
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
+from examples import examples
 from laws.strategies_monitor import NAMES, Recording, recordings, specifications
 from replay.runs import PiecewiseSource, content_of, record, run, write_tracks
 from spatial_replay import Recorder, Sample, Specification, SpecificationError, Trace, parse_specification
@@ -24,7 +25,7 @@ from spatial_replay.replay import ReplayOptions, Window, load_files, run_replay
 from spatial_replay.replay.engine import Replayed
 from spatial_replay.sources import open_source
 
-FEW = settings(max_examples=25)
+FEW = examples(25)
 
 
 def _choices(spec: Specification) -> dict[str, str]:

@@ -5,10 +5,11 @@ from __future__ import annotations
 from itertools import product
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import spatial_replay as sr
+from examples import examples
 from laws.reference import Interval, Prefix
 from spatial_replay.sanity.linear import Inequality, solve
 from spatial_replay.spec.formula import NamedSpec
@@ -97,7 +98,7 @@ def crowded_trace(seed: int, samples: int = 60) -> sr.Trace:
 ROUNDING = 1e-9
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(spatial_formulas(), spatial_formulas(), st.integers(0, 2**32))
 def test_what_the_doctor_excludes_happens_in_no_run(one: str, other: str, seed: int) -> None:
     specification = sr.parse_specification(f"{REGIONS}spec one = {one}\nspec other = {other}\n")
@@ -160,7 +161,7 @@ def true_literals(trace: sr.Trace) -> list[str]:
     return literals
 
 
-@settings(max_examples=25)
+@examples(25)
 @given(st.integers(0, 2**32))
 def test_the_doctor_excludes_nothing_that_is_measured(seed: int) -> None:
     literals = true_literals(crowded_trace(seed, 1))
@@ -171,7 +172,7 @@ def test_the_doctor_excludes_nothing_that_is_measured(seed: int) -> None:
     assert examined.specs[0].undecided == ()
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(spatial_formulas())
 def test_a_placed_run_is_evaluated_to_the_verdict_that_it_shows(text: str) -> None:
     specification = sr.parse_specification(f"{REGIONS}spec one = {text}\n")
@@ -225,7 +226,7 @@ def satisfying_lengths(formula: object) -> dict[bool, set[int]]:
     return lengths
 
 
-@settings(max_examples=80)
+@examples(80)
 @given(_formulas(3))
 def test_shortest_runs_are_found_exactly_where_there_are_runs(text: str) -> None:
     specification = sr.parse_specification(f"spec one = {text}\n")
@@ -259,7 +260,7 @@ sums = st.dictionaries(st.sampled_from("xyzw"), st.sampled_from([-2, -1, 1, 2]),
     st.lists(st.tuples(sums, st.integers(-3, 3), st.booleans()), min_size=1, max_size=6),
     st.lists(st.tuples(sums, st.integers(-2, 2)), max_size=8),
 )
-@settings(max_examples=150)
+@examples(150)
 def test_laws_that_are_added_only_when_they_are_broken_decide_as_all_of_them_do(
     asked: list[tuple[dict[str, int], int, bool]], known: list[tuple[dict[str, int], int]]
 ) -> None:

@@ -6,9 +6,10 @@ from math import cos, pi, sin
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
+from examples import examples
 from spatial_replay import Footprint, Sample, Trace, evaluate, parse_specification, read_trace
 
 LENGTHS = st.floats(0.1, 5)
@@ -48,7 +49,7 @@ def assert_within(scenario: Trace, truth: Footprint) -> None:
         assert open_result.lower - 1e-6 <= result.robustness <= open_result.upper + 1e-6
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(
     LENGTHS,
     LENGTHS,
@@ -85,7 +86,7 @@ def test_an_open_position_and_orientation_widen_the_interval(
     assert_within(scenario, truth)
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(LENGTHS, LENGTHS, PLACES, PLACES, SHARES, SHARES, SHARES, SHARES)
 def test_an_obstacle_anywhere_in_an_occupancy_is_within_the_interval(
     length: float, width: float, x: float, y: float, long: float, wide: float, along: float, across: float

@@ -5,8 +5,9 @@ from __future__ import annotations
 import re
 
 import hypothesis.strategies as st
-from hypothesis import given, settings
+from hypothesis import given
 
+from examples import examples
 from laws.strategies_spec import Vocabulary, formula_texts, noise, specification_texts
 from spatial_replay import SpecificationError, parse_specification
 from spatial_replay.spec import check_names, format_formula, format_specification, instantiate, object_names
@@ -19,7 +20,7 @@ def formula_of(text: str) -> Formula:
 
 
 @given(specification_texts())
-@settings(max_examples=60)
+@examples(60)
 def test_reading_a_canonical_text_gives_an_equal_specification(text: str) -> None:
     specification = parse_specification(text)
     canonical = format_specification(specification)
@@ -28,7 +29,7 @@ def test_reading_a_canonical_text_gives_an_equal_specification(text: str) -> Non
 
 
 @given(specification_texts())
-@settings(max_examples=60)
+@examples(60)
 def test_the_text_of_a_node_means_that_node(text: str) -> None:
     """The text of a node, which tools show by itself, means that node."""
     specification = parse_specification(text)
@@ -40,7 +41,7 @@ def test_the_text_of_a_node_means_that_node(text: str) -> None:
 
 
 @given(noise)
-@settings(max_examples=500)
+@examples(500)
 def test_any_text_is_a_specification_or_has_faults_with_places(text: str) -> None:
     try:
         specification = parse_specification(text)
@@ -99,7 +100,7 @@ def test_a_prefix_reaches_up_to_the_closing_bracket(a: str, b: str) -> None:
 
 
 @given(specification_texts())
-@settings(max_examples=60)
+@examples(60)
 def test_object_and_signal_names_are_exactly_those_used(text: str) -> None:
     specification = parse_specification(text)
     names = object_names(specification)
@@ -109,7 +110,7 @@ def test_object_and_signal_names_are_exactly_those_used(text: str) -> None:
 
 
 @given(specification_texts())
-@settings(max_examples=60)
+@examples(60)
 def test_an_instance_of_a_template_is_about_its_object(text: str) -> None:
     specification = parse_specification(text)
     template = next(spec for spec in specification.specs if spec.parameter == "ego")

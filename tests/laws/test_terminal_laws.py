@@ -8,9 +8,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import pytest
-from hypothesis import HealthCheck, example, given, settings
+from hypothesis import HealthCheck, example, given
 from hypothesis import strategies as st
 
+from examples import examples
 from spatial_replay.cli import run
 
 _STEERING = st.sampled_from(
@@ -19,7 +20,7 @@ _STEERING = st.sampled_from(
 _NAMES = st.tuples(st.text("ab é", max_size=2), _STEERING, st.text("ab", max_size=2)).map("".join)
 
 
-@settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@examples(6, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(_NAMES, _NAMES)
 @example("cup\x1b]0;x\x07\x1b[2J", "\x9b31mfull\u202e\r\n")
 def test_only_what_is_printable_is_printed(capsys: pytest.CaptureFixture[str], name: str, other: str) -> None:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from decimal import Decimal
 
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 import spatial_replay as sr
+from examples import examples
 from tuning.tuned_runs import run_at
 
 TEXTS = {
@@ -34,7 +35,7 @@ def beyond(value: float | str, step: float, direction: int) -> float | str:
     return f"{number:f}s" if isinstance(value, str) else float(number)
 
 
-@settings(max_examples=25, deadline=None)
+@examples(25)
 @given(st.sampled_from(sorted(TEXTS)), st.lists(RUNS, min_size=1, max_size=4))
 def test_the_tightest_value_satisfies_all_good_runs_and_a_tighter_one_does_not(
     name: str, good: list[list[float]]
@@ -52,7 +53,7 @@ def test_the_tightest_value_satisfies_all_good_runs_and_a_tighter_one_does_not(
         assert not all(satisfied(text, name, tighter, run) for run in good)
 
 
-@settings(max_examples=25, deadline=None)
+@examples(25)
 @given(
     st.sampled_from(sorted(TEXTS)),
     st.lists(RUNS, min_size=1, max_size=3),
@@ -98,7 +99,7 @@ def test_the_values_that_fit_are_all_those_stated_and_none_has_a_wider_margin(
     assert all(margin(value) <= tuning.margin for value in others)
 
 
-@settings(max_examples=15, deadline=None)
+@examples(15)
 @given(st.lists(RUNS, min_size=1, max_size=2), st.lists(RUNS, min_size=1, max_size=2))
 def test_several_constants_fit_every_run_and_a_step_beyond_the_ends_of_each_does_not(
     good: list[list[float]], bad: list[list[float]]

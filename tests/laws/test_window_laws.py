@@ -7,9 +7,10 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from examples import examples
 from laws.reference import ANYTHING, Interval, numbers_of
 from laws.strategies_monitor import LEAVES, LeafRun, combinations_of, responses, windows_of
 from laws.test_monitor_laws import fewest
@@ -287,21 +288,21 @@ tiles = st.sampled_from([33, 40, 256, 256])
 widths = st.sampled_from([100, 256, 1024])
 
 
-@settings(max_examples=1000)
+@examples(1000)
 @given(data=st.data(), formula=formulas, run=long_runs(), room=rooms, tile=tiles)
 def test_samples_together_say_what_they_say_one_by_one(data, formula, run, room, tile):
     ends = data.draw(stretches(len(run)))
     assert_same_bits(*both_ways(program_of(formula), run, ends, room=room, tile=tile))
 
 
-@settings(max_examples=200)
+@examples(200)
 @given(data=st.data(), formula=wide_windows, run=long_runs(min_size=500, max_size=900), tile=widths)
 def test_wide_windows_say_the_same_of_samples_together_and_one_by_one(data, formula, run, tile):
     ends = data.draw(stretches(len(run)))
     assert_same_bits(*both_ways(program_of(formula), run, ends, room=2048, tile=tile))
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(data=st.data(), formula=formulas, run=long_runs(min_size=36, max_size=60), room=rooms)
 def test_long_windows_equal_the_definitions(data, formula, run, room):
     ends = data.draw(stretches(len(run)))
@@ -318,7 +319,7 @@ def assert_as_defined(formula, program, run, ends, **options):
         np.testing.assert_array_equal(finals[-1], expected.final)
 
 
-@settings(max_examples=600)
+@examples(600)
 @given(
     data=st.data(),
     case=st.one_of(*[st.tuples(outdone, long_runs())] * 2, st.tuples(outdone_widely, long_runs(700, 1000))),
@@ -338,14 +339,14 @@ def test_leaving_out_what_matters_no_more_changes_nothing(data, case, tile):
         assert_same_bits([one], [other])
 
 
-@settings(max_examples=300)
+@examples(300)
 @given(data=st.data(), formula=ending, run=long_runs(), room=rooms, tile=tiles)
 def test_windows_from_the_first_sample_say_the_same_together_and_one_by_one(data, formula, run, room, tile):
     ends = data.draw(stretches(len(run)))
     assert_same_bits(*both_ways(program_of(formula), run, ends, room=room, tile=tile))
 
 
-@settings(max_examples=100)
+@examples(100)
 @given(data=st.data(), formula=ending, run=long_runs(min_size=36, max_size=60), room=rooms)
 def test_windows_from_the_first_sample_equal_the_definitions(data, formula, run, room):
     ends = data.draw(stretches(len(run)))
@@ -367,7 +368,7 @@ def test_memory_does_not_grow_with_a_window_from_the_first_sample():
         assert run.make_room(size) <= 512
 
 
-@settings(max_examples=40)
+@examples(40)
 @given(data=st.data(), formula=formulas, run=long_runs(min_size=20, max_size=50))
 def test_interpreted_windows_have_the_same_bits(data, formula, run):
     ends, program = data.draw(stretches(len(run))), program_of(formula)

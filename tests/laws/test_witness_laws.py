@@ -6,9 +6,10 @@ import math
 import re
 
 import numpy as np
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from examples import examples
 from laws.strategies_monitor import formulas_of_leaves, leaf_runs, recordings, specifications
 from laws.strategies_spec import Vocabulary
 from laws.test_monitor_laws import observed_in
@@ -52,7 +53,7 @@ def comparison_texts(draw) -> str:
     return text
 
 
-@settings(max_examples=400)
+@examples(400)
 @given(formula=formulas_of_leaves, run=leaf_runs())
 def test_the_path_ends_at_the_number_it_began_with(formula, run):
     order, times = compile_formula(formula).leaves, np.array(run.times_ns)
@@ -83,7 +84,7 @@ def test_the_earliest_of_equal_samples_decides(trace, operator):
     assert witness.time_ns == int(trace.times_ns[int(np.flatnonzero(values == best)[0])])
 
 
-@settings(max_examples=80)
+@examples(80)
 @given(specification=specifications(), recording=recordings())
 def test_a_witness_has_the_value_it_claims(specification, recording):
     trace = recording.trace()
@@ -126,7 +127,7 @@ def total(deciding) -> float:
     )
 
 
-@settings(max_examples=200)
+@examples(200)
 @given(text=comparison_texts(), trace=signal_runs())
 def test_the_threshold_flips_the_verdict(text, trace):
     witness = evaluate(parse_specification(text), trace).result().witness()
@@ -192,7 +193,7 @@ group everyone = all
 """
 
 
-@settings(max_examples=80)
+@examples(80)
 @given(text=st.sampled_from(DISTANCES), number=st.sampled_from([0.5, 2.25, 7.125]), recording=recordings())
 def test_the_threshold_of_a_relation_flips_the_verdict(text, number, recording):
     trace = recording.trace()

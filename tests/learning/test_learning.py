@@ -8,10 +8,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import spatial_replay as sr
+from examples import examples
 from replay.runs import write_tracks
 from spatial_replay import UsageError
 from spatial_replay.cli import run
@@ -127,7 +128,7 @@ def test_runs_left_out_in_turn_say_what_is_found_of_what_was_not_seen() -> None:
     assert all(run.is_right for run in again.checked if not run.is_good)
 
 
-@settings(max_examples=5)
+@examples(5)
 @given(
     st.lists(st.floats(0.45, 1.2), min_size=2, max_size=4, unique=True),
     st.lists(st.tuples(st.floats(0.05, 1.2), st.floats(1.0, 2.2), st.booleans()), max_size=2, unique=True),

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from mcap.exceptions import EndOfFile
 from mcap.reader import make_reader
@@ -23,6 +23,7 @@ from mcap.writer import IndexType, Writer
 from mcap_protobuf.decoder import DecoderFactory
 from mcap_protobuf.schema import build_file_descriptor_set
 
+from examples import examples
 from spatial_replay import (
     Footprint,
     LogError,
@@ -303,7 +304,7 @@ STRETCHES = st.lists(
 
 
 @given(STRETCHES, st.integers(0, 3))
-@settings(max_examples=25)
+@examples(25)
 def test_of_many_chunks_those_with_a_topic_are_found(tmp_path_factory, stretches, wanted):
     channels = [Channel(f"/camera{number}", "json", None) for number in range(4)]
     path = tmp_path_factory.mktemp("stretches") / "run.mcap"

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, given
 from hypothesis import strategies as st
 
 from bags.bag_files import write_mcap
+from examples import examples
 from mapping.feeding import SECOND, Feed, make, pose_stamped, tf, transform
 from spatial_replay import Trace
 from spatial_replay.mapping import MappedSource, parse_mapping
@@ -306,7 +307,7 @@ ticks = st.integers(10, 50)
     delay=st.integers(0, 9),
     window=st.tuples(ticks, ticks).map(sorted),
 )
-@settings(max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@examples(40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_a_window_of_a_log_with_frames_is_a_slice_of_the_whole(
     tmp_path: Path,
     statics: list[tuple[int, int, bool]],

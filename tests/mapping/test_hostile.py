@@ -7,9 +7,10 @@ import copy
 from typing import Any
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
+from examples import examples
 from mapping.feeding import SECOND, Feed, make
 from spatial_replay import LogError, UsageError
 
@@ -103,7 +104,7 @@ def damaged(draw: st.DrawFn, example: Any) -> Any:
 
 @pytest.mark.parametrize("kind", EXAMPLES)
 @pytest.mark.parametrize("head", ["", "fixed_frame: map\n", "clock: header\n"])
-@settings(max_examples=20)
+@examples(20)
 @given(data=st.data())
 def test_a_damaged_message_affects_no_other(kind: str, head: str, data: st.DataObject) -> None:
     example = EXAMPLES[kind]
@@ -125,7 +126,7 @@ def test_a_damaged_message_affects_no_other(kind: str, head: str, data: st.DataO
 
 
 @pytest.mark.parametrize("kind", EXAMPLES)
-@settings(max_examples=20)
+@examples(20)
 @given(data=st.data())
 def test_a_damaged_first_message_is_reported(kind: str, data: st.DataObject) -> None:
     feed = (

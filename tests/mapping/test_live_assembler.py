@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
+from examples import examples
 from mapping.feeding import SECOND, Feed, make, pose_stamped, tf, transform
 from spatial_replay import Trace
 from spatial_replay.mapping import LiveAssembler, ReadingPlan, parse_mapping
@@ -41,7 +42,7 @@ def feeds(draw: st.DrawFn) -> tuple[Feed, list[int]]:
     return feed, sorted(draw(st.sets(st.integers(1, count), max_size=6)))
 
 
-@settings(max_examples=40)
+@examples(40)
 @given(drawn=feeds(), every=st.booleans())
 def test_a_log_gives_the_same_samples_while_it_comes(drawn: tuple[Feed, list[int]], every: bool) -> None:
     feed, cuts = drawn

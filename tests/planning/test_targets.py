@@ -6,12 +6,13 @@ import math
 from dataclasses import replace
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from shapely import affinity
 from shapely.geometry import Polygon, box
 
 import spatial_replay as sr
+from examples import examples
 from planning.kinematics import block
 from spatial_replay import Planner, Settings
 from spatial_replay.planning import Grid, Workspace, moved_object
@@ -42,7 +43,7 @@ def polygon_of(tracked):
     return Polygon(part.vertices)
 
 
-@settings(max_examples=10)
+@examples(10)
 @given(st.floats(3.0, 7.0), st.floats(3.0, 7.0), st.floats(1.2, 2.5), st.floats(0.0, 1.5))
 def test_a_refined_target_is_at_least_as_robust_and_free(x, y, side, yaw):
     goal = affinity.rotate(box(x - side, y - side, x + side, y + side), yaw, use_radians=True)

@@ -14,13 +14,14 @@ from typing import Any
 import pytest
 from google.protobuf.struct_pb2 import Struct
 from google.protobuf.timestamp_pb2 import Timestamp
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from mcap_protobuf.schema import build_file_descriptor_set
 
 import spatial_replay as sr
+from examples import examples
 from replay.runs import SPECIFICATION, content_of, sample
 from spatial_replay.cli import run
 from spatial_replay.replay import run_replay, verify_certificate
@@ -123,7 +124,7 @@ def test_the_ending_counts_the_messages_and_info_lists_their_topics(
         assert topic in listed
 
 
-@settings(max_examples=25, deadline=None)
+@examples(25)
 @given(
     st.lists(
         st.tuples(st.sampled_from(["/a", "/b", "sample"]), st.integers(0, 2**63 - 1), st.binary(max_size=20)),

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import spatial_replay as sr
+from examples import examples
 from replay.runs import PAST, STEP_NS, PiecewiseSource, run
 from spatial_replay import LogError, SpecificationError, UsageError
 from spatial_replay.replay import (
@@ -55,7 +56,7 @@ DISTANCES = st.floats(-3.0, 3.0).map(lambda number: round(number, 3))
 SECONDS = st.integers(1, 40).map(lambda number: f"{number / 4}s")
 
 
-@settings(max_examples=25)
+@examples(25)
 @given(DISTANCES, SECONDS, st.integers(1, 41))
 def test_other_values_give_the_numbers_of_the_edited_text(far: float, soon: str, size: int) -> None:
     evaluated = loaded(size=size).evaluate({"far": far, "soon": soon})
@@ -63,7 +64,7 @@ def test_other_values_give_the_numbers_of_the_edited_text(far: float, soon: str,
     assert_equal(evaluated, sr.evaluate(edited, run(40)))
 
 
-@settings(max_examples=25)
+@examples(25)
 @given(st.lists(st.tuples(DISTANCES, SECONDS), min_size=1, max_size=4))
 def test_earlier_values_change_no_number(tried: list[tuple[float, str]]) -> None:
     held = loaded()

@@ -12,12 +12,13 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pytest
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import spatial_replay as sr
 from annotate.layouts import panels, paths_of
 from annotate.message_paths import values
+from examples import examples
 from replay.runs import STEP_NS, PiecewiseSource, content_of, record, run, sample
 from spatial_replay.annotate.curves import CURVES_CHANNEL
 from spatial_replay.logs import Channel, LogWriter, Messages, Source, encode_objects
@@ -86,13 +87,13 @@ def whole() -> list[Sent]:
 TIMES = st.lists(st.integers(0, COUNT * STEP_NS), max_size=6)
 
 
-@settings(max_examples=25)
+@examples(25)
 @given(TIMES)
 def test_a_playback_from_the_start_is_the_annotated_log_however_it_is_split(until: list[int]) -> None:
     assert played(playback(), 0, until) == whole()
 
 
-@settings(max_examples=25)
+@examples(25)
 @given(st.lists(st.integers(0, COUNT * STEP_NS), min_size=1, max_size=3), TIMES)
 def test_a_playback_after_seeks_is_the_annotated_log_from_there_on(
     sought: list[int], until: list[int]
@@ -107,7 +108,7 @@ def test_a_playback_after_seeks_is_the_annotated_log_from_there_on(
     assert found == expected
 
 
-@settings(max_examples=25)
+@examples(25)
 @given(st.integers(0, 2 * COUNT * STEP_NS))
 def test_a_seek_sends_the_latest_messages(time_ns: int) -> None:
     found = sent(playback().seek(time_ns))
@@ -211,7 +212,7 @@ def test_another_evaluation_is_shown_at_the_present_time() -> None:
     assert sent(player.seek(player.time_ns)) == sent(fresh.seek(5 * STEP_NS))
 
 
-@settings(max_examples=25)
+@examples(25)
 @given(st.lists(st.integers(-STEP_NS, 2 * COUNT * STEP_NS), min_size=2, max_size=6))
 def test_a_playback_stays_within_the_log_and_never_goes_back(times_ns: list[int]) -> None:
     player = playback()

@@ -5,9 +5,10 @@ from __future__ import annotations
 from threading import Thread
 
 import numpy as np
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
+from examples import examples
 from spatial_replay.replay.reused_memory import ReusedMemory
 
 LARGE = 1 << 20
@@ -41,7 +42,7 @@ def test_small_arrays_and_much_smaller_ones_have_memory_of_their_own():
     assert place not in (small.ctypes.data, smaller.ctypes.data)
 
 
-@settings(max_examples=50, deadline=None)
+@examples(50)
 @given(steps=st.lists(st.tuples(st.integers(0, 3), st.integers(LARGE, 3 * LARGE)), max_size=25))
 def test_arrays_in_use_keep_their_numbers(steps):
     memory, kept = ReusedMemory(6 * LARGE), {}

@@ -10,10 +10,11 @@ from pathlib import Path
 from threading import Event, Thread
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import spatial_replay as sr
+from examples import examples
 from spatial_replay import MissingFileError, SpatialReplayError, SpecificationError, UsageError
 from spatial_replay.replay import SpecificationFiles, write_constants
 
@@ -173,7 +174,7 @@ COMMENTS = st.text(
 )
 
 
-@settings(max_examples=30, deadline=None)
+@examples(30)
 @given(
     NUMBERS,
     NUMBERS,

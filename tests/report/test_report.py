@@ -12,10 +12,11 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pytest
 from foxglove_schemas_protobuf.Grid_pb2 import Grid
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import spatial_replay as sr
+from examples import examples
 from report.report_pages import (
     RECORDINGS,
     Page,
@@ -97,7 +98,7 @@ PAST_SPECS = "".join(
 )
 
 
-@settings(max_examples=6, deadline=None)
+@examples(6)
 @given(st.lists(st.tuples(*[st.integers(-9, 9)] * 3), min_size=8, max_size=8))
 def test_what_asks_for_the_past_is_shown_when_it_failed_and_was_worst_when_its_curve_was(
     numbers: list[tuple[int, int, int]],

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import spatial_replay as sr
+from examples import examples
 from pages import shown
 from spatial_replay.sanity.examples import Example
 
@@ -303,7 +304,7 @@ parts = st.one_of(
 )
 
 
-@settings(max_examples=30, deadline=None)
+@examples(30)
 @given(st.lists(parts, min_size=2, max_size=5))
 def test_formulas_that_hold_together_are_decided_as_one_formula_is(formulas: list[str]) -> None:
     together = " and ".join(f"({each})" for each in formulas)

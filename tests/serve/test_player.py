@@ -15,10 +15,11 @@ from threading import Event
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 import spatial_replay as sr
+from examples import examples
 from replay.runs import STEP_NS, PiecewiseSource, run
 from spatial_replay import UsageError
 from spatial_replay.annotate.curves import CURVES_CHANNEL
@@ -153,7 +154,7 @@ RATES = [
 
 
 @pytest.mark.parametrize(("step_ns", "speed"), RATES)
-@settings(max_examples=10, deadline=None)
+@examples(10)
 @given(waits=st.lists(st.floats(0.001, 5.0), min_size=1, max_size=6))
 def test_late_turns_lose_no_sample(step_ns: float, speed: float, waits: list[float]) -> None:
     clock, step_ns = Clock(), math.ceil(step_ns)
