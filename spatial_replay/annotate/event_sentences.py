@@ -26,6 +26,8 @@ def leaf_words(text: str, number: float, amount: str, *, past: bool = False) -> 
     """
     holds, fails = ("held", "failed") if past else ("holds", "fails")
     how = holds if number >= 0.0 else fails
+    if math.isinf(number):
+        return f"`{text}` {how}"
     is_residue = amount.split(" ")[0] == "0"
     return f"`{text}` just {how}" if is_residue else f"`{text}` {how} by {amount}"
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from math import isfinite
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
@@ -335,7 +336,8 @@ class EventReporter:
             return
         missed = found.missed if isinstance(found, DecidingLeaf) else None
         leaf, number = self._leaf(found.shown.value if isinstance(found, DecidingLeaf) else found, now_ns)
-        self.over, self.over_by = self._leaf_text(leaf), amount_text(abs(number), leaf, self._units)
+        amount = amount_text(abs(number), leaf, self._units) if isfinite(number) else ""
+        self.over, self.over_by = self._leaf_text(leaf), amount
         if missed and missed.is_condition:
             self.over = f"missed {missed.response}"
             if isinstance(found, DecidingLeaf) and found.response is None:

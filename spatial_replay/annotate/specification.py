@@ -18,6 +18,7 @@ from spatial_replay.spec import format_specification, parse_specification
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import (
     Atom,
+    Equality,
     Expression,
     Formula,
     Maximum,
@@ -199,11 +200,12 @@ def unit_of(formula: Formula, units: Mapping[str, str]) -> str:
     Args:
         units: those that are declared, of signals by their names, of lengths by "".
     """
-    found = {
-        _atom_unit(node.expression, units) for node in iter_subformulas(formula) if isinstance(node, Atom)
-    }
+    atoms = [node for node in iter_subformulas(formula) if isinstance(node, Atom)]
+    found = {unit for node in atoms for unit in _units(node.expression, units)}
     if len(found) > 1:
         return MIXED
+    if not found and atoms:  # comparisons of modes alone are infinite
+        return DIMENSIONLESS
     return found.pop() if found else units.get(FOOTPRINT_UNITS, FOOTPRINT_UNITS)
 
 
@@ -255,13 +257,6 @@ def _add_automaton(result: SpecificationResult, tree: ReportedTree, automaton: A
         result.automaton.moves.add(source=move.source, target=move.target, guard=guard, label=label)
 
 
-def _atom_unit(expression: Expression, units: Mapping[str, str]) -> str:
-    found = set(_units(expression, units))
-    if len(found) > 1:
-        return MIXED
-    return found.pop() if found else units.get(FOOTPRINT_UNITS, FOOTPRINT_UNITS)
-
-
 def _units(expression: Expression, units: Mapping[str, str]) -> Iterator[str]:
     """Yield the units of everything measured in an expression; constants have none of their own."""
     stack = [expression]
@@ -279,7 +274,7 @@ def _units(expression: Expression, units: Mapping[str, str]) -> Iterator[str]:
                 yield units.get(name) or f"units of {name}"
             case Misalignment():
                 yield DIMENSIONLESS
-            case Number():
+            case Number() | Equality():
                 pass
             case _:
                 yield units.get(FOOTPRINT_UNITS, FOOTPRINT_UNITS)

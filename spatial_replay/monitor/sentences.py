@@ -83,7 +83,8 @@ def sentences_of(
         how = _how_it_decides(witness, witness.deciding, first_ns, is_open=is_open)
         if witness.missed is None or not witness.missed.is_condition or is_open:
             sentences.append(Sentence(f"{what} is `{witness.deciding.text}`, which ", how))
-        sentences.append(Sentence(_flip(witness, witness.deciding, witness.threshold, is_open=is_open)))
+        if witness.obstacle != "infinity":
+            sentences.append(Sentence(_flip(witness, witness.deciding, witness.threshold, is_open=is_open)))
     if witness.open_end is not None:
         sentences.append(_open_end(*witness.open_end, first_ns, witness.units))
     return tuple(sentences)
@@ -223,7 +224,9 @@ def _how_it_decides(
     if math.isnan(amount) or (amount >= 0.0) != (least >= 0.0):
         amount = least
     size = amount_text(abs(amount), deciding.atom, witness.units)
-    how = f"holds by {size}" if amount >= 0.0 else f"fails by {size}"
+    how = "holds" if amount >= 0.0 else "fails"
+    if math.isfinite(amount):
+        how += f" by {size}"
     if abs(least) < abs(amount):
         how += uncertain_text(amount_text(abs(least), deciding.atom, witness.units))
     if without_residue(amount, deciding.atom) == 0.0:
@@ -315,8 +318,9 @@ def _flip(
     if threshold is None:
         opposite = "violated" if witness.verdict is Verdict.SATISFIED else "satisfied"
         match witness.obstacle:
-            case "infinity":
-                return f"No number in it makes that {opposite}: it is infinite."
+            case "limits" if "==" in deciding.atom.parameters:
+                band = "compare with a band, such as 0.9 <= a dist b <= 1.1"
+                return f"No number in it makes that {opposite}: its robustness is never above 0; {band}."
             case "limits":
                 return f"No number that can stand in it makes that {opposite}."
         return f"No number of this atom alone makes it {opposite}: other atoms decide it, too."

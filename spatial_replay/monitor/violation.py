@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from math import isfinite
 
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
@@ -30,7 +31,7 @@ from spatial_replay.spec.checks import object_names, signal_names
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import NamedSpec, Number, Specification
 from spatial_replay.spec.units import declared_unit
-from spatial_replay.text import Instant, Sentence, with_unit
+from spatial_replay.text import Instant, Sentence, number_text, with_unit
 from spatial_replay.trace.sample import FOREVER, Sample
 from spatial_replay.trace.trace import Trace
 
@@ -111,7 +112,9 @@ def _settling(atom: DecidingAtom) -> float:
 def _deciding_words(atom: DecidingAtom, witness: Witness, first_ns: int) -> str:
     """Return an atom, its number, and when it decided."""
     number = _settling(atom)
-    how = f"{'holds' if number >= 0.0 else 'fails'} by {amount_text(abs(number), atom.atom, witness.units)}"
+    how = "holds" if number >= 0.0 else "fails"
+    if isfinite(number):
+        how += f" by {amount_text(abs(number), atom.atom, witness.units)}"
     return f"`{atom.text}` {how} at {Instant(witness.time_ns, first_ns)}"
 
 
@@ -126,6 +129,8 @@ def _short(atom: DecidingAtom, spec: str, amount: str) -> str:
             first, second = measured.names
             where = f"too close to {second}" if needs_more else f"too far from {second}"
             return f"{first} is {amount} {where}"
+        if measured.quantity == "signal" and not isfinite(_settling(atom)):
+            return f"{measured.names[0]} is {number_text(measured.value)}"
         if measured.quantity == "signal":
             return f"{measured.names[0]} is {amount} too {'low' if needs_more else 'high'}"
     return f"`{spec}` is violated"

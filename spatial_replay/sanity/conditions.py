@@ -25,6 +25,7 @@ from spatial_replay.spec.formula import (
     CentroidProjection,
     Earlier,
     Enlarged,
+    Equality,
     Expression,
     Formula,
     Group,
@@ -49,6 +50,7 @@ from spatial_replay.spec.formula import (
     Variable,
     expand,
 )
+from spatial_replay.spec.relations import compare
 from spatial_replay.spec.walks import base_of, iter_formulas, measured_terms
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
@@ -102,6 +104,8 @@ def _built(expression: Expression, regions: Mapping[str, Outline]) -> Tree:
             return _added(_built(expression.first, regions), _built(expression.second, regions))
         case Negative():
             return _times(_built(expression.operand, regions), Fraction(-1))
+        case Equality(signal, value):
+            return _built(compare(signal, "==", value), regions)
         case Scaled():
             return _times(_built(expression.operand, regions), 1 / exact(expression.divisor))
         case Minimum() | Maximum():

@@ -15,6 +15,7 @@ from spatial_replay.spec.formula import (
     Atom,
     Axis,
     Enlarged,
+    Equality,
     Expression,
     Group,
     Misalignment,
@@ -94,7 +95,7 @@ class AtomBuilder:
         return self._atom("dist", minimum(*comparisons), terms, parameters, written, scope)
 
     def comparison(self, written: ComparisonSyntax, scope: Scope) -> Atom:
-        """Return the atom of `signal >= c`, signal - c."""
+        """Return the atom of `signal >= c`, signal - c; `==` and `!=` are exact."""
         name, limit = written.signal, self.resolver.number(written.limit, scope)
         defined = self.resolver.names.definitions.get(name.text)
         if name.text in scope.values:
@@ -103,7 +104,9 @@ class AtomBuilder:
         elif defined is not None and not isinstance(defined, BrokenStatement):
             message = f"{name.text!r} is {kind_of(defined)}; a signal of the log is expected"
             self.resolver.fault(name.span, scope, message)
-        expression = compare(Signal(name.text), written.operator, limit)
+        signal, is_equal = Signal(name.text), Equality(Signal(name.text), limit)
+        exact: Mapping[str, Expression] = {"==": is_equal, "!=": -is_equal}
+        expression = exact.get(written.operator) or compare(signal, written.operator, limit)
         return self._atom("signal", expression, (), (name.text, written.operator, limit), written, scope)
 
     def _atom(

@@ -82,7 +82,7 @@ def _deeper(operands: tuple[FormulaSyntax, ...], span: Span) -> int:
 
 
 def _chain_hint(below: str, above: str) -> str:
-    if "==" in (below, above):
+    if {"==", "!="} & {below, above}:
         return "write a dist b == c, or c1 <= a dist b <= c2"
     if below[0] == above[0]:
         return "write the lesser limit first: c1 <= a dist b <= c2"
@@ -281,6 +281,9 @@ class TreeBuilder:
 
     def distance(self, children: list[Any]) -> DistanceSyntax:
         first, _, second, token, limit = children
+        if token.value == "!=":
+            hint = "write what is too near or too far: a dist b <= c, a dist b >= c"
+            raise StatementError(span_of(token), "a distance is hardly ever exactly a number", hint)
         return DistanceSyntax(first, second, ((token.value, limit),), _cover(children))
 
     def distance_within(self, children: list[Any]) -> DistanceSyntax:

@@ -11,6 +11,7 @@ from lark import Token
 
 from spatial_replay.errors import UsageError
 from spatial_replay.spec.diagnostics import Diagnostic, Faults, SourceText, nearest_hint
+from spatial_replay.spec.format import format_number, format_term
 from spatial_replay.spec.formula import (
     FUTURE_OPERATORS,
     PAST_OPERATORS,
@@ -135,6 +136,21 @@ def past_warnings(specs: Sequence[NamedSpec], source: SourceText) -> Iterator[Di
                     yield source.diagnostic("warning", node.span, message, hint)
                 continue
             stack.extend(operands_of(node))
+
+
+def equality_warnings(specs: Sequence[NamedSpec], source: SourceText) -> Iterator[Diagnostic]:
+    """Yield a warning for each `a dist b == c`: measured lengths are hardly ever equal."""
+    warned: set[Span] = set()
+    for spec in specs:
+        for atom in iter_formulas(spec.formula):
+            if isinstance(atom, Atom) and atom.parameters[:1] == ("==",) and atom.span not in warned:
+                warned.add(atom.span)
+                message = f"`{atom.text}` hardly ever holds: its robustness is at most 0"
+                limit = float(atom.parameters[1])
+                ends = [format_number(float(f"{limit + by:.12g}")) for by in (-0.05, 0.05)]
+                a, b = (format_term(term) for term in atom.terms)
+                hint = f"write a band, such as {ends[0]} <= {a} dist {b} <= {ends[1]}"
+                yield source.diagnostic("warning", atom.span, message, hint)
 
 
 def unused_warnings(names: Namespace, source: SourceText) -> Iterator[Diagnostic]:

@@ -171,6 +171,14 @@ class Signal(_Arithmetic):
 
 
 @dataclass(frozen=True, slots=True)
+class Equality(_Arithmetic):
+    """+inf where a signal is equal to a number, -inf where it is not."""
+
+    signal: Signal
+    value: float
+
+
+@dataclass(frozen=True, slots=True)
 class Sum(_Arithmetic):
     """`first` + `second`."""
 
@@ -208,7 +216,7 @@ class Scaled(_Arithmetic):
 Measurement: TypeAlias = SignedDistance | Protrusion | Projection | CentroidProjection | Misalignment
 """An expression that geometry answers."""
 
-Expression: TypeAlias = Number | Measurement | Signal | Sum | Negative | Minimum | Maximum | Scaled
+Expression: TypeAlias = Number | Measurement | Signal | Equality | Sum | Negative | Minimum | Maximum | Scaled
 
 
 def as_expression(value: object) -> Expression:

@@ -23,6 +23,7 @@ from spatial_replay.spec.expressions import (
     CentroidProjection,
     Earlier,
     Enlarged,
+    Equality,
     Expression,
     Group,
     Maximum,
@@ -52,8 +53,9 @@ if TYPE_CHECKING:
 
 # one home for all values of the language; those of `expressions` are passed on
 __all__ = [  # noqa: RUF022
-    "ANY_CLASS", "Axis", "CentroidProjection", "Earlier", "Enlarged", "Expression", "Group", "Maximum",
-    "Measurement", "Minimum", "Misalignment", "Negative", "Number", "Projection", "Protrusion", "RegionName",
+    "ANY_CLASS", "Axis", "CentroidProjection", "Earlier", "Enlarged", "Equality", "Expression", "Group",
+    "Maximum", "Measurement", "Minimum", "Misalignment", "Negative", "Number", "Projection", "Protrusion",
+    "RegionName",
     "Scaled", "Side", "Signal", "SignedDistance", "Sum", "Term", "TrackedName", "Variable", "as_expression",
     "maximum", "minimum",
     "Atom", "Boolean", "BooleanOperator", "Bound", "Constant", "Formula", "NamedSpec", "Outline",

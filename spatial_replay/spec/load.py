@@ -13,7 +13,13 @@ from lark import Token
 
 from spatial_replay.errors import MissingFileError, SpecificationError, UsageError
 from spatial_replay.spec.atoms import parameters_of
-from spatial_replay.spec.checks import past_warnings, reach_warnings, scale_warnings, unused_warnings
+from spatial_replay.spec.checks import (
+    equality_warnings,
+    past_warnings,
+    reach_warnings,
+    scale_warnings,
+    unused_warnings,
+)
 from spatial_replay.spec.constants import replaced
 from spatial_replay.spec.diagnostics import Diagnostic, Faults, SourceText, nearest_hint
 from spatial_replay.spec.elaborate import Elaborator, TooLargeError
@@ -87,6 +93,7 @@ def parse_specification(
     warnings: list[Diagnostic] = [
         *reach_warnings(tokens, faults.source, used_profile == "spatial_spec"),
         *past_warnings(done, faults.source),
+        *equality_warnings(done, faults.source),
         *unused_warnings(namespace, faults.source),
         *scale_warnings(statements, done, faults.source),
     ]

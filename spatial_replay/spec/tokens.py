@@ -45,8 +45,7 @@ _SIGNS: Mapping[str, str] = MappingProxyType(
         **dict.fromkeys(("&", "&&"), "AND"),
         **dict.fromkeys(("|", "||"), "OR"),
         "=>": "IMPLIES",
-        "!=": "ERROR",
-        **dict.fromkeys(("<=", ">=", "==", "<", ">"), "COMPARE"),
+        **dict.fromkeys(("<=", ">=", "==", "!=", "<", ">"), "COMPARE"),
         "(": "LPAR",
         ")": "RPAR",
         "[": "LSQB",
@@ -128,9 +127,6 @@ def tokenize(text: str, relations: frozenset[str], faults: Faults) -> list[Token
             token_type = KEYWORDS.get(value) or ("RELATION" if value in relations else "NAME")
         elif kind == "sign":
             token_type = _SIGNS[value]
-            if token_type == "ERROR":
-                hint = "write not (... == ...), or two comparisons joined by or"
-                faults.add(span, f"the comparison {value} is not part of the language", hint)
         elif kind == "quoted":
             token_type = "TITLE" if _is_title_expected(tokens) else "NAME"
             value = _unquoted(value, span, faults)

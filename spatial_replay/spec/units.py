@@ -9,6 +9,7 @@ from typing import Literal
 from spatial_replay.spec.format import format_number
 from spatial_replay.spec.formula import (
     Atom,
+    Equality,
     Expression,
     Formula,
     Measurement,
@@ -44,6 +45,8 @@ class Unit:
 
 def units_of(formula: Formula) -> tuple[Unit, ...]:
     """Return the units of the atoms of a formula, each once, in the order of the text.
+
+    `mode == 2` has none: it is infinite, and so never a number that a minimum returns.
 
     A minimum over atoms of one unit is a number of that unit. Over several it compares what may not be
     comparable, unless each of them is scaled: see `is_mixed`.
@@ -98,7 +101,10 @@ def scaled(expression: Expression, scales: Sequence[Scale]) -> Expression:
 def _units(expression: Expression) -> list[Unit]:
     divisor = expression.divisor if isinstance(expression, Scaled) else None
     found: dict[Unit, None] = {}
-    for part in iter_expressions(expression):
+    parts = list(iter_expressions(expression))
+    if any(isinstance(part, Equality) for part in parts):
+        return []
+    for part in parts:
         if isinstance(part, Signal):
             found[Unit("signal", part.name, divisor)] = None
         elif isinstance(part, Misalignment):

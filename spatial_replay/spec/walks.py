@@ -14,6 +14,7 @@ from spatial_replay.spec.formula import (
     CentroidProjection,
     Earlier,
     Enlarged,
+    Equality,
     Expression,
     Formula,
     Group,
@@ -72,6 +73,8 @@ def iter_expressions(expression: Expression) -> Iterator[Expression]:
                 stack += (current.second, current.first)
             case Negative() | Scaled():
                 stack.append(current.operand)
+            case Equality():
+                stack.append(current.signal)
             case Minimum() | Maximum():
                 stack += reversed(current.operands)
 
@@ -233,6 +236,8 @@ def map_leaves(
             return Maximum(tuple([map_leaves(each, change) for each in expression.operands]))
         case Scaled():
             return Scaled(map_leaves(expression.operand, change), expression.divisor)
+        case Equality():
+            return expression
         case _:
             return change(expression)
 

@@ -23,6 +23,7 @@ from spatial_replay.spec.formula import (
     CentroidProjection,
     Earlier,
     Enlarged,
+    Equality,
     Expression,
     Formula,
     Group,
@@ -301,6 +302,9 @@ class Observed:
             case Signal():
                 number = self.signals[t].get(expression.name, math.nan)
                 return None if math.isnan(number) else Interval(number, number)
+            case Equality():
+                number = self.signals[t].get(expression.signal.name, math.nan)
+                return None if math.isnan(number) else TRUE if number == expression.value else FALSE
             case Negative():
                 operand = inner(expression.operand)
                 return None if operand is None else -operand

@@ -113,7 +113,7 @@ def atoms(draw: st.DrawFn, words: Vocabulary) -> str:
             axis = draw(st.sampled_from(words.axes))
             return f"{first} between[{axis}] ({second}, {draw(terms(words))})"
         case "signal":
-            comparison = draw(st.sampled_from(COMPARISONS))
+            comparison = draw(st.sampled_from((*COMPARISONS, "!=")))
             return f"{draw(st.sampled_from(words.signals))} {comparison} {draw(numbers)}"
         case "oriented":
             one, other = (draw(st.sampled_from(words.objects)) for _ in range(2))

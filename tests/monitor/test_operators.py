@@ -7,7 +7,7 @@ from math import inf, nan
 import numpy as np
 import pytest
 
-from monitor.scenes import SECOND, numbers, root
+from monitor.scenes import SECOND, judged, numbers, root
 from spatial_replay import Sample, Trace
 
 P = [1, -2, 3, -4, 5]
@@ -19,7 +19,8 @@ Q = [-5, 4, -3, 2, -1]
     [
         ("p >= 0", [1, 1, 1, 1, 1]),
         ("p <= 0", [-1, -1, -1, -1, -1]),
-        ("p == 0", [-1, -1, -1, -1, -1]),
+        ("p == 1", [inf, inf, inf, inf, inf]),
+        ("p != 1", [-inf, -inf, -inf, -inf, -inf]),
         ("not p > 2", [1, 1, 1, 1, 1]),
         ("p >= 0 and q >= 0", [-5, -5, -5, -5, -5]),
         ("p >= 0 xor q >= 0", [1, 1, 1, 1, 1]),
@@ -139,3 +140,29 @@ def test_an_unknown_number_leaves_a_gap_only_where_it_matters():
     assert root("F p >= 0", trace).verdict == "satisfied"
     assert root("G p >= 0", trace).verdict == "unknown"
     assert root("G p >= 2", trace).verdict == "violated"
+
+
+MODES = {"mode": [0, 2, 2, None], "gap": [-3, 1, -2, -9]}
+
+
+@pytest.mark.parametrize(
+    ("formula", "lower", "upper"),
+    [
+        ("G[0,2] (mode == 2 -> gap >= 0)", -2, -2),
+        ("G[0,1] (mode == 2 -> gap >= 0)", 1, 1),
+        ("G[0,2] not (mode == 2)", -inf, -inf),
+        ("G[0,2] mode != 1", inf, inf),
+        ("F (mode == 3)", -inf, inf),
+        ("G (mode == 2 -> gap >= 0)", -9, -2),
+    ],
+)
+def test_modes_are_compared_exactly_and_unknown_where_they_are_missing(formula, lower, upper):
+    result = judged(formula, numbers(**MODES)).result()
+    assert (result.lower, result.upper) == (lower, upper)
+
+
+def test_a_reason_about_a_mode_has_no_margin():
+    evaluation = judged("G (not (mode == 2))", numbers(mode=[0, 2, 2]))
+    text = evaluation.explain()
+    assert "which holds at 1.000 s (within `spec`): mode is 2." in text
+    assert "inf" not in text.split("What decides")[1] and "No number" not in text

@@ -23,6 +23,7 @@ from spatial_replay.spec.formula import (
     Atom,
     Boolean,
     Earlier,
+    Equality,
     Expression,
     Formula,
     Group,
@@ -51,6 +52,7 @@ AND, OR = 8, 9  # intervals
 AND_MEMBER, OR_MEMBER = 10, 11  # a, and b where members c is 1, anything where it is -1
 DIVIDE = 12  # a by constant b, which is positive
 CLOSEST = 13  # closest pair a, as an interval
+EQUAL = 14  # signal a and constant b: +inf or -inf; not a number where the signal is not
 
 TILE = 128
 """Samples processed together: few, so that their columns stay in the processor's cache."""
@@ -147,6 +149,10 @@ def run_instructions(
                 elif op == AND:
                     for k in range(count):
                         target[k] = min(first[k], second[k])
+                elif op == EQUAL:
+                    for k in range(count):
+                        equal = np.inf if first[k] == constants[b] else -np.inf
+                        target[k] = equal if first[k] == first[k] else np.nan
                 elif op == DIVIDE:
                     for k in range(count):
                         target[k] = first[k] / constants[b]
@@ -258,6 +264,9 @@ class LeafCode:
                 return self._row(ADD, first, self._expression(expression.second, bindings))
             case Negative():
                 return self._row(NEGATE, self._expression(expression.operand, bindings))
+            case Equality(signal, value):
+                constant = self.constants.setdefault(value, len(self.constants))
+                return self._row(EQUAL, self._expression(signal, bindings), constant)
             case Scaled(operand, divisor):
                 constant = self.constants.setdefault(divisor, len(self.constants))
                 return self._row(DIVIDE, self._expression(operand, bindings), constant)

@@ -24,6 +24,7 @@ from spatial_replay.spec.formula import (
     CentroidProjection,
     Earlier,
     Enlarged,
+    Equality,
     Expression,
     Formula,
     Group,
@@ -68,7 +69,7 @@ def _reasons(scene: TraceScene, part: Expression) -> Iterator[str]:
                 yield f"there is no signal {part.name!r}"
             elif not np.isfinite(values[scene.skip]):
                 yield f"signal {part.name!r} has no finite value in the sample"
-        case Number() | Sum() | Negative() | Minimum() | Maximum() | Scaled():
+        case Number() | Equality() | Sum() | Negative() | Minimum() | Maximum() | Scaled():
             return
         case _:
             for term in terms_of(part):
@@ -253,6 +254,8 @@ def _branch(
             yield from _branch(scene, expression.operand, end.turned, -sign)
         case Scaled():
             yield from _branch(scene, expression.operand, end, sign)
+        case Equality():
+            yield sign, expression.signal
         case Minimum() | Maximum():
             operands = expression.operands
             intervals = _intervals(scene, [_as_atom(each) for each in operands])
