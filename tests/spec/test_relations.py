@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
+from math import inf
 from typing import Any
 
 import pytest
@@ -13,6 +14,7 @@ from spatial_replay.spec.formula import (
     Atom,
     CentroidProjection,
     Enlarged,
+    Equality,
     Expression,
     Maximum,
     Minimum,
@@ -52,6 +54,8 @@ def value(expression: Expression) -> float:
             return 0.25
         case Signal():
             return 20.0
+        case Equality():
+            return inf if value(expression.signal) == expression.value else -inf
         case Sum():
             return value(expression.first) + value(expression.second)
         case Negative():
@@ -108,7 +112,9 @@ PAPER = {
     "temperature > 3.5": 16.5,
     "temperature <= 3.5": -16.5,
     "temperature < 3.5": -16.5,
-    "temperature == 21": -1.0,
+    "temperature == 21": -inf,
+    "temperature == 20": inf,
+    "temperature != 21": inf,
 }
 CHANGED_IN_PUBLISHED = {
     "a touch[4] b": 1.0,
