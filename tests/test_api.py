@@ -79,5 +79,8 @@ def test_mistakes_are_named(tmp_path: Path) -> None:
     with pytest.raises(sr.UsageError, match=r"report writes an HTML page; name it run\.html"):
         sr.write_report(LOG, SPEC, output=log)
     assert log.read_bytes() == b"a log that is needed"
-    with pytest.raises(TypeError, match="evry"):
+    with pytest.raises(sr.UsageError, match="evry=2 is no option; did you mean 'every'"):
         sr.replay_log(LOG, SPEC, evry=2)  # type: ignore[call-arg]
+    for asked in (sr.info, sr.verify, lambda log, **own: sr.evaluate_logs(log, output="out", **own)):
+        with pytest.raises(sr.UsageError, match=r"maping=.m\.yaml. is no option; did you mean .mapping."):
+            asked(LOG, maping="m.yaml")

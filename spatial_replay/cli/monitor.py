@@ -19,6 +19,7 @@ from spatial_replay.cli.options import (
     load_spec_options,
     naming_option,
     output_option,
+    overwrite_option,
     profile_option,
     specs_option,
 )
@@ -73,6 +74,7 @@ def _bytes(context: click.Context, parameter: click.Parameter, text: str) -> int
 @constants_option
 @profile_option
 @output_option("Log of the whole run to write (MCAP), with the robot's own messages.")
+@overwrite_option
 @click.option(
     "--topics",
     metavar="PATTERN",
@@ -147,6 +149,7 @@ def monitor(
     constants: Mapping[str, float | str],
     profile: str | None,
     output: Path | None,
+    overwrite: bool,
     topics: tuple[str, ...],
     length_s: float | None,
     until: str | None,
@@ -208,7 +211,9 @@ def monitor(
     if output is not None:
         _refuse_inputs(output, specs, mapping_file)
     with ExitStack() as opened:
-        recorders = opened.enter_context(open_recorders(files, mapping, output, trigger, clips))
+        recorders = opened.enter_context(
+            open_recorders(files, mapping, output, trigger, clips, overwrite=overwrite)
+        )
         writers: list[SampleWriter] = [*recorders]
         fire = next((each.trigger for each in recorders if trigger and each.is_triggered), None)
         if fire is not None:

@@ -88,6 +88,9 @@ def log_output_option(text: str) -> Callable[[_Command], _Command]:
     return click.option("-o", "--output", type=LogOutput(path_type=Path), required=True, help=text)
 
 
+overwrite_option = click.option("--overwrite", is_flag=True, help="Replace a log that exists already.")
+"""Of commands that record what nothing could make again."""
+
 durability_option = click.option(
     "--durability",
     type=click.Choice(["process", "disk"]),

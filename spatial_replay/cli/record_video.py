@@ -16,6 +16,7 @@ from spatial_replay.cli.options import (
     load_spec_options,
     log_output_option,
     naming_option,
+    overwrite_option,
     profile_option,
     specs_option,
 )
@@ -69,6 +70,7 @@ def duration_ns(context: click.Context, parameter: click.Parameter, text: str | 
     help="Tags file (YAML): which tag is on which object, and where the plane is.",
 )
 @log_output_option("Log to write (MCAP).")
+@overwrite_option
 @durability_option
 @specs_option("Specification to evaluate while recording; repeat for several.")
 @constants_option
@@ -101,6 +103,7 @@ def video(
     offsets: tuple[str, ...],
     tags_file: LogFile,
     output: Path,
+    overwrite: bool,
     durability: Durability,
     specs: tuple[LogFile, ...],
     constants: Mapping[str, float | str],
@@ -128,6 +131,7 @@ def video(
       spatial-replay record video --camera 0 --tags tags.yaml --spec table.spatial -o run.mcap --for 60s
     """
     # imported here so that --help stays fast
+    from spatial_replay.logs.output_file import refuse_existing
     from spatial_replay.perception.observer import camera_names
     from spatial_replay.perception.tags_file import load_tags
     from spatial_replay.runs.record_video import record_seen
@@ -136,6 +140,8 @@ def video(
         raise UsageError("give either videos or a log, or --camera N")
     if length_ns is not None and camera is None:
         raise UsageError("--for ends a run with --camera; leave it out")
+    if camera is not None and not overwrite:
+        refuse_existing(output)
     files = load_spec_options(specs, profile, constants)
     show_diagnostics(warning for file in files for warning in file.warnings)
     tags = load_tags(tags_file)

@@ -37,6 +37,7 @@ from spatial_replay.recording.recorder import Recorder, SampleWriter
 from spatial_replay.recording.recording import RunEvent
 from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.formula import Specification
+from spatial_replay.spec.load import listed_specifications
 from spatial_replay.text import counted
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
@@ -83,7 +84,7 @@ class LiveSession:
         for name, value in (("max_delay_s", max_delay_s), ("dead_man_s", dead_man_s)):
             if value is not None and not (math.isfinite(value) and value > 0):
                 raise UsageError(f"{name} is {value!r}; give seconds above 0")
-        self.files = [specifications] if isinstance(specifications, Specification) else list(specifications)
+        self.files = listed_specifications(specifications)
         if not self.files:
             raise UsageError("there is no specification to monitor; give one")
         self._address = address

@@ -16,6 +16,7 @@ from spatial_replay.mapping import LogMapping, load_mapping
 from spatial_replay.recording.recorder import Recorder
 from spatial_replay.recording.trigger import Trigger
 from spatial_replay.spec.formula import Specification
+from spatial_replay.spec.load import listed_specifications
 
 _WAITING = 65_536
 """Samples, and messages, that may wait for a recorder: a robot waits for no disk."""
@@ -34,11 +35,14 @@ def open_recorders(
     output: Path | None = None,
     trigger: Trigger | None = None,
     clips: Path | None = None,
+    *,
+    overwrite: bool = False,
 ) -> Iterator[list[Recorder]]:
     """Open the log of a whole run, and the recorder of clips, as far as they are wanted.
 
     Raises:
-        UsageError: a trigger without a folder, or the other way around, or one that is not understood.
+        UsageError: a trigger without a folder, or the other way around, or one that is not understood; an
+            output that exists, unless it may be overwritten.
         OutputError: something cannot be written.
     """
     if (trigger is None) != (clips is None):
@@ -54,6 +58,7 @@ def open_recorders(
                     waiting=_WAITING,
                     block=False,
                     trigger=own,
+                    overwrite=overwrite,
                 )
             )
             for path, own in ((output, None), (clips, trigger))
@@ -81,6 +86,7 @@ async def monitor(
     topics: Sequence[str] = (),
     max_delay_s: float = MAX_DELAY_S,
     dead_man_s: float | None = None,
+    overwrite: bool = False,
 ) -> AsyncIterator[LiveUpdate]:
     """Monitor a running robot; yield an update for each sample.
 
@@ -95,18 +101,20 @@ async def monitor(
         topics: patterns of the topics whose messages are written; those that are mapped by default.
         max_delay_s: how long a sample waits for transforms, and for topics whose stamps lag behind.
         dead_man_s: after so much silence of a topic, what it reported is unknown.
+        overwrite: replace an output that exists.
 
     Raises:
-        UsageError: a template, options that do not work, a mapping that does not fit what is sent.
+        UsageError: a template, options that do not work, a mapping that does not fit what is sent, an output
+            that exists.
         RemoteError: the first connection fails.
         LogError: time jumps back by more than a second.
         OutputError: the log cannot be written.
     """
-    files = [specifications] if isinstance(specifications, Specification) else list(specifications)
+    files = listed_specifications(specifications)
     if mapping is not None and not isinstance(mapping, LogMapping):
         mapping = load_mapping(mapping)
     written = None if output is None else Path(output), trigger, None if clips is None else Path(clips)
-    with open_recorders(files, mapping, *written) as recorders:
+    with open_recorders(files, mapping, *written, overwrite=overwrite) as recorders:
         session = LiveSession(
             address,
             files,

@@ -57,14 +57,15 @@ Durability: TypeAlias = Literal["process", "disk"]
 """What a flushed file survives: the end of the process, or that of the machine, too."""
 
 
-def open_output(output: Path, durability: Durability = "process") -> BinaryIO:
+def open_output(output: Path, durability: Durability = "process", *, overwrite: bool = True) -> BinaryIO:
     """Open a file to write in place; opening, writing and closing it fail with an OutputError.
 
     Args:
         durability: "disk" for a file whose every flush waits until the disk has it.
+        overwrite: whether a file with content may be replaced.
 
     Raises:
-        UsageError: another durability.
+        UsageError: another durability; a file that must not be replaced.
         OutputError: it cannot be written, or another program, or another part of this one, is writing it.
     """
     if durability not in get_args(Durability):
@@ -76,6 +77,8 @@ def open_output(output: Path, durability: Durability = "process") -> BinaryIO:
             if stat.S_ISREG(os.fstat(descriptor).st_mode):
                 # only the owner of the lock may empty the file
                 _lock(descriptor, output)
+                if not overwrite:
+                    refuse_existing(output)
                 os.ftruncate(descriptor, 0)
         return _stream(descriptor, output, durability)
     except BaseException:
@@ -173,6 +176,17 @@ def refuse_inputs(output: Path, inputs: Iterable[Path]) -> None:
             raise UsageError(f"{output} is an input too and would be lost; give the output another name")
         if each.is_dir() and output.resolve().is_relative_to(each.resolve()):
             raise UsageError(f"{output} lies in the folder {each}, which is an input; write it elsewhere")
+
+
+def refuse_existing(output: Path) -> None:
+    """Check that an output replaces no recording, which nothing could make again.
+
+    Raises:
+        UsageError: it is a file with content.
+    """
+    if output.is_file() and output.stat().st_size:
+        remedy = "give another name, or --overwrite (`overwrite=True`) to replace it"
+        raise UsageError(f"{output} exists already; {remedy}")
 
 
 def refuse_addresses(output: Path, remedy: str = "write to this machine, and copy that") -> None:

@@ -26,6 +26,7 @@ from spatial_replay.recording.recorder_log import FileLog, RecorderLog, RunEnd, 
 from spatial_replay.recording.recording import RunEvent, refuse_templates
 from spatial_replay.recording.trigger import Trigger
 from spatial_replay.spec.formula import Specification
+from spatial_replay.spec.load import listed_specifications
 from spatial_replay.text import times_apart
 from spatial_replay.trace.axes import units_metadata
 from spatial_replay.trace.sample import Sample
@@ -315,6 +316,7 @@ class Recorder(SampleWriter):
         trigger: Trigger | None = None,
         durability: Durability = "process",
         planner: Planner | None = None,
+        overwrite: bool = False,
     ) -> None:
         """Begin a log.
 
@@ -322,7 +324,7 @@ class Recorder(SampleWriter):
         code is compiled first, which takes many seconds.
 
         Args:
-            path: replaced if it exists; with a trigger, the folder that its logs are written to.
+            path: the log; with a trigger, the folder that its logs are written to.
             specifications: evaluated as the samples arrive, without templates; one or several.
             about: further metadata of the log: a seed, where the samples come from.
             units: for sentences, axes and viewers: of signals by their names, of lengths by "".
@@ -333,15 +335,17 @@ class Recorder(SampleWriter):
             durability: "process" for a log that survives the end of the process; "disk" for one that
                 survives that of the machine, too: then each flush waits for the disk (fsync).
             planner: observes the samples that are written; its decisions are recorded, see `next_step`.
+            overwrite: replace a file that exists and is not empty.
 
         Raises:
             UsageError: a specification that cannot be recorded, units that are not texts, a limit below 1, a
-                trigger that names none of the specs, a planner together with a trigger or without `block`.
+                trigger that names none of the specs, a planner together with a trigger or without `block`, a
+                file that exists.
             OutputError: the file cannot be written.
         """
         if waiting < 1:
             raise UsageError(f"waiting is {waiting}; give 1 or more samples")
-        files = [specifications] if isinstance(specifications, Specification) else list(specifications)
+        files = listed_specifications(specifications)
         if planner is not None and planner.specification not in files:
             files.insert(0, planner.specification)
         refuse_templates(files)
@@ -350,7 +354,7 @@ class Recorder(SampleWriter):
         self._clips: ClipLog | None = None
         if trigger is None:
             refuse_inputs(self._path, ())
-            log: RecorderLog = FileLog(self._path, files, about, durability)
+            log: RecorderLog = FileLog(self._path, files, about, durability, overwrite=overwrite)
         else:
             log = self._clips = ClipLog(self._path, files, about, trigger)
         self._entered = ExitStack()

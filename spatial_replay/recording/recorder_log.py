@@ -106,13 +106,15 @@ class FileLog:
         files: Sequence[Specification],
         about: Mapping[str, str] | None,
         durability: Durability = "process",
+        *,
+        overwrite: bool = True,
     ) -> None:
         """Begin the file, with everything compiled that writing to it takes."""
         self.backlog = 0
         self._unevaluated: deque[Trace] = deque()
         self._plans: deque[Mapping[str, str]] = deque()
         self._at_once = _AT_FIRST
-        self._stream = open_output(path, durability)
+        self._stream = open_output(path, durability, overwrite=overwrite)
         try:
             self._writer = LogWriter(self._stream, clock=time.monotonic)
             self._recording = Recording(self._writer, files, about)

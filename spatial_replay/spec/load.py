@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache, partial
 from os import PathLike
 from pathlib import Path
@@ -156,6 +156,19 @@ def require_specification(value: object) -> None:
     if not isinstance(value, Specification):
         remedy = "give a Specification, from parse_specification(text) or load_specification(path)"
         raise UsageError(f"specification is {shortened(value)}; {remedy}")
+
+
+def listed_specifications(value: object) -> list[Specification]:
+    """Return one or several specifications as a list.
+
+    Raises:
+        UsageError: anything else, such as the path of a file.
+    """
+    is_several = isinstance(value, Iterable) and not isinstance(value, (str, bytes))
+    listed = list(value) if is_several else [value]  # type: ignore[call-overload]
+    for each in listed:
+        require_specification(each)
+    return listed
 
 
 def _require_text(value: object) -> None:

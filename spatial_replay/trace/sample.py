@@ -42,6 +42,15 @@ def _require_name(name: object, what: str) -> None:
         )
 
 
+_EXAMPLES = MappingProxyType(
+    {
+        "objects": "{'cup': Footprint.disc(0, 0, 0.1)}",
+        "signals": "{'battery': 0.8}",
+        "unknown": "{'cup': None}",
+    }
+)
+
+
 @dataclass(frozen=True, slots=True)
 class Sample:
     """Every object and signal at one time.
@@ -64,8 +73,13 @@ class Sample:
     unknown: Mapping[str, str | None] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if isinstance(self.time_ns, bool) or not isinstance(self.time_ns, int):
+        if isinstance(self.time_ns, bool) or not isinstance(self.time_ns, (int, np.integer)):
             raise TraceError(f"time_ns is {self.time_ns!r}; give integer nanoseconds")
+        for what, named in (("objects", self.objects), ("signals", self.signals), ("unknown", self.unknown)):
+            if not isinstance(named, Mapping):
+                raise TraceError(
+                    f"{what} is {shortened(named)}; give a dict by name, as in {_EXAMPLES[what]}"
+                )
         if not 0 <= self.time_ns <= LATEST_NS:
             raise TraceError(f"time_ns is {self.time_ns}; give a time from 0 to 2**63 - 1 ns")
         objects: dict[str, TrackedObject | Footprint] = {}
@@ -79,6 +93,10 @@ class Sample:
         signals: dict[str, float] = {}
         for name, value in self.signals.items():
             _require_name(name, "a signal")
+            if isinstance(value, (bool, np.bool_, str, bytes)):
+                raise TraceError(
+                    f"signal {name!r} is {shortened(value)}; give a number, such as 1.0 for true"
+                )
             try:
                 signals[name] = float(value)
             except (TypeError, ValueError, OverflowError) as error:
@@ -90,6 +108,7 @@ class Sample:
             # a class may be empty, as that of a tracked object
             if class_name not in (None, ""):
                 _require_name(class_name, "a class")
+        object.__setattr__(self, "time_ns", int(self.time_ns))
         object.__setattr__(self, "objects", MappingProxyType(objects))
         object.__setattr__(self, "unknown", MappingProxyType(dict(self.unknown)))
         object.__setattr__(self, "signals", MappingProxyType(signals))

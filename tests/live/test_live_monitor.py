@@ -578,6 +578,18 @@ def test_messages_that_do_not_fit_are_said_once_and_counted_at_the_end(
     assert len(said) == 2 and "and 29 more like this" in said[1]
 
 
+def test_a_recorded_run_is_not_replaced_unasked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    mapped, spec = files(tmp_path, MAPPING, SPEC)
+    log = tmp_path / "live.mcap"
+    log.write_bytes(b"a run that is over")
+    # nothing listens there, and nothing is asked
+    command = ["monitor", "ws://127.0.0.1:9", "--mapping", str(mapped), "--spec", str(spec), "-o", str(log)]
+    assert run(command) == 2
+    assert "live.mcap exists already; give another name, or --overwrite" in capsys.readouterr().err
+    assert log.read_bytes() == b"a run that is over"
+    assert run([*command, "--overwrite"]) == 3
+
+
 def test_a_name_that_the_robot_does_not_report_is_noted_once(tmp_path: Path) -> None:
     mapped, spec = files(tmp_path, MAPPING, "spec clear = G (robto dist vase >= 0.5)")
     with robot() as own:

@@ -118,6 +118,10 @@ def test_a_loop_that_may_not_wait_drops_samples_and_counts_them(tmp_path: Path) 
     ("options", "said"),
     [
         ({"waiting": 0}, "waiting is 0"),
+        (
+            {"specifications": "safety.spatial"},
+            r"'safety\.spatial'; give a Specification, from .*load_specification",
+        ),
         ({"specifications": [parse_specification("spec s(ego) = F ego ovlp a")]}, "is a template"),
     ],
 )
@@ -176,8 +180,10 @@ def test_a_second_recorder_of_a_log_is_refused(tmp_path: Path) -> None:
         with pytest.raises(OutputError, match="is being written by another recorder"):
             Recorder(path)
         recorder.write(sample(1))
+    with pytest.raises(UsageError, match=r"run\.mcap exists already; give another name, or .*overwrite=True"):
+        Recorder(path)
     assert read_trace(path) == run(2)
-    Recorder(path).close()
+    Recorder(path, overwrite=True).close()
     assert len(open_source(path).metadata()) > 1
 
 
@@ -243,7 +249,7 @@ def test_a_handler_for_sigterm_of_the_program_stays(tmp_path: Path) -> None:
             signal.raise_signal(signal.SIGTERM)
         assert came == [signal.SIGTERM]
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        with Recorder(tmp_path / "run.mcap"):
+        with Recorder(tmp_path / "run.mcap", overwrite=True):
             assert signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL
         assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
     finally:

@@ -16,6 +16,27 @@ def two_samples():
     return Trace.from_samples([Sample(0, {"a": BOX}, {"force": 1.0}), Sample(5, {"b": BOX})])
 
 
+def test_times_of_numpy_are_times() -> None:
+    sample = Sample(np.int64(7))
+    assert (sample, type(sample.time_ns)) == (Sample(7), int)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({"signals": {"on": True}}, "signal 'on' is True; give a number, such as 1.0"),
+        ({"signals": {"on": np.True_}}, "signal 'on' is .*True.*; give a number"),
+        ({"signals": {"mode": "3"}}, "signal 'mode' is '3'; give a number"),
+        ({"objects": [BOX]}, "objects is .*; give a dict by name, as in {'cup': Footprint"),
+        ({"signals": 0.8}, "signals is 0.8; give a dict by name, as in {'battery': 0.8}"),
+        ({"unknown": ["cup"]}, "unknown is .*; give a dict by name, as in {'cup': None}"),
+    ],
+)
+def test_values_of_other_kinds_are_refused(arguments: dict[str, object], said: str) -> None:
+    with pytest.raises(TraceError, match=said):
+        Sample(0, **arguments)  # type: ignore[arg-type]
+
+
 def test_missing_objects_are_absent():
     assert two_samples().rows.tolist() == [[0, -1], [-1, 1]]
     assert np.isnan(two_samples().signals["force"][1])

@@ -200,7 +200,7 @@ def _recorded(
 ) -> tuple[list[float], list[float]]:
     """What each sample cost the loop, and how much later than planned each turn of the loop began."""
     times, delays = [], []
-    with sr.Recorder(path, specifications=specification) as recorder:
+    with sr.Recorder(path, specifications=specification, overwrite=True) as recorder:
         begun = time.perf_counter()
         for k, sample in enumerate(samples):
             if hertz is not None:
