@@ -31,7 +31,7 @@ from spatial_replay.text import counted
 
 if TYPE_CHECKING:
     from spatial_replay.tuning import TunedConstant, Tuning
-    from spatial_replay.tuning.varied import Value
+    from spatial_replay.tuning.margins import Value
 
 _PICTURES = (".png", ".svg", ".html")
 _MANY = frozenset({"--good", "--bad"})

@@ -1,23 +1,317 @@
-"""The smallest part of a log that still shows why a verdict is what it is, as a log of its own."""
+"""Clips: the smallest part of a log that shows its verdicts."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
-from spatial_replay.compare.clip_window import ClipSearch, chosen_nodes
+import numpy as np
+
+from spatial_replay.compare.alignment import file_of
 from spatial_replay.errors import UsageError
+from spatial_replay.geometry.arrays import Booleans, Floats, Integers
 from spatial_replay.logs.remote import RemoteFile
 from spatial_replay.logs.source import Source
+from spatial_replay.monitor.atoms.delays import look_back
+from spatial_replay.monitor.atoms.measurements import leaf_values
+from spatial_replay.monitor.atoms.terms import TraceScene
+from spatial_replay.monitor.causes import conjuncts_of, find_causes
+from spatial_replay.monitor.offline import OfflineNodes, evaluate_offline
+from spatial_replay.monitor.online.codes import in_channels
+from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.semantics import require_ltlf
+from spatial_replay.monitor.stream import NEVER
+from spatial_replay.monitor.verdict import Verdict, final_verdict, online_verdict
+from spatial_replay.monitor.witness.path import End, MissedResponse, deciding_path, missed_response
+from spatial_replay.monitor.witness.unfinished import UnfinishedNodes, evaluate_unfinished
 from spatial_replay.replay.annotated import run_replay
 from spatial_replay.replay.clipped_source import clipped_source
 from spatial_replay.replay.engine import Replay, Replayed
 from spatial_replay.replay.kept_messages import KEEP_ALL
-from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions, Window
-from spatial_replay.spec.formula import Specification
+from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions, Selection, Window
+from spatial_replay.spec.diagnostics import nearest_hint
+from spatial_replay.spec.formula import Outline, Specification, iter_nodes
+from spatial_replay.trace.trace import ABSENT, Trace, window_of
+from spatial_replay.tuning.search import last_that_holds
+
+
+class KeptNode(NamedTuple):
+    """A node whose verdict a clip keeps, by its id, and what it is called."""
+
+    result: SpecResult
+    node: int
+    title: str
+
+
+def chosen_nodes(results: Sequence[SpecResult], of: Sequence[str]) -> list[KeptNode]:
+    """Return the results and named specs within them that are asked for, by default those that are violated.
+
+    Where none is violated these are all results.
+    """
+    if not of:
+        violated = [result for result in results if result.verdict is Verdict.VIOLATED]
+        return [KeptNode(result, 0, result.title) for result in violated or results]
+    found, known = [], dict[str, None]()
+    for result in results:
+        names = {node.name: node.id for node in reversed(result.nodes) if node.name is not None}
+        known |= dict.fromkeys([result.title, *names])
+        if result.title in of or result.name in of:
+            found.append(KeptNode(result, 0, result.title))
+        found += [KeptNode(result, names[name], name) for name in of if names.get(name)]
+    for name in of:
+        if name not in known and all(name != result.name for result in results):
+            hint = nearest_hint(name, known) or f"there are {', '.join(known)}"
+            raise UsageError(f"no spec is named {name!r}; {hint}")
+    return found
+
+
+class _Path(NamedTuple):
+    """What decides a node, as a clip has to repeat it.
+
+    Attributes:
+        nodes: the ids on the path to the deciding atom.
+        decided_ns: the sample that decides.
+        number: the interval of the last of these nodes there.
+        missed: the implication on the path that failed.
+    """
+
+    nodes: tuple[int, ...]
+    decided_ns: int
+    number: tuple[float, float]
+    missed: MissedResponse | None
+
+
+class _Part:
+    """One node of a result, evaluated over any window of its samples."""
+
+    def __init__(self, kept: KeptNode, trace: Trace | None, regions: Mapping[str, Outline]) -> None:
+        result = kept.result
+        if result.leaves is None:
+            raise UsageError("a clip needs the leaves of every sample, which were not stored")
+        self._result, self._node = result, kept.node
+        self._leaves, self._times_ns = result.leaves, result.times_ns
+        self._order = result.evidence.instance.program.leaves
+        self._nodes = [node for _, _, node in iter_nodes(result.formula)]
+        self._trace, self._regions = trace, regions
+        self._reach = look_back([result.formula])
+        # an instance lasts from the first to the last appearance of its object
+        self._seen_ns: Integers | None = None
+        if result.object is not None and trace is not None:
+            self._seen_ns = trace.times_ns[_appearances(trace, result.object)]
+        self._certain_ns = result.certain_ns(kept.node)
+        cause = result.first_cause(kept.node)
+        self._cause = None if cause is None else cause.node
+        self._settled_ns = self._certain_ns if cause is None else cause.settled_ns
+        done = self._evaluated(self._leaves, self._times_ns)
+        self._ends = self._ends_of(done)
+        self._verdict = final_verdict(*self._ends[0][:2])
+        self._paths = [self._path(done, self._times_ns, self._node), *self._settled(self._leaves, done)]
+        times_ns = [path.decided_ns for path in self._paths]
+        times_ns += [each for each in (self._certain_ns, self._settled_ns) if each is not None]
+        self.span_ns = min(times_ns), max(times_ns)
+
+    def holds_over(self, start_ns: int, end_ns: int) -> bool:
+        """Say whether all of it is the same over the samples from one time to another, both included."""
+        if self._seen_ns is not None:
+            begin, end = window_of(self._seen_ns, start_ns, end_ns + 1)
+            if begin == end:
+                return False
+            start_ns, end_ns = self._seen_ns[[begin, end - 1]].tolist()
+        begin, end = window_of(self._times_ns, start_ns, end_ns + 1)
+        if begin == end:
+            return False
+        leaves, times_ns = self._within(begin, end, start_ns), self._times_ns[begin:end]
+        done = self._evaluated(leaves, times_ns)
+        return (
+            self._ends_of(done) == self._ends
+            and self._path(done, times_ns, self._node) == self._paths[0]
+            and self._is_certain_alike(leaves, times_ns)
+            and self._first_cause(leaves, times_ns, done) == self._cause
+            and self._settled(leaves, done, times_ns) == self._paths[1:]
+        )
+
+    def _within(self, begin: int, end: int, first_ns: int) -> Floats:
+        """Return the leaves of a window as a log of its own has them: nothing is known before its start."""
+        leaves = self._leaves[:, :, begin:end]
+        samples, duration_ns = self._reach
+        if self._trace is None or (samples, duration_ns) == (0, 0):
+            return leaves
+        times_ns = self._times_ns[begin:end]
+        count = max(samples, int(np.searchsorted(times_ns, first_ns + duration_ns)))
+        from_, to = window_of(self._trace.times_ns, int(times_ns[0]), int(times_ns[-1]) + 1)
+        head = self._trace.slice(from_, min(from_ + count, to))
+        if not len(head):
+            return leaves
+        instance = self._result.evidence.instance
+        known = leaf_values(TraceScene(head, self._regions), self._order, instance.bindings)
+        channels = max(len(known), len(leaves))
+        leaves = np.array(in_channels(leaves, channels))
+        leaves[:, :, : len(head)] = in_channels(known, channels)
+        return leaves
+
+    def _evaluated(self, leaves: Floats, times_ns: Integers) -> OfflineNodes:
+        return evaluate_offline(self._result.formula, self._order, np.ascontiguousarray(leaves), times_ns)
+
+    def _unfinished(self, leaves: Floats, times_ns: Integers, count: int) -> UnfinishedNodes:
+        """Return the nodes as the first samples alone settle them."""
+        return evaluate_unfinished(self._result.formula, self._order, leaves[:, :, :count], times_ns[:count])
+
+    def _ends_of(self, done: OfflineNodes) -> list[tuple[float, ...]]:
+        """Return the ends, the nominal ones, too, of the node and of the part that failed first."""
+        nodes = [self._node, *(() if self._cause is None else (self._cause,))]
+        return [
+            tuple(float(end[0]) + 0.0 for wide in (True, False) for end in done.ends(node, wide=wide))
+            for node in nodes
+        ]
+
+    def _path(self, done: OfflineNodes | UnfinishedNodes, times_ns: Integers, node: int) -> _Path:
+        goes_on = isinstance(done, UnfinishedNodes)
+        lower, upper = (float(end[0]) + 0.0 for end in done.ends(node))
+        end = End.of(final_verdict(lower, upper))
+        path = deciding_path(self._result.formula, done, times_ns, node, end, goes_on=goes_on)
+        last = path.steps[-1]
+        low, high = done.ends(last.node)
+        return _Path(
+            tuple(step.node for step in path.steps),
+            int(times_ns[last.sample]),
+            (float(low[last.sample]), float(high[last.sample])),
+            missed_response(path, self._nodes, done, times_ns) if end is End.HIGH else None,
+        )
+
+    def _settled(self, leaves: Floats, done: OfflineNodes, times_ns: Integers | None = None) -> list[_Path]:
+        """Return what decided the part that failed first, or the verdict that became certain, when it did."""
+        times_ns = self._times_ns if times_ns is None else times_ns
+        node = self._node if self._cause is None else self._cause
+        if self._settled_ns is None:
+            return [self._path(done, times_ns, node)]
+        count = int(np.searchsorted(times_ns, self._settled_ns, side="right"))
+        return [self._path(self._unfinished(leaves, times_ns, count), times_ns[:count], node)]
+
+    def _is_certain_alike(self, leaves: Floats, times_ns: Integers) -> bool:
+        """Say whether the verdict becomes certain at the same sample, or at none."""
+        count = len(times_ns)
+        if self._certain_ns is not None:
+            count = int(np.searchsorted(times_ns, self._certain_ns, side="right"))
+            if not count or times_ns[count - 1] != self._certain_ns:
+                return False
+            if self._online_verdict(leaves, times_ns, count) is not self._verdict:
+                return False
+            count -= 1
+        return count == 0 or self._online_verdict(leaves, times_ns, count) is not self._verdict
+
+    def _online_verdict(self, leaves: Floats, times_ns: Integers, count: int) -> Verdict:
+        lower, upper = self._unfinished(leaves, times_ns, count).ends(self._node)
+        return online_verdict(float(lower[0]) + 0.0, float(upper[0]) + 0.0)
+
+    def _first_cause(self, leaves: Floats, times_ns: Integers, done: OfflineNodes) -> int | None:
+        """Return the part that fails first, given that the verdict becomes certain when it did in the log."""
+        if self._cause is None:
+            return None
+        parts = conjuncts_of(self._nodes[self._node], "")
+        conjuncts = [replace(each, node=self._node + each.node) for each in parts]
+        final, values = np.zeros((len(self._nodes), 2)), np.zeros(len(self._nodes))
+        settled_ns = np.full((len(self._nodes), 2), NEVER, np.int64)
+        prefix, certain_ns = None, self._certain_ns or 0
+        if self._certain_ns is not None:
+            count = int(np.searchsorted(times_ns, self._certain_ns, side="right"))
+            prefix = self._unfinished(leaves, times_ns, count)
+        for node in (each.node for each in conjuncts):
+            final[node] = [float(end[0]) + 0.0 for end in done.ends(node)]
+            low, high = (float(end[0]) + 0.0 for end in done.ends(node, wide=False))
+            values[node] = low if low == high else np.nan
+            # no part was settled earlier than the whole, and one that is later does not come first
+            if prefix is not None and prefix.ends(node)[1][0] < 0.0:
+                settled_ns[node, 1] = certain_ns
+        causes = find_causes(conjuncts, values, final, settled_ns, lambda node, settled_ns: None)
+        return causes[0].node if causes else None
+
+
+class ClipSearch:
+    """Searches the window: from the samples that decide outwards, then from both ends inwards."""
+
+    def __init__(
+        self,
+        source: Source,
+        files: Sequence[Specification],
+        options: ReplayOptions,
+        kept: Sequence[KeptNode],
+        around_ns: int,
+    ) -> None:
+        results = [each.result for each in kept]
+        needs_samples = any(
+            result.object is not None or look_back([result.formula]) != (0, 0) for result in results
+        )
+        trace = None
+        if needs_samples:
+            trace = Selection(source, files, options).trace()
+        self._parts = [
+            _Part(each, trace, _regions(files, each.result)) for each in kept if len(each.result.times_ns)
+        ]
+        self._times_ns = _joined_times([result.times_ns for result in results])
+        first_ns = min(part.span_ns[0] for part in self._parts) - around_ns
+        last_ns = max(part.span_ns[1] for part in self._parts) + around_ns
+        last = len(self._times_ns) - 1
+        self._inner = (
+            int(np.searchsorted(self._times_ns, first_ns)),
+            min(last, int(np.searchsorted(self._times_ns, last_ns, side="right")) - 1),
+        )
+        self._known: dict[tuple[int, int], bool] = {}
+
+    def window(self) -> tuple[int, int]:
+        """Return the times of the first and the last sample of the clip."""
+        first, last = self._outwards()
+        while True:
+            begin = self._cut(first, self._inner[0], partial(self._holds, last=last))
+            end = self._cut(last, self._inner[1], partial(self._holds, begin))
+            if (begin, end) == (first, last):
+                return int(self._times_ns[first]), int(self._times_ns[last])
+            first, last = begin, end
+
+    def _outwards(self) -> tuple[int, int]:
+        """Widen the window in doubling steps until it has the results; small ones cost least."""
+        low, high = self._inner
+        last, step = len(self._times_ns) - 1, 0
+        while True:
+            window = max(low - step, 0), min(high + step, last)
+            if window == (0, last) or self._holds(*window):
+                return window
+            step = max(2 * step, 1)
+
+    def _cut(self, outer: int, inner: int, holds: Callable[[int], bool]) -> int:
+        """Return an end near the inner one that holds; the outer one does, and windows near it cost most."""
+        if inner == outer or holds(inner):
+            return inner
+        towards = 1 if outer > inner else -1
+        return last_that_holds(inner, outer - towards, lambda at: not holds(at)) + towards
+
+    def _holds(self, first: int, last: int) -> bool:
+        """Say whether a window has every result, for the same reason."""
+        if (first, last) not in self._known:
+            times = int(self._times_ns[first]), int(self._times_ns[last])
+            self._known[first, last] = all(part.holds_over(*times) for part in self._parts)
+        return self._known[first, last]
+
+
+def _joined_times(times_ns: Sequence[Integers]) -> Integers:
+    first = times_ns[0]
+    # objects of a template may come one after the other, each for as many samples
+    if all(np.array_equal(each, first) for each in times_ns):
+        return first
+    return np.unique(np.concatenate(times_ns))
+
+
+def _regions(files: Sequence[Specification], result: SpecResult) -> Mapping[str, Outline]:
+    """Return the regions of the file that a result comes from."""
+    file = file_of(files, result)
+    return {} if file is None else file.regions
+
+
+def _appearances(trace: Trace, name: str) -> Booleans:
+    return np.asarray(trace.rows[:, trace.names.index(name)] != ABSENT)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,30 +1,343 @@
-"""The edits between two formulas, each of which can be made without the others."""
+"""Edits between two versions of a formula: declarations, trees, shared names, and kinds of edits."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Hashable, Iterator, Mapping
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from typing import Literal, NamedTuple, TypeAlias
+from difflib import SequenceMatcher
+from functools import partial
+from itertools import chain
+from types import MappingProxyType
+from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
-from spatial_replay.compare.declarations import DeclarationChange
-from spatial_replay.spec.format import format_formula, format_term
+from lark import Token
+
+from spatial_replay.errors import SpecificationError, UsageError
+from spatial_replay.spec.diagnostics import Faults, SourceText
+from spatial_replay.spec.expressions import Expression
+from spatial_replay.spec.format import format_bound, format_formula, format_term
 from spatial_replay.spec.formula import (
     Atom,
     Boolean,
+    Earlier,
+    Enlarged,
     Formula,
     Group,
+    Measurement,
+    Outline,
     Quantified,
     RegionName,
     Span,
+    Specification,
     Temporal,
     Term,
     Truth,
+    Variable,
     iter_nodes,
     operands_of,
     operator_of,
 )
-from spatial_replay.spec.walks import base_of, iter_terms
+from spatial_replay.spec.load import parse_specification
+from spatial_replay.spec.parser import split_statements
+from spatial_replay.spec.relations import RELATION_NAMES
+from spatial_replay.spec.tokens import span_of, tokenize
+from spatial_replay.spec.walks import base_of, iter_formulas, iter_terms, map_leaves, map_terms, substitute
+
+
+def unify_regions(
+    formulas: Sequence[Formula], regions: Mapping[str, Outline], others: Mapping[str, Outline]
+) -> tuple[list[Formula], dict[str, Outline]]:
+    """Rename the regions of some formulas that others have with another shape; texts stay.
+
+    Returns:
+        The formulas, and the regions of both.
+    """
+    renamed: dict[str, str] = {}
+    joined = dict(others)
+    for name, outline in regions.items():
+        if others.get(name, outline) != outline:
+            own = f"{name} (before)"
+            while own in others or own in regions:
+                own += "'"
+            renamed[name] = own
+        joined[renamed.get(name, name)] = outline
+    if not renamed:
+        return list(formulas), joined
+    return [_with_terms(formula, partial(_with_region, renamed=renamed)) for formula in formulas], joined
+
+
+@dataclass(frozen=True, slots=True)
+class SharedNames:
+    """Puts one name in place of all that stand for the same.
+
+    Attributes:
+        regions: for each region, the first one of its shape.
+    """
+
+    regions: Mapping[str, str]
+
+    @classmethod
+    def of(cls, regions: Mapping[str, Outline]) -> SharedNames:
+        """Find the regions of one shape."""
+        first: dict[Outline, str] = {}
+        return cls({name: first.setdefault(outline, name) for name, outline in regions.items()})
+
+    def expression(self, expression: Expression) -> Expression:
+        """Return an expression whose groups are known by their members, and regions by their shapes."""
+        return map_leaves(expression, partial(_changed_leaf, change=self.term))
+
+    def term(self, term: Any) -> Any:
+        """Return a term of the same kind."""
+        if isinstance(term, Group):
+            return replace(term, name="")
+        if isinstance(term, RegionName):
+            return RegionName(self.regions.get(term.name, term.name))
+        if not isinstance(term, (Earlier, Enlarged)):
+            return term
+        return replace(term, term=self.term(term.term))
+
+
+def without_variables(formula: Quantified) -> Formula:
+    """Return the body of a quantifier with variables that are known by their place alone."""
+    inner = sum(isinstance(each, Quantified) for each in iter_formulas(formula.body))
+    # no name of a text begins with a blank and a number
+    return substitute(
+        formula.body,
+        {name: Variable(f" {inner}.{index}") for index, name in enumerate(formula.variables)},
+    )
+
+
+def _with_terms(formula: Formula, change: Callable[[Term], Term]) -> Formula:
+    match formula:
+        case Truth():
+            return formula
+        case Atom():
+            expression = map_leaves(formula.expression, partial(_changed_leaf, change=change))
+            return replace(formula, expression=expression, terms=tuple(map(change, formula.terms)))
+        case Quantified():
+            return replace(formula, body=_with_terms(formula.body, change))
+        case _:
+            return replace(formula, operands=tuple([_with_terms(each, change) for each in formula.operands]))
+
+
+def _changed_leaf(leaf: Any, change: Callable[[Term], Term]) -> Any:
+    return map_terms(leaf, change) if isinstance(leaf, Measurement) else leaf
+
+
+def _with_region(term: Term, renamed: Mapping[str, str]) -> Term:
+    if isinstance(term, RegionName):
+        return RegionName(renamed.get(term.name, term.name))
+    if not isinstance(term, (Earlier, Enlarged)):
+        return term
+    inner: Any = _with_region(term.term, renamed)
+    return replace(term, term=inner)
+
+
+DeclarationKind: TypeAlias = Literal["constant", "region", "group", "definition"]
+
+_KINDS: Final[Mapping[str, DeclarationKind]] = MappingProxyType(
+    {
+        "CONST": "constant",
+        "REGION": "region",
+        "GROUP": "group",
+        "DEF": "definition",
+        "SCALE": "definition",
+        "USE": "definition",
+    }
+)
+_MOST_CHANGES: Final = 32
+"""Declarations that edits are traced back to; two texts that differ in more are hardly versions of one."""
+
+
+class TextPlace(NamedTuple):
+    """A line of a specification file, from 1, or a statement that begins there, written on one line."""
+
+    filename: str
+    line: int
+    text: str
+
+
+class DeclarationChange(NamedTuple):
+    """A declaration that the versions do not share; `old` or `new` is None if only the other has it."""
+
+    kind: DeclarationKind
+    name: str
+    old: TextPlace | None
+    new: TextPlace | None
+
+
+class _Statement(NamedTuple):
+    span: Span
+    place: TextPlace
+    words: tuple[str, ...]
+
+
+_Key: TypeAlias = tuple[str, str]
+"""The word that a statement begins with, and the name that it declares."""
+
+
+class TextVersions:
+    """Two versions of a text, and what lies between them: some declarations of one put into the other.
+
+    Holds what was parsed, for one diff.
+
+    Attributes:
+        old, new: the specifications.
+        changes: the declarations that differ by more than blanks and comments; of very many, the first.
+    """
+
+    def __init__(self, old: Specification, new: Specification) -> None:
+        self.old, self.new = old, new
+        self._statements = statements_of(old), statements_of(new)
+        one, other = self._statements
+        # specs are compared node by node
+        keys = [key for key in dict.fromkeys((*one, *other)) if key[0] != "SPEC"]
+        self._keys = [key for key in keys if _words(one, key) != _words(other, key)][:_MOST_CHANGES]
+        self.changes = tuple(
+            DeclarationChange(_KINDS[key[0]], key[1], _place(one, key), _place(other, key))
+            for key in self._keys
+        )
+        self._known: dict[tuple[bool, frozenset[int]], Specification | None] = {}
+
+    def applied(self, changes: Collection[int]) -> Specification | None:
+        """Return the old text with some declarations of the new one, by number; None if it has errors."""
+        return self._version(frozenset(changes), is_old=True)
+
+    def undone(self, changes: Collection[int]) -> Specification | None:
+        """Return the new text with some declarations of the old one, by number; None if it has errors."""
+        return self._version(frozenset(changes), is_old=False)
+
+    def edited_lines(
+        self, specs: Sequence[tuple[str, str]], spans: tuple[Span | None, Span | None]
+    ) -> tuple[TextPlace | None, TextPlace | None]:
+        """Return a line that differs of the first of some specs that was edited, in either text.
+
+        None stands for a line that the other text does not have, or, twice, for no such spec.
+
+        Args:
+            specs: their names in the old text and in the new one.
+            spans: of several lines that differ, that of either of these is looked for.
+        """
+        for names in specs:
+            found = [of.get(("SPEC", name)) for of, name in zip(self._statements, names, strict=True)]
+            one, other = found
+            if one is not None and other is not None and one.words != other.words:
+                break
+        else:
+            return None, None
+        old = _lines_of(self.old, one.span, spans[0])
+        new = _lines_of(self.new, other.span, spans[1])
+        one_words, other_words = (
+            [tuple(line.place.text.partition("#")[0].split()) for line in lines] for lines in (old, new)
+        )
+        codes = SequenceMatcher(None, one_words, other_words, autojunk=False).get_opcodes()
+        blocks = [(old[a:b], new[c:d]) for kind, a, b, c, d in codes if kind != "equal"]
+        return _chosen(max(blocks, key=lambda block: sum(line.is_wanted for line in (*block[0], *block[1]))))
+
+    def _version(self, changes: frozenset[int], *, is_old: bool) -> Specification | None:
+        if (is_old, changes) not in self._known:
+            keys = [self._keys[number] for number in changes]
+            # what is exchanged may need declarations that only the other text has
+            texts = (self._exchanged(keys, is_old, is_strict) for is_strict in (True, False))
+            found = (self._parsed(text, keys, is_old) for text in texts)
+            self._known[is_old, changes] = next((each for each in found if each is not None), None)
+        return self._known[is_old, changes]
+
+    def _exchanged(self, keys: Collection[_Key], is_old: bool, is_strict: bool) -> str:
+        base, other = self._statements if is_old else self._statements[::-1]
+        file, source = (self.old, self.new) if is_old else (self.new, self.old)
+        pieces: list[tuple[Span, str]] = []
+        first = []
+        for key in self._keys:
+            if key in base and key in other and key in keys:
+                pieces.append((base[key].span, _text(source, other[key].span)))
+            elif key not in base and (key in keys or not is_strict):
+                first.append(_text(source, other[key].span))
+            elif key not in other and key in keys and is_strict:
+                pieces.append((base[key].span, ""))
+        text = file.source
+        for span, piece in sorted(pieces, reverse=True):
+            text = text[: span.start] + piece + text[span.end :]
+        return "\n".join((*first, text))
+
+    def _parsed(self, text: str, keys: Iterable[_Key], is_old: bool) -> Specification | None:
+        file, other = (self.old, self.new) if is_old else (self.new, self.old)
+        profile = other.profile if any(word == "USE" for word, _ in keys) else file.profile
+        with suppress(SpecificationError, UsageError):
+            return parse_specification(text, filename=file.filename, profile=profile)
+        return None
+
+
+class _Line(NamedTuple):
+    """A line of a statement; wanted is that of a certain place."""
+
+    place: TextPlace
+    is_wanted: bool
+
+
+def _lines_of(file: Specification, statement: Span, span: Span | None) -> list[_Line]:
+    first, last = (file.source.count("\n", 0, at) for at in (statement.start, statement.end))
+    wanted = -1 if span is None or span == Span(0, 0) else file.source.count("\n", 0, span.start)
+    lines = file.source.split("\n")
+    return [
+        _Line(TextPlace(file.filename, number + 1, lines[number].strip()), number == wanted)
+        for number in range(first, last + 1)
+    ]
+
+
+def _chosen(block: tuple[Sequence[_Line], Sequence[_Line]]) -> tuple[TextPlace | None, TextPlace | None]:
+    """Return the wanted line of either text, or else the one as far down as that of the other."""
+    wanted = [number for lines in block for number, line in enumerate(lines) if line.is_wanted]
+    old, new = (
+        next((line.place for line in lines if line.is_wanted), None)
+        or (lines[min(next(iter(wanted), 0), len(lines) - 1)].place if lines else None)
+        for lines in block
+    )
+    return old, new
+
+
+def statements_of(file: Specification) -> dict[_Key, _Statement]:
+    """Return the statements of a specification's text by what they declare."""
+    source = SourceText.of(file.source, file.filename)
+    faults = Faults(source)
+    found: dict[_Key, _Statement] = {}
+    for group in split_statements(tokenize(file.source, RELATION_NAMES | file.relations, faults), faults):
+        first, last = group.tokens[0], group.tokens[-1]
+        if first.type not in (*_KINDS, "SPEC") or first is last:
+            continue
+        span = Span(span_of(first).start, span_of(last).end)
+        place = TextPlace(file.filename, source.line_of(span.start), _on_one_line(file.source, group.tokens))
+        name = "profile" if first.type == "USE" else str(group.tokens[1].value)
+        words = tuple(f"{token.type} {token.value}" for token in group.tokens)
+        found.setdefault((first.type, name), _Statement(span, place, words))
+    return found
+
+
+def _on_one_line(source: str, tokens: Sequence[Token]) -> str:
+    """Return a statement as written, but for ends of lines and comments within it."""
+    pieces: list[str] = []
+    at = span_of(tokens[0]).start
+    for token in tokens:
+        start, end = span_of(token)
+        gap = source[at:start]
+        pieces += [gap if gap.isspace() and "\n" not in gap else " " * bool(gap), source[start:end]]
+        at = end
+    return "".join(pieces)
+
+
+def _words(statements: Mapping[_Key, _Statement], key: _Key) -> tuple[str, ...] | None:
+    return statements[key].words if key in statements else None
+
+
+def _place(statements: Mapping[_Key, _Statement], key: _Key) -> TextPlace | None:
+    return statements[key].place if key in statements else None
+
+
+def _text(file: Specification, span: Span) -> str:
+    return file.source[span.start : span.end]
+
 
 EditKind: TypeAlias = Literal[
     "constant", "region", "group", "definition", "replaced", "added", "removed", "moved", "renamed"
@@ -297,3 +610,295 @@ def _subjects(formula: Formula) -> Counter[str]:
         if isinstance(node, Atom) and not node.terms
     )
     return found
+
+
+def compare_trees(
+    old: Formula,
+    new: Formula,
+    name: str,
+    regions: Mapping[str, Outline],
+    origins: Sequence[Origin] = (),
+    specs: tuple[Collection[str], Collection[str]] = ((), ()),
+) -> TreeDiff:
+    """Compare two formulas over the same regions (see `unify_regions`).
+
+    Args:
+        name: what the formulas are called.
+        origins: the edits of the two texts that nodes follow from; without them, each node has its own.
+        specs: the names of all specs of the two texts.
+    """
+    comparison = _Comparison(regions, specs)
+    merged = comparison.align(Place(old, 0, (name,), 0), Place(new, 0, (name,), 0))
+    return comparison.finished(merged, origins)
+
+
+def changed_nodes(old: Formula, new: Formula, regions: Mapping[str, Outline]) -> frozenset[int]:
+    """Return the ids of the nodes of a new formula that differ from an old one, and of those within them."""
+    comparison = _Comparison(regions)
+    comparison.align(Place(old, 0, ("",), 0), Place(new, 0, ("",), 0))
+    sites = [site for site in comparison.sites if site.kind != "renamed"]
+    return frozenset(number for site in sites for number in site.ids[1])
+
+
+class _Comparison:
+    """Aligns two trees; numbers meanings, so that equal ones are found at once."""
+
+    def __init__(
+        self, regions: Mapping[str, Outline], specs: tuple[Collection[str], Collection[str]] = ((), ())
+    ) -> None:
+        self._names = SharedNames.of(regions)
+        self._specs = specs
+        self._renamed: set[tuple[str | None, str | None]] = set()
+        self._numbers: dict[Hashable, int] = {}
+        self._known: dict[int, tuple[Formula, int]] = {}
+        self.sites: list[FoundSite] = []
+
+    def meaning(self, node: Formula) -> int:
+        """Return a number that nodes of equal meaning share: names and the order of operands do not count."""
+        known = self._known.get(id(node))
+        if known is None:
+            known = self._known[id(node)] = (node, self._meaning(node))
+        return known[1]
+
+    def _meaning(self, node: Formula) -> int:
+        key: Hashable
+        match node:
+            case Truth():
+                key = node.value
+            case Atom():
+                key = self._names.expression(node.expression)
+            case Quantified():
+                group = self._names.term(node.group)
+                key = (node.quantifier, len(node.variables), group, self.meaning(without_variables(node)))
+            case Boolean(operator="spec"):
+                return self.meaning(node.operands[0])
+            case Boolean(operator="and" | "or" as operator):
+                # brackets around some of the operands mean nothing
+                members = Place(node, 0, ("",), 0).members(operator, through_names=True)
+                key = (operator, tuple(sorted(self.meaning(each.node) for each in members)))
+            case Boolean(operator="xor" | "<->"):
+                key = (node.operator, tuple(sorted(map(self.meaning, node.operands))))
+            case Boolean():
+                key = (node.operator, tuple(map(self.meaning, node.operands)))
+            case Temporal():
+                key = (node.operator, node.bound, tuple(map(self.meaning, node.operands)))
+        return self._numbers.setdefault(key, len(self._numbers))
+
+    def align(self, old: Place, new: Place) -> Merged:
+        """Compare two nodes that stand in for each other."""
+        names = old.node.name, new.node.name
+        is_renamed = names[0] != names[1] and None not in names
+        is_equal = self.meaning(old.node) == self.meaning(new.node)
+        if is_renamed and not is_equal and (names[0] in self._specs[1] or names[1] in self._specs[0]):
+            # another spec stands there, and neither was edited
+            return self._site(FoundSite("replaced", old, new))
+        if is_renamed:
+            self._renamed.add(names)
+            self.sites.append(FoundSite("renamed", old, new))
+        if is_equal:
+            self._align_names(old, new)
+            return new.node
+        old, new = old.bare, new.bare
+        match old.node, new.node:
+            case Boolean(operator="and" | "or" as one), Boolean(operator=other) if one == other:
+                return self._matched(old.node, old.members(one), new.node, new.members(one))
+            case _, Boolean(operator="and" | "or" as one) if self._is_among(old, new.members(one)):
+                return self._matched(new.node, [old], new.node, new.members(one))
+            case Boolean(operator="and" | "or" as one), _ if self._is_among(new, old.members(one)):
+                return self._matched(old.node, old.members(one), old.node, [new])
+            case Boolean(), Boolean() if old.node.operator == new.node.operator:
+                return Inner(None, old.node, new.node, self._pairwise(old, new))
+            case Temporal(), Temporal() if old.node.operator == new.node.operator:
+                edit = None
+                if old.node.bound != new.node.bound:
+                    edit = self._site(FoundSite("constant", old, new)).edit
+                return Inner(edit, old.node, new.node, self._pairwise(old, new))
+            case Quantified(), Quantified() if _ranges_alike(old.node, new.node):
+                kind, subject = kind_of(old.node, new.node)
+                return self._site(FoundSite(kind, old, new, subject, self._parts(old, new)))
+        kind, subject = kind_of(old.node, new.node)
+        return self._site(FoundSite(kind, old, new, subject))
+
+    def _parts(self, old: Place, new: Place) -> tuple[FoundSite, ...]:
+        """Return where the bodies of two quantifiers differ, which are evaluated as one."""
+        count = len(self.sites)
+        bodies = [
+            Place(place.node.body, place.id, place.specs, place.depth + 1)
+            for place in (old, new)
+            if isinstance(place.node, Quantified)
+        ]
+        self.align(bodies[0], bodies[1])
+        inner, self.sites = self.sites[count:], self.sites[:count]
+
+        def inside(place: Place | None, whole: Place) -> Place | None:
+            return None if place is None else replace(place, id=whole.id)
+
+        parts = chain(*(each.parts or (each,) for each in inner))
+        return tuple(each._replace(old=inside(each.old, old), new=inside(each.new, new)) for each in parts)
+
+    def finished(self, merged: Merged, origins: Sequence[Origin]) -> TreeDiff:
+        """Join the sites of one edit, wherever they occur, and return the edits."""
+        declared = [origin for origin in origins if origin.change is not None]
+        shared: list[tuple[set[int], list[int]]] = []
+        rest: list[int] = []
+        for number, site in enumerate(self.sites):
+            own = {index for index, origin in enumerate(declared) if site.follows_from(origin)}
+            if not own:
+                rest.append(number)
+                continue
+            # declarations that share a node are edited together
+            joined = [each for each in shared if each[0] & own]
+            shared = [each for each in shared if not each[0] & own]
+            shared.append(
+                (own.union(*(each[0] for each in joined)), [*chain(*(each[1] for each in joined)), number])
+            )
+        units = [(min(sites), sites, sorted(own)) for own, sites in shared]
+        joined_rest = self._joined([self.sites[number] for number in rest])
+        units += [(rest[sites[0]], [rest[number] for number in sites], []) for sites in joined_rest]
+        units.sort()
+        numbers = {site: unit for unit, (_, sites, _) in enumerate(units) for site in sites}
+        text = [origin for origin in origins if origin.change is None]
+        return TreeDiff(
+            tuple(
+                tuple(self._unit(sites, [declared[index] for index in own], text)) for _, sites, own in units
+            ),
+            renumbered(merged, numbers),
+        )
+
+    def _joined(self, found: Sequence[FoundSite]) -> Iterable[list[int]]:
+        """Join places that follow from one edit of the text of the specs, by number."""
+        removed, added = (
+            {self.meaning(place.node) for each in found for place in each.only(kind)}
+            for kind in ("removed", "added")
+        )
+        joined: dict[Hashable, list[int]] = {}
+        for number, each in enumerate(found):
+            places = each.old, each.new
+            meanings = [None if place is None else self.meaning(place.node) for place in places]
+            known = {meaning for meaning in meanings if meaning is not None}
+            spans = tuple(None if place is None else place.node.span for place in places)
+            specs = self._specs_of(each.old, each.new)[:1]
+            key: Hashable = ("place", each.kind == "renamed", specs, *spans)
+            if each.kind in ("added", "removed") and known <= removed & added:
+                key = ("moved", *known)
+            elif Span(0, 0) in spans:
+                key = (each.kind, specs, *(_place_text(place, each.kind) for place in places), *meanings)
+            joined.setdefault(key, []).append(number)
+        return joined.values()
+
+    def _specs_of(self, old: Place | None, new: Place | None) -> tuple[tuple[str, str], ...]:
+        """Return the specs that have the two places in their text, innermost first, by both names."""
+        if old is None or new is None:
+            return tuple((name, name) for place in (old, new) if place is not None for name in place.around)
+        pairs = [(one, other) for other in new.specs for one in old.specs]
+        return tuple(pair for pair in pairs if pair[0] == pair[1] or pair in self._renamed)
+
+    def _unit(
+        self, sites: Sequence[int], declared: Sequence[Origin], text: Sequence[Origin]
+    ) -> Iterator[Edit]:
+        """Yield the edits that sites follow from together: of each declaration, and of the specs' text."""
+        found = [self.sites[site] for site in sites]
+        for origin in declared:
+            if origin.change is not None:
+                edit = self._edit([each for each in found if each.follows_from(origin)])
+                yield replace(edit, kind=origin.change.kind, subject=origin.change.name, change=origin.change)
+        if declared:
+            own = [each for each in found if any(each.follows_from(origin) for origin in text)]
+        else:
+            own = list(chain(*(each.parts or (each,) for each in found)))
+        for numbers in self._joined(own):
+            yield self._edit([own[number] for number in numbers])
+
+    def _edit(self, found: Sequence[FoundSite]) -> Edit:
+        olds = [each.old for each in found if each.old is not None]
+        news = [each.new for each in found if each.new is not None]
+        kinds = {each.kind for each in found}
+        kind: EditKind = "moved" if kinds == {"added", "removed"} else found[0].kind
+        first_old, first_new = next(iter(olds), None), next(iter(news), None)
+        if kind == "moved":
+            specs = self._specs_of(first_old, None), self._specs_of(None, first_new)
+        else:
+            specs = (self._specs_of(first_old, first_new),) * 2
+        return Edit(
+            kind,
+            specs[1][0][1],
+            _place_text(first_old, kind),
+            _place_text(first_new, kind),
+            tuple(dict.fromkeys(place.id for place in olds)),
+            tuple(dict.fromkeys(place.id for place in news)),
+            None if first_old is None else first_old.node.span,
+            None if first_new is None else first_new.node.span,
+            max(place.depth for place in (*olds, *news)),
+            found[0].subject,
+            old_specs=specs[0],
+            new_specs=specs[1],
+        )
+
+    def _site(self, found: FoundSite) -> Site:
+        self.sites.append(found)
+        old, new = (None if place is None else place.node for place in (found.old, found.new))
+        return Site(len(self.sites) - 1, old, new)
+
+    def _align_names(self, old: Place, new: Place) -> None:
+        """Note the nodes within equal ones that have other names."""
+        for one, other in zip(old.operands, new.operands, strict=False):
+            if self.meaning(one.node) == self.meaning(other.node):
+                if one.node.name != other.node.name and None not in (one.node.name, other.node.name):
+                    self.sites.append(FoundSite("renamed", one, other))
+                self._align_names(one, other)
+
+    def _pairwise(self, old: Place, new: Place) -> tuple[Merged, ...]:
+        return tuple([self.align(*pair) for pair in zip(old.operands, new.operands, strict=True)])
+
+    def _is_among(self, place: Place, operands: Sequence[Place]) -> bool:
+        return any(self.meaning(place.node) == self.meaning(each.node) for each in operands)
+
+    def _matched(self, old_node: Any, olds: Sequence[Place], new_node: Any, news: Sequence[Place]) -> Inner:
+        """Match the operands of a conjunction or disjunction: equal ones, those of one name, similar ones."""
+        partner: dict[int, int] = {}
+        taken: set[int] = set()
+
+        def match(fits: Any) -> None:
+            for number, new in enumerate(news):
+                for index, old in enumerate(olds if number not in partner else ()):
+                    if index not in taken and fits(old, new):
+                        partner[number] = index
+                        taken.add(index)
+                        break
+
+        match(lambda old, new: self.meaning(old.node) == self.meaning(new.node))
+        match(lambda old, new: old.node.name is not None and old.node.name == new.node.name)
+        for least in (1.0, 0.5, 0.01):
+            match(lambda old, new, least=least: _is_alike(old, new, least, by_operator=True))
+        match(lambda old, new: _is_alike(old, new, 0.5, by_operator=False))
+        operands: list[Merged] = [
+            self.align(olds[partner[number]], new)
+            if number in partner
+            else self._site(FoundSite("added", None, new))
+            for number, new in enumerate(news)
+        ]
+        left = [old for index, old in enumerate(olds) if index not in taken]
+        operands += [self._site(FoundSite("removed", old, None)) for old in left]
+        return Inner(None, old_node, new_node, tuple(operands))
+
+
+def _is_alike(old: Place, new: Place, least: float, *, by_operator: bool) -> bool:
+    """Say whether two nodes are about the same, of one operator or of any."""
+    one, other = old.bare.node, new.bare.node
+    return (not by_operator or operator_of(one) == operator_of(other)) and similarity(one, other) >= least
+
+
+def _ranges_alike(old: Quantified, new: Quantified) -> bool:
+    """Say whether two quantifiers differ in their bodies alone."""
+    return (old.quantifier, old.variables, old.group) == (new.quantifier, new.variables, new.group)
+
+
+def _place_text(place: Place | None, kind: EditKind) -> str | None:
+    if place is None:
+        return None
+    if kind == "renamed":
+        return place.node.name
+    if kind == "constant" and isinstance(place.node, Temporal):
+        # the operands stay or have edits of their own
+        return f"{place.node.operator}{format_bound(place.node.bound)} …"
+    return format_formula(place.node)

@@ -1,33 +1,492 @@
-"""Two runs side by side: where they part, who moved differently, and what that did to each spec."""
+"""Two runs: which objects, signals, results and decisions differ, and since when."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from pathlib import Path
+from typing import Any, Final, NamedTuple
 
-from spatial_replay.compare.alignment import Alignment, align_runs
-from spatial_replay.compare.decision_diff import DecisionDiff, compare_decisions
-from spatial_replay.compare.movement import (
-    ObjectDiff,
-    SignalDiff,
-    compare_objects,
-    compare_signals,
-    movement_sentence,
-    signal_sentence,
-)
-from spatial_replay.compare.run_results import RunSpecDiff, compare_results
+import numpy as np
+
+from spatial_replay.compare.alignment import Alignment, Parting, align_runs, parting_of
+from spatial_replay.compiled import elementwise, kernel
+from spatial_replay.errors import UsageError
+from spatial_replay.geometry.arrays import Booleans, Floats, Integers
+from spatial_replay.geometry.batch import FootprintBatch
+from spatial_replay.geometry.measure import MeasureRequest, Operand, measure
 from spatial_replay.lazy import Displayed
+from spatial_replay.logs.schemas.PlanDecision_pb2 import PlanDecision
 from spatial_replay.logs.source import Source
 from spatial_replay.monitor.evaluate import Evaluation, evaluate
 from spatial_replay.monitor.result import SpecResult
+from spatial_replay.monitor.sentences import reason_sentence
+from spatial_replay.planning.read import read_decisions
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, LogNames, ReplayOptions, Selection
 from spatial_replay.spec.diagnostics import Diagnostic
-from spatial_replay.spec.formula import Specification
-from spatial_replay.text import counted, counted_from, json_number
+from spatial_replay.spec.formula import Atom, Specification, iter_nodes
+from spatial_replay.spec.walks import other_names
+from spatial_replay.text import Instant, Sentence, counted, counted_from, json_number, number_text, with_unit
+from spatial_replay.trace.other_units import OTHER_UNITS, require_same_units
 from spatial_replay.trace.sample import FOREVER
 from spatial_replay.trace.trace import Trace
+
+_PAIRS_AT_ONCE: Final = 16_384
+"""Observations that are compared at once: few enough for the processor's cache."""
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectDiff:
+    """One object in two aligned runs.
+
+    Attributes:
+        first_ns: the first sample of A in which it is not just where, or as, it is in B.
+        apart_ns: the first one in which the two footprints do not touch; None if they always do.
+        greatest: the greatest signed distance between the two footprints, at `greatest_ns`; NaN where none
+            was measured.
+        shift: how far its vertices' mean is away at most.
+        only_a, only_b: in how many pairs of samples only one run has it.
+    """
+
+    name: str
+    first_ns: int
+    apart_ns: int | None
+    greatest: float
+    greatest_ns: int
+    shift: float
+    only_a: int
+    only_b: int
+
+
+@dataclass(frozen=True, slots=True)
+class SignalDiff:
+    """One signal in two aligned runs.
+
+    Attributes:
+        first_ns: the first sample of A in which its value is not that in B.
+        greatest: the greatest difference of two known values, at `greatest_ns`; NaN where there are none.
+        ratio: how many times as large the median of its magnitudes is in B; NaN if one of them is 0.
+    """
+
+    name: str
+    first_ns: int
+    greatest: float
+    greatest_ns: int
+    ratio: float
+
+    @property
+    def has_other_unit(self) -> bool:
+        """Whether it seems to be in another unit in B: percent instead of parts, millimetres for metres."""
+        return self.ratio >= OTHER_UNITS or self.ratio <= 1.0 / OTHER_UNITS
+
+
+def compare_signals(a: Trace, b: Trace, alignment: Alignment) -> tuple[SignalDiff, ...]:
+    """Return the common signals with other values."""
+    times_ns = a.times_ns[alignment.a]
+    diffs = []
+    for name in sorted(set(a.signals) & set(b.signals)):
+        one, other = a.signals[name][alignment.a], b.signals[name][alignment.b]
+        differs = (one != other) & ~(np.isnan(one) & np.isnan(other))
+        if not differs.any():
+            continue
+        known = np.flatnonzero(~(np.isnan(one) | np.isnan(other)))
+        apart = np.abs(other - one)
+        farthest = int(known[apart[known].argmax()]) if len(known) else None
+        sizes = [float(np.median(np.abs(each[known]))) if len(known) else 0.0 for each in (one, other)]
+        diffs.append(
+            SignalDiff(
+                name,
+                int(times_ns[differs.argmax()]),
+                np.nan if farthest is None else float(apart[farthest]),
+                int(times_ns[differs.argmax() if farthest is None else farthest]),
+                sizes[1] / sizes[0] if min(sizes) > 0.0 else np.nan,
+            )
+        )
+    return tuple(diffs)
+
+
+def compare_objects(a: Trace, b: Trace, alignment: Alignment) -> tuple[ObjectDiff, ...]:
+    """Return the common objects that moved differently: those apart first come first, then the farthest.
+
+    Raises:
+        UsageError: no object is in both runs, or one run is in another unit.
+    """
+    names = sorted(set(a.names) & set(b.names))
+    if not names and (a.names or b.names):
+        raise UsageError(
+            f"the runs have no object in common: A has {_listed(a.names)}; B has {_listed(b.names)}. "
+            "Map the same things to the same names"
+        )
+    require_same_units(a, b)
+    # (P, K) observations
+    one, other = (
+        trace.rows[rows][:, [trace.names.index(name) for name in names]]
+        for trace, rows in ((a, alignment.a), (b, alignment.b))
+    )
+    in_both = np.flatnonzero((one >= 0) & (other >= 0))
+    moved, shift, distances = np.zeros(one.shape, np.bool_), np.zeros(one.shape), np.full(one.shape, np.nan)
+    for start in range(0, len(in_both), _PAIRS_AT_ONCE):
+        places = in_both[start : start + _PAIRS_AT_ONCE]
+        found = _object_diff(a, one.flat[places], b, other.flat[places])
+        for values, part in zip((moved, shift, distances), found, strict=True):
+            values.flat[places] = part
+    times_ns = a.times_ns[alignment.a]
+    only = (one >= 0) & (other < 0), (other >= 0) & (one < 0)
+    diffs = []
+    for number, name in enumerate(names):
+        only_a, only_b = (each[:, number] for each in only)
+        differs = moved[:, number] | only_a | only_b
+        if not differs.any():
+            continue
+        distance = distances[:, number]
+        apart = np.flatnonzero(distance > 0.0)
+        farthest = None if np.isnan(distance).all() else int(np.nanargmax(distance))
+        diffs.append(
+            ObjectDiff(
+                name,
+                int(times_ns[differs.argmax()]),
+                int(times_ns[apart[0]]) if len(apart) else None,
+                np.nan if farthest is None else float(distance[farthest]),
+                int(times_ns[differs.argmax() if farthest is None else farthest]),
+                float(np.sqrt(shift[:, number].max())),
+                int(np.count_nonzero(only_a)),
+                int(np.count_nonzero(only_b)),
+            )
+        )
+    never = int(a.times_ns[-1]) + 1
+    return tuple(
+        sorted(diffs, key=lambda each: (each.apart_ns or never, -each.shift, each.first_ns, each.name))
+    )
+
+
+def _object_diff(a: Trace, one: Integers, b: Trace, other: Integers) -> tuple[Booleans, Floats, Floats]:
+    """Compare observations in pairs.
+
+    Returns:
+        Which differ, the squared shift of their vertices' mean, and the signed distance of the two
+        footprints; NaN for those that do not differ.
+    """
+    both = FootprintBatch.concatenate([a.footprints.select(one), b.footprints.select(other)])
+    first = np.arange(len(one))
+    second = first + len(one)
+    moved, shift = np.zeros(len(one), np.bool_), np.zeros(len(one))
+    shapes = both.part_start, both.vertex_start, both.vertices, both.radius
+    _compare_shapes(*shapes, first, second, moved, shift)
+    columns = [(both.bottom[first], both.bottom[second]), (both.top[first], both.top[second])]
+    columns += [(a.yaw[one], b.yaw[other]), (a.uncertainty[one], b.uncertainty[other])]
+    for value, beside in columns:
+        moved |= (value != beside) & ~(np.isnan(value) & np.isnan(beside))
+    distance = np.full(len(one), np.nan)
+    operands = [Operand(rows[moved, None]) for rows in (first, second)]
+    distance[moved] = measure(both, operands, [MeasureRequest("signed_distance", 0, 1)])[0]
+    return moved, shift, distance
+
+
+@elementwise
+@kernel
+def _compare_shapes(
+    part_start: Integers,
+    vertex_start: Integers,
+    vertices: Floats,
+    radius: Floats,
+    first: Integers,
+    second: Integers,
+    differs: Booleans,
+    shift: Floats,
+) -> None:
+    """Fill in for pairs of rows whether shapes differ, and the squared shift of their vertices' mean."""
+    for k in range(len(first)):
+        parts, others = part_start[first[k]], part_start[second[k]]
+        count, other_count = part_start[first[k] + 1] - parts, part_start[second[k] + 1] - others
+        differ = count != other_count
+        for p in range(min(count, other_count)):
+            size = vertex_start[parts + p + 1] - vertex_start[parts + p]
+            other_size = vertex_start[others + p + 1] - vertex_start[others + p]
+            if size != other_size or radius[parts + p] != radius[others + p]:
+                differ = True
+        begin, end = vertex_start[parts], vertex_start[parts + count]
+        other_begin, other_end = vertex_start[others], vertex_start[others + other_count]
+        if not differ:
+            for i in range(end - begin):
+                for axis in range(2):
+                    differ |= vertices[begin + i, axis] != vertices[other_begin + i, axis]
+        differs[k] = differ
+        if not differ or begin == end or other_begin == other_end:
+            continue
+        # relative to one vertex, so that coordinates far from the origin do not cancel
+        x0, y0 = vertices[begin, 0], vertices[begin, 1]
+        x = y = other_x = other_y = 0.0
+        for i in range(begin, end):
+            x += vertices[i, 0] - x0
+            y += vertices[i, 1] - y0
+        for i in range(other_begin, other_end):
+            other_x += vertices[i, 0] - x0
+            other_y += vertices[i, 1] - y0
+        x = other_x / (other_end - other_begin) - x / (end - begin)
+        y = other_y / (other_end - other_begin) - y / (end - begin)
+        shift[k] = x * x + y * y
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names[:8]) + (", …" if len(names) > 8 else "") or "none"
+
+
+def movement_sentence(each: ObjectDiff, start_ns: int) -> Sentence:
+    """Return since when an object moved differently, and how far the two are apart."""
+    parts: list[str | Instant] = ["differs since ", Instant(each.first_ns, start_ns)]
+    if each.shift:
+        parts.append(f", by up to {number_text(each.shift)}")
+    if each.apart_ns is not None:
+        parts += ["; apart from itself since ", Instant(each.apart_ns, start_ns)]
+        parts += [f", farthest by {number_text(each.greatest)} at ", Instant(each.greatest_ns, start_ns)]
+    for which, count in (("A", each.only_a), ("B", each.only_b)):
+        if count:
+            parts.append(f"; only {which} has it in {counted(count, 'sample')}")
+    return Sentence(*parts)
+
+
+def signal_sentence(each: SignalDiff, start_ns: int) -> Sentence:
+    """Return since when a signal has other values, by how much, and whether its unit may be another."""
+    parts: list[str | Instant] = ["differs since ", Instant(each.first_ns, start_ns)]
+    if each.greatest > 0.0:
+        parts += [f", by up to {number_text(each.greatest)} at ", Instant(each.greatest_ns, start_ns)]
+    if each.has_other_unit:
+        times, which = (each.ratio, "B") if each.ratio > 1.0 else (1.0 / each.ratio, "A")
+        parts.append(f"; {times:,.0f} times as large in {which}: it may be in another unit there")
+    return Sentence(*parts)
+
+
+@dataclass(frozen=True, eq=False)
+class RunSpecDiff:
+    """One result in two runs.
+
+    Attributes:
+        a, b: the results.
+        first_ns: the first sample of A with a value of another sign than the one beside it in B, or None.
+        nodes: ids of the deepest nodes whose verdicts differ.
+        parting: where the runs part in its automaton; None if the verdict is the same, or it has none.
+        moved: the objects that the deciding atoms are about, as far as they moved differently.
+    """
+
+    a: SpecResult
+    b: SpecResult
+    first_ns: int | None
+    nodes: tuple[int, ...]
+    parting: Parting | None
+    moved: tuple[ObjectDiff, ...]
+
+    @property
+    def is_flipped(self) -> bool:
+        """Whether the verdict differs."""
+        return self.a.verdict is not self.b.verdict
+
+    @property
+    def is_different(self) -> bool:
+        """Whether the verdict or a final number differs."""
+        one, other = ((each.robustness, each.lower, each.upper) for each in (self.a, self.b))
+        return self.is_flipped or not np.array_equal(one, other, equal_nan=True)
+
+    def sentences(self, starts_ns: tuple[int, int]) -> Iterator[Sentence]:
+        """Yield what differs; times of each run count from its own start."""
+        texts = [f"{each.verdict} ({with_unit(each.robustness, each.unit)})" for each in (self.a, self.b)]
+        yield Sentence(" | ".join(texts) + ("" if self.is_different else ", the same"))
+        if self.first_ns is not None:
+            yield Sentence("the sign of its value differs since ", Instant(self.first_ns, starts_ns[0]))
+        if self.parting is not None:
+            where = self.parting
+            yield Sentence(
+                "they part in the automaton: ",
+                *_entered(where.a_ns, where.a_states, starts_ns[0]),
+                " | ",
+                *_entered(where.b_ns, where.b_states, starts_ns[1]),
+            )
+        for node in self.nodes:
+            yield Sentence(f"brought about by `{self.a.nodes[node].text}`")
+        for which, result, start_ns in zip("AB", (self.a, self.b), starts_ns, strict=True):
+            if self.is_flipped and result.causes and result.causes[0].witness is not None:
+                reason = reason_sentence(result.causes[0].witness, first_ns=start_ns)
+                yield Sentence(f"{which}: ", *reason.parts)
+        if self.moved:
+            names = ", ".join(each.name for each in self.moved)
+            yield Sentence(f"of what it is about, these moved differently: {names}")
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """The same as values for JSON."""
+        parting = self.parting
+        return {
+            "name": self.a.name,
+            "object": self.a.object,
+            "flipped": self.is_flipped,
+            "a": _result_value(self.a),
+            "b": _result_value(self.b),
+            "first_ns": self.first_ns,
+            "nodes": [{"id": node, "text": self.a.nodes[node].text} for node in self.nodes],
+            "parting": None
+            if parting is None
+            else {
+                "a_ns": parting.a_ns,
+                "b_ns": parting.b_ns,
+                "a_states": list(parting.a_states),
+                "b_states": list(parting.b_states),
+            },
+            "moved": [each.name for each in self.moved],
+        }
+
+
+def compare_results(
+    one: SpecResult,
+    other: SpecResult,
+    alignment: Alignment,
+    traces: tuple[Trace, Trace],
+    objects: Sequence[ObjectDiff],
+    files: Sequence[Specification],
+) -> RunSpecDiff:
+    """Compare the results of one spec in two aligned runs.
+
+    Args:
+        objects: those that moved differently.
+    """
+    moved = {each.name: each for each in objects}
+    nodes = _deepest_flipped(one, other)
+    if not nodes and one.can_explain and one.robustness != other.robustness:
+        nodes = (one.deciding_node(),)
+    names = [name for node in nodes for name in sorted(_objects_of(one, node)) if name in moved]
+    return RunSpecDiff(
+        one,
+        other,
+        _first_sign(one, other, alignment, traces),
+        nodes,
+        parting_of(one, other, files) if one.verdict is not other.verdict else None,
+        tuple(moved[name] for name in dict.fromkeys(names)),
+    )
+
+
+def _deepest_flipped(one: SpecResult, other: SpecResult) -> tuple[int, ...]:
+    """Return the nodes with other verdicts that have no such node below."""
+    flipped = {
+        node.id
+        for node, beside in zip(one.nodes, other.nodes, strict=True)
+        if node.verdict is not beside.verdict
+    }
+    if 0 not in flipped:
+        return ()
+    below = {one.nodes[node].parent for node in flipped}
+    # of a conjunction only what brought it about: the way down from the root is flipped, too
+    reached = {0}
+    for node in sorted(flipped):
+        if one.nodes[node].parent in reached:
+            reached.add(node)
+    return tuple(sorted(reached - below))
+
+
+def _objects_of(result: SpecResult, node: int) -> frozenset[str]:
+    formula = next(each for identifier, _, each in iter_nodes(result.formula) if identifier == node)
+    bound = result.evidence.bound(formula)
+    names: set[str] = set(other_names(bound))
+    for _, _, leaf in iter_nodes(bound):
+        if isinstance(leaf, Atom):
+            names |= {getattr(term, "name", "") for term in leaf.terms}
+    return frozenset(names)
+
+
+def _first_sign(
+    one: SpecResult, other: SpecResult, alignment: Alignment, traces: tuple[Trace, Trace]
+) -> int | None:
+    """Return the first sample with a value of another sign than the one beside it."""
+    signs = []
+    for result, trace, chosen in zip((one, other), traces, (alignment.a, alignment.b), strict=True):
+        value = np.full(len(trace), np.nan)
+        value[np.searchsorted(trace.times_ns, result.times_ns)] = result.series[0, 0]
+        signs.append(np.where(np.isnan(value), 0, np.where(value >= 0.0, 1, -1))[chosen])
+    differs = signs[0] != signs[1]
+    return int(traces[0].times_ns[alignment.a[differs.argmax()]]) if differs.any() else None
+
+
+def _entered(time_ns: int | None, states: Sequence[int], start_ns: int) -> tuple[str | Instant, ...]:
+    if time_ns is None:
+        return ("the end of the run",)
+    return f"state {', '.join(map(str, states))} at ", Instant(time_ns, start_ns)
+
+
+def _result_value(result: SpecResult) -> dict[str, Any]:
+    return {
+        "verdict": str(result.verdict),
+        "robustness": json_number(result.robustness),
+        "lower": json_number(result.lower),
+        "upper": json_number(result.upper),
+    }
+
+
+class DecisionDiff(NamedTuple):
+    """The first decision of two planned runs that differs.
+
+    Attributes:
+        number: of the decision, from 0.
+        a, b: the decisions in words, or that there is none.
+        a_ns, b_ns: when they were made.
+        maps: the objects whose gradient maps differ.
+    """
+
+    number: int
+    a: str
+    b: str
+    a_ns: int | None
+    b_ns: int | None
+    maps: tuple[str, ...]
+
+
+def compare_decisions(sources: tuple[Source, Source]) -> DecisionDiff | None:
+    """Return the first decision that differs, or None; of logs that were not planned, None."""
+    decisions: list[tuple[PlanDecision, ...]] = []
+    for source in sources:
+        path = getattr(source, "path", None)
+        found: tuple[PlanDecision, ...] = ()
+        if isinstance(path, Path) and source.kind == "MCAP":
+            with suppress(UsageError):
+                found = read_decisions(path).decisions
+        decisions.append(found)
+    for number in range(max(map(len, decisions))):
+        pair = [own[number] if number < len(own) else None for own in decisions]
+        if _compared(pair[0]) != _compared(pair[1]):
+            hashes = [_map_hashes(decision) for decision in pair]
+            maps = sorted(
+                name for name in hashes[0].keys() & hashes[1].keys() if hashes[0][name] != hashes[1][name]
+            )
+            texts = [_decision_text(decision) for decision in pair]
+            times_ns = [None if decision is None else decision.time_ns for decision in pair]
+            return DecisionDiff(number, texts[0], texts[1], times_ns[0], times_ns[1], tuple(maps))
+    return None
+
+
+def _compared(decision: PlanDecision | None) -> bytes | None:
+    """Return what of a decision counts: what is to be done and why, not when it was made or how it went."""
+    if decision is None:
+        return None
+    copy = PlanDecision.FromString(decision.SerializeToString())
+    copy.ClearField("time_ns")
+    copy.ClearField("outcome")
+    copied: bytes = copy.SerializeToString(deterministic=True)
+    return copied
+
+
+def _map_hashes(decision: PlanDecision | None) -> dict[str, tuple[bytes, ...]]:
+    hashes: dict[str, tuple[bytes, ...]] = {}
+    for edge in () if decision is None else decision.considered:
+        for candidate in edge.candidates:
+            hashes[candidate.object] = (*hashes.get(candidate.object, ()), candidate.map_sha256)
+    return hashes
+
+
+def _decision_text(decision: PlanDecision | None) -> str:
+    if decision is None:
+        return "none: the run has no such decision"
+    target = decision.target
+    where = f"; {target.object} to ({target.x:.4g}, {target.y:.4g})" if decision.HasField("target") else ""
+    return f"{decision.reason}{where}"
+
 
 _MOST_LISTED: Final = 12
 

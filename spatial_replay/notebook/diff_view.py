@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from spatial_replay.compare.runs import LogDiff
-from spatial_replay.compare.spec_diff import SpecDiff
-from spatial_replay.compare.specifications import SpecificationDiff
+from spatial_replay.compare.specifications import SpecDiff, SpecificationDiff
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.notebook import html, plot

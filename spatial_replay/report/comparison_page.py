@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from spatial_replay import __version__
-from spatial_replay.compare.movement import movement_sentence, signal_sentence
-from spatial_replay.compare.runs import LogDiff
+from spatial_replay.compare.runs import LogDiff, movement_sentence, signal_sentence
 from spatial_replay.compare.specifications import SpecificationDiff
 from spatial_replay.logs.output_file import replacing
 from spatial_replay.logs.source import Source

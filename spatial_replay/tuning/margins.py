@@ -1,13 +1,15 @@
-"""How far each run is from the verdict that it should not have, with some values for the constants."""
+"""Tuned constants: what varies, in which direction, and the margins of labelled runs."""
 
 from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
+from decimal import Decimal
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import Final, NamedTuple, TypeAlias
+from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -20,14 +22,393 @@ from spatial_replay.monitor.instances import Instance, find_instances
 from spatial_replay.monitor.offline import OfflineFormula, new_leaves
 from spatial_replay.monitor.online.codes import in_channels
 from spatial_replay.spec import check_names
+from spatial_replay.spec.constants import text_of, value_given
+from spatial_replay.spec.diagnostics import nearest_hint
 from spatial_replay.spec.expressions import Measurement
-from spatial_replay.spec.formula import Atom, Formula, Outline, Quantified, Specification
+from spatial_replay.spec.formula import (
+    Atom,
+    Boolean,
+    Bound,
+    Constant,
+    Enlarged,
+    Expression,
+    Formula,
+    Maximum,
+    Minimum,
+    Negative,
+    Number,
+    Outline,
+    Projection,
+    Protrusion,
+    Quantified,
+    Scaled,
+    SignedDistance,
+    Specification,
+    Sum,
+    Temporal,
+    Term,
+    expand,
+)
+from spatial_replay.spec.syntax import Duration
 from spatial_replay.spec.walks import iter_expressions, iter_formulas
 from spatial_replay.trace.sample import FOREVER
 from spatial_replay.trace.trace import Trace, window_of
-from spatial_replay.tuning.direction import Direction, direction
-from spatial_replay.tuning.substitution import Numbers, Probe, formula_with
-from spatial_replay.tuning.varied import Value, VariedConstant
+
+Numbers: TypeAlias = Mapping[str, float]
+"""Values of constants, durations in nanoseconds."""
+_Fill: TypeAlias = Callable[[Numbers], Any]
+
+
+class Probe(NamedTuple):
+    """A formula as it was parsed with some values."""
+
+    formula: Formula
+    numbers: Numbers
+
+
+class _NeedsParsingError(Exception):
+    """A part of a formula depends on a constant in another way than by being it."""
+
+
+def formula_with(probes: Sequence[Probe]) -> Callable[[Numbers], Formula] | None:
+    """Return a function that returns the formula with other values, or None where only parsing gives it.
+
+    A number that is a constant, or one negated, in all probes is taken to be it; texts of atoms stay as in
+    the first probe. Windows whose two ends may cross are left to the parser, which checks them.
+    """
+    try:
+        return _fill([probe.formula for probe in probes], [probe.numbers for probe in probes])
+    except _NeedsParsingError:
+        return None
+
+
+def _fill(parts: Sequence[Any], values: Sequence[Numbers]) -> _Fill:
+    first = parts[0]
+    if all(type(part) is type(first) for part in parts) and all(part == first for part in parts):
+        return lambda _: first
+    if isinstance(first, float | int):
+        return _number(parts, values)
+    if any(type(part) is not type(first) for part in parts):
+        raise _NeedsParsingError
+    if isinstance(first, tuple):
+        if any(len(part) != len(first) for part in parts):
+            raise _NeedsParsingError
+        fills = [_fill(each, values) for each in zip(*parts, strict=True)]
+        return lambda numbers: tuple(fill(numbers) for fill in fills)
+    if not is_dataclass(first) or isinstance(first, type):
+        raise _NeedsParsingError
+    changing = {}
+    for name in (field.name for field in fields(first) if field.init and field.compare):
+        own = [getattr(part, name) for part in parts]
+        if any(each != own[0] for each in own) and not (isinstance(first, Atom) and name == "text"):
+            changing[name] = _fill(own, values)
+    if isinstance(first, Bound) and "lower" in changing and first.upper is not None:
+        raise _NeedsParsingError
+    return lambda numbers: replace(first, **{name: fill(numbers) for name, fill in changing.items()})
+
+
+def _number(parts: Sequence[Any], values: Sequence[Numbers]) -> _Fill:
+    kind = type(parts[0])
+    if kind is bool or any(type(part) is not kind for part in parts):
+        raise _NeedsParsingError
+    for name in values[0]:
+        for sign in (1, -1):
+            if all(part == sign * each[name] for part, each in zip(parts, values, strict=True)):
+                return lambda numbers, name=name, sign=sign: kind(sign * numbers[name])  # type: ignore[misc]
+    raise _NeedsParsingError
+
+
+Value: TypeAlias = float | str
+"""A number or, as a text, a duration, as `parse_specification` takes it."""
+
+_PARTS: Final = 1_000_000
+"""At least as many values are tried for a number, so that steps of the grid are short decimals."""
+
+
+@dataclass(frozen=True)
+class VariedConstant:
+    """A constant, and the values from `low` to `high` that are tried: both of them, and multiples of `step`.
+
+    Attributes:
+        written: its value in the text.
+        low, high, step: numbers, or nanoseconds of a duration.
+    """
+
+    name: str
+    written: Constant
+    low: Decimal
+    high: Decimal
+    step: Decimal
+
+    @classmethod
+    def of(cls, name: str, written: Constant, low: Value, high: Value) -> VariedConstant:
+        """Return a constant with a fine grid.
+
+        Raises:
+            UsageError: an end that is none, or of another kind than the constant; an empty range.
+        """
+        ends = [_decimal(name, each, written) for each in (low, high)]
+        width = ends[1] - ends[0]
+        shown = f"[{_text(ends[0], written)}, {_text(ends[1], written)}]"
+        if width <= 0:
+            raise UsageError(f"{name}: the range {shown} is empty; give a lower and a greater end")
+        if written.range is not None:
+            # what a text allows is decided there
+            inner = [Decimal(repr(each)) for each in written.range]
+            if written.duration_ns is not None:
+                inner = [each * 10**9 for each in inner]
+            if not inner[0] <= ends[0] < ends[1] <= inner[1]:
+                allowed = f"[{_text(inner[0], written)}, {_text(inner[1], written)}]"
+                raise UsageError(
+                    f"{name}: {shown} is outside of {allowed}, the range in the text; "
+                    "choose within it, or widen it there"
+                )
+        step = Decimal(1).scaleb((width / _PARTS).adjusted())
+        return cls(
+            name, written, ends[0], ends[1], step if written.duration_ns is None else max(step, Decimal(1))
+        )
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether both ends are whole numbers, so that it may count samples."""
+        return self.written.duration_ns is None and all(each % 1 == 0 for each in (self.low, self.high))
+
+    def in_whole_numbers(self) -> VariedConstant:
+        """Return the constant with a grid of whole numbers."""
+        return replace(self, step=Decimal(1))
+
+    @cached_property
+    def steps(self) -> int:
+        """The number of the last value; that of the first is 0."""
+        return max(1, int(-(-self.high // self.step)) - self._before)
+
+    @cached_property
+    def _before(self) -> int:
+        """The greatest multiple of the step that is at most `low`."""
+        return int((self.low / self.step).to_integral_value(rounding="ROUND_FLOOR"))
+
+    def decimal(self, number: int) -> Decimal:
+        """Return the value of that number, exactly."""
+        if number <= 0:
+            return self.low
+        return self.high if number >= self.steps else self.step * (self._before + number)
+
+    def value(self, number: int) -> Value:
+        """Return the value of that number as `parse_specification` takes it."""
+        decimal = self.decimal(number)
+        return float(decimal) if self.written.duration_ns is None else text_of(Duration(int(decimal)))
+
+    def number(self, number: int) -> float:
+        """Return the value of that number, a duration in nanoseconds."""
+        decimal = self.decimal(number)
+        return float(decimal) if self.written.duration_ns is None else int(decimal)
+
+    @property
+    def written_number(self) -> float:
+        """The value in the text, a duration in nanoseconds."""
+        return self.written.value if self.written.duration_ns is None else self.written.duration_ns
+
+    def text(self, number: int) -> str:
+        """Return the value of that number as written in a text: `70`, `2.5s`."""
+        return _text(self.decimal(number), self.written)
+
+    def nearest(self, value: Decimal) -> int:
+        """Return the number of the value next to another one."""
+        inside = min(max(value, self.low), self.high)
+        return min(max(int((inside / self.step).to_integral_value()) - self._before, 0), self.steps)
+
+    @property
+    def start(self) -> int:
+        """The number of the value next to the written one."""
+        return self.nearest(_decimal(self.name, _written(self.written), self.written))
+
+    def roundest(self, first: int, last: int) -> int:
+        """Return the number of a short value near the middle of a range of numbers."""
+        middle = (self.decimal(first) + self.decimal(last)) / 2
+        width = (self.decimal(last) - self.decimal(first)) / 2
+        exponent = width.adjusted() + 1 if width else self.step.adjusted()
+        while exponent > self.step.adjusted():
+            unit = Decimal(1).scaleb(exponent)
+            number = self.nearest((middle / unit).to_integral_value() * unit)
+            if first <= number <= last and 4 * abs(self.decimal(number) - middle) <= 2 * width:
+                return number
+            exponent -= 1
+        return self.nearest(middle)
+
+
+def varied_constants(
+    specification: Specification, ranges: Mapping[str, tuple[Value, Value] | None]
+) -> tuple[VariedConstant, ...]:
+    """Return the constants to tune: those with a range in `ranges`; without any, those with one in the text.
+
+    Args:
+        ranges: the values to try, by name; None takes the range in the text.
+
+    Raises:
+        UsageError: no such constant, one without a range, an empty range, none at all.
+    """
+    known = specification.constants
+    with_range = [name for name, each in known.items() if each.range is not None and not each.is_computed]
+    chosen = ranges or dict.fromkeys(with_range)
+    if not chosen:
+        example = next(iter(known), None)
+        raise UsageError(
+            f"{specification.filename} has no constant to tune; "
+            "name a number in it: const NAME = VALUE in [LOW, HIGH]"
+            if example is None
+            else f"no constant of {specification.filename} has a range to tune it in; "
+            f"vary one ({example}=LOW:HIGH), or write const {example} = "
+            f"{text_of_constant(known[example])} in [LOW, HIGH]"
+        )
+    varied = []
+    for name, ends in chosen.items():
+        if name not in known:
+            hint = nearest_hint(name, known) or f"the constants are: {', '.join(known) or 'none'}"
+            raise UsageError(f"{specification.filename} has no constant {name!r} to vary; {hint}")
+        if known[name].is_computed:
+            raise UsageError(f"{name} is computed from other constants; vary those")
+        if ends is None:
+            span = known[name].range
+            if span is None:
+                raise UsageError(f"{name} has no range in the text; give one: {name}=LOW:HIGH")
+            ends = (_end(span[0], known[name]), _end(span[1], known[name]))
+        varied.append(VariedConstant.of(name, known[name], *ends))
+    return tuple(varied)
+
+
+def text_of_constant(constant: Constant) -> str:
+    """Write a constant as a text does."""
+    return text_of(constant.value if constant.duration_ns is None else Duration(constant.duration_ns))
+
+
+def _written(constant: Constant) -> Value:
+    return constant.value if constant.duration_ns is None else text_of_constant(constant)
+
+
+def _end(value: float, constant: Constant) -> Value:
+    return value if constant.duration_ns is None else text_of(Duration(round(value * 1e9)))
+
+
+def _decimal(name: str, value: Value, written: Constant) -> Decimal:
+    read = value_given(name, value)
+    if isinstance(read, Duration) != (written.duration_ns is not None):
+        kind = "a number" if written.duration_ns is None else "a duration such as 2s"
+        raise UsageError(f"{name} cannot be {value!r}: it is {kind} ({text_of_constant(written)} as written)")
+    return Decimal(read.ns) if isinstance(read, Duration) else Decimal(repr(read))
+
+
+def _text(value: Decimal, written: Constant) -> str:
+    return text_of(float(value) if written.duration_ns is None else Duration(int(value)))
+
+
+Direction: TypeAlias = Literal[-1, 0, 1]
+"""1: looser, its robustness is at least that of the other in every log; -1: tighter; 0: the same."""
+
+
+def direction(before: Specification, after: Specification) -> Direction | None:
+    """Return how the results of one specification compare with those of another, of the same shape.
+
+    Returns:
+        None where one is looser in some logs and tighter in others, or where that is not known.
+    """
+    if before.regions != after.regions or len(before.results) != len(after.results):
+        return None
+    return _common(
+        _of_formula(one.formula, other.formula)
+        for one, other in zip(before.results, after.results, strict=True)
+    )
+
+
+def _common(directions: Iterable[Direction | None]) -> Direction | None:
+    """Return the direction of something that rises with each of its parts."""
+    found = set(directions) - {0}
+    if not found:
+        return 0
+    return found.pop() if len(found) == 1 else None
+
+
+def _opposite(direction: Direction | None) -> Direction | None:
+    return None if direction is None else -direction
+
+
+def _sign(difference: float) -> Direction:
+    return 1 if difference > 0 else -1 if difference < 0 else 0
+
+
+def _of_formula(before: Formula, after: Formula) -> Direction | None:
+    if before == after:
+        return 0
+    if isinstance(before, Boolean) and before.operator in ("xor", "<->"):
+        return None
+    match expand(before), expand(after):
+        case Atom() as one, Atom() as other:
+            return _of_expression(one.expression, other.expression)
+        case Quantified() as one, Quantified() as other:
+            same = (one.quantifier, one.variables, one.group) == (
+                other.quantifier,
+                other.variables,
+                other.group,
+            )
+            return _of_formula(one.body, other.body) if same else None
+        case Boolean() as one, Boolean() as other if _alike(one, other):
+            parts = _common(map(_of_formula, one.operands, other.operands))
+            return _opposite(parts) if one.operator == "not" else parts
+        case Temporal() as one, Temporal() as other if _alike(one, other):
+            window = _of_bound(one.bound, other.bound)
+            window = _opposite(window) if one.operator in ("G", "H") else window
+            return _common([window, *map(_of_formula, one.operands, other.operands)])
+    return None
+
+
+def _alike(one: Boolean | Temporal, other: Boolean | Temporal) -> bool:
+    return one.operator == other.operator and len(one.operands) == len(other.operands)
+
+
+def _of_bound(before: Bound | None, after: Bound | None) -> Direction | None:
+    """Return 1 if the window of an operator such as F grew: it has more samples to choose from."""
+    if before == after:
+        return 0
+    if before is None or after is None or before.unit != after.unit:
+        return None
+    ends = [float("inf") if each.upper is None else each.upper for each in (before, after)]
+    return _common([_sign(before.lower - after.lower), _sign(ends[1] - ends[0])])
+
+
+def _of_expression(before: Expression, after: Expression) -> Direction | None:
+    if before == after:
+        return 0
+    match before, after:
+        case Number() as one, Number() as other:
+            return _sign(other.value - one.value)
+        case Sum() as one, Sum() as other:
+            return _common([_of_expression(one.first, other.first), _of_expression(one.second, other.second)])
+        case Negative() as one, Negative() as other:
+            return _opposite(_of_expression(one.operand, other.operand))
+        case Scaled() as one, Scaled() as other if one.divisor == other.divisor:
+            return _of_expression(one.operand, other.operand)
+        case Minimum() as one, Minimum() as other if len(one.operands) == len(other.operands):
+            return _common(map(_of_expression, one.operands, other.operands))
+        case Maximum() as one, Maximum() as other if len(one.operands) == len(other.operands):
+            return _common(map(_of_expression, one.operands, other.operands))
+        case SignedDistance() as one, SignedDistance() as other:
+            grown = [_of_term(one.first, other.first), _of_term(one.second, other.second)]
+            return _opposite(_common(grown))
+        case Protrusion() as one, Protrusion() as other:
+            return _common([_of_term(one.inner, other.inner), _opposite(_of_term(one.outer, other.outer))])
+        case Projection() as one, Projection() as other if (one.side, one.axis) == (other.side, other.axis):
+            grew = _of_term(one.term, other.term)
+            return grew if one.side == "max" else _opposite(grew)
+    return None
+
+
+def _of_term(before: Term, after: Term) -> Direction | None:
+    """Return 1 if a footprint is enlarged more."""
+    if before == after:
+        return 0
+    if isinstance(before, Enlarged) and isinstance(after, Enlarged):
+        return _common([_of_term(before.term, after.term), _sign(after.radius - before.radius)])
+    return None
+
 
 Point: TypeAlias = tuple[int, ...]
 """The number of a value on the grid of each constant."""

@@ -19,10 +19,16 @@ from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import constant_writer
 from spatial_replay.text import counted, json_number
 from spatial_replay.trace.other_units import require_same_units
-from spatial_replay.tuning.direction import Direction
-from spatial_replay.tuning.margins import LabelledRun, Margins, Point
+from spatial_replay.tuning.margins import (
+    Direction,
+    LabelledRun,
+    Margins,
+    Point,
+    Value,
+    text_of_constant,
+    varied_constants,
+)
 from spatial_replay.tuning.search import Found, Search
-from spatial_replay.tuning.varied import Value, text_of_constant, varied_constants
 
 MOST_RUNS: Final = 10_000
 MOST_SAMPLES: Final = 1 << 25

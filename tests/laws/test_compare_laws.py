@@ -15,7 +15,7 @@ from examples import examples
 from laws.strategies_monitor import HEADER, WORDS, Recording, recordings, specifications
 from laws.strategies_spec import formula_texts
 from spatial_replay import Specification
-from spatial_replay.compare.shared_names import unify_regions
+from spatial_replay.compare.edits import unify_regions
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.spec.formula import Formula, NamedSpec
 
