@@ -165,7 +165,7 @@ def listed_specifications(value: object) -> list[Specification]:
         UsageError: anything else, such as the path of a file.
     """
     is_several = isinstance(value, Iterable) and not isinstance(value, (str, bytes))
-    listed = list(value) if is_several else [value]  # type: ignore[call-overload]
+    listed: list[Any] = list(value) if is_several else [value]  # type: ignore[call-overload]
     for each in listed:
         require_specification(each)
     return listed
