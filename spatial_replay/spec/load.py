@@ -8,6 +8,7 @@ from functools import lru_cache, partial
 from os import PathLike
 from pathlib import Path
 from reprlib import repr as shortened
+from typing import Any
 
 from lark import Token
 
