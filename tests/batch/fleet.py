@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import NamedTuple
 
-from click.testing import CliRunner, Result
-
-from spatial_replay.cli import run
+from cli.program import run_program
 
 GATE = """\
 # at least as far apart as in the standard
@@ -36,24 +35,18 @@ def write_fleet(folder: Path, distances: list[float]) -> None:
         write_log(folder / f"logs/run-{number}.jsonl", distance)
 
 
-class Done:
-    """What a command said, and its exit code."""
+class Done(NamedTuple):
+    """A command's exit code, and what it said."""
 
-    def __init__(self, result: Result) -> None:
-        self.code = int(result.return_value) if result.return_value is not None else result.exit_code
-        self.out, self.err = result.stdout, result.stderr
+    code: int
+    out: str
+    err: str
 
 
 def command(*arguments: str) -> Done:
-    """Run the program in this process, as its entry point does."""
-    import click
-
-    @click.command(context_settings={"ignore_unknown_options": True, "help_option_names": []})
-    @click.argument("given", nargs=-1, type=click.UNPROCESSED)
-    def program(given: tuple[str, ...]) -> int:
-        return run(given)
-
-    return Done(CliRunner().invoke(program, ["--", *arguments], standalone_mode=False))
+    """Run the program in this process, from the current folder."""
+    done = run_program(*arguments, cwd=Path())
+    return Done(done.returncode, done.stdout, done.stderr)
 
 
 def batch(*arguments: str) -> Done:

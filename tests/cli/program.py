@@ -1,4 +1,4 @@
-"""Running the program as a user does, in a process of its own."""
+"""Running the program as a user does, in this process or in one of its own."""
 
 from __future__ import annotations
 
@@ -7,7 +7,12 @@ import pty
 import subprocess
 import sys
 from collections.abc import Mapping
+from contextlib import chdir
 from pathlib import Path
+
+from click.testing import CliRunner
+
+from spatial_replay.cli import run
 
 PROGRAM = (sys.executable, "-m", "spatial_replay")
 
@@ -19,7 +24,16 @@ def environment(**variables: str) -> dict[str, str]:
 
 
 def run_program(*arguments: str, cwd: Path, **variables: str) -> subprocess.CompletedProcess[str]:
-    """Run the program in a folder; standard output and error are pipes."""
+    """Run the program in this process, from a folder; it finds pipes as standard output and error."""
+    unset = {"NO_COLOR": None, "FORCE_COLOR": None}
+    with chdir(cwd), CliRunner().isolation(env=unset | {"TERM": "xterm"} | variables) as (out, err, _):
+        code = run(arguments)
+        sys.stderr.flush()
+    return subprocess.CompletedProcess(arguments, code, out.getvalue().decode(), err.getvalue().decode())
+
+
+def run_process(*arguments: str, cwd: Path, **variables: str) -> subprocess.CompletedProcess[str]:
+    """Run the program in a process of its own."""
     return subprocess.run(
         [*PROGRAM, *arguments],
         cwd=cwd,

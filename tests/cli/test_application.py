@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 
 import spatial_replay
-from cli.program import PROGRAM, environment, run_program, standard_error_on_terminal
+from cli.program import PROGRAM, environment, run_process, run_program, standard_error_on_terminal
 from spatial_replay.cli.application import COMMANDS
 
 
 def test_version_and_help_go_to_standard_output(tmp_path: Path) -> None:
-    version = run_program("--version", cwd=tmp_path)
+    version = run_process("--version", cwd=tmp_path)
     assert (version.returncode, version.stdout, version.stderr) == (
         0,
         f"spatial-replay {spatial_replay.__version__}\n",
@@ -140,14 +140,14 @@ def test_an_interrupt_ends_with_code_130_and_one_line(tmp_path: Path) -> None:
 
 
 def test_a_shell_completes_commands_and_options(tmp_path: Path) -> None:
-    script = run_program("completion", "bash", cwd=tmp_path)
+    script = run_process("completion", "bash", cwd=tmp_path)
     assert script.returncode == 0
     assert "complete -o nosort -F _spatial_replay_completion spatial-replay" in script.stdout
     for words, expected in (
         ("spatial-replay ch", "plain,check"),
         ("spatial-replay check --pro", "plain,--profile"),
     ):
-        completed = run_program(
+        completed = run_process(
             cwd=tmp_path,
             _SPATIAL_REPLAY_COMPLETE="bash_complete",
             COMP_WORDS=words,

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from cli.interruptions import MANY, interrupted, write_many
-from cli.program import PROGRAM, run_program
+from cli.program import PROGRAM, run_process, run_program
 from replay.runs import content_of, run, write_tracks
 from spatial_replay import read_trace
 from spatial_replay.cli import run as run_in_process
@@ -47,7 +47,7 @@ def test_unknown_names_are_a_warning(
 def test_a_full_disk_gives_code_70_and_one_line(tracks: Path) -> None:
     if not Path("/dev/full").is_char_device():
         pytest.skip("no /dev/full here")
-    done = run_program("record", "tracks", "run.jsonl", "-o", "/dev/full", cwd=tracks.parent)
+    done = run_process("record", "tracks", "run.jsonl", "-o", "/dev/full", cwd=tracks.parent)
     assert (done.returncode, done.stdout) == (70, "")
     expected = "spatial-replay: error: /dev/full could not be written: no space left on the device\n"
     assert done.stderr == expected

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from cli.interruptions import interrupted
-from cli.program import PROGRAM, environment, run_program
+from cli.program import PROGRAM, environment, run_process, run_program
 from replay.runs import content_of
 from spatial_replay import read_trace
 from spatial_replay.cli import run
@@ -28,7 +28,7 @@ def _simulator() -> None:
 def test_equal_options_give_equal_bytes_in_every_process(tmp_path: Path) -> None:
     options = ("--seed", "7", "--noise", "0.001", "--inject", "slip@1s", "--duration", "3s")
     for name, hash_seed in [("one.mcap", "1"), ("two.mcap", "2")]:
-        done = run_program("record", "push", "-o", name, *options, cwd=tmp_path, PYTHONHASHSEED=hash_seed)
+        done = run_process("record", "push", "-o", name, *options, cwd=tmp_path, PYTHONHASHSEED=hash_seed)
         said = f"wrote {name}: 91 samples over 3.000 s of 3 objects: green, red, blue\n"
         assert (done.returncode, done.stderr) == (0, "")
         assert done.stdout == said + "the robot: stopped in the middle of its motion\n"

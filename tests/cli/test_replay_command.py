@@ -15,7 +15,7 @@ import pytest
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 from cli.interruptions import interrupted, write_many
-from cli.program import PROGRAM, run_program
+from cli.program import PROGRAM, run_process, run_program
 from replay.runs import SPECIFICATION, content_of, run, write_tracks
 from spatial_replay import Trace
 from spatial_replay.cli import run as run_in_process
@@ -282,7 +282,7 @@ def test_a_full_disk_gives_code_70_and_leaves_no_file(folder: Path) -> None:
         pytest.skip("no /dev/full here")
     (folder / "full").symlink_to("/dev/full")
     before = sorted(folder.iterdir())
-    done = run_program(*REPLAY, "-o", "full", cwd=folder)
+    done = run_process(*REPLAY, "-o", "full", cwd=folder)
     assert (done.returncode, done.stdout) == (70, "")
     assert done.stderr == "spatial-replay: error: full could not be written: no space left on the device\n"
     assert sorted(folder.iterdir()) == before
