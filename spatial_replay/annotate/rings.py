@@ -15,8 +15,7 @@ from spatial_replay.geometry.arrays import (
     flat_index,
     starts_from_counts,
 )
-from spatial_replay.geometry.batch import FootprintBatch
-from spatial_replay.geometry.footprint import Footprint
+from spatial_replay.geometry.footprint import Footprint, FootprintBatch
 from spatial_replay.trace.trace import Trace
 
 ROUND: Final = 32

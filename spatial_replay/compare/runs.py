@@ -15,7 +15,7 @@ from spatial_replay.compare.alignment import Alignment, Parting, align_runs, par
 from spatial_replay.compiled import elementwise, kernel
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Booleans, Floats, Integers
-from spatial_replay.geometry.batch import FootprintBatch
+from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.geometry.measure import MeasureRequest, Operand, measure
 from spatial_replay.lazy import Displayed
 from spatial_replay.logs.schemas.PlanDecision_pb2 import PlanDecision

@@ -12,8 +12,7 @@ import numpy as np
 
 from spatial_replay.compiled import kernel, piece
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.geometry.batch import FootprintBatch
-from spatial_replay.geometry.footprint import ConvexPart, Footprint
+from spatial_replay.geometry.footprint import ConvexPart, Footprint, FootprintBatch
 from spatial_replay.geometry.measure import Operand
 
 Point = tuple[float, float]

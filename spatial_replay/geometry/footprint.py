@@ -1,10 +1,13 @@
-"""Footprints: the shapes that objects and regions cover in the plane."""
+"""Footprints: the shapes that objects and regions cover in the plane, alone or many in flat arrays.
+
+Their centres, and footprints moved and turned, are here, too.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from struct import Struct
 from typing import Final, Literal, TypeAlias
@@ -13,7 +16,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from spatial_replay.errors import GeometryError
-from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.geometry.arrays import (
+    Floats,
+    Integers,
+    counts_from_starts,
+    flat_index,
+    read_only_floats,
+    read_only_integers,
+    starts_from_counts,
+)
 from spatial_replay.geometry.outline import (
     MOST_CONVEX_CORNERS,
     NOT_CONVEX,
@@ -311,3 +322,274 @@ def _ring(vertices: Floats) -> tuple[tuple[float, float], ...]:
     corners = [(x, y) for x, y in vertices.tolist()]
     first = corners.index(min(corners))
     return tuple(corners[first:] + corners[:first])
+
+
+# -------------------------------------------------------------------------------------------- many footprints
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FootprintBatch:
+    """R footprints made of P convex parts with V vertices in total, as ragged rows.
+
+    Footprint r has the parts part_start[r] up to part_start[r + 1]; part p has the vertices
+    vertex_start[p] up to vertex_start[p + 1]. Vertices of a part are in counter-clockwise order, without
+    repeated or collinear ones (one vertex: a point or disc, two: a segment or capsule); raw outlines go
+    through `normalise_polygons` first.
+
+    Attributes:
+        part_start: (R + 1,) int64.
+        vertex_start: (P + 1,) int64.
+        vertices: (V, 2) float64, in footprint units.
+        radius: (P,) float64, rounding radius of each part, at least 0.
+        bottom, top: (R,) float64, height interval; NaN where a footprint has none.
+        All are contiguous and read-only.
+
+    Raises:
+        GeometryError: arrays whose lengths do not fit together.
+    """
+
+    part_start: Integers
+    vertex_start: Integers
+    vertices: Floats
+    radius: Floats
+    bottom: Floats
+    top: Floats
+
+    def __post_init__(self) -> None:
+        for name in ("part_start", "vertex_start"):
+            object.__setattr__(self, name, read_only_integers(getattr(self, name)))
+        for name in ("vertices", "radius", "bottom", "top"):
+            object.__setattr__(self, name, read_only_floats(getattr(self, name)))
+        rows, parts, vertices = len(self.part_start) - 1, len(self.vertex_start) - 1, len(self.vertices)
+        expected = {"vertices": (vertices, 2), "radius": (parts,), "bottom": (rows,), "top": (rows,)}
+        for name, shape in expected.items():
+            if getattr(self, name).shape != shape:
+                actual = getattr(self, name).shape
+                raise GeometryError(f"{name} is {actual}; {rows} rows of {parts} parts need {shape}")
+        for name, last in (("part_start", parts), ("vertex_start", vertices)):
+            start = getattr(self, name)
+            if start[0] != 0 or start[-1] != last or (start[1:] < start[:-1]).any():
+                raise GeometryError(f"{name} must rise from 0 to {last}; it is {start}")
+
+    @classmethod
+    def trusted(cls, **columns: Floats | Integers) -> FootprintBatch:
+        """Build rows of new, contiguous arrays that are known to fit together.
+
+        For a few rows, checking takes longer than making them.
+        """
+        batch = object.__new__(cls)
+        for name, array in columns.items():
+            array.flags.writeable = False
+            object.__setattr__(batch, name, array)
+        return batch
+
+    def __len__(self) -> int:
+        return len(self.part_start) - 1
+
+    @property
+    def nbytes(self) -> int:
+        """The size of its arrays in bytes."""
+        numbers = (self.vertices, self.radius, self.bottom, self.top)
+        return self.part_start.nbytes + self.vertex_start.nbytes + sum(array.nbytes for array in numbers)
+
+    @classmethod
+    def from_footprints(
+        cls, footprints: Sequence[Footprint], heights: Sequence[tuple[float, float] | None] | None = None
+    ) -> FootprintBatch:
+        """Build one row per footprint, with its height interval (bottom, top) if it has one."""
+        packed = [part.packed for footprint in footprints for part in footprint.parts]
+        # a part's number of vertices and radius lie before its vertices
+        numbers = np.frombuffer(b"".join(packed)).reshape(-1, 2)
+        heads = starts_from_counts([len(each) for each in packed]) // numbers.strides[0]
+        intervals = [height or (np.nan, np.nan) for height in heights or [None] * len(footprints)]
+        return cls(
+            part_start=starts_from_counts([len(footprint.parts) for footprint in footprints]),
+            vertex_start=heads - np.arange(len(heads)),
+            vertices=np.delete(numbers, heads[:-1], axis=0),
+            radius=numbers[heads[:-1], 1],
+            bottom=np.array([bottom for bottom, _ in intervals], dtype=np.float64),
+            top=np.array([top for _, top in intervals], dtype=np.float64),
+        )
+
+    @classmethod
+    def unknown(cls, count: int) -> FootprintBatch:
+        """Build rows of which nothing is known: one point each, at NaN."""
+        return cls.trusted(
+            part_start=np.arange(count + 1, dtype=np.int64),
+            vertex_start=np.arange(count + 1, dtype=np.int64),
+            vertices=np.full((count, 2), np.nan),
+            radius=np.zeros(count),
+            bottom=np.full(count, np.nan),
+            top=np.full(count, np.nan),
+        )
+
+    @classmethod
+    def concatenate(cls, batches: Sequence[FootprintBatch]) -> FootprintBatch:
+        """Join the rows of several batches, one after the other."""
+        if len(batches) == 1:
+            return batches[0]
+        none = np.empty(0, np.int64)
+        part_counts = np.concatenate([none, *(counts_from_starts(batch.part_start) for batch in batches)])
+        vertex_counts = np.concatenate([none, *(counts_from_starts(batch.vertex_start) for batch in batches)])
+        return cls.trusted(
+            part_start=starts_from_counts(part_counts),
+            vertex_start=starts_from_counts(vertex_counts),
+            vertices=np.concatenate([np.empty((0, 2)), *(batch.vertices for batch in batches)]),
+            radius=np.concatenate([np.empty(0), *(batch.radius for batch in batches)]),
+            bottom=np.concatenate([np.empty(0), *(batch.bottom for batch in batches)]),
+            top=np.concatenate([np.empty(0), *(batch.top for batch in batches)]),
+        )
+
+    def select(self, rows: Integers) -> FootprintBatch:
+        """Return the given rows (K,), in the order given; a row may be repeated."""
+        if len(rows) == len(self) and (rows == np.arange(len(self))).all():
+            return self
+        first_part = self.part_start[rows]
+        part_counts = self.part_start[rows + 1] - first_part
+        parts = flat_index(first_part, part_counts)
+        first_vertex = self.vertex_start[parts]
+        vertex_counts = self.vertex_start[parts + 1] - first_vertex
+        return FootprintBatch.trusted(
+            part_start=starts_from_counts(part_counts),
+            vertex_start=starts_from_counts(vertex_counts),
+            vertices=self.vertices.take(flat_index(first_vertex, vertex_counts), axis=0),
+            radius=self.radius[parts],
+            bottom=self.bottom[rows],
+            top=self.top[rows],
+        )
+
+    def with_outlines(self, vertex_start: Integers, vertices: Floats) -> FootprintBatch:
+        """Return the same parts with other vertices, of as many parts: new arrays."""
+        return FootprintBatch.trusted(
+            part_start=self.part_start,
+            vertex_start=vertex_start,
+            vertices=vertices,
+            radius=self.radius,
+            bottom=self.bottom,
+            top=self.top,
+        )
+
+    def footprint(self, row: int) -> Footprint:
+        """Return the footprint of one row; see `footprints`."""
+        (footprint,) = self.footprints([row])
+        return footprint
+
+    def footprints(self, rows: Sequence[int]) -> list[Footprint]:
+        """Return the footprints of some rows.
+
+        Raises:
+            GeometryError: coordinates that are not those of convex parts.
+        """
+        is_all = len(rows) == len(self) and list(rows) == list(range(len(self)))
+        chosen = self if is_all else self.select(np.array(rows, np.int64))
+        parts = convex_parts(chosen.vertex_start, chosen.vertices, chosen.radius)
+        return [Footprint(tuple(parts[begin:end])) for begin, end in pairwise(chosen.part_start.tolist())]
+
+    def height(self, row: int) -> tuple[float, float] | None:
+        """Return the height interval (bottom, top) of one row, or None."""
+        bottom = float(self.bottom[row])
+        return None if math.isnan(bottom) else (bottom, float(self.top[row]))
+
+
+# ------------------------------------------------------------------------------------------------------ poses
+
+_FLAT: Final = 1e-12
+"""Twice the area over the squared perimeter; a polygon with less has no centroid of its area."""
+
+
+def centre_of(footprint: Footprint) -> tuple[float, float]:
+    """Return the centre (x, y) of an object: the centroid of its parts' areas.
+
+    A part is weighted by its area, and has the centroid of its polygon before rounding, or the mean of the
+    vertices if that polygon has no area. Areas of overlap count twice.
+    """
+    weights, centres = zip(*map(_weight_and_centre, footprint.parts), strict=True)
+    if sum(weights) <= 0.0:
+        weights = (1.0,) * len(centres)
+    total = sum(weights)
+    x, y = (sum(w * each[axis] for w, each in zip(weights, centres, strict=True)) / total for axis in (0, 1))
+    return x, y
+
+
+def radius_of(tracked: TrackedObject) -> float:
+    """Return the distance from an object's centre to its farthest point."""
+    centre = np.array(centre_of(tracked.footprint))
+    return max(float(np.hypot(*(p.vertices - centre).T).max()) + p.radius for p in tracked.footprint.parts)
+
+
+def moved_object(tracked: TrackedObject, x: float, y: float, turn: float = 0.0) -> TrackedObject:
+    """Return the object with its centre at (x, y), turned by an angle in radians; heights stay."""
+    footprint = tracked.footprint
+    centre = np.array(centre_of(footprint))
+    place = np.array([[x, y]])
+    parts = []
+    for part in footprint.parts:
+        corners = part.vertices
+        placed = np.empty((1, *corners.shape))
+        fill_placed(corners, centre, place, turn, placed)
+        parts.append(ConvexPart(placed[0], part.radius))
+    yaw = None if tracked.yaw is None else tracked.yaw + turn
+    return replace(tracked, footprint=Footprint(tuple(parts)), yaw=yaw)
+
+
+def with_poses(
+    batch: FootprintBatch, tracked: TrackedObject, positions: Floats, turns: Floats
+) -> FootprintBatch:
+    """Return a batch, and A * M more rows: the object turned by each angle (A,), at each position (M, 2)."""
+    parts = tracked.footprint.parts
+    centre = np.array(centre_of(tracked.footprint))
+    count = len(positions) * len(turns)
+    outlines = [part.vertices for part in parts]
+    corners = np.concatenate(outlines)
+    sizes = np.array([len(outline) for outline in outlines], np.int64)
+    bottom, top = tracked.height or (math.nan, math.nan)
+    part_start = batch.part_start[-1] + np.arange(count + 1, dtype=np.int64) * len(sizes)
+    vertex_start = batch.vertex_start[-1] + starts_from_counts(np.tile(sizes, count))
+    # of many cells, they are written where they stay
+    vertices = np.empty((len(batch.vertices) + count * len(corners), 2))
+    vertices[: len(batch.vertices)] = batch.vertices
+    placed = vertices[len(batch.vertices) :].reshape(len(turns), len(positions), len(corners), 2)
+    for number, turn in enumerate(turns.tolist()):
+        fill_placed(corners, centre, positions, turn, placed[number])
+    return FootprintBatch.trusted(
+        part_start=np.concatenate((batch.part_start[:-1], part_start)),
+        vertex_start=np.concatenate((batch.vertex_start[:-1], vertex_start)),
+        vertices=vertices,
+        radius=np.concatenate((batch.radius, np.tile([part.radius for part in parts], count))),
+        bottom=np.concatenate((batch.bottom, np.full(count, bottom))),
+        top=np.concatenate((batch.top, np.full(count, top))),
+    )
+
+
+def fill_placed(vertices: Floats, centre: Floats, positions: Floats, turn: float, placed: Floats) -> None:
+    """Fill `placed` (M, n, 2): vertices (n, 2) turned around the centre, moved to each position (M, 2)."""
+    local = vertices - centre
+    if turn != 0.0:
+        cosine, sine = math.cos(turn), math.sin(turn)
+        x, y = local[:, 0], local[:, 1]
+        local = np.stack((x * cosine - y * sine, x * sine + y * cosine), axis=1)
+    # both coordinates in one go, as complex numbers, and along the many positions, not along the few vertices
+    at = np.ascontiguousarray(positions, np.float64).view(np.complex128)[..., 0]
+    filled = placed.view(np.complex128)[..., 0]
+    for number, (x, y) in enumerate(local.tolist()):
+        np.add(at, complex(x, y), out=filled[:, number])
+
+
+def _weight_and_centre(part: ConvexPart) -> tuple[float, tuple[float, float]]:
+    """Return a part's area, and the centroid of its polygon before rounding."""
+    # plain numbers are quicker than arrays for the few vertices of a part
+    corners = part.vertices.tolist()
+    (x0, y0), *_ = corners
+    doubled = sum_x = sum_y = length = 0.0
+    for (ax, ay), (bx, by) in zip(corners, corners[1:] + corners[:1], strict=True):
+        cross = (ax - x0) * (by - y0) - (bx - x0) * (ay - y0)
+        doubled += cross
+        sum_x += cross * (ax + bx - 2.0 * x0)
+        sum_y += cross * (ay + by - 2.0 * y0)
+        length += math.hypot(bx - ax, by - ay)
+    # a rounded polygon is the polygon, a strip along its sides, and sectors at its corners that make a disc
+    area = doubled / 2 + length * part.radius + math.pi * part.radius**2
+    if len(corners) > 2 and doubled > _FLAT * length**2:
+        return area, (x0 + sum_x / (3.0 * doubled), y0 + sum_y / (3.0 * doubled))
+    count = len(corners)
+    return area, (sum(x for x, _ in corners) / count, sum(y for _, y in corners) / count)

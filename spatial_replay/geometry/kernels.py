@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from spatial_replay.compiled import elementwise, inlined, long_kernel
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.geometry.calipers import are_many, walked
 
 NOTHING, SIGNED_DISTANCE, PROTRUSION = -1, 0, 1
 MIN_X, MAX_X, MIN_Y, MAX_Y, MIN_Z, MAX_Z = 2, 3, 4, 5, 6, 7
@@ -184,8 +183,6 @@ def _convex_distance(
     """Return the signed distance of two convex polygons, segments or points (without their radii)."""
     if a_stop - a_start == BOX and b_stop - b_start == BOX:
         return _distance_by_edges(vertices, edges, a_start, a_start + BOX, b_start, b_start + BOX)
-    if are_many(a_stop - a_start, b_stop - b_start):
-        return walked(vertices, edges, False, a_start, a_stop, b_start, b_stop)
     return _distance_by_edges(vertices, edges, a_start, a_stop, b_start, b_stop)
 
 
@@ -200,10 +197,6 @@ def _convex_protrusion(
             distance = _distance_by_edges(vertices, edges, i, i + 1, b_start, b_start + BOX)
             greatest = max(greatest, distance)
         return greatest
-    if are_many(a_stop - a_start, b_stop - b_start):
-        if a_stop - a_start == BOX:
-            _fill_edges(vertices, edges, a_start, a_start + BOX)
-        return walked(vertices, edges, True, a_start, a_stop, b_start, b_stop)
     for i in range(a_start, a_stop):
         greatest = max(greatest, _distance_by_edges(vertices, edges, i, i + 1, b_start, b_stop))
     return greatest

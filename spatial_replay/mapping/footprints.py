@@ -20,7 +20,7 @@ from spatial_replay.geometry.arrays import (
     flat_index,
     starts_from_counts,
 )
-from spatial_replay.geometry.batch import FootprintBatch
+from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.geometry.outline import convex_hull
 from spatial_replay.mapping.field_paths import Style
 from spatial_replay.mapping.transforms import is_upright

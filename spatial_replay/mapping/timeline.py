@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from spatial_replay.geometry.arrays import Booleans, Floats, Integers
-from spatial_replay.geometry.batch import FootprintBatch
-from spatial_replay.geometry.footprint import Concave
+from spatial_replay.geometry.footprint import Concave, FootprintBatch
 from spatial_replay.mapping.detections import EVERY_OBJECT, Detections
 from spatial_replay.mapping.footprints import Solids, footprints_from_solids
 from spatial_replay.mapping.model import FOREVER_NS

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from spatial_replay.lazy import loaded_when_used
 
 if TYPE_CHECKING:
-    from spatial_replay.geometry.poses import centre_of, moved_object
+    from spatial_replay.geometry.footprint import centre_of, moved_object
     from spatial_replay.logs.topics import PLAN_METADATA
     from spatial_replay.planning.decision_log import BlackBox, map_fields, plan_metadata
     from spatial_replay.planning.decisions import Candidate, Executor, Outcome, Reason, Step, Target
@@ -93,7 +93,7 @@ __getattr__, __dir__ = loaded_when_used(
         "maps": ("FREE", "GradientMap", "MapLayers", "gradient_map", "map_layers", "proposition_maps"),
         "paths": ("shortest_path",),
         "planner": ("Planner",),
-        ".geometry.poses": ("centre_of", "moved_object"),
+        ".geometry.footprint": ("centre_of", "moved_object"),
         "read": (
             "PLAN_METADATA",
             "LoggedStep",

@@ -21,8 +21,7 @@ from spatial_replay.annotate.rings import outlines_of
 from spatial_replay.annotate.scene.scene_entities import FRAME
 from spatial_replay.annotate.scene.scene_frames import cell_colours
 from spatial_replay.errors import LogError, UsageError
-from spatial_replay.geometry.footprint import TrackedObject
-from spatial_replay.geometry.poses import centre_of, moved_object
+from spatial_replay.geometry.footprint import TrackedObject, centre_of, moved_object
 from spatial_replay.logs.messages import Messages, merge, messages_of
 from spatial_replay.logs.schemas.PlanDecision_pb2 import (
     PlanCandidate,

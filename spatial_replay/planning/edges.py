@@ -16,8 +16,7 @@ from typing import Any, Final, NamedTuple, TypeAlias
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.guards import MAX_CUBES, Transition
 from spatial_replay.errors import NoAutomatonError, UsageError
-from spatial_replay.geometry.footprint import TrackedObject
-from spatial_replay.geometry.poses import centre_of, moved_object, radius_of
+from spatial_replay.geometry.footprint import TrackedObject, centre_of, moved_object, radius_of
 from spatial_replay.monitor.atoms.live import SampleLeaves
 from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene

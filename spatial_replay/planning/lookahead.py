@@ -24,8 +24,7 @@ import numpy as np
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.guards import Transition
 from spatial_replay.geometry.arrays import Booleans, Floats
-from spatial_replay.geometry.footprint import TrackedObject
-from spatial_replay.geometry.poses import centre_of, moved_object, radius_of
+from spatial_replay.geometry.footprint import TrackedObject, centre_of, moved_object, radius_of
 from spatial_replay.planning.decisions import Candidate, Consideration, Edge, Reason, Target
 from spatial_replay.planning.edges import (
     LATER,

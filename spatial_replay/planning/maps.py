@@ -19,11 +19,16 @@ from numpy.typing import NDArray
 from spatial_replay.cores import over_cores
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Booleans, Floats
-from spatial_replay.geometry.batch import FootprintBatch
-from spatial_replay.geometry.footprint import Footprint, TrackedObject
+from spatial_replay.geometry.footprint import (
+    Footprint,
+    FootprintBatch,
+    TrackedObject,
+    centre_of,
+    fill_placed,
+    with_poses,
+)
 from spatial_replay.geometry.kernels import measure_rows
 from spatial_replay.geometry.measure import MeasureRequest, Operand, Remeasured
-from spatial_replay.geometry.poses import centre_of, fill_placed, with_poses
 from spatial_replay.lazy import Displayed
 from spatial_replay.monitor.atoms.measurements import MovedLeaves, leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene

@@ -17,8 +17,7 @@ from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.guards import Transition
 from spatial_replay.errors import TraceError
 from spatial_replay.geometry.arrays import Booleans, Floats
-from spatial_replay.geometry.footprint import Footprint, TrackedObject
-from spatial_replay.geometry.poses import centre_of, moved_object, radius_of
+from spatial_replay.geometry.footprint import Footprint, TrackedObject, centre_of, moved_object, radius_of
 from spatial_replay.planning.decisions import Candidate, Consideration, Guards, Reason, Target
 from spatial_replay.planning.edges import (
     BESIDE,

@@ -12,8 +12,7 @@ from spatial_replay.automata.compile import chosen_spec
 from spatial_replay.automata.guards import Transition
 from spatial_replay.automata.ltlf import bounds_in_samples, counts_seconds
 from spatial_replay.errors import TraceError, UsageError
-from spatial_replay.geometry.footprint import TrackedObject
-from spatial_replay.geometry.poses import centre_of, moved_object
+from spatial_replay.geometry.footprint import TrackedObject, centre_of, moved_object
 from spatial_replay.planning.decisions import (
     Consideration,
     Edge,

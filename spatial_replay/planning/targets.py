@@ -14,8 +14,7 @@ from typing import Final
 import numpy as np
 
 from spatial_replay.geometry.arrays import Booleans, Floats
-from spatial_replay.geometry.footprint import TrackedObject
-from spatial_replay.geometry.poses import centre_of, radius_of
+from spatial_replay.geometry.footprint import TrackedObject, centre_of, radius_of
 from spatial_replay.planning.decisions import Target
 from spatial_replay.planning.maps import (
     CONSTRAINED,

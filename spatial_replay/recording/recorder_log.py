@@ -15,9 +15,8 @@ import numpy as np
 from spatial_replay.annotate.automaton_state import SpecAutomaton
 from spatial_replay.compiled import compile_ahead
 from spatial_replay.errors import OutputError
-from spatial_replay.geometry.batch import FootprintBatch
 from spatial_replay.geometry.contact import contacts
-from spatial_replay.geometry.footprint import Footprint, TrackedObject
+from spatial_replay.geometry.footprint import Footprint, FootprintBatch, TrackedObject
 from spatial_replay.geometry.measure import Operand
 from spatial_replay.logs.mcap.writer import LogWriter
 from spatial_replay.logs.messages import Messages

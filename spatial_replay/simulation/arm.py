@@ -10,8 +10,7 @@ from typing import TypeAlias
 import numpy as np
 
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.geometry.batch import FootprintBatch
-from spatial_replay.geometry.footprint import Footprint
+from spatial_replay.geometry.footprint import Footprint, FootprintBatch
 from spatial_replay.geometry.measure import MeasureRequest, Operand, measure
 from spatial_replay.simulation.bullet import REST, STEPS_PER_S, Engine, downwards, joints_for, tool_frame
 from spatial_replay.simulation.world import Body, Pose, TreeTick, footprint, height

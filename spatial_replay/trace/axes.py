@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.geometry.batch import FootprintBatch
+from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.trace.declared_units import (
     checked_units,
     signal_units_from_metadata,

@@ -17,8 +17,7 @@ from spatial_replay.geometry.arrays import (
     flat_index,
     starts_from_counts,
 )
-from spatial_replay.geometry.batch import FootprintBatch
-from spatial_replay.geometry.footprint import Concave, Footprint
+from spatial_replay.geometry.footprint import Concave, Footprint, FootprintBatch
 from spatial_replay.geometry.outline import SOUND, normalise_polygons
 from spatial_replay.trace.trace import ABSENT, Trace
 

@@ -11,8 +11,7 @@ import numpy as np
 
 from spatial_replay.errors import TraceError
 from spatial_replay.geometry.arrays import Floats, Integers, read_only_floats, read_only_integers
-from spatial_replay.geometry.batch import FootprintBatch
-from spatial_replay.geometry.footprint import Footprint, TrackedObject
+from spatial_replay.geometry.footprint import Footprint, FootprintBatch, TrackedObject
 from spatial_replay.lazy import Displayed
 from spatial_replay.text import times_apart
 from spatial_replay.trace.declared_units import checked_units

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from spatial_replay import Footprint, GeometryError
-from spatial_replay.geometry.batch import FootprintBatch
+from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.geometry.outline import EMPTY, NOT_CONVEX, NOT_FINITE, SOUND, normalise_polygons
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from spatial_replay import Footprint, GeometryError
 from spatial_replay.compiled import only
-from spatial_replay.geometry.batch import FootprintBatch
+from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.geometry.measure import MeasureRequest, Operand, measure
 
 UNIT = Footprint.box(0, 0, 1, 1)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 import spatial_replay as sr
-from spatial_replay.geometry.batch import FootprintBatch
+from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.logs.messages import BLOCK_SAMPLES, Block
 from spatial_replay.recording import record_source
 

@@ -19,7 +19,7 @@ import numpy as np
 import zstandard
 from mcap.reader import make_reader
 
-from spatial_replay.geometry.batch import FootprintBatch
+from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.logs.messages import Block
 from spatial_replay.logs.source import reading_only
 from spatial_replay.recording import record_source

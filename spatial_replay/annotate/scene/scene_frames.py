@@ -16,7 +16,7 @@ from spatial_replay.annotate.scene.scene_text import ArrowTexts
 from spatial_replay.annotate.violations import Violations
 from spatial_replay.compiled import copying_kernel, floats_at
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.geometry.batch import FootprintBatch
+from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.logs.message_numbers import nearest_whole
 from spatial_replay.palette import NEGATIVE, NEUTRAL, POSITIVE
 

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.geometry.batch import FootprintBatch
-from spatial_replay.geometry.footprint import Concave
+from spatial_replay.geometry.footprint import Concave, FootprintBatch
 from spatial_replay.logs.formats.tracks import iter_lines
 from spatial_replay.logs.messages import BLOCK_SAMPLES
 from spatial_replay.logs.read_options import FaultList, Lost, frame_times

@@ -18,8 +18,7 @@ from typing import Any, BinaryIO, TypeAlias, cast
 import numpy as np
 
 from spatial_replay.geometry.arrays import starts_from_counts
-from spatial_replay.geometry.batch import FootprintBatch
-from spatial_replay.geometry.footprint import Concave
+from spatial_replay.geometry.footprint import Concave, FootprintBatch
 from spatial_replay.logs.messages import BLOCK_SAMPLES
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.text import Sentence, is_encodable, times_apart

@@ -15,8 +15,7 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from spatial_replay.geometry.arrays import Floats, Integers, starts_from_counts
-from spatial_replay.geometry.batch import FootprintBatch
-from spatial_replay.geometry.footprint import Concave
+from spatial_replay.geometry.footprint import Concave, FootprintBatch
 from spatial_replay.logs.objects.wire import LayoutError, WireTemplate, rows_of
 from spatial_replay.logs.payloads import Bytes, Payloads, Words
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectState, ObjectStates

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from spatial_replay.compiled import copying_kernel, floats_at, integers_at
 from spatial_replay.geometry.arrays import Floats, Integers, starts_from_counts
-from spatial_replay.geometry.batch import FootprintBatch
+from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.geometry.outline import are_normalised
 from spatial_replay.logs.objects.decode import (
     FIRST_LAYOUTS,

@@ -23,7 +23,7 @@ import numpy as np
 
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats, Integers, places_of, starts_from_counts
-from spatial_replay.geometry.batch import FootprintBatch
+from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.geometry.measure import QUANTITY_CODES
 from spatial_replay.monitor.atoms.delays import NO_DELAY, RecentSamples, iter_delays
 from spatial_replay.monitor.atoms.instructions import LeafCode

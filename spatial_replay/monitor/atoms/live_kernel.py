@@ -17,10 +17,9 @@ import numpy as np
 
 from spatial_replay.compiled import allocating_apart, flags_at, floats_at, inlined, integers_at, merged
 from spatial_replay.geometry.arrays import Flags, Floats, Integers
-from spatial_replay.geometry.closest import closest_rows
 from spatial_replay.geometry.footprint import BOTTOM, PARTS, TOP, UNCERTAINTY, YAW
 from spatial_replay.geometry.kernels import measure_rows
-from spatial_replay.geometry.measure import misalignment_of
+from spatial_replay.geometry.measure import closest_rows, misalignment_of
 from spatial_replay.monitor.atoms.instructions import run_instructions
 from spatial_replay.monitor.atoms.plan_arrays import PlacedPlan, PlanArrays, plan_at
 

@@ -10,13 +10,13 @@ import numpy as np
 
 from spatial_replay.cores import over_cores
 from spatial_replay.geometry.arrays import Booleans, Flags, Floats, read_only_floats
-from spatial_replay.geometry.batch import FootprintBatch
-from spatial_replay.geometry.closest import closest_pairs
+from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.geometry.measure import (
     MeasureRequest,
     Operand,
     Quantity,
     Remeasured,
+    closest_pairs,
     measure,
     misalignment,
 )

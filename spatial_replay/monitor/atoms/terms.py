@@ -10,8 +10,7 @@ from typing import TypeAlias
 import numpy as np
 
 from spatial_replay.geometry.arrays import Booleans, Flags, Floats, Integers
-from spatial_replay.geometry.batch import FootprintBatch
-from spatial_replay.geometry.footprint import Footprint
+from spatial_replay.geometry.footprint import Footprint, FootprintBatch
 from spatial_replay.geometry.measure import Operand
 from spatial_replay.spec.formula import (
     ANY_CLASS,
