@@ -66,6 +66,7 @@ class Detections:
         uncertainty: (R,) radius.
         covariance: (R, 3, 3) of the position with the number of deviations applied, or None.
         lifetime_ns: (R,), 0 for no limit; None if no object has a limit.
+        is_locked: (R,) whether an object stays in its frame, which may move; None if none does.
         deleted: (message, code of the name or `EVERY_OBJECT`) of each deletion.
         skipped: the number of objects without a solid.
     """
@@ -81,6 +82,7 @@ class Detections:
     uncertainty: Floats
     covariance: Floats | None
     lifetime_ns: Integers | None
+    is_locked: Booleans | None
     deleted: list[tuple[int, int]]
     skipped: int
 
@@ -100,6 +102,7 @@ class Detections:
             uncertainty=self.uncertainty[same],
             covariance=None if self.covariance is None else self.covariance[same],
             lifetime_ns=None,
+            is_locked=None,
             deleted=[],
             skipped=0,
         )
@@ -126,6 +129,7 @@ class DetectionChunk:
     numbers: Floats = field(default_factory=lambda: np.empty((0, 0)))
     covariance: Floats | None = None
     lifetimes: list[int] = field(default_factory=list)
+    locked: list[bool] = field(default_factory=list)
     solids: list[list[Solid]] = field(default_factory=list)
     corner_counts: Integers = field(default_factory=lambda: np.empty(0, np.int64))
     corners: Floats = field(default_factory=lambda: np.empty((0, 3)))
@@ -165,6 +169,7 @@ def detections_from_chunks(
         else:
             solids = _shapes(layout, binding, poses, numbers)
     has_frames, has_stamps = chunks[0].frames is not None, chunks[0].stamps is not None
+    locked = list(chain.from_iterable(chunk.locked for chunk in chunks))
     spreads = [chunk.covariance for chunk in chunks if chunk.covariance is not None]
     return Detections(
         message=np.concatenate([number[chunk.places[chunk.message]] for chunk in chunks]),
@@ -178,6 +183,7 @@ def detections_from_chunks(
         uncertainty=_uncertainty(binding, numbers, len(name)),
         covariance=np.concatenate(spreads) if spreads else None,
         lifetime_ns=_joined(chunk.lifetimes for chunk in chunks) if binding.lifetime is not None else None,
+        is_locked=np.array(locked, np.bool_) if any(locked) else None,
         deleted=deleted,
         skipped=skipped,
     )
@@ -198,6 +204,7 @@ def _no_detections(deleted: list[tuple[int, int]], skipped: int) -> Detections:
         uncertainty=numbers,
         covariance=None,
         lifetime_ns=None,
+        is_locked=None,
         deleted=deleted,
         skipped=skipped,
     )

@@ -186,6 +186,8 @@ class Extractor:
             chunk.solids = [each for each in solids if each]
             chunk.skipped = len(solids) - len(chunk.solids)
             objects = objects.where([bool(each) for each in solids])
+            if self._layout.stays:
+                chunk.locked = [bool(get(each, "frame_locked")) for each in objects.values]
         elif binding.polygon is not None:
             corners = [binding.polygon(each) for each in objects.values]
             outlines = outlines_from_lists(corners, is_bounds=self._layout.is_bounds)

@@ -227,6 +227,8 @@ class LiveAssembler:
             except MISFITS:
                 # reported when it is read for its objects
                 continue
+            # a sample waits for the frame that a marker moves with
+            self._follows_frames = self._follows_frames or any(chunk.locked)
             stamps = chunk.stamps or [0] * len(chunk.name)
             for frame, stamp_ns in dict.fromkeys(zip(chunk.frames or (), stamps, strict=False)):
                 if frame != self._plan.mapping.fixed_frame:

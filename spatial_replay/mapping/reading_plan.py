@@ -30,6 +30,7 @@ class PlannedTopic:
         mapping: its entry; None for topics that are read for transforms or times only.
         layout: where its objects are; None for a topic without objects.
         max_age_ns: how long an observation or a signal stays valid.
+        between_ns: its objects are unknown between transforms that are farther apart.
         is_transforms: whether its transforms place frames; `is_static`: at all times.
         is_lasting: whether a message counts however old it is.
         is_latched: whether it may have been sent long before it was recorded.
@@ -40,6 +41,7 @@ class PlannedTopic:
     mapping: TopicMapping | None
     layout: MessageLayout | None
     max_age_ns: int
+    between_ns: int
     is_transforms: bool
     is_static: bool
     is_lasting: bool
@@ -183,14 +185,16 @@ def _planned(
     if layout is not None and GEODETIC in layout.position:
         layout = replace(layout, origin=mapping.origin)
     stays = topic.latched or (layout is not None and layout.stays)
-    default = mapping.max_age_ns or (FOREVER_NS if stays else DEFAULT_MAX_AGE_NS)
-    max_age_ns = (entry.max_age_ns if entry is not None else None) or default
+    default = FOREVER_NS if stays else DEFAULT_MAX_AGE_NS
+    given = (entry.max_age_ns if entry is not None else None) or mapping.max_age_ns
+    max_age_ns = FOREVER_NS if is_static else given or default
     return PlannedTopic(
         name=topic.name,
         clock=(entry.clock if entry is not None else None) or mapping.clock,
         mapping=entry,
         layout=layout,
         max_age_ns=max_age_ns,
+        between_ns=min(given or DEFAULT_MAX_AGE_NS, HISTORY_NS),
         is_transforms=is_transforms,
         is_static=is_static,
         is_latched=topic.latched,

@@ -5,7 +5,7 @@ The tracker holds the last state of every object and signal, so that a log can b
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -38,11 +38,10 @@ _MOST_NAMES = 8
 """Names listed in one remark."""
 
 
-class _Carried(NamedTuple):
-    """A frame that a static transform fixes to its parent, as one message reports it."""
+class _Following(NamedTuple):
+    """An object that stays in its frame, which may move: as one message reports it."""
 
-    time_ns: int
-    log_time_ns: int
+    frame: str
     detections: Detections
     place: int
 
@@ -80,7 +79,7 @@ class Tracker:
         self._rows = ObservationRows.blank(np.empty(0, np.int64))
         self._added: list[ObservationRows] = []
         self._events = {name: Events.none() for name in readers}
-        self._carried: dict[str, dict[int, list[_Carried]]] = {}
+        self._following: dict[int, _Following] = {}
         self._signals: dict[tuple[str, int], tuple[Integers, Floats]] = {}
         self._topic_of_name: dict[int, str] = {}
         self._advances = 0
@@ -113,10 +112,8 @@ class Tracker:
         """Return the samples at some times, up to the time of the last `advance`."""
         if not len(times_ns):
             return Trace.empty()
-        for topic, carried in self._carried.items():
-            self._place_carried(topic, carried, times_ns)
-        self._store_added()
         codes, rows, classes = self._states(times_ns)
+        self._store_added()
         names = [self._names.by_code[code] for code in codes.tolist()]
         appears = (rows != ABSENT).any(axis=0).tolist()
         order = sorted((i for i in range(len(names)) if appears[i]), key=names.__getitem__)
@@ -167,9 +164,8 @@ class Tracker:
         for name, last in self._events.items():
             self._events[name] = replace(last, row=number[last.row])
         self._signals = {key: (times[-1:], values[-1:]) for key, (times, values) in self._signals.items()}
-        for carried in self._carried.values():
-            for each in carried.values():
-                del each[:-1]
+        kept = set(chosen.tolist())
+        self._following = {int(number[row]): e for row, e in self._following.items() if row in kept}
 
     def lose(self, time_ns: int, topics: Collection[str]) -> None:
         """Make unknown, from a time on, what some topics have reported: objects stay, without a place."""
@@ -180,7 +176,6 @@ class Tracker:
             at = np.full(len(rows), time_ns, np.int64)
             forever = np.full(len(rows), FOREVER_NS, np.int64)
             self._events[topic] = Events(last.name, at, rows, forever, last.class_code).after(last)
-            self._carried.pop(topic, None)
         self._signals = {
             key: (np.array([time_ns]), np.array([np.nan])) if key[0] in topics else series
             for key, series in self._signals.items()
@@ -195,13 +190,6 @@ class Tracker:
         self._claim_names(reader.name, detections.name)
         layout = reader.planned.layout
         is_complete = layout is not None and layout.complete
-        if reader.planned.is_static:
-            carried = self._carried.setdefault(reader.name, {})
-            for index, code in enumerate(detections.name.tolist()):
-                message = int(detections.message[index])
-                each = _Carried(int(times_ns[message]), int(log_times_ns[message]), detections, index)
-                carried.setdefault(code, []).append(each)
-            return
         self._count_replaced(reader.name, times_ns, _replaced(detections, times_ns, is_complete=is_complete))
 
         def report(index: int, what: str) -> None:
@@ -210,6 +198,9 @@ class Tracker:
         transforms = self._transforms(reader, detections, times_ns)
         rows = rows_from_detections(detections, transforms, self._plan.mapping.axes, self._concave, report)
         number = self._add(rows)
+        for place in self._follows(reader, detections).tolist():
+            frame = (detections.frames or ())[place]
+            self._following[int(number[place])] = _Following(frame, detections, place)
         again = _repeated_names(detections) if is_complete else []
         if again:
             for index in again:
@@ -221,40 +212,28 @@ class Tracker:
         events = events_from_messages(detections, times_ns, number, alive=alive, is_complete=is_complete)
         self._events[reader.name] = events.after(before)
 
-    def _place_carried(
-        self, topic: str, carried: Mapping[int, Sequence[_Carried]], times_ns: Integers
-    ) -> None:
-        """Place the frames of static transforms at the times of samples: they move with their parents."""
-        mapping, before = self._plan.mapping, self._events[topic]
-        events: list[Events] = []
-        for code, reports in carried.items():
-            starts = np.searchsorted(times_ns, [each.time_ns for each in reports]).tolist()
-            for each, start, end in zip(reports, starts, [*starts[1:], len(times_ns)], strict=True):
-                at = times_ns[start:end]
-                if not len(at):
-                    continue
-                detections, index = each.detections, each.place
-                transforms = None
-                if detections.frames is not None and mapping.fixed_frame is not None:
-                    frame = detections.frames[index]
-                    transforms = self._tree.between(mapping.fixed_frame, frame, at, by_stamp=False)
-                    self._count_missing(topic, frame, at[~transforms.known])
+    def _place_following(self, topic: str, times_ns: Integers, rows: Integers) -> None:
+        """Replace the rows (T, N) of objects that stay in moving frames by those of each time."""
+        if not self._following:
+            return
+        for column in rows.T:
+            for row in np.unique(column).tolist():
+                if row in self._following:
+                    where = np.flatnonzero(column == row)
+                    column[where] = self._placed(topic, self._following[row], times_ns[where])
 
-                def report(_: int, what: str, each: _Carried = each) -> None:
-                    self._report_object(topic, each.log_time_ns, each.detections, each.place, what)
-
-                # while nothing moves, one observation is enough
-                changed = _changes(transforms, len(at))
-                moved = None if transforms is None else transforms.select(changed)
-                repeated = detections.repeated(index, len(changed))
-                rows = rows_from_detections(repeated, moved, mapping.axes, self._concave, report)
-                number = self._add(rows)[np.searchsorted(changed, np.arange(len(at)), "right") - 1]
-                same = np.full(len(at), code, np.int64)
-                classes = np.full(len(at), detections.class_code[index], np.int64)
-                events.append(Events(same, at, number, np.full(len(at), FOREVER_NS, np.int64), classes))
-        for new in events:
-            before = new.after(before)
-        self._events[topic] = before
+    def _placed(self, topic: str, following: _Following, times_ns: Integers) -> Integers:
+        """Return the rows of an object that stays in a frame, where that is at some times."""
+        mapping, (frame, detections, index) = self._plan.mapping, following
+        fixed, longest_ns = mapping.fixed_frame or "", self._readers[topic].planned.between_ns
+        found = self._tree.between(fixed, frame, times_ns, by_stamp=False, longest_ns=longest_ns, holds=True)
+        self._count_missing(topic, frame, times_ns[~found.known])
+        # while nothing moves, one observation is enough
+        changed = _changes(found)
+        repeated, moved = detections.repeated(index, len(changed)), found.select(changed)
+        # faults were reported when it arrived
+        rows = rows_from_detections(repeated, moved, mapping.axes, self._concave, lambda index, what: None)
+        return self._add(rows)[np.searchsorted(changed, np.arange(len(times_ns)), "right") - 1]
 
     def _report_object(
         self, topic: str, log_time_ns: int, detections: Detections, index: int, what: str
@@ -310,17 +289,31 @@ class Tracker:
         stamp_ns = np.zeros(count, np.int64) if detections.stamp_ns is None else detections.stamp_ns
         # a stamp of 0 is one that was never set
         stamped = stamp_ns != 0
+        follows = self._follows(reader, detections)
+        # these are placed at the times of samples
+        result.put(follows, Transforms.identity(len(follows)))
+        stays = np.ones(count, np.bool_)
+        stays[follows] = False
         for frame, code in codes.items():
             for by_stamp in (False, True):
-                chosen = np.flatnonzero((of_frame == code) & (stamped == by_stamp))
+                chosen = np.flatnonzero(stays & (of_frame == code) & (stamped == by_stamp))
                 if not len(chosen):
                     continue
                 at = stamp_ns[chosen] if by_stamp else clock_ns[chosen]
-                between = self._tree.between(fixed, frame, at, by_stamp=by_stamp)
+                longest_ns = reader.planned.between_ns
+                between = self._tree.between(fixed, frame, at, by_stamp=by_stamp, longest_ns=longest_ns)
                 result.put(chosen, between)
                 missing = clock_ns[chosen[~between.known]]
                 self._count_missing(reader.name, frame, missing[self._is_relevant(reader, missing)])
         return result
+
+    def _follows(self, reader: TopicReader, detections: Detections) -> Integers:
+        """Return the indices of objects that stay in frames that may move."""
+        if detections.frames is None or self._plan.mapping.fixed_frame is None:
+            return np.empty(0, np.int64)
+        if reader.planned.is_static:
+            return np.arange(len(detections.name))
+        return np.flatnonzero(False if detections.is_locked is None else detections.is_locked)
 
     def _is_relevant(self, reader: TopicReader, times_ns: Integers) -> Booleans:
         """Return whether observations at some times may be valid in the window."""
@@ -337,6 +330,7 @@ class Tracker:
         for topic, events in self._events.items():
             state = events.state(times_ns, self._readers[topic].planned.max_age_ns)
             self._count_stale(topic, times_ns, state[0], state[1])
+            self._place_following(topic, times_ns, state[1])
             states.append(state)
         codes, rows, classes = zip(*states, strict=True)
         return np.concatenate(codes), np.concatenate(rows, axis=1), np.concatenate(classes, axis=1)
@@ -467,12 +461,10 @@ def _replaced(detections: Detections, times_ns: Integers, *, is_complete: bool) 
     return np.unique(message[:-1][is_again])
 
 
-def _changes(transforms: Transforms | None, count: int) -> Integers:
+def _changes(transforms: Transforms) -> Integers:
     """Return the indices of transforms that differ from the one before, and the first."""
-    if transforms is None:
-        return np.zeros(min(count, 1), np.int64)
-    changed = np.ones(count, np.bool_)
     rotation, translation, known = transforms
+    changed = np.ones(len(known), np.bool_)
     changed[1:] = (
         (rotation[1:] != rotation[:-1]).any(axis=(1, 2))
         | (translation[1:] != translation[:-1]).any(axis=1)

@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from hypothesis import HealthCheck, given
 from hypothesis import strategies as st
 
 from bags.bag_files import write_mcap
 from examples import examples
-from mapping.feeding import SECOND, Feed, make, pose_stamped, tf, transform
+from mapping.feeding import SECOND, Feed, header, make, pose, pose_stamped, ros, tf, transform
 from spatial_replay import Trace
 from spatial_replay.mapping import MappedSource, parse_mapping
 from spatial_replay.mapping.transforms import FrameTree
@@ -146,6 +147,75 @@ def test_a_frame_that_is_fixed_to_a_moving_one_moves_with_it() -> None:
     assert made.remarks == ()
     assert make(text, feed, batch=2).trace == made.trace
     assert make(text, feed, start_ns=4 * SECOND).trace == made.trace.slice(3, 6)
+
+
+def locked(time_ns: int, **more: Any) -> Any:
+    """Return a cube of one metre that stays at the origin of the base."""
+    size = ros("geometry_msgs/Vector3", x=1.0, y=1.0, z=1.0)
+    return ros(
+        "visualization_msgs/Marker",
+        header=header("base", time_ns),
+        ns="zone",
+        type=1,
+        pose=pose(0, 0),
+        scale=size,
+        frame_locked=True,
+        **more,
+    )
+
+
+def test_a_marker_that_is_locked_to_its_frame_moves_with_it() -> None:
+    feed = moving(*(tick * SECOND for tick in range(6)))
+    feed.add("/marker", SECOND + 1, locked(SECOND))
+    for tick in range(1, 12):
+        feed.add("/tick", tick * SECOND // 2, {})
+    feed.add("/marker", 4 * SECOND + 1, locked(4 * SECOND, action=2))
+    feed.messages.sort(key=lambda message: message[1])
+    text = "fixed_frame: map\nsample: {topic: /tick}\ntopics: {/marker: {}}"
+    made = make(text, feed)
+    assert made.states("zone_0") == "--++++++---"
+    assert [made.centre(n, "zone_0")[0] for n in range(2, 8)] == [1.5, 2, 2.5, 3, 3.5, 4]
+    assert make(text, feed, batch=2).trace == made.trace
+    assert make(text, feed, start_ns=3 * SECOND).trace == made.trace.slice(5, 11)
+
+
+def test_a_locked_marker_is_unknown_once_its_frame_is_silent_for_longer_than_max_age() -> None:
+    feed = moving(0, SECOND, 2 * SECOND)
+    feed.add("/marker", 1, locked(0))
+    for tick in range(1, 9):
+        feed.add("/tick", tick * SECOND // 2, {})
+    feed.messages.sort(key=lambda message: message[1])
+    made = make("fixed_frame: map\nsample: {topic: /tick}\ntopics: {/marker: {}}", feed)
+    assert made.states("zone_0") == "++++++??"
+    assert "/marker: 2 observations are unknown, the first at 3.500 s: no transform" in made.remarks[0]
+
+
+def test_an_entity_that_is_locked_to_its_frame_moves_with_it() -> None:
+    update = SceneUpdate()
+    entity = update.entities.add(frame_id="base", id="zone", frame_locked=True)
+    cube = entity.cubes.add()
+    cube.pose.orientation.w = cube.size.x = cube.size.y = cube.size.z = 1.0
+    feed = moving(0, SECOND, 2 * SECOND).add("/scene", 1, update)
+    feed.add("/tick", SECOND, {}).add("/tick", 2 * SECOND, {})
+    feed.messages.sort(key=lambda message: message[1])
+    made = make("fixed_frame: map\nsample: {topic: /tick}\ntopics: {/scene: {}}", feed)
+    assert [made.centre(n, "zone")[0] for n in range(2)] == [1, 2]
+
+
+def test_nothing_is_interpolated_over_more_than_max_age() -> None:
+    feed = moving(0, SECOND // 2, 4 * SECOND, 4 * SECOND + SECOND // 2)
+    for tick in range(10):
+        at = tick * SECOND // 2
+        feed.add("/p", at, pose_stamped(0, 0, "base", time_ns=at))
+    feed.messages.sort(key=lambda message: message[1])
+    made = make("fixed_frame: map\ntopics: {/p: {}}", feed)
+    assert made.states("p") == "++??????++"
+    assert any(
+        "the transforms of 'base' pause for up to 3.500 s, longest from 0.500 s on, longer than max_age"
+        in text
+        for text in made.remarks
+    )
+    assert make("fixed_frame: map\ntopics: {/p: {max_age: 4s}}", feed).states("p") == "++++++++++"
 
 
 def test_frames_in_a_cycle_make_objects_unknown() -> None:
