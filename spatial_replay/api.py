@@ -19,6 +19,7 @@ from spatial_replay.logs.remote import LogFile, local_files, log_file, sendable
 from spatial_replay.logs.source import MemorySource, Source
 from spatial_replay.logs.topics import MAPPED
 from spatial_replay.monitor.semantics import Semantics
+from spatial_replay.monitor.verdict import ALLOWED_KINDS, FAILING_KINDS, checked_kinds
 from spatial_replay.replay.annotated import load_files, recorded_texts, run_replay
 from spatial_replay.replay.engine import Replayed
 from spatial_replay.replay.selection import ReplayOptions, Window
@@ -398,6 +399,10 @@ def evaluate_logs(
     from spatial_replay.batch.suite import Conditions, Suite, load_suite
 
     _refuse_unknown(reading, Reading)
+    fails, allowed = (
+        checked_kinds("fail_on", fail_on, FAILING_KINDS),
+        checked_kinds("allow", allow, ALLOWED_KINDS),
+    )
     named = [logs] if isinstance(logs, str | PathLike) else list(logs)
     mapping = reading.get("mapping")
     conditions = Conditions(
@@ -417,8 +422,7 @@ def evaluate_logs(
     else:
         files = [specifications] if isinstance(specifications, str | PathLike) else specifications
         suite = Suite.of_logs([fspath(log) for log in named], [sendable(file) for file in files], conditions)
-    suite = suite.allowing(frozenset(allow))
-    return run_batch(prepare(suite), output, workers_of(jobs, dask), fail_on=frozenset(fail_on))
+    return run_batch(prepare(suite.allowing(allowed)), output, workers_of(jobs, dask), fail_on=fails)
 
 
 def read_results(folder: PathName) -> pa.Table:

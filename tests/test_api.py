@@ -81,6 +81,12 @@ def test_mistakes_are_named(tmp_path: Path) -> None:
     assert log.read_bytes() == b"a log that is needed"
     with pytest.raises(sr.UsageError, match="evry=2 is no option; did you mean 'every'"):
         sr.replay_log(LOG, SPEC, evry=2)  # type: ignore[call-arg]
+    for kinds, said in (
+        ({"fail_on": "vacuous"}, "give a sequence"),
+        ({"allow": ["droped"]}, "mean 'dropped'"),
+    ):
+        with pytest.raises(sr.UsageError, match=said):
+            sr.evaluate_logs(LOG, SPEC, output="out", **kinds)  # type: ignore[arg-type]
     for asked in (sr.info, sr.verify, lambda log, **own: sr.evaluate_logs(log, output="out", **own)):
         with pytest.raises(sr.UsageError, match=r"maping=.m\.yaml. is no option; did you mean .mapping."):
             asked(LOG, maping="m.yaml")

@@ -17,7 +17,8 @@ from spatial_replay.cli.terminal import show_diagnostics, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.downloads import local_copy
 from spatial_replay.logs.remote import LogFile, is_address, local_files, log_file
-from spatial_replay.text import counted, nearest_hint
+from spatial_replay.monitor.verdict import ALLOWED_KINDS, FAILING_KINDS, checked_kinds
+from spatial_replay.text import counted
 from spatial_replay.trace.time_points import time_point_from_text
 
 if TYPE_CHECKING:
@@ -146,24 +147,18 @@ semantics_option = click.option(
     help="Robustness over finite traces, or Def. 16 of the paper to the letter.",
 )
 
-_FAILURES = ("vacuous", "cut", "unknown")
-_ALLOWED = ("vacuous", "dropped")
-
 
 def _read_kinds(
     known: Sequence[str], context: click.Context, parameter: click.Parameter, text: str
 ) -> frozenset[str]:
-    kinds = frozenset(kind.strip() for kind in text.split(",") if kind.strip())
-    for kind in sorted(kinds - {*known}):
-        hint = nearest_hint(kind, known) or f"the kinds are {', '.join(known)}"
-        raise UsageError(f"{parameter.opts[0]}: {kind!r} is not a kind of result; {hint}")
-    return kinds
+    kinds = [kind.strip() for kind in text.split(",") if kind.strip()]
+    return checked_kinds(parameter.opts[0], kinds, known)
 
 
 fail_on_option = click.option(
     "--fail-on",
     metavar="KINDS",
-    callback=partial(_read_kinds, _FAILURES),
+    callback=partial(_read_kinds, FAILING_KINDS),
     default="",
     help="Exit with 1 on these as well: vacuous, cut, unknown, or several with commas between.",
 )
@@ -171,7 +166,7 @@ fail_on_option = click.option(
 allow_option = click.option(
     "--allow",
     metavar="KINDS",
-    callback=partial(_read_kinds, _ALLOWED),
+    callback=partial(_read_kinds, ALLOWED_KINDS),
     default="",
     help="Let these pass instead of exit code 4: vacuous (tested by nothing), dropped (samples that the "
     "recorder lost), or both with a comma between.",

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from math import hypot, inf
-from typing import Literal
+from operator import itemgetter
+from typing import Literal, TypeAlias
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from spatial_replay.spec.diagnostics import Diagnostic, SourceText
 from spatial_replay.spec.format import format_bound, format_number, format_term
 from spatial_replay.spec.formula import (
     ANY_CLASS,
+    FUTURE_OPERATORS,
     Atom,
     Bound,
     Expression,
@@ -215,7 +217,30 @@ def window_lines(specification: Specification, log: LogNumbers) -> list[str]:
             upper = "the end" if bound.upper is None else f"{bound.upper / log.rate:.3g} s"
             name = f"{node.operator if isinstance(node, Temporal) else ''}{format_bound(bound)}"
             lines[f"{name} is {bound.lower / log.rate:.3g} s to {upper}"] = None
+    for spec in specification.results:
+        reach_s, windows = _reach(spec.formula, log.rate)
+        if len(windows) > 1 and any(bound.unit == "samples" for _, bound in windows):
+            lines[f"{_nested(windows)} reaches {reach_s:.3g} s ahead"] = None
     return [f"at {log.rate:.4g} samples a second, {line}" for line in lines]
+
+
+_Windows: TypeAlias = tuple[tuple[Temporal, Bound], ...]
+
+
+def _reach(formula: Formula, rate: float) -> tuple[float, _Windows]:
+    """Return how far a formula looks ahead, in seconds, and the windows within each other that do."""
+    found = max((_reach(each, rate) for each in operands_of(formula)), key=itemgetter(0), default=(0.0, ()))
+    bound = formula.bound if isinstance(formula, Temporal) else None
+    if not isinstance(formula, Temporal) or bound is None or formula.operator not in FUTURE_OPERATORS:
+        return found
+    if bound.upper is None:
+        return found
+    own_s = bound.upper / rate if bound.unit == "samples" else bound.upper / 1e9
+    return own_s + found[0], ((formula, bound), *found[1])
+
+
+def _nested(windows: _Windows) -> str:
+    return " of ".join(f"{node.operator}{format_bound(bound)}" for node, bound in windows)
 
 
 def plausibility_warnings(specification: Specification, log: LogNumbers) -> tuple[Diagnostic, ...]:
@@ -252,6 +277,16 @@ def plausibility_warnings(specification: Specification, log: LogNumbers) -> tupl
             doubts = _doubts_of_window(key, node.bound, log)
         for message, hint in doubts:
             found.setdefault(key, source.diagnostic("warning", node.span, message, hint))
+    for spec in specification.results:
+        reach_s, windows = _reach(spec.formula, log.rate or inf)
+        name = _nested(windows)
+        if len(windows) > 1 and reach_s > log.seconds and name not in found:
+            message = f"the windows {name} together are longer than this log"
+            hint = (
+                f"they reach {reach_s:.3g} s ahead, and the log has {log.seconds:.3f} s, so its end decides"
+            )
+            if not any(f"{node.operator}{format_bound(bound)}" in found for node, bound in windows):
+                found[name] = source.diagnostic("warning", windows[0][0].span, message, hint)
     return tuple(sorted(found.values(), key=lambda each: (each.line, each.column)))
 
 

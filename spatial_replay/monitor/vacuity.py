@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Literal, NamedTuple, TypeAlias
 
@@ -103,7 +103,7 @@ def find_vacuous(
     scopes = _scopes(instance.formula, times_ns)
     found = [
         *_empty_windows(nodes, scopes, times_ns),
-        *_idle_implications(nodes, scopes, leaves, times_ns, evidence),
+        *_idle_implications(leaves, times_ns, evidence),
         *_idle_bodies(nodes, scopes, evidence),
         *_empty_groups(nodes, scopes, evidence),
     ]
@@ -135,8 +135,14 @@ def _part(idle: _Idle, node: Formula, evidence: Evidence) -> UntestedPart:
 # ---------------------------------------------------------------------------------------------- scopes
 
 
-def _scopes(formula: Formula, times_ns: Integers) -> list[_Samples]:
-    """Return for each node the samples (T,) at which the number of the formula depends on it."""
+def _scopes(
+    formula: Formula, times_ns: Integers, held: Callable[[Formula], _Samples] | None = None
+) -> list[_Samples]:
+    """Return for each node the samples (T,) at which the number of the formula depends on it.
+
+    Args:
+        held: where an antecedent may hold; then the samples at which the verdict depends on a node.
+    """
     count = len(times_ns)
     scopes: list[_Samples] = []
     operands_passed: list[int] = []
@@ -151,6 +157,8 @@ def _scopes(formula: Formula, times_ns: Integers) -> list[_Samples]:
         operands_passed[parent] += 1
         above = nodes[parent]
         within = scopes[parent]
+        if held and place == 1 and isinstance(above, Boolean) and above.operator == "->" and within.any():
+            within = within & held(above.operands[0])
         scopes.append(_below(above, place, within, times_ns) if isinstance(above, Temporal) else within)
     return scopes
 
@@ -212,24 +220,23 @@ def _empty_windows(
             yield _Idle(identifier, "empty window", (f"was never tested: {what}.",))
 
 
-def _idle_implications(
-    nodes: Sequence[Formula],
-    scopes: Sequence[_Samples],
-    leaves: Floats,
-    times_ns: Integers,
-    evidence: Evidence,
-) -> Iterator[_Idle]:
-    order = evidence.instance.program.leaves
-    for identifier, (node, scope) in enumerate(zip(nodes, scopes, strict=True)):
+def _idle_implications(leaves: Floats, times_ns: Integers, evidence: Evidence) -> Iterator[_Idle]:
+    formula, order = evidence.instance.formula, evidence.instance.program.leaves
+
+    def held(antecedent: Formula) -> _Samples:
+        return evaluate_offline(antecedent, order, leaves, times_ns).ends(0)[1] >= 0.0
+
+    scopes = _scopes(formula, times_ns, held)
+    for (identifier, _, node), scope in zip(iter_nodes(formula), scopes, strict=True):
         if isinstance(node, Boolean) and node.operator == "->" and scope.any():
-            high = evaluate_offline(node.operands[0], order, leaves, times_ns).ends(0)[1]
-            if not (high[scope] >= 0.0).any():
-                yield _untested(identifier, node, evidence)
+            is_held = held(node.operands[0])
+            if not is_held[scope].any():
+                yield _untested(identifier, node, evidence, " where it counts" if is_held.any() else "")
 
 
-def _untested(identifier: int, implication: Boolean, evidence: Evidence) -> _Idle:
+def _untested(identifier: int, implication: Boolean, evidence: Evidence, where: str = "") -> _Idle:
     antecedent = format_formula(evidence.bound(implication.operands[0]))
-    what = f"was never tested: `{antecedent}` never held."
+    what = f"was never tested: `{antecedent}` never held{where}."
     return _Idle(identifier, "antecedent never held", (what,))
 
 
@@ -241,25 +248,36 @@ def _idle_bodies(nodes: Sequence[Formula], scopes: Sequence[_Samples], evidence:
         inner = list(_implications(node))
         if not inner:
             continue
-        columns = evidence.columns([evidence.bound(held) for _, held in inner])
+        columns = evidence.columns([evidence.bound(held) for _, held, _ in inner])
         high = columns[low_and_high(len(columns), wide=True)[1]]
-        for (implication, _), ends in zip(inner, high, strict=True):
+        for (implication, _, is_nested), ends in zip(inner, high, strict=True):
             if not (ends[scope] >= 0.0).any():
-                yield _untested(identifier, implication, evidence)
+                yield _untested(identifier, implication, evidence, " where it counts" if is_nested else "")
 
 
-def _implications(node: Quantified) -> Iterator[tuple[Boolean, Formula]]:
-    """Yield each implication in a quantifier's body, with the formula that its antecedent ever holds."""
-    stack: list[Formula] = [node.body]
+def _implications(node: Quantified) -> Iterator[tuple[Boolean, Formula, bool]]:
+    """Yield each implication in a quantifier's body, with the formula that its antecedent ever holds.
+
+    Within the consequent of another one, which is said as well, both antecedents have to hold.
+    """
+    stack: list[tuple[Formula, tuple[Formula, ...]]] = [(node.body, ())]
     while stack:
-        current = stack.pop()
+        current, given = stack.pop()
         if isinstance(current, Quantified):
-            for implication, held in _implications(current):
-                yield implication, replace(node, quantifier="exists", body=held)
+            for implication, held, is_nested in _implications(current):
+                body = _all((*given, held))
+                yield implication, replace(node, quantifier="exists", body=body), is_nested or bool(given)
             continue
+        operands = [(each, given) for each in operands_of(current)]
         if isinstance(current, Boolean) and current.operator == "->":
-            yield current, replace(node, quantifier="exists", body=current.operands[0])
-        stack.extend(reversed(operands_of(current)))
+            holding = (*given, current.operands[0])
+            yield current, replace(node, quantifier="exists", body=_all(holding)), bool(given)
+            operands[1] = (current.operands[1], holding)
+        stack.extend(reversed(operands))
+
+
+def _all(formulas: tuple[Formula, ...]) -> Formula:
+    return formulas[0] if len(formulas) == 1 else Boolean("and", formulas)
 
 
 def _empty_groups(

@@ -2,10 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from enum import StrEnum
+from reprlib import repr as shortened
+from typing import Final
 
 from spatial_replay.errors import UsageError
+from spatial_replay.text import nearest_hint
+
+FAILING_KINDS: Final = ("vacuous", "cut", "unknown")
+"""Kinds of results that fail where asked (`fail_on`)."""
+ALLOWED_KINDS: Final = ("vacuous", "dropped")
+"""Kinds of results that pass where asked (`allow`)."""
+
+
+def checked_kinds(name: str, kinds: object, known: Sequence[str]) -> frozenset[str]:
+    """Return kinds of results as a set.
+
+    Raises:
+        UsageError: something else than a sequence of known kinds.
+    """
+    if isinstance(kinds, str) or not isinstance(kinds, Iterable):
+        raise UsageError(f"{name} is {shortened(kinds)}; give a sequence, as in ({known[0]!r},)")
+    for kind in kinds:
+        if kind not in known:
+            hint = nearest_hint(str(kind), known) or f"the kinds are {', '.join(known)}"
+            raise UsageError(f"{name}: {shortened(kind)} is not a kind of result; {hint}")
+    return frozenset(kinds)
 
 
 class Verdict(StrEnum):

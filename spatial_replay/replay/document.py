@@ -49,7 +49,7 @@ def document_from_replay(
         "semantics": replayed.semantics,
         "certificate": dict(replayed.certificate),
         "specifications": [
-            _result(result, replayed.start_ns, signal, window_ns) for result in replayed.results
+            _result(result, replayed.first_ns, signal, window_ns) for result in replayed.results
         ],
         "vacuous": [_untested(each, replayed.first_ns) for each in replayed.vacuous],
     }

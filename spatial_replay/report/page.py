@@ -41,9 +41,7 @@ def header(report: RunReport, omissions: Sequence[str]) -> Html:
         omissions: what the page leaves out to limit its size.
     """
     counts = element("span", _counts(report), **{"class": "quiet"}) if len(report.results) > 1 else Html("")
-    title = element(
-        "div", element("h1", text(report.log)), chip(report.verdict), counts, **{"class": "title"}
-    )
+    title = element("div", element("h1", text(report.log)), _chip_of(report), counts, **{"class": "title"})
     return element(
         "header",
         element("a", "Skip to the run", **{"class": "skip", "href": "#main"}),
@@ -53,6 +51,11 @@ def header(report: RunReport, omissions: Sequence[str]) -> Html:
         element("noscript", element("p", _WITHOUT_SCRIPTS, **{"class": "notice"})),
         **{"class": "top"},
     )
+
+
+def _chip_of(report: RunReport) -> Html:
+    deciding = [each.result for each in report.results if each.result.verdict is report.verdict]
+    return chip(report.verdict, is_tested=all(each.tested != "nothing" for each in deciding))
 
 
 def panels(report: RunReport) -> Html:
@@ -180,7 +183,7 @@ def _summary(each: ReportedResult, first_ns: int) -> Html:
     marks = [element("span", mark, **{"class": "chip is-vacuous"})] if mark else []
     return element(
         "summary" if each.sentences else "div",
-        chip(result.verdict),
+        chip(result.verdict, is_tested=result.tested != "nothing"),
         *marks,
         *_requirement(result.spec.id, result.title, result.spec.title),
         element("span", text(", ".join(numbers)), **{"class": "numbers"}),
@@ -238,8 +241,9 @@ def sentence_html(sentence: Sentence, first_ns: int) -> Iterator[Html]:
             yield element("code", text(piece)) if number % 2 else text(piece)
 
 
-def chip(verdict: str) -> Html:
-    return element("span", verdict, **{"class": f"chip is-{verdict}"})
+def chip(verdict: str, *, is_tested: bool = True) -> Html:
+    """Return a verdict on its colour, which is that of none where nothing tested it."""
+    return element("span", verdict, **{"class": f"chip is-{verdict if is_tested else 'vacuous'}"})
 
 
 _BOTH: Final = MappingProxyType(

@@ -130,6 +130,17 @@ def test_with_a_log_windows_in_samples_are_shown_in_seconds(
     assert output.err == ""
 
 
+def test_windows_within_each_other_are_added(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log, spec = tmp_path / "slow.jsonl", tmp_path / "s.spatial"
+    log.write_text(SLOW)
+    spec.write_text("spec s = G[0, 2] ((battery >= 0.2) -> F[0s, 1s] (battery >= 0.2))")
+    assert run(["check", str(spec), "--log", str(log)]) == 0
+    output = capsys.readouterr()
+    assert "at 2 samples a second, G[0, 2] of F[0s, 1s] reaches 2 s ahead" in output.out
+    assert "the windows G[0, 2] of F[0s, 1s] together are longer than this log" in output.err
+    assert "they reach 2 s ahead, and the log has 1.500 s, so its end decides" in output.err
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -217,6 +217,11 @@ def test_the_semantics_of_the_paper_reports_no_violation_online() -> None:
             "`(p >= 9) -> (F (q >= 0))` was never tested: `p >= 9` never held.",
         ),
         (
+            "G ((p <= 1) -> ((p >= 3) -> (q >= 0)))",
+            "antecedent never held",
+            "`(p >= 3) -> (q >= 0)` was never tested: `p >= 3` never held where it counts.",
+        ),
+        (
             "G (forall x in people: x dist y >= 1)",
             "no members",
             "`forall x in people: (x dist y >= 1)` decided nothing: no object was ever in `people`.",

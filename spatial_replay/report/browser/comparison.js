@@ -85,7 +85,7 @@ function makeCurvesOfBoth(clock, other, pairs) {
     const times = [results[0].times, Float64Array.from(results[1].times, (time) => beside(pairs.knots, time, 1, 0))];
     const both = Float64Array.from(new Set([...times[0], ...times[1]])).sort();
     curves = nodes.map((node, index) => ({
-      node: {id: index},
+      node: {id: index, unit: node.unit},
       name: pairs.labels[index],
       colour: clock.run.palette.curves[index],
       reading: element("span", {class: "number"}),
