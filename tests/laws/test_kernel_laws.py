@@ -73,14 +73,30 @@ def test_a_log_is_replayed_where_no_cache_can_be_written(tmp_path):
     replay(RECORDINGS / "table.jsonl", "--spec", RECORDINGS / "table_edited.spatial", **environment)
 
 
+_ONE_KERNEL = """
+from spatial_replay.compiled import kernel, only
+
+@kernel
+def doubled(number):
+    return 2 * number
+
+with only("compiled"):
+    print(doubled(2))
+"""
+
+
 def test_machine_code_lies_in_a_folder_of_its_own_sources(tmp_path):
-    stale = tmp_path / "kernels-0000000000000000"
-    stale.mkdir()
+    cache, program = tmp_path / "cache", tmp_path / "program.py"
+    stale = cache / "kernels-0000000000000000"
+    stale.mkdir(parents=True)
     (stale / "step.nbi").write_bytes(b"code of another version")
-    cache = {"SPATIAL_REPLAY_CACHE": str(tmp_path), "SPATIAL_REPLAY_KERNELS": "compiled"}
-    replay(RECORDINGS / "table.jsonl", "--spec", RECORDINGS / "table_edited.spatial", **cache)
-    (used,) = set(tmp_path.iterdir()) - {stale}
-    assert list(used.rglob("*.nbi"))
+    program.write_text(_ONE_KERNEL)
+    environment = os.environ | {"SPATIAL_REPLAY_CACHE": str(cache), "SPATIAL_REPLAY_KERNELS": ""}
+    done = subprocess.run(
+        [sys.executable, program], env=environment, capture_output=True, text=True, check=True
+    )
+    (used,) = set(cache.iterdir()) - {stale}
+    assert (done.stdout, [each.suffix for each in used.rglob("*.nbi")]) == ("4\n", [".nbi"])
     assert (stale / "step.nbi").read_bytes() == b"code of another version"
 
 
