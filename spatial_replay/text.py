@@ -167,7 +167,8 @@ def nearest_hint(name: str, known: Iterable[str]) -> str:
     if len(name) > _LONGEST_NAME:
         return ""
     candidates = [candidate for candidate in known if len(candidate) <= _LONGEST_NAME][:_MOST_NAMES]
-    close = difflib.get_close_matches(name, candidates, n=_MOST_ALIKE)
+    same = [candidate for candidate in candidates if candidate.casefold() == name.casefold()]
+    close = same or difflib.get_close_matches(name, candidates, n=_MOST_ALIKE)
     return f"did you mean {max(close, key=partial(_likeness, name))!r}?" if close else ""
 
 

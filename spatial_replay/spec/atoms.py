@@ -9,6 +9,7 @@ from types import MappingProxyType
 from typing import get_args
 
 from spatial_replay.errors import UsageError
+from spatial_replay.spec.builder import MIRRORED
 from spatial_replay.spec.diagnostics import Faults
 from spatial_replay.spec.format import format_number, format_relation
 from spatial_replay.spec.formula import (
@@ -96,6 +97,10 @@ class AtomBuilder:
 
     def comparison(self, written: ComparisonSyntax, scope: Scope) -> Atom:
         """Return the atom of `signal >= c`, signal - c; `==` and `!=` are exact."""
+        limit_first = isinstance(written.limit, Name) and not self.resolver.is_number(written.limit, scope)
+        if isinstance(written.limit, Name) and limit_first and self.resolver.is_number(written.signal, scope):
+            turned = written._replace(signal=written.limit, limit=written.signal)
+            return self.comparison(turned._replace(operator=MIRRORED[written.operator]), scope)
         name, limit = written.signal, self.resolver.number(written.limit, scope)
         defined = self.resolver.names.definitions.get(name.text)
         if name.text in scope.values:

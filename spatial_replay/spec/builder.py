@@ -52,7 +52,7 @@ MAX_EXCLUDED = 1000
 MAX_DURATION_NS = 2**63 - 1
 
 _BOOLEAN = MappingProxyType({"AND": "and", "OR": "or", "XOR": "xor", "IMPLIES": "->", "IFF": "<->"})
-_MIRRORED = MappingProxyType({"<=": ">=", "<": ">", ">=": "<=", ">": "<", "==": "=="})
+MIRRORED = MappingProxyType({"<=": ">=", "<": ">", ">=": "<=", ">": "<", "==": "==", "!=": "!="})
 _NS = MappingProxyType({"s": Decimal(10**9), "ms": Decimal(10**6)})
 
 
@@ -143,6 +143,8 @@ def _looking_back(written: Quantity) -> Quantity:
                 return written.operands[0]
             return Arithmetic("-", (written,), written.span, written.depth + 1)
     hint = "write [-3] for three samples earlier, [-2.5s] for 2.5 seconds"
+    if isinstance(written, Name):
+        hint = f"leave [{written.text}] out for what it is now; {hint}"
     raise StatementError(written.span, "the brackets behind an object look back, so expected '-'", hint)
 
 
@@ -292,12 +294,16 @@ class TreeBuilder:
             if token.value not in ("<=", "<"):
                 message = f"{token.value!r} cannot stand on the {side} of a chained comparison, only <= or <"
                 raise StatementError(span_of(token), message, _chain_hint(below.value, above.value))
-        comparisons = ((_MIRRORED[below.value], lower), (above.value, upper))
+        comparisons = ((MIRRORED[below.value], lower), (above.value, upper))
         return DistanceSyntax(first, second, comparisons, _cover(children))
 
     def comparison(self, children: list[Any]) -> ComparisonSyntax:
         signal, token, limit = children
         return ComparisonSyntax(signal, token.value, limit, _cover(children))
+
+    def turned_comparison(self, children: list[Any]) -> ComparisonSyntax:
+        limit, token, signal = children
+        return ComparisonSyntax(signal, MIRRORED[token.value], limit, _cover(children))
 
     # ----------------------------------------------------------------------------------------- terms
 

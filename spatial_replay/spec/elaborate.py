@@ -15,6 +15,7 @@ from spatial_replay.spec.builder import MAX_DEPTH
 from spatial_replay.spec.diagnostics import Faults
 from spatial_replay.spec.formula import (
     Boolean,
+    Bound,
     Earlier,
     Formula,
     Group,
@@ -28,9 +29,11 @@ from spatial_replay.spec.formula import (
 )
 from spatial_replay.spec.relations import Relation
 from spatial_replay.spec.resolve import MAX_SIZE, Anything, Namespace, Resolver, Scope, Value, kind_of
+from spatial_replay.spec.spellings import function_hint
 from spatial_replay.spec.syntax import (
     Arithmetic,
     BooleanSyntax,
+    BoundSyntax,
     BrokenStatement,
     Call,
     ComparisonSyntax,
@@ -340,9 +343,23 @@ class Elaborator:
             hint = f"F and G take windows; {written.operator} means one sample"
             self.resolver.fault(written.bound.span, scope, f"{written.operator!r} takes no window", hint)
         bound = self.resolver.bound(written.bound, scope)
+        if written.bound is not None and bound is not None:
+            self._check_unit(written, written.bound, bound, scope)
         inner = scope.deeper()
         operands = tuple([self.formula(operand, inner) for operand in written.operands])
         return Temporal(written.operator, operands, bound, span=span)  # type: ignore[arg-type]
+
+    def _check_unit(self, written: TemporalSyntax, window: BoundSyntax, bound: Bound, scope: Scope) -> None:
+        """Refuse a window without a unit in the spelling of tools whose windows are seconds."""
+        text = self.faults.source.text
+        word, ends = (text[each.start : each.end] for each in (written.keyword, window.span))
+        is_ours = word == written.operator and ":" not in ends
+        if is_ours or bound.unit != "samples" or (bound.lower, bound.upper) in ((0, 0), (0, None)):
+            return
+        last, end = ("inf", "inf") if bound.upper is None else (bound.upper, f"{bound.upper}s")
+        samples, seconds = f"[{bound.lower}, {last}]", f"[{bound.lower}s, {end}]"
+        hint = f"write {written.operator}{samples} for samples, {written.operator}{seconds} for seconds"
+        self.resolver.fault(window.span, scope, "a window needs its unit in this spelling", hint)
 
     # -------------------------------------------------------------------------------- names and calls
 
@@ -384,8 +401,8 @@ class Elaborator:
                 hint = f"truth values are written {name.text.lower()}"
             written = name.text if name.text.isidentifier() else quoted(name.text)
             hint = hint or (
-                f"an object needs a relation, such as {written} ovlp b, "
-                f"and a signal a comparison, such as {written} >= 1.0"
+                f"a signal needs a comparison, such as {written} >= 1.0 or, for a flag, {written} == 1; "
+                f"an object needs a relation, such as {written} ovlp other"
             )
             self.resolver.fault(name.span, scope, f"no spec is named {name.text!r}", hint)
 
@@ -427,7 +444,8 @@ class Elaborator:
             self.resolver.fault(written.name.span, scope, f"{name!r} is a template, not a macro", hint)
             return
         macros = (each for each, what in self.names.definitions.items() if isinstance(what, DefStatement))
-        hint = self.faults.nearest(name, macros) or "define it with def"
+        inner = self.faults.source.text[written.name.span.end : written.span.end].strip()
+        hint = self.faults.nearest(name, macros) or function_hint(name, inner) or "define it with def"
         self.resolver.fault(written.name.span, scope, f"no macro is named {name!r}", hint)
 
     def _argument(self, written: TermSyntax | NumberSyntax | Arithmetic, scope: Scope) -> Value:

@@ -12,6 +12,8 @@ from spatial_replay.spec.diagnostics import nearest_hint
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import load_specification, parse_specification
 
+_FORMULA = re.compile(r"[(<>=]")
+"""What a formula has, and the name of a file hardly ever."""
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?", re.ASCII)
 
 
@@ -78,6 +80,11 @@ def _parsed(
         return parse_specification(
             source.text, filename=source.filename, profile=profile, constants=constants
         )
+    written = str(source)
+    if _FORMULA.search(written) and not written.endswith(".spatial") and not source.exists():
+        return parse_specification(written, filename="<formula>", profile=profile, constants=constants)
+    if source.suffix in (".yaml", ".yml"):
+        raise UsageError(f"{source.name} is a mapping, not a specification; give it by --mapping")
     return load_specification(source, profile=profile, constants=constants)
 
 

@@ -19,7 +19,7 @@ from lark.lexer import Lexer
 from spatial_replay.spec.builder import MAX_DEPTH, StatementError, TreeBuilder
 from spatial_replay.spec.diagnostics import Faults, nearest_hint
 from spatial_replay.spec.formula import Span
-from spatial_replay.spec.spellings import meant
+from spatial_replay.spec.spellings import meant, meant_statement
 from spatial_replay.spec.syntax import BrokenStatement, FormulaSyntax, Name, SpecStatement, Statement
 from spatial_replay.spec.tokens import BINARY_TYPES, KEYWORDS, STATEMENT_TYPES, quoted, span_of
 
@@ -197,7 +197,8 @@ def _parse_group(group: TokenGroup, relations: Collection[str], faults: Faults) 
         return _broken(tokens)
     if not group.is_bare_formula and tokens[0].type not in STATEMENT_TYPES:
         words = ", ".join(_STATEMENT_WORDS)
-        hint = nearest_hint(tokens[0].value, _STATEMENT_WORDS) or "a line that goes on ends in an operator"
+        hint = meant_statement(tokens) or nearest_hint(tokens[0].value, _STATEMENT_WORDS)
+        hint = hint or "a line that goes on ends in an operator"
         faults.add(span_of(tokens[0]), f"expected a statement ({words}), found {tokens[0].value!r}", hint)
         return _broken(tokens)
     parsing: Any = grammar().parse_interactive(start="formula" if group.is_bare_formula else "statement")
@@ -239,6 +240,8 @@ def _too_deep(tokens: Sequence[Token]) -> Token | None:
 def _broken(tokens: Sequence[Token]) -> BrokenStatement | None:
     if len(tokens) > 1 and tokens[1].type == "NAME" and tokens[0].type not in ("USE", "SCALE"):
         return BrokenStatement(Name(tokens[1].value, span_of(tokens[1])))
+    if len(tokens) > 1 and tokens[0].type == "NAME" and tokens[1].type == "EQUAL":
+        return BrokenStatement(Name(tokens[0].value, span_of(tokens[0])))
     return None
 
 

@@ -423,6 +423,13 @@ class Resolver:
 
         return value_of(written, named, report) or 0.0
 
+    def is_number(self, name: Name, scope: Scope) -> bool:
+        """Return whether a name is that of a constant, or of a number that a macro was given."""
+        local = scope.values.get(name.text)
+        if local is not None:
+            return isinstance(local, (float, Duration))
+        return isinstance(self.names.definitions.get(name.text), ConstStatement)
+
     def number(self, written: Quantity, scope: Scope) -> float:
         """Return a plain number; a duration in its place is a fault."""
         value = self.quantity(written, scope)

@@ -19,6 +19,7 @@ _PREFIX_WORDS: Mapping[str, tuple[str, str]] = MappingProxyType(
         "once": ("PREFIX", "O"),
         "historically": ("PREFIX", "H"),
         "NOT": ("NOT", "not"),
+        **{f"{operator}_": ("PREFIX", operator) for operator in "GFXOH"},
     }
 )
 _INFIX_WORDS: Mapping[str, tuple[str, str]] = MappingProxyType(
@@ -30,6 +31,7 @@ _INFIX_WORDS: Mapping[str, tuple[str, str]] = MappingProxyType(
         "OR": ("OR", "or"),
         "XOR": ("XOR", "xor"),
         "IMPLIES": ("IMPLIES", "->"),
+        **{f"{operator}_": ("INFIX", operator) for operator in "URWS"},
     }
 )
 _MEANT: Mapping[str, str] = MappingProxyType(
@@ -73,7 +75,9 @@ _MEANT_SIGNS: Mapping[str, str] = MappingProxyType(
         **{"%": "a share is written as the log has it: 20 % of a signal from 0 to 1 is 0.2"},
         **{";": "a statement ends with its line; leave it out"},
         **dict.fromkeys(("{", "}"), "numbers stand in square brackets: F[0, 5s], closeto[0.1]"),
-        **dict.fromkeys(("//", "/*"), "a comment begins with #"),
+        **dict.fromkeys(("//", "/*", "--"), "a comment begins with #"),
+        **{"~>": "leads to is written G (p -> F (q))", "\\A": "write forall p in people: ..."},
+        **{"\\E": "write exists p in people: ...", "\\in": "write in"},
         **dict.fromkeys(
             ("'", "“", "”", "„", "\u2018", "\u2019", "`"), 'names with other characters stand in "quotes"'
         ),
@@ -86,6 +90,24 @@ _LENGTHS: Mapping[str, float] = MappingProxyType(
 _TIMES: Mapping[str, float] = MappingProxyType({"us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "sec": 1.0})
 _OPPOSITE: Mapping[str, str] = MappingProxyType({"STAR": "/", "SLASH": "*", "PLUS": "-", "MINUS": "+"})
 """Signs of arithmetic, and what each is on the other side of a comparison."""
+_SHAPES: Mapping[str, str] = MappingProxyType(
+    {
+        **dict.fromkeys(("rect", "rectangle", "square", "aabb"), "box(xmin, ymin, xmax, ymax)"),
+        **dict.fromkeys(("disc", "disk", "sphere", "ellipse"), "circle((x, y), r)"),
+    }
+)
+_TYPES = frozenset(
+    {"float", "float64", "double", "int", "bool", "real", "string", "input", "output", "signal"}
+)
+"""Words that declare signals elsewhere."""
+_AT_TIMES: Mapping[str, str] = MappingProxyType(
+    {
+        **dict.fromkeys(("for", "during"), "G[0s, {0}]"),
+        **dict.fromkeys(("within", "before", "until"), "F[0s, {0}]"),
+        **{"after": "G[{0}, inf]", "from": "G[{0}, inf]", "at": "F[{0}, {0}]"},
+    }
+)
+"""Operators that words of time stand for, given that time."""
 _DEFINING = frozenset({"let", "var", "val", "define", "param", "parameter", "constant", "set"})
 _WITH_NUMBER = frozenset({"closeto", "farfrom", "touch", "oriented", "moved"})
 _STATEMENTS = frozenset({"CONST", "REGION", "GROUP", "DEF", "SPEC"})
@@ -111,7 +133,7 @@ def read_spellings(tokens: list[Token], faults: Faults) -> list[Token]:
             brackets.append(token.type)
         elif token.type in ("RPAR", "RSQB") and brackets:
             brackets.pop()
-        following = tokens[index + 1 : index + 3]
+        following = tokens[index + 1 : index + 4]
         pair = token.value + following[0].value if following else ""
         if pair in ("[]", "<>") and _starts(result) and following[0].start_pos == token.end_pos:
             _report(_as(token, "ERROR", pair), faults)
@@ -172,7 +194,8 @@ def _is_in_front(before: Sequence[Token], after: Sequence[Token]) -> bool:
     if not _starts(before):
         return False
     if after[0].type == "LSQB":
-        return len(after) > 1 and after[1].type != "MINUS"
+        is_index = [each.type for each in after[1:]] == ["NAME", "RSQB"]
+        return len(after) > 1 and after[1].type != "MINUS" and not is_index
     # "always until p" is the name `always`, unless a relation follows: then `until` is one
     if after[0].value in _INFIX_WORDS and after[0].type == "NAME":
         return len(after) > 1 and after[1].type in _RELATIONS
@@ -238,6 +261,8 @@ def meant(tokens: Sequence[Token], position: int, accepted: Collection[str]) -> 
     last, before, *_ = [*reversed(tokens[max(0, position - 2) : position]), missing, missing]
     after = tokens[position + 1] if position + 1 < len(tokens) else missing
     found = f"{token.value!r} cannot stand here"
+    if position == 1 and (statement := meant_statement(tokens)):
+        return f"{last.value!r} begins no statement", statement
     if window := _meant_window(tokens, position):
         return found, f"a window is written with both of its ends: {window}"
     relation = last if last.type == "RELATION" else before
@@ -245,10 +270,20 @@ def meant(tokens: Sequence[Token], position: int, accepted: Collection[str]) -> 
         return found, f"the number of a relation stands in square brackets: {relation.value}[{token.value}]"
     if before.type == "RSQB" and last.value in ("s", "ms"):
         return f"{last.value!r} cannot stand here", "each number has its unit: [0s, 5s], [200ms, 1s]"
-    if token.type in _RELATIONS and before.type == "SLASH" and last.type == "NAME":
+    if token.type in _RELATIONS and before.type in ("SLASH", "MINUS") and last.type == "NAME":
         first = tokens[position - 3].value if position > 2 else ""
-        hint = f'a name with a slash is written in quotes: "{first}/{last.value}"'
+        hint = f'a name with {before.value} is written in quotes: "{first}{before.value}{last.value}"'
         return f"{token.value!r} needs an object, region or group on its left", hint
+    if token.type == "MINUS" and before.type in _RELATIONS - {"COMPARE"} and after.type == "NAME":
+        return found, f'a name with - is written in quotes: "{last.value}-{after.value}"'
+    if token.type in _RELATIONS and before.type == "LPAR" and last.type == "NAME" and position > 2:
+        name = tokens[position - 3]
+        if name.type == "NAME" and (hint := function_hint(name.value, _argument(tokens, position - 1))):
+            return f"{name.value!r} is not a function", hint
+    if shape := _meant_shape(tokens, position, accepted):
+        return found, shape
+    if token.type == "NUMBER" and (operator := _AT_TIMES.get(last.value.lower())):
+        return found, f"a window stands behind its operator: {operator.format(token.value)} (...)"
     if last.type in _STATEMENTS and token.type != "NAME" and token.value.isidentifier():
         kind = "a relation" if "RELATION" not in accepted and token.type in _RELATIONS else "a reserved word"
         return f"{token.value!r} is {kind}, so no name for a {last.value}", "give it another name"
@@ -268,12 +303,8 @@ def meant(tokens: Sequence[Token], position: int, accepted: Collection[str]) -> 
         return _meant_word(token, last, after, accepted)
     if token.type in _OPPOSITE and before.type == "DIST" and "COMPARE" in accepted:
         return f"a distance has no {token.value!r}", "it is compared as it is: put the number into its limit"
-    if token.type in ("EQUAL", "COLON") and position == 1 and last.type == "NAME":
-        written = "".join(each.value for each in tokens[position:] if each.type not in ("EQUAL", "COLON"))
-        hint = f"equality is written ==; a number is defined by const {last.value} = {written or '1.0'}"
-        return found, hint
-    if last.type == "NAME" and before.type == "COMPARE" and token.type in ("COMPARE", "$END"):
-        return _meant_comparison(tokens, position)
+    if last.type == "NAME" and before.type == token.type == "COMPARE":
+        return _meant_range(tokens, position)
     if last.type == "COMPARE" and token.type in ("NUMBER", "MINUS") and _has_arithmetic(tokens, position):
         return "a signal is compared as it is", _meant_arithmetic(tokens, position)
     if token.type == "COMPARE" and (call := _meant_call(tokens[:position], token.value, after.value)):
@@ -322,6 +353,7 @@ def _meant_window(tokens: Sequence[Token], position: int) -> str:
             ["LSQB", "NUMBER", "NUMBER", *_]
             | ["LSQB", "NUMBER", "MINUS", "NUMBER", "RSQB"]
             | ["LPAR", "NUMBER", "COMMA", "NUMBER", *_]
+            | ["LSQB", "NUMBER", "COMMA", "NUMBER", "RPAR"]
         ):
             return f"{operator}[{numbers[0]}, {numbers[1]}]"
     return ""
@@ -370,9 +402,6 @@ def _meant_definition(tokens: Sequence[Token], position: int) -> tuple[str, str]
 
 def _meant_word(token: Token, last: Token, after: Token, accepted: Collection[str]) -> tuple[str, str] | None:
     word = str(token.value).lower()
-    if last.value.lower() in _DEFINING and after.type == "EQUAL":
-        message = f"{last.value!r} begins no statement"
-        return message, f"a number is defined by const {token.value} = 1.0, a formula by spec"
     if "RELATION" in accepted:
         if word in ("is", "are") and after.type in _RELATIONS:
             return f"{token.value!r} cannot stand here", f"leave it out: {last.value} {after.value} ..."
@@ -381,17 +410,94 @@ def _meant_word(token: Token, last: Token, after: Token, accepted: Collection[st
             return f"unknown relation {token.value!r}", hint
     if "AND" in accepted and word in _MEANT_BETWEEN:
         return f"{token.value!r} is not an operator", f"the operator is written {_MEANT_BETWEEN[word]}"
-    if "AND" in accepted and word in ("for", "within", "during"):
-        return f"{token.value!r} cannot stand here", "a window stands behind its operator: F[0, 5s] (...)"
+    if "AND" in accepted and word in _AT_TIMES:
+        window = _AT_TIMES[word].format(after.value or "5s")
+        return f"{token.value!r} cannot stand here", f"a window stands behind its operator: {window} (...)"
     return None
 
 
-def _meant_comparison(tokens: Sequence[Token], position: int) -> tuple[str, str] | None:
-    """Return what was meant by `5 <= battery` and by `5 <= battery <= 8`."""
+def _meant_range(tokens: Sequence[Token], position: int) -> tuple[str, str]:
+    """Return what was meant by `5 <= battery <= 8`."""
     limit, sign, name = (each.value for each in tokens[position - 3 : position])
     turned = sign.translate(str.maketrans("<>", "><"))
-    first = f"{name} {turned} {limit}"
-    if position == len(tokens):
-        return "a comparison that begins with its number", f"the signal comes first: {first}"
     then = tokens[position + 1].value if position + 1 < len(tokens) else "..."
-    return "a range of a signal", f"write {first} and {name} {tokens[position].value} {then}"
+    return "a range of a signal", f"write {name} {turned} {limit} and {name} {tokens[position].value} {then}"
+
+
+def meant_statement(tokens: Sequence[Token]) -> str:
+    """Return how a line is written that begins with no word of a statement; "" where that is not known."""
+    line = [each for each in tokens if each.line == tokens[0].line]
+    if line[0].value.lower() in _TYPES and len(line) > 1 and line[1].type == "NAME":
+        return "signals are not declared: leave the line out"
+    if line[0].value.lower() in _DEFINING:
+        del line[0]
+    if len(line) < 3 or line[1].type not in ("EQUAL", "COLON"):
+        return ""
+    is_number = all(each.type in ("NUMBER", "NAME", *_OPPOSITE) for each in line[2:])
+    definition = f"{line[0].value} = {_as_written(line[2:])}"
+    if is_number:
+        return f"a number is defined by const {definition}; equality is written =="
+    return f"a formula is named by spec {definition}"
+
+
+def _as_written(tokens: Sequence[Token]) -> str:
+    """Return tokens as a text, with blanks where there were some."""
+    gaps = ["" if one.end_pos == other.start_pos else " " for one, other in pairwise(tokens)]
+    return "".join(token.value + gap for token, gap in zip(tokens, [*gaps, ""], strict=True))
+
+
+def _meant_shape(tokens: Sequence[Token], position: int, accepted: Collection[str]) -> str:
+    """Return how the shape of a region is written; "" where that is not what is wrong."""
+    token = tokens[position] if position < len(tokens) else None
+    if token is not None and "CIRCLE" in accepted and token.value.lower() in _SHAPES:
+        return f"it is written {_SHAPES[token.value.lower()]}"
+    start = next(
+        (n for n in range(position - 1, max(-1, position - 5), -1) if tokens[n].type in _SHAPE), None
+    )
+    if start is None or "HEIGHT" in accepted:
+        return ""
+    numbers = _numbers(tokens[start:])
+    pairs = [f"({x}, {y})" for x, y in zip(numbers[::2], numbers[1::2], strict=False)]
+    match tokens[start].type:
+        case "BOX" if len(numbers) == 4:
+            return f"a box has four numbers: box({', '.join(numbers)})"
+        case "CIRCLE" if len(numbers) == 3:
+            return f"the centre stands in brackets: circle({pairs[0]}, {numbers[2]})"
+        case "POLYGON" if len(numbers) > 5:
+            return f"each corner stands in brackets: polygon({', '.join(pairs)})"
+    return ""
+
+
+_SHAPE = frozenset({"BOX", "CIRCLE", "POLYGON"})
+
+
+def _numbers(tokens: Sequence[Token]) -> list[str]:
+    """Return the numbers up to the end of the line, with their signs."""
+    line = [each for each in tokens if each.line == tokens[0].line]
+    signs = ["-" if before.type == "MINUS" else "" for before in line]
+    return [sign + each.value for sign, each in zip(signs, line[1:], strict=False) if each.type == "NUMBER"]
+
+
+def _argument(tokens: Sequence[Token], start: int) -> str:
+    """Return what stands in brackets from a place on, with the brackets."""
+    depth, end = 1, start
+    while end < len(tokens) and depth:
+        depth += {"LPAR": 1, "RPAR": -1}.get(tokens[end].type, 0)
+        end += 1
+    return f"({_as_written(tokens[start : end - (depth == 0)])})"
+
+
+def function_hint(name: str, argument: str) -> str:
+    """Return how a function of other tools is written; "" where it is none that is known.
+
+    Args:
+        argument: what it was of, in brackets.
+    """
+    match name.lower():
+        case "rise" | "rising" | "rising_edge" | "rose":
+            return f"a rising edge is written (Y not {argument}) and {argument}"
+        case "fall" | "falling" | "falling_edge" | "fell":
+            return f"a falling edge is written (Y {argument}) and not {argument}"
+        case "abs" | "fabs" | "norm" | "magnitude" if " dist " in argument:
+            return f"a distance is compared as it is: leave {name} out"
+    return ""

@@ -67,7 +67,7 @@ _TOKEN = re.compile(
     | (?P<number>(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?(?P<unit>[A-Za-z_][A-Za-z0-9_]*)?)
     | (?P<word>[A-Za-z_][A-Za-z0-9_]*)
     | (?P<quoted>"(?:[^"\\\r\n]|\\[^\r\n])*")
-    | (?P<foreign>/\\|\\/|<=>|<-->|-->|==>|//[^\r\n]*|/\*[^\r\n]*)
+    | (?P<foreign>/\\|\\/|\\[A-Za-z]+|<=>|<-->|-->|==>|~>|//[^\r\n]*|/\*[^\r\n]*|--[ \t][^\r\n]*)
     | (?P<sign><->|->|<=|>=|==|=>|!=|&&|\|\||[<>!&|()\[\],:=+*/-])
     | (?P<unknown>"[^\r\n]*|[^\sA-Za-z0-9_"\#()\[\],:=<>!&|.+*/-]+|.)
     """,
@@ -131,7 +131,7 @@ def tokenize(text: str, relations: frozenset[str], faults: Faults) -> list[Token
             token_type = "TITLE" if _is_title_expected(tokens) else "NAME"
             value = _unquoted(value, span, faults)
         elif kind == "foreign":
-            sign = value[:2] if value[:2] in ("//", "/*") else value
+            sign = value[:2] if value.startswith(("//", "/*", "-- ", "--\t")) else value
             faults.add(span, f"'{sign}' is not part of the language", meant_sign(sign))
             token_type = "ERROR"
         elif kind == "unknown":

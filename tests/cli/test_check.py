@@ -253,3 +253,82 @@ def test_errors_are_marked_at_their_lines_for_github_and_for_code_scanning(
     assert run(["check", str(path), "--format", "sarif"]) == 0
     assert json.loads(capsys.readouterr().out)["runs"][0]["results"] == []
     assert run(["check", str(path), "--format", "github", "--json"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("text", "caret", "remedy"),
+    [
+        ("always[0:5] (battery >= 1)", "[0:5]", "G[0, 5] for samples, G[0s, 5s] for seconds"),
+        ("eventually[0,4] (battery >= 1)", "[0,4]", "F[0, 4] for samples, F[0s, 4s] for seconds"),
+        ("G_[0,5] (battery >= 1)", "[0,5]", "G[0, 5] for samples, G[0s, 5s] for seconds"),
+        ("G[2:inf] (battery >= 1)", "[2:inf]", "G[2, inf] for samples, G[2s, inf] for seconds"),
+        ("(a ovlp b) U_[0,5] (battery >= 1)", "[0,5]", "U[0, 5] for samples, U[0s, 5s] for seconds"),
+        ("G[0,5) (battery >= 1)", ")", "G[0, 5]"),
+        ("region r = circle(0, 0, 1)\nspec s = F (a ovlp r)", "0", "circle((0, 0), 1)"),
+        ("region r = rect(0, 0, 1, 1)\nspec s = F (a ovlp r)", "rect", "box(xmin, ymin, xmax, ymax)"),
+        ("region r = box((0,0),(1,-1))\nspec s = F (a ovlp r)", ",", "box(0, 0, 1, -1)"),
+        ("region r = polygon(0,0, 1,1, 2,3)\nspec s = F (a ovlp r)", "0", "polygon((0, 0), (1, 1), (2, 3))"),
+        ("G (x[t] >= 1)", "t", "leave [t] out"),
+        ("G (abs(x) <= 1)", "<=", "write x >= -1 and x <= 1"),
+        ("G (abs(a dist b) <= 1)", "dist", "leave abs out"),
+        ("const d = 5\nspec s = G (a dist b >= D)", "D", "did you mean 'd'?"),
+        ("keep = 0.5\nspec s = G (a dist b >= keep)", "keep", "const keep = 0.5"),
+        ("let keep = 0.5\nspec s = G (a dist b >= keep)", "let", "const keep = 0.5"),
+        ("let keep = 0.5\nG (a dist b >= keep)", "keep", "const keep = 0.5"),
+        ("out = always (battery >= 1)", "=", "spec out = G (battery >= 1)"),
+        ("float battery\nout = always (battery >= 1)", "battery", "leave the line out"),
+        ("input float battery\nspec s = G (battery >= 1)", "input", "leave the line out"),
+        ("G (rise(p) -> a ovlp b)", "rise", "(Y not (p)) and (p)"),
+        ("G (fell(battery >= 1) -> a ovlp b)", ">=", "(Y (battery >= 1)) and not (battery >= 1)"),
+        ("(a ovlp b) ~> (c ovlp d)", "~>", "G (p -> F (q))"),
+        (r"\A p \in people : p ovlp b", r"\A", "write forall p in people: ..."),
+        ("G (base-link dist cup >= 1)", "dist", '"base-link"'),
+        ("G (cup dist base-link >= 1)", "-", '"base-link"'),
+        ("G (a ovlp b) -- comment", "-- comment", "a comment begins with #"),
+        ("battery and G (a ovlp b)", "battery", "battery >= 1.0"),
+        ("after 5s (a ovlp b)", "5s", "G[5s, inf]"),
+        ("F (a ovlp b) within 5s", "within", "F[0s, 5s]"),
+    ],
+)
+def test_spellings_of_other_tools_get_the_one_that_is_meant(
+    text: str, caret: str, remedy: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "other.spatial"
+    path.write_text(text)
+    assert run(["check", str(path)]) == 2
+    head, line, mark, hint, *_ = capsys.readouterr().err.splitlines()
+    assert head.startswith(f"error: {path.name}:") or f"{path.name}:" in head
+    assert line[mark.index("^") : mark.rindex("^") + 1] == caret
+    assert remedy in hint
+
+
+@pytest.mark.parametrize(
+    ("text", "title"),
+    [
+        ("G (0.1 <= charge)", "charge >= 0.1"),
+        ("G (2 == mode)", "mode == 2"),
+        ("const low = 3\nspec s = G (low < charge)", "charge > 3"),
+        ("always[0s:5s] (charge >= 1)", "G[0s, 5s]"),
+        ("G_[0s, 5s] (charge >= 1)", "G[0s, 5s]"),
+    ],
+)
+def test_spellings_that_mean_the_same_are_read(
+    text: str, title: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "other.spatial"
+    path.write_text(text)
+    assert run(["check", str(path)]) == 0
+    assert title in capsys.readouterr().out
+
+
+def test_a_formula_stands_in_place_of_a_file_and_a_mapping_does_not(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = tmp_path / "log.jsonl"
+    log.write_text(LOG)
+    assert run(["replay", str(log), "--spec", "F (cube dist hans <= 1)"]) in (1, 4)
+    assert "spec" in capsys.readouterr().out
+    mapping = tmp_path / "own.yaml"
+    mapping.write_text("topics: {}\n")
+    assert run(["replay", str(log), "--spec", str(mapping)]) == 2
+    assert "own.yaml is a mapping, not a specification; give it by --mapping" in capsys.readouterr().err

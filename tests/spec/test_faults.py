@@ -68,7 +68,6 @@ spec template(ego) = ego ovlp goal
         ("spec s = battery > force", "force", "unknown constant 'force'", "with a number, not with a signal"),
         ("spec s = G (force)", "(force)", "no spec is named 'force'", "such as force >= 1.0"),
         ("spec s = G True", "True", "no spec is named 'True'", "truth values are written true"),
-        ("spec s = 5 <= battery", "", "begins with its number", "the signal comes first: battery >= 5"),
         ("spec s = 5 <= battery < 8", "<", "a range of a signal", "battery >= 5 and battery < 8"),
         ("spec s = a inside goal", "inside", "unknown relation 'inside'", "write a enclosedin goal"),
         ("spec s = a not ovlp goal", "not", "cannot stand within a relation", "in front: not a ovlp"),

@@ -257,10 +257,10 @@ def test_a_value_given_for_a_constant_has_its_unit_and_keeps_its_range() -> None
     ("written", "meaning"),
     [
         ("always (a ovlp b)", "G (a ovlp b)"),
-        ("always[0:5] a ovlp b", "G[0, 5] (a ovlp b)"),
+        ("always[0s:5s] a ovlp b", "G[0s, 5s] (a ovlp b)"),
         ("eventually[0s, 2s] next a ovlp b", "F[0s, 2s] (X (a ovlp b))"),
         ("(a ovlp b) until (c ovlp d)", "(a ovlp b) U (c ovlp d)"),
-        ("a closeto[3] b until[0, 3] c ovlp d", "(a closeto[3] b) U[0, 3] (c ovlp d)"),
+        ("a closeto[3] b until[0s, 3s] c ovlp d", "(a closeto[3] b) U[0s, 3s] (c ovlp d)"),
         ("once (a ovlp b) since historically a ovlp b", "O ((a ovlp b) S (H (a ovlp b)))"),
         ("a ovlp b && c ovlp d || NOT e ovlp f", "(a ovlp b and c ovlp d) or (not e ovlp f)"),
         ("a ovlp b AND c ovlp d => e ovlp f", "(a ovlp b and c ovlp d) -> e ovlp f"),
