@@ -1,0 +1,1 @@
+"""Evaluations as messages that viewers draw: robustness, events, scene, automaton, layout."""

@@ -1,0 +1,1 @@
+"""Footprints and the distances between them; knows no formulas."""

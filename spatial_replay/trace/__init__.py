@@ -1,0 +1,1 @@
+"""Samples as columns, with a cache of their measurements."""
