@@ -15,16 +15,22 @@ import click
 
 from spatial_replay.cli.application import ExitCode
 from spatial_replay.cli.decisions import decision_lines, decision_rows
-from spatial_replay.cli.options import JsonCommand, LogPath, ReadArguments, reading_options
+from spatial_replay.cli.options import (
+    JsonCommand,
+    LogPath,
+    ReadArguments,
+    input_files,
+    output_option,
+    reading_options,
+)
 from spatial_replay.cli.output import MANY, WORST_FIRST, counts_text
 from spatial_replay.cli.progress import progress
-from spatial_replay.cli.terminal import show, show_bytes, show_file, show_json, warn
+from spatial_replay.cli.terminal import printing_to, show, show_bytes, show_file, show_json, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import LogFile
 from spatial_replay.text import counted, counted_from, escaped, requirement_text
 
 if TYPE_CHECKING:
-    from spatial_replay.bags.reader import MessageReader
     from spatial_replay.logs.mcap.summary import LogSummary
     from spatial_replay.logs.source import Source
     from spatial_replay.sources.overview import Overview, Survey
@@ -55,6 +61,7 @@ _OF_MESSAGES = frozenset({"mapping", "on_time_jump", "late"})
 @click.option(
     "--panel", is_flag=True, help="Print the extension with panels for viewers instead; it is for every log."
 )
+@output_option("File to write instead of standard output.")
 @reading_options
 def info(
     log: LogFile | None,
@@ -64,6 +71,7 @@ def info(
     specification: str | None,
     layout: bool,
     panel: bool,
+    output: Path | None,
     reading: ReadArguments,
 ) -> int:
     """Show what a log contains: samples, objects, signals, topics, attachments.
@@ -77,33 +85,53 @@ def info(
     Examples:
       spatial-replay info annotated.mcap
       spatial-replay info blocks.jsonl.gz --json
-      spatial-replay info drive.bag --suggest-mapping > drive.yaml
+      spatial-replay info drive.bag --suggest-mapping -o drive.yaml
       spatial-replay info push.mcap --decisions
-      spatial-replay info annotated.mcap --specification > used.spatial
-      spatial-replay info annotated.mcap --layout > layout.json
-      spatial-replay info --panel > spatial-replay.foxe
+      spatial-replay info annotated.mcap --specification -o used.spatial
+      spatial-replay info annotated.mcap --layout -o layout.json
+      spatial-replay info --panel -o spatial-replay.foxe
     """
-    if panel:
-        if log is not None or any((as_json, suggest_mapping, decisions, layout, specification is not None)):
-            raise UsageError("--panel prints the extension, which is the same for every log; remove the rest")
-        return _print_panel()
-    if log is None:
+    wanted = [
+        name
+        for name, is_given in (
+            ("--suggest-mapping", suggest_mapping),
+            ("--decisions", decisions),
+            ("--specification", specification is not None),
+            ("--layout", layout),
+            ("--panel", panel),
+        )
+        if is_given
+    ]
+    if len(wanted) > 1:
+        raise UsageError(f"{' and '.join(wanted)} print different things; give one of them")
+    if as_json and wanted and not decisions:
+        raise UsageError(f"{wanted[0]} prints no JSON; remove --json")
+    if panel and log is not None:
+        raise UsageError("--panel prints the extension, which is the same for every log; remove the log")
+    if log is None and not panel:
         raise click.MissingParameter(param_hint="'LOG'", param_type="argument")
-    if layout or specification is not None:
-        what = "layout" if layout else "specification"
-        if as_json or suggest_mapping or decisions or (layout and specification is not None):
-            raise UsageError(f"--{what} prints only the {what}; remove the other options")
-        return _print_layout(log) if layout else _print_specification(log, specification or "")
-    if decisions:
-        return _print_decisions(log, as_json)
+    with printing_to(output, () if log is None else input_files(log, reading=reading)):
+        if log is None:
+            return _print_panel()
+        if layout:
+            return _print_layout(log)
+        if specification is not None:
+            return _print_specification(log, specification)
+        if decisions:
+            return _print_decisions(log, as_json)
+        if suggest_mapping:
+            return _print_mapping(log)
+        return _print_overview(log, as_json, reading)
+
+
+def _print_overview(log: LogFile, as_json: bool, reading: ReadArguments) -> int:
+    """Print what a log contains."""
     # imported here so that --help stays fast
     from spatial_replay.logs.read_options import ReadOptions
     from spatial_replay.sources.open_log import open_source
     from spatial_replay.sources.overview import messages_in, overview_of, overview_of_survey, survey
 
     reader = messages_in(log)
-    if suggest_mapping:
-        return _print_mapping(log, reader, as_json)
     surveyed, about = None, {}
     if reader is not None:
         with progress("messages") as advance:
@@ -235,13 +263,12 @@ def _specs_of(text: SpecificationText) -> Sequence[NamedSpec]:
         return ()
 
 
-def _print_mapping(log: LogFile, reader: MessageReader | None, as_json: bool) -> int:
+def _print_mapping(log: LogFile) -> int:
     """Print a first version of a mapping file for an external log."""
     from spatial_replay.sources.open_log import open_source
-    from spatial_replay.sources.overview import survey
+    from spatial_replay.sources.overview import messages_in, survey
 
-    if as_json:
-        raise UsageError("--suggest-mapping prints YAML; remove --json")
+    reader = messages_in(log)
     if reader is None:
         source = open_source(log)
         raise UsageError(f"{source.name} needs no mapping: it names its objects")

@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
 @click.command()
 @evaluation_options
-@output_option("Report to write (HTML).", required=True)
+@output_option("Report to write (HTML).  [default: the log's name, here]")
 @semantics_option
-def report(request: EvaluationArguments, output: Path, semantics: Semantics) -> int:
+def report(request: EvaluationArguments, output: Path | None, semantics: Semantics) -> int:
     """Write an HTML report of a recorded run, for any browser.
 
     It shows verdicts and explanations, the specification's tree, curves, the scene from above, the automaton,
@@ -37,12 +37,14 @@ def report(request: EvaluationArguments, output: Path, semantics: Semantics) -> 
 
     \b
     Examples:
+      spatial-replay report run.mcap
       spatial-replay report run.mcap --spec blocks.spatial -o run.html
       spatial-replay report run.mcap --spec edited.spatial --semantics paper -o run.html
     """
     # imported here so that --help stays fast
     from spatial_replay.report.write import refuse_output, write_report
 
+    output = Path(f"{Path(request.log.name.removesuffix('.gz')).stem}.html") if output is None else output
     refuse_output(output, request.inputs)
     inputs = open_inputs(request)
     with progress("samples") as advance:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import shutil
 import sys
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, redirect_stdout
 from textwrap import wrap
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias, cast
 
 import click
 
@@ -17,6 +19,8 @@ from spatial_replay.errors import UsageError
 from spatial_replay.text import escaped, without_repetition
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from spatial_replay.errors import Diagnosis
 
 PROGRAM: Final = "spatial-replay"
@@ -112,8 +116,28 @@ def show_bytes(content: bytes) -> None:
         UsageError: to a terminal, which would show it as noise.
     """
     if sys.stdout.isatty():
-        raise UsageError("this is no text: redirect it to a file, as `… > spatial-replay.foxe`")
+        raise UsageError("this is no text; add -o FILE, as in -o spatial-replay.foxe")
     click.echo(content, nl=False)
+
+
+@contextmanager
+def printing_to(output: Path | None, inputs: Iterable[Path] = ()) -> Iterator[None]:
+    """Write to a file, while this lasts, what is printed to standard output; None leaves it there.
+
+    Raises:
+        UsageError: the output is an input, a folder, or in none.
+        OutputError: it cannot be written.
+    """
+    if output is None:
+        yield
+        return
+    from spatial_replay.logs.output_file import replacing
+
+    with replacing(output, inputs) as stream:
+        printed = io.TextIOWrapper(io.BytesIO(), encoding="utf-8", write_through=True)
+        with redirect_stdout(printed):
+            yield
+        stream.write(cast(io.BytesIO, printed.buffer).getvalue())
 
 
 def show_diagnostics(diagnostics: Iterable[Diagnosis]) -> None:

@@ -305,6 +305,20 @@ def test_for_a_log_without_a_layout_the_error_says_how_to_get_one(
     assert run(["info", str(log), "--layout"]) == 2
     assert "run.jsonl has no layout" in capsys.readouterr().err
     assert run(["info", str(log), "--layout", "--json"]) == 2
+    assert run(["info", str(log), "--layout", "--decisions"]) == 2
+    assert "--decisions and --layout print different things" in capsys.readouterr().err
+
+
+def test_an_overview_goes_to_a_file_and_never_to_the_log(
+    log: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(["info", str(log)]) == 0
+    printed, file = capsys.readouterr().out, log.with_name("info.txt")
+    assert run(["info", str(log), "-o", str(file)]) == 0
+    assert (file.read_text(), capsys.readouterr().out) == (printed, "")
+    before = log.read_bytes()
+    assert run(["info", str(log), "-o", str(log)]) == 2
+    assert log.read_bytes() == before
 
 
 def test_the_extension_for_viewers_is_printed(log: Path, capfdbinary: pytest.CaptureFixture[bytes]) -> None:
@@ -320,6 +334,9 @@ def test_the_extension_for_viewers_is_printed(log: Path, capfdbinary: pytest.Cap
     assert package["name"] and package["publisher"] and package["version"]
     # a text of a log is never read as HTML, or as code
     assert not re.search(rb"innerHTML|outerHTML|insertAdjacentHTML|\beval\(|new Function", script)
+    file = log.with_name("spatial-replay.foxe")
+    assert run(["info", "--panel", "-o", str(file)]) == 0
+    assert (file.read_bytes(), capfdbinary.readouterr().out) == (content, b"")
     assert run(["info", "--panel", str(log)]) == 2
     assert run(["info", "--panel", "--json"]) == 2
     assert run(["info"]) == 2

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import click
 import pytest
 from click.testing import CliRunner
 
@@ -34,6 +33,14 @@ def test_a_report_uses_the_specification_of_the_log_by_default(tmp_path: Path) -
     code, _ = call("report", RECORDINGS / "push.mcap", "-o", tmp_path / "run.html")
     assert code == 0
     assert "push.spatial" in page_of(tmp_path / "run.html").within("header#")
+
+
+def test_a_report_is_named_by_its_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "run.1.mcap").write_bytes((RECORDINGS / "push.mcap").read_bytes())
+    monkeypatch.chdir(tmp_path)
+    code, said = call("report", "run.1.mcap")
+    assert (code, "wrote run.1.html" in said) == (0, True)
+    assert "push.spatial" in page_of(tmp_path / "run.1.html").within("header#")
 
 
 def test_a_report_covers_the_readable_part_of_a_damaged_log(tmp_path: Path) -> None:
@@ -84,8 +91,6 @@ def test_a_report_takes_a_window_and_the_paper_semantics(tmp_path: Path) -> None
 
 def test_options_that_cannot_work_leave_no_report(tmp_path: Path) -> None:
     output, log = tmp_path / "run.html", RECORDINGS / "table.jsonl"
-    with pytest.raises(click.MissingParameter):
-        call("report", log)
     with pytest.raises(UsageError, match="holds no specification of its own"):
         call("report", log, "-o", output)
     spec = tmp_path / "s.spatial"
