@@ -123,7 +123,7 @@ class Assembler:
         self._begin_ns: int | None = None
         self._newest_ns = -1
         self._latest_ns = self._settled_ns = self._forgot_ns = -1
-        self._count = self._bytes = 0
+        self._count = self._bytes = self._recorded = 0
         self._step = _FIRST_STEP
         self.jump: Sentence | None = None
         """Where time jumped back so far that the log is taken to end there."""
@@ -140,7 +140,7 @@ class Assembler:
             LogError: time jumps back too far, and `on_time_jump` is "error".
             UsageError: the mapping does not fit what the messages hold.
         """
-        columns = messages if isinstance(messages, MessageColumns) else _columns(messages)
+        columns = messages if isinstance(messages, MessageColumns) else self._columns(messages)
         traces: list[Trace] = []
         ends = np.cumsum(np.fromiter(map(len, columns.payloads), np.int64, len(columns)))
         begin = 0
@@ -185,7 +185,7 @@ class Assembler:
             UsageError: the mapping does not fit what the messages hold.
         """
         if messages and not self.is_finished:
-            self._add_step(_columns(messages))
+            self._add_step(self._columns(messages))
 
     @property
     def newest_ns(self) -> int:
@@ -253,15 +253,23 @@ class Assembler:
                 listed = ", ".join(map(repr, texts))
                 what = f"`names` of the signal {signal!r} lacks {listed}; it is unknown there"
                 self._remarks.add(f"{reader.name}: {what}")
-            if reader.unstamped:
-                were = (
-                    "message without objects was"
-                    if reader.unstamped == 1
-                    else "messages without objects were"
-                )
+            if (step := reader.pending.first_step) is not None:
+                steps = counted(reader.pending.steps, "time")
+                since = Instant(step.from_ns, 0)
                 self._remarks.add(
-                    f"{reader.name}: {reader.unstamped} {were} left out: they have no stamp for the clock"
-                    " header"
+                    Sentence(
+                        f"{reader.name}: the clock steps back {steps} though its messages are numbered on,"
+                        f" first by {(step.from_ns - step.to_ns) / 1e9:.3f} s at ",
+                        since,
+                        ": those recorded after a step count right after those before; cut the log there, or"
+                        " take another `clock`",
+                    )
+                )
+            if reader.unstamped:
+                were = "message was" if reader.unstamped == 1 else "messages were"
+                self._remarks.add(
+                    f"{reader.name}: {reader.unstamped} {were} left out, without a stamp, or with one of 0,"
+                    " for the clock header"
                 )
         self._check_fixed_frame()
         self._settled_ns = LATEST_NS
@@ -390,7 +398,8 @@ class Assembler:
             # samples up to here are out already: a late message counts from now on
             times_ns = np.maximum(stamped.times_ns, self._settled_ns + 1)
             self._latest_ns = max(self._latest_ns, int(times_ns.max(initial=-1)))
-            reader.pending.add(times_ns, arrived.sequence[stamped.places], log_times_ns, stamped.contents)
+            sequences, recorded = arrived.sequence[stamped.places], arrived.place[stamped.places]
+            reader.pending.add(times_ns, sequences, log_times_ns, recorded, stamped.contents)
 
     def _settle(self, upto_ns: int) -> Trace:
         """Return the samples up to a time before which no further message is expected."""
@@ -409,17 +418,18 @@ class Assembler:
             self._forgot_ns = upto_ns
         return trace
 
+    def _columns(self, messages: Sequence[Message]) -> MessageColumns:
+        if not messages:
+            return MessageColumns()
+        topics, *numbers, payloads = zip(*messages, strict=True)
+        log_ns, publish_ns, sequence = (np.array(each, np.int64) for each in numbers)
+        place = self._recorded + np.arange(len(messages))
+        self._recorded += len(messages)
+        channel = np.zeros(len(messages), np.int64)
+        return MessageColumns(topics, log_ns, publish_ns, sequence, payloads, place, channel)
+
     def _add_fault(self, topic: str, log_time_ns: int, what: str) -> None:
         self._faults.add(Sentence(f"{self._name}: {topic} at ", Instant(log_time_ns, 0), f": {what}"))
-
-
-def _columns(messages: Sequence[Message]) -> MessageColumns:
-    if not messages:
-        return MessageColumns()
-    topics, *numbers, payloads = zip(*messages, strict=True)
-    log_ns, publish_ns, sequence = (np.array(each, np.int64) for each in numbers)
-    place, channel = np.arange(len(messages)), np.zeros(len(messages), np.int64)
-    return MessageColumns(topics, log_ns, publish_ns, sequence, payloads, place, channel)
 
 
 class _Stamped(NamedTuple):

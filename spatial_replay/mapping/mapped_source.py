@@ -117,6 +117,7 @@ class MappedSource:
             f"{self.name}: it has no topic {topic!r}, which {self.mapping.name} marks as optional"
             for topic in plan.absent
         )
+        blocks.remarks.extend(f"{self.name}: {remark}" for remark in plan.remarks)
         blocks.remarks.extend(_unread(self.name, topics, plan))
         files = files_of_bag_around(self.path) if isinstance(self.path, Path) else ()
         if len(files) > 1:

@@ -145,7 +145,7 @@ class Sampling:
     """When samples are taken: at each message of a topic, or at multiples of a step.
 
     Attributes:
-        topic: None, without a step, for the first topic with objects.
+        topic: None, without a step, for the most frequent topic with objects.
     """
 
     topic: str | None = None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from spatial_replay.bags.columns import DISORDER_NS
@@ -19,7 +19,7 @@ from spatial_replay.mapping.message_types import (
 )
 from spatial_replay.mapping.model import DEFAULT_MAX_AGE_NS, FOREVER_NS, Clock, LogMapping, TopicMapping
 from spatial_replay.mapping.transforms import HISTORY_NS
-from spatial_replay.text import nearest_hint
+from spatial_replay.text import counted, nearest_hint
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +62,7 @@ class ReadingPlan:
         lost: topics with transforms that cannot be decoded, with the reason.
         absent: optional topics that the log lacks.
         sampled_topic: the topic whose messages are sampled; None for samples at multiples of a step.
+        remarks: what is doubtful about the choice of that topic.
     """
 
     mapping: LogMapping
@@ -73,6 +74,7 @@ class ReadingPlan:
     sampled_topic: str | None = None
     lost: tuple[tuple[str, str], ...] = ()
     absent: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, mapping: LogMapping, topics: Sequence[Topic], late_ns: int = DISORDER_NS) -> ReadingPlan:
@@ -93,7 +95,7 @@ class ReadingPlan:
         names += [topic.name for topic in transforms if topic.unreadable is None]
         lost = [(each.name, each.unreadable) for each in transforms if each.unreadable and each.count != 0]
         is_stepped = mapping.sampling.step_ns is not None
-        sampled = None if is_stepped else mapping.sampling.topic or _first(mapping, known)
+        sampled = None if is_stepped else mapping.sampling.topic or _most_frequent(mapping, known)
         if sampled is not None and sampled not in names:
             names.append(sampled)
         planned = tuple(_planned(mapping, mapped.get(name), known[name], needs_frames) for name in names)
@@ -108,6 +110,7 @@ class ReadingPlan:
             sampled_topic=sampled,
             lost=tuple(lost),
             absent=tuple(topic for topic in mapped if topic not in known),
+            remarks=_slow_sampling(sampled, [known[topic] for topic in mapped if topic in known], known),
         )
 
     def lookback_ns(self, topic: str) -> int | None:
@@ -170,10 +173,33 @@ def _faults(mapping: LogMapping, known: dict[str, Topic]) -> list[str]:
     return faults
 
 
-def _first(mapping: LogMapping, known: Container[str]) -> str:
-    """Return the topic that is sampled by default: the first of the log with objects, else its first."""
+def _most_frequent(mapping: LogMapping, known: Mapping[str, Topic]) -> str:
+    """Return the topic that is sampled by default: of those with objects, if any, the one with most messages.
+
+    Where a log does not say how many there are, the first one counts.
+    """
     present = [entry for entry in mapping.topics if entry.topic in known]
-    return next((entry.topic for entry in present if entry.reads_objects), present[0].topic)
+    names = [entry.topic for entry in present if entry.reads_objects] or [entry.topic for entry in present]
+    counts = [known[name].count for name in names]
+    return names[0] if None in counts else max(names, key=lambda name: known[name].count or 0)
+
+
+_MANY_TIMES = 10
+
+
+def _slow_sampling(
+    sampled: str | None, mapped: Sequence[Topic], known: Mapping[str, Topic]
+) -> tuple[str, ...]:
+    """Return a remark if a mapped topic has many times the messages of the one that is sampled."""
+    most = max(mapped, key=lambda topic: topic.count or 0)
+    count = None if sampled is None else known[sampled].count
+    if count is None or most.count is None or most.count < _MANY_TIMES * max(count, 1):
+        return ()
+    messages = counted(count, "message")
+    return (
+        f"samples are taken at {sampled}, which has {messages}, where {most.name} has {most.count};"
+        f" `sample: {{topic: {most.name}}}` takes one at each of these",
+    )
 
 
 def _planned(

@@ -43,7 +43,9 @@ MISFITS = (FieldError, AttributeError, LookupError, TypeError, ValueError, Overf
 ReportFault: TypeAlias = Callable[[str, int, str], None]
 """Takes the topic and the log time of a message that is lost, and the reason."""
 
-_NO_STAMP = "the clock is header, but its messages have no stamp; give `stamp`, or `clock: log`"
+_NO_STAMP = (
+    "the clock is header, but its messages have no stamp; give `stamp`, or `clock: log` for this topic"
+)
 
 _PATIENCE = 100
 """Messages of a topic that may misfit before the first that fits; beyond that the mapping is wrong."""
@@ -93,7 +95,7 @@ class TopicReader:
     ) -> None:
         self.planned = planned
         self.name = planned.name
-        self.pending = PendingMessages()
+        self.pending = PendingMessages(has_own_clock=planned.clock == "header")
         self.decodes_on_arrival = (
             planned.is_transforms
             or planned.clock == "header"
@@ -102,7 +104,8 @@ class TopicReader:
         self.transforms = TransformReader() if planned.is_transforms else None
         self.extractor: Extractor | None = None
         self.unstamped = 0
-        """Messages without objects and without a stamp, which have no time on the clock `header`."""
+        """Messages without a stamp, or with one of 0, which have no time on the clock `header`."""
+        self._is_stamped = False
         if planned.layout is not None and planned.mapping is not None:
             self.extractor = Extractor(
                 planned.layout, planned.mapping, names, classes, needs_frame=needs_frame
@@ -152,14 +155,15 @@ class TopicReader:
             time_ns = self._stamp(message)
             if time_ns is not None and not 0 <= time_ns <= LATEST_NS:
                 raise ContentError(f"its stamp {time_ns} ns lies outside the times of a log")
-            return time_ns
+            # a stamp of 0 was never set, but by simulators, before they have a time
+            return time_ns or (0 if self.planned.is_static else None)
 
         times = self._read_each(read, messages, log_times_ns, good)
         # a list without objects and without a header has no stamp
         has_stamp = np.array([time_ns is not None for time_ns in times], np.bool_)
-        if self.extractor is not None:
-            self.unstamped += int(np.count_nonzero(good & ~has_stamp))
+        self.unstamped += int(np.count_nonzero(good & ~has_stamp))
         good &= has_stamp
+        self._is_stamped = self._is_stamped or bool(good.any())
         return np.array([time_ns or 0 for time_ns in times], np.int64)
 
     def read(self, log_times_ns: Integers, contents: Sequence[Any]) -> TopicColumns:
@@ -198,6 +202,8 @@ class TopicReader:
         Raises:
             UsageError: there were messages, and the mapping fitted none.
         """
+        if self.unstamped and not self._is_stamped and self.is_mapped:
+            raise self._misfit_error(_NO_STAMP)
         for what, (_, first) in self._misfits.items():
             is_bound = self._signals is not None
             if what == "objects":
@@ -333,49 +339,86 @@ class TopicReader:
         return UsageError(f"{self._mapping_name}: topics.{self.name}: {reason}")
 
 
-class PendingMessages:
-    """Messages of one topic that wait until no earlier message can arrive."""
+class ClockStep(NamedTuple):
+    """Where the clock of a topic steps back."""
 
-    def __init__(self) -> None:
-        self._times_ns: list[Integers] = []
-        self._sequences: list[Integers] = []
-        self._log_times_ns: list[Integers] = []
+    from_ns: int
+    to_ns: int
+
+
+class PendingMessages:
+    """Messages of one topic that wait until no earlier message can arrive.
+
+    Attributes:
+        steps: how often the time steps back between messages whose sequence goes on.
+        first_step: where it does so the first time.
+    """
+
+    def __init__(self, *, has_own_clock: bool) -> None:
+        self.steps = 0
+        self.first_step: ClockStep | None = None
+        self._has_own_clock = has_own_clock
+        self._columns: list[tuple[Integers, Integers, Integers, Integers]] = []
         self._contents: list[Any] = []
 
     def __len__(self) -> int:
         return len(self._contents)
 
     def add(
-        self, times_ns: Integers, sequences: Integers, log_times_ns: Integers, contents: list[Any]
+        self,
+        times_ns: Integers,
+        sequences: Integers,
+        log_times_ns: Integers,
+        recorded: Integers,
+        contents: list[Any],
     ) -> None:
         """Add messages in the order of arrival.
 
         Args:
+            recorded: numbers that increase in the order of recording.
             contents: payloads, or decoded messages.
         """
-        self._times_ns.append(times_ns)
-        self._sequences.append(sequences)
-        self._log_times_ns.append(log_times_ns)
+        self._columns.append((times_ns, sequences, log_times_ns, recorded))
         self._contents += contents
 
     def take(self, upto_ns: int) -> tuple[Integers, Integers, list[Any]]:
         """Remove the messages up to a time, and return their times, log times and contents.
 
-        They are ordered by time, then sequence, then arrival.
+        They are ordered by time, then sequence, then arrival. A message that was recorded after a step of the
+        clock, and would be sorted among those before, counts right after them.
         """
-        times, sequences, log_times = (
-            np.concatenate([np.empty(0, np.int64), *arrays])
-            for arrays in (self._times_ns, self._sequences, self._log_times_ns)
-        )
+        none = np.empty(0, np.int64)
+        columns = zip((none, none, none, none), *self._columns, strict=True)
+        times, sequences, log_times, recorded = map(np.concatenate, columns)
         contents = self._contents
+        if not self._has_own_clock:
+            times = self._without_steps(times, sequences, recorded)
         if len(times) and not (times[1:] > times[:-1]).all():
             order = np.lexsort((sequences, times))
             times, sequences, log_times = times[order], sequences[order], log_times[order]
-            contents = [contents[i] for i in order.tolist()]
+            recorded, contents = recorded[order], [contents[i] for i in order.tolist()]
         count = int(np.searchsorted(times, upto_ns, "right"))
-        self._times_ns, self._sequences = [times[count:]], [sequences[count:]]
-        self._log_times_ns, self._contents = [log_times[count:]], contents[count:]
+        self._columns = [(times[count:], sequences[count:], log_times[count:], recorded[count:])]
+        self._contents = contents[count:]
         return times[:count], log_times[:count], contents[:count]
+
+    def _without_steps(self, times_ns: Integers, sequences: Integers, recorded: Integers) -> Integers:
+        """Return times that do not step back, if the sequence goes on where they do."""
+        if (recorded[1:] > recorded[:-1]).all() and (times_ns[1:] >= times_ns[:-1]).all():
+            return times_ns
+        order = np.argsort(recorded, kind="stable")
+        times = times_ns[order]
+        back = np.flatnonzero(times[1:] < times[:-1])
+        if not len(back) or not (np.diff(sequences[order]) > 0).all():
+            return times_ns
+        self.steps += len(back)
+        at = int(back[0])
+        self.first_step = self.first_step or ClockStep(int(times[at]), int(times[at + 1]))
+        # strictly increasing: what was recorded later counts later
+        number = np.arange(len(times))
+        moved = np.empty_like(times)
+        moved[order] = np.maximum.accumulate(times - number) + number
+        return moved
 
 
 def _number(value: object) -> float:

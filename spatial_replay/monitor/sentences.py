@@ -383,10 +383,16 @@ def gap_sentence(gap: Gap, first_ns: int) -> Sentence:
     if gap.missing == gap.samples:
         return Sentence(f"{gap.name} is missing in every sample.")
     many = f"{gap.name} is missing in {gap.missing:,} of {counted(gap.samples, 'sample')}"
-    if gap.is_at_start and gap.next_ns is not None:
-        # whole milliseconds, not past the sample
-        start = f"--from {(gap.next_ns - first_ns) // 10**6 / 1e3:.3f}s"
-        return Sentence(f"{many}, all before ", Instant(gap.next_ns, first_ns), f": {start} leaves them out.")
+    if gap.window is not None:
+        parts: list[str | Instant] = []
+        options = []
+        for word, option, at_ns in zip(("before ", "from "), ("--from", "--to"), gap.window, strict=True):
+            if at_ns is not None:
+                parts += [" or " if parts else "", word, Instant(at_ns, first_ns)]
+                # whole milliseconds, not past the sample
+                options.append(f"{option} {(at_ns - first_ns) // 10**6 / 1e3:.3f}s")
+        on = " on" if gap.window[1] is not None else ""
+        return Sentence(f"{many}, all ", *parts, f"{on}: {' '.join(options)} leaves them out.")
     first, last = Instant(gap.first_ns, first_ns), Instant(gap.last_ns, first_ns)
     if first == last:
         return Sentence(f"{many}, at ", first, ".")

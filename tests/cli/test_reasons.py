@@ -281,6 +281,24 @@ def test_replay_names_the_option_that_leaves_out_what_is_missing_at_the_start(
     assert run(["replay", log, "--spec", "near.spatial", "--from", "0.033s"]) == 0
 
 
+def test_replay_names_the_options_that_leave_out_what_is_missing_at_both_ends(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "near.spatial").write_text("spec near = G (cup dist plate >= 0)\n")
+    samples = [json.loads(line) for line in LOG.read_text().splitlines()]
+    for sample in (samples[0], *samples[-2:]):
+        sample["objects"] = [each for each in sample["objects"] if each["name"] != "plate"]
+    (folder / "both.jsonl").write_text("\n".join(map(json.dumps, samples)))
+    log = str(folder / "both.jsonl")
+    assert run(["replay", log, "--spec", "near.spatial"]) == 4
+    remedy = "--from 0.033s --to 9.933s"
+    expected = (
+        f"missing in 3 of 300 samples, all before 0.033 s or from 9.933 s on: {remedy} leaves them out."
+    )
+    assert expected in capsys.readouterr().out
+    assert run(["replay", log, "--spec", "near.spatial", *remedy.split()]) == 0
+
+
 def test_an_unknown_verdict_can_fail_a_gate(folder: Path) -> None:
     (folder / "unknown.spatial").write_text("spec s = G (cupp ovlp plate)\n")
     assert _document(folder, "unknown.spatial")[0] == 4

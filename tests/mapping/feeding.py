@@ -125,6 +125,7 @@ class Feed:
     messages: list[tuple[str, int, Any]] = field(default_factory=list)
     latched: frozenset[str] = frozenset()
     types: dict[str, str] = field(default_factory=dict)
+    counts: dict[str, int] = field(default_factory=dict)
 
     def add(self, topic: str, time_ns: int, content: Any) -> Feed:
         self.messages.append((topic, time_ns, content))
@@ -133,7 +134,8 @@ class Feed:
     def topics(self) -> list[Topic]:
         found = {topic: type_of(content) for topic, _, content in reversed(self.messages)} | self.types
         return [
-            Topic(name, kind, "cdr", latched=name in self.latched) for name, kind in sorted(found.items())
+            Topic(name, kind, "cdr", latched=name in self.latched, count=self.counts.get(name))
+            for name, kind in sorted(found.items())
         ]
 
     def decoder(self, topic: str) -> Decoder:

@@ -90,11 +90,13 @@ def test_an_object_that_a_complete_list_leaves_out_is_absent() -> None:
 def test_lists_that_are_empty_before_the_first_object_are_samples() -> None:
     def listed(*numbers: int, time_ns: int) -> Any:
         found = [ros("apriltag_msgs/AprilTagDetection", id=number) for number in numbers]
-        return ros("apriltag_msgs/AprilTagDetectionArray", header=header("", time_ns), detections=found)
+        return ros(
+            "apriltag_msgs/AprilTagDetectionArray", header=header("", SECOND + time_ns), detections=found
+        )
 
     def marked(*numbers: int, time_ns: int) -> Any:
         marks = [
-            ros("visualization_msgs/Marker", header=header("", time_ns), ns="m", id=number, type=1)
+            ros("visualization_msgs/Marker", header=header("", SECOND + time_ns), ns="m", id=number, type=1)
             for number in numbers
         ]
         return ros("visualization_msgs/MarkerArray", markers=marks)
@@ -103,19 +105,81 @@ def test_lists_that_are_empty_before_the_first_object_are_samples() -> None:
     for tick, numbers in enumerate([(), (), (), (1,), ()]):
         tags.add("/tags", tick + 9, listed(*numbers, time_ns=tick * SECOND))
         marks.add("/marks", tick + 9, marked(*numbers, time_ns=tick * SECOND))
-        stamp = {"stamp": {"sec": tick, "nanosec": 0}}
+        stamp = {"stamp": {"sec": tick + 1, "nanosec": 0}}
         each = [{"id": number, "x": 0.0, "y": 0.0, "header": stamp} for number in numbers]
         things.add("/things", tick + 9, {"header": stamp, "things": each})
     made = make("clock: header\ntopics: {/tags: {}}", tags)
-    assert seconds(made.trace.times_ns) == [0, 1, 2, 3, 4]
+    assert seconds(made.trace.times_ns) == [1, 2, 3, 4, 5]
     assert made.states("tag1")[:3] + made.states("tag1")[4] == "----"
     # objects have stamps of their own, and a list without objects that of its header
     made = make("clock: header\ntopics: {/things: {objects: 'things[*]', name: 't{id}'}}", things)
-    assert (seconds(made.trace.times_ns), made.states("t1")) == ([0, 1, 2, 3, 4], "---+-")
+    assert (seconds(made.trace.times_ns), made.states("t1")) == ([1, 2, 3, 4, 5], "---+-")
     # what has no stamp at all is counted
     made = make("clock: header\ntopics: {/marks: {}}", marks)
-    assert seconds(made.trace.times_ns) == [3]
-    assert "/marks: 4 messages without objects were left out" in made.remarks[0]
+    assert seconds(made.trace.times_ns) == [4]
+    assert "/marks: 4 messages were left out, without a stamp" in made.remarks[0]
+
+
+def test_messages_with_a_stamp_of_0_have_no_time_on_the_clock_header() -> None:
+    feed = Feed()
+    for tick in range(6):
+        stamp = tick * SECOND if tick > 2 else 0
+        feed.add("/p", tick, pose_stamped(tick, 0, time_ns=stamp))
+    made = make("clock: header\ntopics: {/p: {}}", feed)
+    assert seconds(made.trace.times_ns) == [3, 4, 5]
+    assert made.remarks == (
+        "test.bag: /p: 3 messages were left out, without a stamp, or with one of 0, for the clock header",
+    )
+
+
+def test_a_topic_whose_stamps_are_all_0_needs_another_clock() -> None:
+    feed = Feed().add("/p", 1, pose_stamped(0, 0, time_ns=SECOND)).add("/zone", 1, pose_stamped(0, 0))
+    with pytest.raises(UsageError, match=r"topics\./zone: .* no stamp; .*`clock: log` for this topic"):
+        make("clock: header\ntopics: {/p: {}, /zone: {}}", feed)
+    made = make("clock: header\ntopics: {/p: {}, /zone: {clock: log, max_age: forever}}", feed)
+    assert made.states("zone") == "+"
+
+
+@pytest.mark.parametrize("batch", [1, 7, 1000])
+def test_a_clock_that_steps_back_between_numbered_messages_is_remarked(batch: int) -> None:
+    feed = Feed()
+    for tick in range(40):
+        feed.add("/p", 10 * SECOND + tick * 100 * MS - (750 * MS if tick >= 20 else 0), point(tick))
+    made = make("topics: {/p: {}}", feed, batch=batch)
+    assert [made.centre(n, "p")[0] for n in range(40)] == list(range(40))
+    assert made.remarks == (
+        "test.bag: /p: the clock steps back 1 time though its messages are numbered on, first by 0.650 s at"
+        " 11.900 s: those recorded after a step count right after those before; cut the log there, or take"
+        " another `clock`",
+    )
+
+
+def counted_feed(**counts: int) -> Feed:
+    feed = Feed(counts={f"/{name}": count for name, count in counts.items()})
+    for name, count in counts.items():
+        for tick in range(count):
+            feed.add(f"/{name}", tick * SECOND // count, point(tick))
+    feed.messages.sort(key=lambda message: message[1])
+    return feed
+
+
+def test_without_a_choice_the_most_frequent_topic_is_sampled() -> None:
+    made = make("topics: {/zone: {}, /p: {}}", counted_feed(zone=1, p=20))
+    assert (len(made.trace), made.remarks) == (20, ())
+    # one that has signals alone may be ten times as frequent
+    signals = "topics: {/p: {}, /imu: {signals: {a: x}}}"
+    made = make(signals, counted_feed(p=4, imu=40))
+    assert len(made.trace) == 4
+
+
+def test_a_topic_that_is_sampled_too_rarely_is_remarked() -> None:
+    mapping = parse_mapping("sample: {topic: /zone}\ntopics: {/zone: {}, /p: {}}")
+    few, many = counted_feed(zone=1, p=9), counted_feed(zone=1, p=10)
+    assert ReadingPlan.of(mapping, few.topics()).remarks == ()
+    assert ReadingPlan.of(mapping, many.topics()).remarks == (
+        "samples are taken at /zone, which has 1 message, where /p has 10; `sample: {topic: /p}` takes one at"
+        " each of these",
+    )
 
 
 def test_a_max_age_of_the_file_counts_for_latched_topics_and_markers_too() -> None:
@@ -145,9 +209,9 @@ def test_messages_out_of_order_by_up_to_a_second_are_sorted() -> None:
 
     feed = Feed()
     for number, tick in enumerate([0, 5, 2, 9, 4, 12]):
-        feed.add("/p", number, stamped(tick, tick * 100 * MS))
+        feed.add("/p", number, stamped(tick, SECOND + tick * 100 * MS))
     made = make("clock: header\ntopics: {/p: {}}", feed)
-    assert seconds(made.trace.times_ns) == pytest.approx([0, 0.2, 0.4, 0.5, 0.9, 1.2])
+    assert seconds(made.trace.times_ns) == pytest.approx([1, 1.2, 1.4, 1.5, 1.9, 2.2])
     assert [made.centre(n, "p")[0] for n in range(6)] == [0, 2, 4, 5, 9, 12]
 
 
@@ -190,14 +254,15 @@ def test_stamps_may_be_as_late_as_is_said(batch: int) -> None:
     feed = Feed()
     # a detector whose stamps are three seconds old when they are logged, beside one that is quick
     for tick in range(40):
-        feed.add("/quick", tick * 100 * MS, pose_stamped(tick, 0, time_ns=tick * 100 * MS))
-        feed.add("/slow", tick * 100 * MS + 1, pose_stamped(tick, 5, time_ns=max(0, tick - 30) * 100 * MS))
+        at, late = ((1 + each) * 100 * MS for each in (tick, max(0, tick - 30)))
+        feed.add("/quick", at, pose_stamped(tick, 0, time_ns=at))
+        feed.add("/slow", at + 1, pose_stamped(tick, 5, time_ns=late))
     text = "clock: header\ntopics: {/quick: {}, /slow: {max_age: forever}}"
     with pytest.raises(LogError, match=r"time jumps back by \d\.\d{3} s, from \d\.\d{3} s to .*--late 5s"):
         make(text, feed, batch=batch)
     for late_ns in (5 * SECOND, LATEST_NS):
         made = make(text, feed, batch=batch, late_ns=late_ns)
-        assert seconds(made.trace.times_ns) == [tick / 10 for tick in range(40)]
+        assert seconds(made.trace.times_ns) == [(1 + tick) / 10 for tick in range(40)]
         assert made.centre(5, "slow") == (35.0, 5.0)
 
 

@@ -40,7 +40,8 @@ class Gap:
         missing, samples: in how many of how many samples it is missing.
         first_ns, last_ns: the first and the last of these.
         next_ns: the sample after the last of these; None if there is none.
-        is_at_start: whether they are the first samples, without another one between.
+        window: the start, and the end (not included), of the samples between missing ones at the ends of a
+            log; None if others are missing.
     """
 
     name: str
@@ -49,7 +50,7 @@ class Gap:
     first_ns: int
     last_ns: int
     next_ns: int | None
-    is_at_start: bool
+    window: tuple[int | None, int | None] | None
 
 
 class Evidence:
@@ -208,6 +209,13 @@ def is_missing(trace: Trace, part: NamedPart) -> NDArray[np.bool_]:
 def _gap(name: str, missing: NDArray[np.bool_], times_ns: Integers) -> Gap:
     at = np.flatnonzero(missing)
     first, last = int(at[0]), int(at[-1])
+    # leading and trailing samples, without another one between
+    begin, end = int(np.argmin(missing)), len(missing) - int(np.argmin(missing[::-1]))
+    is_at_ends = 0 < begin + len(missing) - end == len(at) < len(missing)
+    window = (
+        int(times_ns[begin]) if begin else None,
+        int(times_ns[end]) if end < len(missing) else None,
+    )
     return Gap(
         name,
         len(at),
@@ -215,5 +223,5 @@ def _gap(name: str, missing: NDArray[np.bool_], times_ns: Integers) -> Gap:
         int(times_ns[first]),
         int(times_ns[last]),
         int(times_ns[last + 1]) if last + 1 < len(missing) else None,
-        last + 1 == len(at),
+        window if is_at_ends else None,
     )
