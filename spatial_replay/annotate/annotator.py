@@ -30,7 +30,6 @@ from spatial_replay.annotate.standing import FinalStanding, StandingEncoder
 from spatial_replay.annotate.violations import EvaluatedResult, violated_since
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.messages import Channel, Messages, messages_of
-from spatial_replay.logs.payloads import chosen_payloads, joined_payloads
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.schemas.Robustness_pb2 import Robustness, StandingUpdate
 from spatial_replay.logs.schemas.Specification_pb2 import Specification as SpecificationMessage
@@ -329,7 +328,8 @@ class Annotator:
             return self._messages(channel, blocks[0].times_ns, encoded[0])
         times_ns = np.concatenate([np.empty(0, np.int64), *(block.times_ns for block in blocks)])
         order = np.argsort(times_ns, kind="stable")
-        return self._messages(channel, times_ns[order], chosen_payloads(joined_payloads(encoded), order))
+        payloads = [payload for each in encoded for payload in each]
+        return self._messages(channel, times_ns[order], [payloads[place] for place in order.tolist()])
 
     def _messages(self, channel: Channel, times_ns: Integers, payloads: Sequence[bytes]) -> Messages:
         first = self._written[channel.topic]

@@ -16,8 +16,7 @@ from spatial_replay.automata.guards import Transition
 from spatial_replay.errors import NoAutomatonError
 from spatial_replay.geometry.arrays import Flags, Integers, combined, equal_places
 from spatial_replay.logs.messages import Attachment
-from spatial_replay.logs.objects.wire import WireTemplate
-from spatial_replay.logs.payloads import Filled, filled_in
+from spatial_replay.logs.objects.wire import WireTemplate, placed
 from spatial_replay.logs.schemas import AutomatonState_pb2
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.topics import AUTOMATA_PREFIX
@@ -86,7 +85,7 @@ class AutomatonRun:
         values = self._values(block)
         before, after = self._steps(values)
         keys, groups = _distinct(before, after)
-        filled = []
+        encoded = []
         for number, key in enumerate(keys):
             members = np.flatnonzero(groups == number)
             template = self._template(key, before[members[0]], after[members[0]])
@@ -94,8 +93,8 @@ class AutomatonRun:
             marks[:, :-3] = _TRUTHS[values[:, members]].T
             marks[:, -3:] = self._summary(after[members[0]])
             words = block.times_ns[members].astype(np.uint64)[:, None]
-            filled.append((members, Filled(template, words, marks)))
-        return filled_in(len(block.times_ns), filled)
+            encoded.append((members, template.encode(words, marks)))
+        return placed(len(block.times_ns), encoded)
 
     def pass_over(self, block: SeriesBlock) -> None:
         """Take in the next samples without a message."""

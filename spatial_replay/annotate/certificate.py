@@ -8,74 +8,19 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections import deque
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spatial_replay import __version__
-from spatial_replay.cores import Work, drop
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.messages import Messages
-from spatial_replay.logs.payloads import columns_of, side_by_side
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.spec.format import format_specification
 from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.trace import ABSENT, Trace
-
-_MOST_WAITING = 8
-_MOST_WAITING_BYTES = 16 * 2**20
-"""Pieces of an evaluation, and bytes of them, that may wait to be hashed when another one comes, so that
-memory stays bounded."""
-
-
-class Hashing:
-    """Hashes pieces of an evaluation in their order, on whichever core is free."""
-
-    def __init__(self) -> None:
-        self._waiting: deque[tuple[int, Work[None]]] = deque()
-        self._waiting_bytes = 0
-
-    def take(self, size: int, add: Callable[[], None]) -> None:
-        """Call `add` for a piece of so many bytes, which must not change afterwards.
-
-        The piece itself is in memory anyway: however large, it waits only for those before it.
-        """
-        while self._waiting and (
-            self._waiting[0][1].is_done
-            or len(self._waiting) >= _MOST_WAITING
-            or self._waiting_bytes > _MOST_WAITING_BYTES
-        ):
-            self._await_first()
-        self._waiting_bytes += size
-        before = self._waiting[-1][1] if self._waiting else None
-        work = Work(partial(_after, before, add), waits=True)
-        self._waiting.append((size, work))
-        work.hand_out()
-
-    def finish(self) -> None:
-        """Wait until everything was taken in."""
-        while self._waiting:
-            self._await_first()
-
-    def give_up(self) -> None:
-        """Take in no more."""
-        drop(hashed for _, hashed in self._waiting)
-
-    def _await_first(self) -> None:
-        size, hashed = self._waiting[0]
-        hashed.result()
-        self._waiting.popleft()
-        self._waiting_bytes -= size
-
-
-def _after(before: Work[None] | None, add: Callable[[], None]) -> None:
-    if before is not None:
-        before.result()
-    add()
 
 
 class SampleHash:
@@ -151,13 +96,14 @@ class MessageHash:
         codes = codes[messages.channel]
         for code in np.flatnonzero(np.bincount(codes)).tolist():
             rows = np.flatnonzero(codes == code)
-            lengths, payloads = side_by_side(messages.payloads, rows)
+            payloads = [messages.payloads[row] for row in rows.tolist()]
+            lengths = np.fromiter(map(len, payloads), np.int64, len(payloads))
             hashes = self._topics.setdefault(
                 topics[code], (hashlib.sha256(), hashlib.sha256(), hashlib.sha256())
             )
             _take_in(hashes[0], _integers(messages.log_time_ns[rows]))
             _take_in(hashes[1], _integers(lengths))
-            _take_in(hashes[2], payloads)
+            _take_in(hashes[2], b"".join(payloads))
 
     def hexdigest(self) -> str:
         total = hashlib.sha256()
@@ -220,8 +166,6 @@ class EvaluationHashes:
     def __init__(self, names: Sequence[tuple[str, str | None]]) -> None:
         """Start before the first sample; each result has a name and, of a template, an object."""
         self._samples, self._messages, self._results = SampleHash(), MessageHash(), ResultHash(names)
-        self._of_samples, self._of_messages, self._of_results = Hashing(), Hashing(), Hashing()
-        self._hashing = self._of_samples, self._of_messages, self._of_results
 
     def add(self, trace: Trace, own: Messages, results: Sequence[SeriesBlock]) -> None:
         """Take in the next samples, the log's own messages, and the numbers of each result."""
@@ -230,21 +174,11 @@ class EvaluationHashes:
 
     def add_samples(self, trace: Trace, own: Messages) -> None:
         """Take in the next samples and the log's own messages; their results follow, in any pieces."""
-        self._of_samples.take(trace.nbytes, partial(self._samples.add, trace))
-        size = int(columns_of(own.payloads).sizes.sum())
-        self._of_messages.take(size, partial(self._messages.add, own))
+        self._samples.add(trace)
+        self._messages.add(own)
 
     def add_results(self, results: Sequence[SeriesBlock]) -> None:
         """Take in the next numbers of each result."""
-        size = sum(block.series.nbytes for block in results)
-        self._of_results.take(size, partial(self._take_in_results, results))
-
-    def give_up(self) -> None:
-        """Take in no more, since there will be no certificate."""
-        for hashing in self._hashing:
-            hashing.give_up()
-
-    def _take_in_results(self, results: Sequence[SeriesBlock]) -> None:
         for index, block in enumerate(results):
             self._results.add(index, block.series)
 
@@ -256,8 +190,6 @@ class EvaluationHashes:
         Args:
             plan: the metadata of a planned run.
         """
-        for hashing in self._hashing:
-            hashing.finish()
         return {
             "samples_sha256": self._samples.hexdigest(),
             "messages_sha256": self._messages.hexdigest(),

@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spatial_replay.compiled import copying_kernel, floats_at, integers_at
 from spatial_replay.geometry.arrays import Floats, Integers
 
 
@@ -71,82 +70,16 @@ def standing_of(
         (S,) numbers of `Standing`, and (S,) its robustness, in the sign that counts, where it holds or is
         violated; else NaN.
     """
-    standing, numbers = np.empty(len(at), np.uint8), np.empty(len(at))
-    if len(at):
-        series, at = np.ascontiguousarray(series), np.ascontiguousarray(at)
-        around = np.array([own, conjunct or _NONE, obligation or _NONE], np.int64)
-        nodes, _, samples = series.shape
-        _stand(series.ctypes.data, nodes, samples, at.ctypes.data, around, standing, numbers)
-    return standing, numbers
-
-
-_NONE = Obligation(-1, 0.0)
-
-_FULFILLED, _HOLDING, _VIOLATED, _PENDING, _UNKNOWN = map(int, Standing)
-
-
-def _stand_by_arrays(
-    series_at: int,
-    nodes: int,
-    samples: int,
-    at_at: int,
-    around: Integers,
-    standing: NDArray[np.uint8],
-    numbers: Floats,
-) -> None:
-    """Do what `_stand` does, all samples together."""
-    series, at = floats_at(series_at, (nodes, 4, samples)), integers_at(at_at, len(standing))
-    own, conjunct, obligation = (Obligation(*each) for each in around.tolist())
     now = own.sign * series[own.node, 1, at]
-    standing[:] = _UNKNOWN
-    standing[now >= 0.0] = _HOLDING
-    is_pending = np.full(now.shape, conjunct.node < 0)
+    standing = np.full(now.shape, Standing.UNKNOWN, np.uint8)
+    standing[now >= 0.0] = Standing.HOLDING
+    is_pending = np.full(now.shape, conjunct is None)
     for each in (conjunct, obligation):
-        if each.node >= 0:
+        if each is not None:
             is_pending |= each.is_open(series, at)
     fails = now < 0.0
-    standing[fails] = np.where(is_pending[fails], _PENDING, _VIOLATED)
-    if obligation.node >= 0:
-        standing[obligation.is_fulfilled(series, at)] = _FULFILLED
-    numbers[:] = np.where((standing == _HOLDING) | (standing == _VIOLATED), now, np.nan)
-
-
-@copying_kernel(_stand_by_arrays)
-def _stand(
-    series_at: int,
-    nodes: int,
-    samples: int,
-    at_at: int,
-    around: Integers,
-    standing: NDArray[np.uint8],
-    numbers: Floats,
-) -> None:
-    """Fill in `standing` and `numbers` as `standing_of` returns them.
-
-    Args:
-        around: (3, 2), the requirement, its conjunct and its obligation: a node, -1 for none, and a sign.
-    """
-    at = integers_at(at_at, standing.shape[0])
-    for s in range(standing.shape[0]):
-        t = series_at + 8 * at[s]
-        now = around[0, 1] * floats_at(t + 8 * samples * (4 * around[0, 0] + 1), 1)[0]
-        is_pending, is_fulfilled = around[1, 0] < 0, False
-        for k in range(1, 3):
-            node, sign = around[k, 0], around[k, 1]
-            if node >= 0:
-                lower = floats_at(t + 8 * samples * (4 * node + 2), 1)[0]
-                upper = floats_at(t + 8 * samples * (4 * node + 3), 1)[0]
-                is_pending = is_pending or (upper >= 0.0 if sign > 0 else lower <= 0.0)
-                if k == 2:
-                    is_fulfilled = lower >= 0.0 if sign > 0 else upper < 0.0
-        numbers[s] = np.nan
-        if is_fulfilled:
-            standing[s] = _FULFILLED
-        elif now >= 0.0:
-            standing[s], numbers[s] = _HOLDING, now
-        elif now < 0.0 and is_pending:
-            standing[s] = _PENDING
-        elif now < 0.0:
-            standing[s], numbers[s] = _VIOLATED, now
-        else:
-            standing[s] = _UNKNOWN
+    standing[fails] = np.where(is_pending[fails], Standing.PENDING, Standing.VIOLATED)
+    if obligation is not None:
+        standing[obligation.is_fulfilled(series, at)] = Standing.FULFILLED
+    counts = (standing == Standing.HOLDING) | (standing == Standing.VIOLATED)
+    return standing, np.where(counts, now, np.nan)

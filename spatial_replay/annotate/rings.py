@@ -6,7 +6,6 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from spatial_replay.compiled import copying_kernel, floats_at, integers_at
 from spatial_replay.geometry.arrays import (
     Floats,
     Integers,
@@ -104,41 +103,10 @@ def boxes(points: Floats, start: Integers) -> tuple[Floats, Floats]:
         points: (P, 2).
         start: (R + 1,), where each row begins and the last one ends; none is empty.
     """
-    low, high = np.empty((len(start) - 1, 2)), np.empty((len(start) - 1, 2))
-    if len(low):
-        points, start = np.ascontiguousarray(points), np.ascontiguousarray(start)
-        _boxes(points.ctypes.data, start.ctypes.data, low, high)
-    return low, high
-
-
-def _boxes_by_corner(points_at: int, start_at: int, low: Floats, high: Floats) -> None:
-    """Do what `_boxes` does, the same corner of all rows together."""
-    start = integers_at(start_at, len(low) + 1)
-    points, count = floats_at(points_at, (int(start[-1]), 2)), int(start[1] - start[0])
-    if count > ROUND or (np.diff(start) != count).any():
-        low[:] = np.minimum.reduceat(points, start[:-1])
-        high[:] = np.maximum.reduceat(points, start[:-1])
-        return
-    corners = points[start[0] : start[-1]].reshape(-1, count, 2)
-    low[:] = high[:] = corners[:, 0]
-    for corner in range(1, count):
-        np.minimum(low, corners[:, corner], out=low)
-        np.maximum(high, corners[:, corner], out=high)
-
-
-@copying_kernel(_boxes_by_corner)
-def _boxes(points_at: int, start_at: int, low: Floats, high: Floats) -> None:
-    """Fill in the least and the greatest coordinates (R, 2) of rows of points; NaN if one of them is."""
-    start = integers_at(start_at, low.shape[0] + 1)
-    points = floats_at(points_at, 2 * start[low.shape[0]])
-    for row in range(low.shape[0]):
-        for axis in range(2):
-            least = greatest = points[2 * start[row] + axis]
-            for k in range(start[row] + 1, start[row + 1]):
-                number = points[2 * k + axis]
-                least = number if number < least or number != number else least
-                greatest = number if number > greatest or number != number else greatest
-            low[row, axis], high[row, axis] = least, greatest
+    if len(start) < 2:
+        return np.empty((0, 2)), np.empty((0, 2))
+    points = points[: start[-1]]
+    return np.minimum.reduceat(points, start[:-1]), np.maximum.reduceat(points, start[:-1])
 
 
 _ANGLES = np.arange(ROUND) * (2.0 * np.pi / ROUND)

@@ -10,12 +10,9 @@ import numpy as np
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
-from spatial_replay.compiled import copying_kernel, floats_at
 from spatial_replay.errors import LogError
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.logs.message_numbers import Columns, gathered
-from spatial_replay.logs.objects.wire import LayoutError, WireTemplate, rows_of
-from spatial_replay.logs.payloads import Filled, filled_in
+from spatial_replay.logs.objects.wire import LayoutError, WireTemplate, rows_of, words_of
 from spatial_replay.logs.schemas.Robustness_pb2 import (
     FAILS_SO_FAR,
     HOLDS_SO_FAR,
@@ -62,7 +59,7 @@ def encode_robustness(
     series: Floats,
     *,
     final: bool = False,
-) -> Sequence[bytes]:
+) -> list[bytes]:
     """Return one message for each sample.
 
     Args:
@@ -73,12 +70,10 @@ def encode_robustness(
         series: (N, 4, T): value, now, lower, upper.
         final: whether lower and upper are those of the finished log.
     """
-    count = len(times_ns)
-    numbers = series.reshape(4 * len(names), count)
-    words = gathered([Columns(times_ns[:, None]), Columns(numbers.T)], count)
-    marks = gathered([Columns(standing_codes(series, final=final).T)], count, np.uint8)
+    numbers = series.reshape(4 * len(names), len(times_ns))
+    words = words_of([times_ns[:, None], numbers.T])
     template = _encoded_once(name, object, tuple(names), final)
-    return filled_in(count, [(np.arange(count), Filled(template, words, marks))])
+    return template.encode(words, standing_codes(series, final=final).T)
 
 
 @lru_cache(64)
@@ -105,35 +100,14 @@ def standing_codes(series: Floats, *, final: bool = False) -> Codes:
         series: (N, 4, T): value, now, lower, upper.
         final: whether lower and upper are those of the finished log; otherwise more samples may come.
     """
-    series = np.ascontiguousarray(series)
-    codes = np.empty((len(series), series.shape[2]), np.uint8)
-    if codes.size:
-        open_codes = (UNKNOWN, UNKNOWN) if final else (HOLDS_SO_FAR, FAILS_SO_FAR)
-        _codes(series.ctypes.data, *codes.shape, *open_codes, codes)
-    return codes
-
-
-def _codes_by_mask(series_at: int, nodes: int, samples: int, holds: int, fails: int, codes: Codes) -> None:
-    """Do what `_codes` does, with arrays of all numbers."""
-    value, _, lower, upper = floats_at(series_at, (nodes, 4, samples)).swapaxes(0, 1)
-    codes[:] = UNKNOWN
-    codes[value >= 0.0] = holds
-    codes[value < 0.0] = fails
+    value, _, lower, upper = series.swapaxes(0, 1)
+    codes = np.full(value.shape, UNKNOWN, np.uint8)
+    if not final:
+        codes[value >= 0.0] = HOLDS_SO_FAR
+        codes[value < 0.0] = FAILS_SO_FAR
     codes[upper < 0.0] = VIOLATED
     codes[lower >= 0.0] = SATISFIED
-
-
-@copying_kernel(_codes_by_mask)
-def _codes(series_at: int, nodes: int, samples: int, holds: int, fails: int, codes: Codes) -> None:
-    """Fill in numbers of `Standing` (N, T); `holds` and `fails` are those of what is open."""
-    for n in range(nodes):
-        own = series_at + 32 * n * samples
-        value = floats_at(own, samples)
-        lower, upper = floats_at(own + 16 * samples, samples), floats_at(own + 24 * samples, samples)
-        for t in range(samples):
-            code = holds if value[t] >= 0.0 else fails if value[t] < 0.0 else UNKNOWN
-            code = VIOLATED if upper[t] < 0.0 else code
-            codes[n, t] = SATISFIED if lower[t] >= 0.0 else code
+    return codes
 
 
 def decode_robustness(payloads: Sequence[bytes]) -> list[RobustnessSeries]:

@@ -16,9 +16,7 @@ from spatial_replay.annotate.robustness import Codes, standing_codes
 from spatial_replay.annotate.scene.scene_update import spaced
 from spatial_replay.annotate.specification import ReportedTree, unit_of
 from spatial_replay.geometry.arrays import Floats, Integers, combined, equal_places
-from spatial_replay.logs.message_numbers import Columns, gathered
-from spatial_replay.logs.objects.wire import WireTemplate
-from spatial_replay.logs.payloads import Filled, filled_in
+from spatial_replay.logs.objects.wire import WireTemplate, placed, rounded, words_of
 from spatial_replay.logs.schemas.Robustness_pb2 import (
     FAILS_NOW,
     FAILS_SO_FAR,
@@ -245,7 +243,7 @@ class StandingEncoder:
         )
         counts = (of_results == VIOLATED).sum(axis=0)
         marks, numbers = self._columns(series, codes)
-        filled_groups, of_violated = [], dict[int, tuple[Floats, Floats]]()
+        encoded, of_violated = [], dict[int, tuple[Floats, Floats]]()
         is_listed = np.arange(len(order))[:, None] < counts
         keys = [worst, *(which for _, which in words), *np.where(is_listed, order, -1)]
         for members in equal_places(combined(keys, len(times_ns))):
@@ -254,18 +252,17 @@ class StandingEncoder:
             said = tuple(texts[which[first]] for texts, which in words)
             layout = _Layout(int(worst[first]), said, violated, final)
             now = series[layout.worst][:_MOST_ROWS, 1]
-            own = [Columns(each, members) for each in (times_ns[:, None], *numbers)]
+            own = [each[members] for each in (times_ns[:, None], *numbers)]
             for each, _ in layout.violated:
                 if each not in of_violated:
                     seconds = (np.minimum(since_ns[each], times_ns) - (self._first_ns or 0)) / 1e9
                     of_violated[each] = np.round(seconds, 3)[:, None], -series[each][0, 3, :, None]
                 since, by = of_violated[each]
-                own += [Columns(since, members), Columns(by, members, is_rounded=True)]
-            own.append(Columns(now.T, members, is_rounded=True))
-            own_marks = [Columns(each, members) for each in (*marks, _present(now).T)]
-            of = (gathered(own, len(members)), gathered(own_marks, len(members), np.uint8))
-            filled_groups.append((members, Filled(self._template(layout), *of)))
-        return filled_in(len(times_ns), filled_groups)
+                own += [since[members], rounded(by[members])]
+            own.append(rounded(now.T[members]))
+            own_marks = np.concatenate([each[members] for each in (*marks, _present(now).T)], axis=1)
+            encoded.append((members, self._template(layout).encode(words_of(own), own_marks)))
+        return placed(len(times_ns), encoded)
 
     def _columns(self, series: Sequence[Floats], codes: Sequence[Codes]) -> tuple[list[Codes], list[Floats]]:
         """Return the standing (S, 1) and the robustness (S, 1) of each entry of `results`."""

@@ -21,7 +21,7 @@ import numpy as np
 
 from spatial_replay.errors import LogError
 from spatial_replay.geometry.arrays import Integers
-from spatial_replay.logs.mcap.chunks import too_many_waiting
+from spatial_replay.logs.mcap.read import too_many_waiting
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.text import Instant
 

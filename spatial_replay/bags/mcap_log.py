@@ -9,28 +9,34 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from functools import cached_property
-from typing import BinaryIO
 
 import numpy as np
-from mcap.opcode import Opcode
 
 from spatial_replay.bags.columns import Columns, MessageColumns, in_order, places_in
 from spatial_replay.bags.decoders import topic_of, topics_by_name
 from spatial_replay.bags.reader import MessageReader
 from spatial_replay.bags.topic import Topic
 from spatial_replay.geometry.arrays import Integers
-from spatial_replay.logs.mcap.chunk_records import DamageError, walk_records
-from spatial_replay.logs.mcap.chunk_walk import ChunkWalk
-from spatial_replay.logs.mcap.chunks import ChunkPlace, most_waiting, plan_places, read_records
-from spatial_replay.logs.mcap.index import Directory, iter_attachments, iter_metadata, read_directory
-from spatial_replay.logs.mcap.reader import directory_remarks
+from spatial_replay.logs.mcap.index import (
+    ChunkPlace,
+    DamageError,
+    Directory,
+    iter_attachments,
+    iter_metadata,
+    read_directory,
+)
+from spatial_replay.logs.mcap.read import (
+    ChunkWalk,
+    directory_remarks,
+    iter_records,
+    most_waiting,
+    split_records,
+)
 from spatial_replay.logs.messages import Attachment, Channel
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.logs.remote import LogFile, open_file
 from spatial_replay.text import Instant, Sentence
 from spatial_replay.trace.sample import LATEST_NS
-
-_MESSAGE_FIELDS = 22
 
 
 class McapLog(MessageReader):
@@ -101,8 +107,11 @@ class McapLog(MessageReader):
             places.sort(key=lambda ranked: ranked[1].start_ns)
         self._walked, self._walked_all = 0, len(places) == len(directory.chunks)
         with open_file(self._file) as stream:
-            plan_places(stream, (place for _, place in places))
-            contents = (self._messages(stream, *ranked, wanted, first, last) for ranked in places)
+            found = iter_records(stream, [place for _, place in places])
+            contents = (
+                self._messages(rank, place, content, wanted, first, last)
+                for (rank, _), (place, content) in zip(places, found, strict=True)
+            )
             if as_recorded:
                 yield from contents
                 return
@@ -147,41 +156,45 @@ class McapLog(MessageReader):
         return np.array(sorted(self._contents[1]), np.int64)
 
     def _messages(
-        self, stream: BinaryIO, rank: int, place: ChunkPlace, wanted: dict[int, str], first: int, last: int
+        self,
+        rank: int,
+        place: ChunkPlace,
+        content: bytes | DamageError,
+        wanted: dict[int, str],
+        first: int,
+        last: int,
     ) -> MessageColumns:
         """Read the messages in a place; what is lost of them goes to the faults."""
         span = Sentence("messages between ", Instant(place.start_ns, 0), " and ", Instant(place.end_ns, 0))
-        try:
-            content = read_records(stream, place)
-        except DamageError as damage:
-            self._fault(place, Sentence(f"{damage}; the ", span, " are lost"))
+        if isinstance(content, DamageError):
+            self._fault(place, Sentence(f"{content}; the ", span, " are lost"))
             return MessageColumns()
-        heads, breaks_off = walk_records(content)
-        is_message = (heads.opcode == Opcode.MESSAGE) & (heads.end - heads.begin >= _MESSAGE_FIELDS)
-        if breaks_off:
+        split = split_records(content)
+        channel, times = split.heads["channel"], split.heads["log_time"]
+        if split.breaks_off:
             self._fault(
-                place, Sentence("a record breaks off; of the ", span, f", {is_message.sum()} could be read")
+                place, Sentence("a record breaks off; of the ", span, f", {len(channel)} could be read")
             )
-        self._walked += int(is_message.sum())
-        beyond = is_message & (heads.log_time > LATEST_NS)
+        self._walked += len(channel)
+        beyond = times > LATEST_NS
         if beyond.any():
             self._fault(place, Sentence(f"{beyond.sum()} of the ", span, " have a time beyond 2**63 - 1 ns"))
-        if len(unknown := set(np.unique(heads.channel[is_message]).tolist()) - self._contents[1].keys()):
+        if len(unknown := set(np.unique(channel).tolist()) - self._contents[1].keys()):
             self._fault(
                 place,
                 Sentence("some of the ", span, f" are of a channel {min(unknown)} that is not declared"),
             )
-        rows = is_message & np.isin(heads.channel, np.array(list(wanted), np.uint64))
-        rows &= (heads.log_time >= first) & (heads.log_time < last)
-        bounds = zip((heads.begin[rows] + _MESSAGE_FIELDS).tolist(), heads.end[rows].tolist(), strict=True)
+        is_chosen = np.isin(channel, list(wanted)) & (times >= first) & (times < last)
+        rows = np.flatnonzero(is_chosen)
+        heads = split.heads[rows]
         return MessageColumns(
-            [wanted[number] for number in heads.channel[rows].tolist()],
-            heads.log_time[rows].view(np.int64),
-            heads.publish_time[rows].view(np.int64),
-            heads.sequence[rows].view(np.int64),
-            [content[begin:end] for begin, end in bounds],
-            places_in(rank, np.flatnonzero(rows)),
-            np.searchsorted(self._numbers, heads.channel[rows].astype(np.int64)),
+            [wanted[number] for number in heads["channel"].tolist()],
+            heads["log_time"].astype(np.int64),
+            heads["publish_time"].astype(np.int64),
+            heads["sequence"].astype(np.int64),
+            [content[split.payloads[row]] for row in rows.tolist()],
+            places_in(rank, rows),
+            np.searchsorted(self._numbers, heads["channel"].astype(np.int64)),
         )
 
     def _fault(self, place: ChunkPlace, what: str) -> None:

@@ -31,8 +31,8 @@ from spatial_replay.bags.ros1_index import (
 from spatial_replay.bags.ros_definitions import full_type_name
 from spatial_replay.bags.topic import Topic
 from spatial_replay.geometry.arrays import Integers
-from spatial_replay.logs.mcap.chunk_records import DamageError
-from spatial_replay.logs.mcap.chunks import most_waiting
+from spatial_replay.logs.mcap.index import DamageError
+from spatial_replay.logs.mcap.read import most_waiting
 from spatial_replay.logs.messages import Channel, Schema
 from spatial_replay.text import Instant, Sentence
 

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from spatial_replay.compiled import kernel, piece
 from spatial_replay.geometry.arrays import Integers
-from spatial_replay.logs.mcap.chunk_records import DamageError
-from spatial_replay.logs.mcap.chunks import ALWAYS_ALLOWED, LARGEST_CHUNK, MOST_TIMES_LARGER
+from spatial_replay.logs.mcap.index import LARGEST_CHUNK, DamageError
+from spatial_replay.logs.mcap.read import ALWAYS_ALLOWED, MOST_TIMES_LARGER
 from spatial_replay.logs.read_options import FaultList
 
 BAG_MAGIC = b"#ROSBAG V2.0\n"

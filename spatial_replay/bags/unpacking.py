@@ -12,7 +12,8 @@ from typing import BinaryIO
 import zstandard
 
 from spatial_replay.errors import LogError, OutputError
-from spatial_replay.logs.mcap.chunks import ALWAYS_ALLOWED, LARGEST_CHUNK, MOST_TIMES_LARGER
+from spatial_replay.logs.mcap.index import LARGEST_CHUNK
+from spatial_replay.logs.mcap.read import ALWAYS_ALLOWED, MOST_TIMES_LARGER
 from spatial_replay.logs.output_file import open_output, output_error
 from spatial_replay.logs.read_options import FaultList
 

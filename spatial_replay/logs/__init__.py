@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 from spatial_replay.lazy import loaded_when_used
 
 if TYPE_CHECKING:
-    from spatial_replay.logs.mcap.reader import McapSource
+    from spatial_replay.logs.mcap.read import McapSource
     from spatial_replay.logs.mcap.summary import summarise_mcap
-    from spatial_replay.logs.mcap.writer import LogWriter
+    from spatial_replay.logs.mcap.write import LogWriter
     from spatial_replay.logs.messages import Attachment, Block, Channel, MemorySink, Messages, Schema
     from spatial_replay.logs.objects.decode import decode_objects
     from spatial_replay.logs.objects.encode import encode_objects
@@ -37,9 +37,9 @@ __all__ = [
 __getattr__, __dir__ = loaded_when_used(
     globals(),
     {
-        "mcap.reader": ("McapSource",),
+        "mcap.read": ("McapSource",),
         "mcap.summary": ("summarise_mcap",),
-        "mcap.writer": ("LogWriter",),
+        "mcap.write": ("LogWriter",),
         "messages": ("Attachment", "Block", "Channel", "MemorySink", "Messages", "Schema"),
         "objects.decode": ("decode_objects",),
         "objects.encode": ("encode_objects",),

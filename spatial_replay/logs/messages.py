@@ -14,7 +14,6 @@ from typing import Protocol
 import numpy as np
 
 from spatial_replay.geometry.arrays import Integers
-from spatial_replay.logs.payloads import chosen_payloads, joined_payloads
 from spatial_replay.trace.trace import Trace
 
 BLOCK_SAMPLES = 12_288
@@ -134,7 +133,7 @@ def join(streams: Sequence[Messages]) -> Messages:
         sequence=_joined([stream.sequence for stream in streams]),
         log_time_ns=_joined([stream.log_time_ns for stream in streams]),
         publish_time_ns=_joined([stream.publish_time_ns for stream in streams]),
-        payloads=joined_payloads([stream.payloads for stream in streams]),
+        payloads=[payload for stream in streams for payload in stream.payloads],
     )
 
 
@@ -146,7 +145,7 @@ def select(messages: Messages, chosen: Integers) -> Messages:
         sequence=messages.sequence[chosen],
         log_time_ns=messages.log_time_ns[chosen],
         publish_time_ns=messages.publish_time_ns[chosen],
-        payloads=chosen_payloads(messages.payloads, chosen),
+        payloads=[messages.payloads[place] for place in chosen.tolist()],
     )
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Protocol, TypeVar, cast
 
-from spatial_replay.cores import Work, drop
 from spatial_replay.errors import LogError
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.messages import BLOCK_SAMPLES, Attachment, Block
@@ -185,16 +185,12 @@ def read_blocks(
 
 
 def read_ahead(blocks: Generator[_Read, None, None]) -> Iterator[_Read]:
-    """Yield the same blocks, each read while the previous one is processed, if a core is free for that."""
-    waiting = Work(partial(next, blocks, None), waits=True)
-    try:
+    """Yield the same blocks, each read while the previous one is processed."""
+    with closing(blocks), ThreadPoolExecutor(1, "reading-ahead") as thread:
+        waiting = thread.submit(next, blocks, None)
         while (block := waiting.result()) is not None:
-            waiting = Work(partial(next, blocks, None), waits=True)
-            waiting.hand_out()
+            waiting = thread.submit(next, blocks, None)
             yield block
-    finally:
-        drop([waiting])
-        blocks.close()
 
 
 def reading_only(source: Source, keep: tuple[str, ...] = ()) -> Source:

@@ -14,7 +14,7 @@ import numpy as np
 
 from spatial_replay.errors import LogError, SpatialReplayError, UsageError
 from spatial_replay.lazy import Displayed
-from spatial_replay.logs.mcap.reader import McapSource
+from spatial_replay.logs.mcap.read import McapSource
 from spatial_replay.logs.messages import Block, Messages, merge, select
 from spatial_replay.logs.schemas.PlanDecision_pb2 import PlanDecision
 from spatial_replay.logs.source import Source, SourceOf, read_blocks

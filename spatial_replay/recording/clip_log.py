@@ -18,7 +18,7 @@ import numpy as np
 
 from spatial_replay.errors import OutputError, system_reason
 from spatial_replay.geometry.footprint import Footprint
-from spatial_replay.logs.mcap.writer import LogWriter
+from spatial_replay.logs.mcap.write import LogWriter
 from spatial_replay.logs.messages import Channel, Messages
 from spatial_replay.logs.output_file import open_output
 from spatial_replay.logs.topics import TRIGGER

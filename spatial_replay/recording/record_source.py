@@ -10,7 +10,7 @@ from itertools import chain
 from pathlib import Path
 
 from spatial_replay.errors import LogError, OutputError, UsageError
-from spatial_replay.logs.mcap.writer import LogWriter
+from spatial_replay.logs.mcap.write import LogWriter
 from spatial_replay.logs.output_file import Durability, open_output, refuse_inputs
 from spatial_replay.logs.source import Source, axes_of, read_blocks, reading_options, units_of
 from spatial_replay.recording.interruption import leaving, uninterrupted

@@ -18,7 +18,7 @@ from spatial_replay.errors import OutputError
 from spatial_replay.geometry.contact import contacts
 from spatial_replay.geometry.footprint import Footprint, FootprintBatch, TrackedObject
 from spatial_replay.geometry.measure import Operand
-from spatial_replay.logs.mcap.writer import LogWriter
+from spatial_replay.logs.mcap.write import LogWriter
 from spatial_replay.logs.messages import Messages
 from spatial_replay.logs.output_file import Durability, open_output
 from spatial_replay.logs.topics import PLAN_METADATA

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 from spatial_replay import __version__
 from spatial_replay.annotate.certificate import specifications_json
-from spatial_replay.cores import Work, drop
 from spatial_replay.errors import UsageError
-from spatial_replay.logs.messages import Messages, Sink
+from spatial_replay.logs.messages import Sink
 from spatial_replay.logs.source import Source, reading_options, units_metadata
 from spatial_replay.logs.topics import (
     AUTOMATA,
@@ -83,7 +81,7 @@ def run_replay(
     if output is None:
         return replay.run(advance=advance)
     # imported here since a replay without an annotated log needs no writer
-    from spatial_replay.logs.mcap.writer import WHOLE_CHUNK_NS, LogWriter
+    from spatial_replay.logs.mcap.write import WHOLE_CHUNK_NS, LogWriter
     from spatial_replay.logs.output_file import replacing
 
     with ExitStack() as stack:
@@ -91,8 +89,7 @@ def run_replay(
             LogWriter(stack.enter_context(replacing(output, inputs)), chunk_ns=WHOLE_CHUNK_NS)
         )
         _begin(sink, source, replay, options, layer=layer)
-        with _behind(sink.write_messages) as write:
-            replayed = replay.run(write, layer=layer, advance=advance)
+        replayed = replay.run(sink.write_messages, layer=layer, advance=advance)
         layout = replay.layout()
         sink.add_attachment(layout.name, layout.media_type, layout.data)
         texts = {
@@ -102,26 +99,6 @@ def run_replay(
         sink.add_metadata(VERDICTS, texts)
         sink.add_metadata(CERTIFICATE, replayed.certificate)
     return replayed
-
-
-@contextmanager
-def _behind(write: Callable[[Messages], None]) -> Iterator[Callable[[Messages], None]]:
-    """Give what writes messages in order, while the next ones are made, if a core is free for that."""
-    waiting = list[Work[None]]()
-
-    def write_behind(messages: Messages) -> None:
-        # no more than these wait, so that memory stays bounded
-        for each in waiting:
-            each.result()
-        waiting[:] = [Work(partial(write, messages), waits=True)]
-        waiting[0].hand_out()
-
-    try:
-        yield write_behind
-        for each in waiting:
-            each.result()
-    finally:
-        drop(waiting)
 
 
 def load_files(

@@ -14,7 +14,7 @@ from spatial_replay.bags.decoders import decoder_of
 from spatial_replay.bags.ros_definitions import full_type_name
 from spatial_replay.bags.topic import Topic
 from spatial_replay.errors import LogError
-from spatial_replay.logs.mcap.reader import McapSource
+from spatial_replay.logs.mcap.read import McapSource
 from spatial_replay.logs.messages import Block, Channel, Messages, merge, select
 from spatial_replay.logs.source import Source, SourceOf, read_blocks
 from spatial_replay.logs.topics import OBJECTS

@@ -178,12 +178,7 @@ class Replay:
             UsageError: no sample in the window.
             SpecificationError: names that the log never has, if names are strict.
         """
-        try:
-            self._pass(write, layer=layer, advance=advance)
-        except BaseException:
-            if self._hashes is not None:
-                self._hashes.give_up()
-            raise
+        self._pass(write, layer=layer, advance=advance)
         replayed = self._replayed()
         if write is not None:
             write(self._evaluation.end(self._end_ns, replayed.results))

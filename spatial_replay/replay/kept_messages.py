@@ -47,7 +47,7 @@ def _check_patterns(source: Source, patterns: Sequence[str]) -> None:
 
 
 def _topics(source: Source) -> list[str]:
-    from spatial_replay.logs.mcap.reader import McapSource
+    from spatial_replay.logs.mcap.read import McapSource
 
     if isinstance(source, McapSource):
         with source.open_walk() as walk:

@@ -18,7 +18,7 @@ from google.protobuf.message import DecodeError
 from spatial_replay.annotate.robustness import RobustnessSeries, decode_robustness
 from spatial_replay.errors import LogError, UsageError, importing
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.logs.mcap.reader import McapSource
+from spatial_replay.logs.mcap.read import McapSource
 from spatial_replay.logs.output_file import replacing
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.schemas.Specification_pb2 import Specification, SpecificationResult

@@ -10,7 +10,7 @@ from typing import Any
 
 from spatial_replay.annotate.certificate import PLAN_SHA256, plan_sha256
 from spatial_replay.errors import LogError, UsageError
-from spatial_replay.logs.mcap.reader import McapSource
+from spatial_replay.logs.mcap.read import McapSource
 from spatial_replay.logs.source import Source
 from spatial_replay.logs.topics import CERTIFICATE, METADATA, PLAN_METADATA
 from spatial_replay.monitor.semantics import Semantics

@@ -21,7 +21,6 @@ from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs import topics as log_topics
 from spatial_replay.logs.messages import Messages
 from spatial_replay.logs.output_file import refuse_inputs, replacing
-from spatial_replay.logs.payloads import chosen_payloads, iter_alike
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.source import Source, axes_of
 from spatial_replay.logs.source import units_of as declared_units
@@ -68,8 +67,8 @@ class Collector:
         chosen = np.flatnonzero(np.isin(messages.channel, collected))
         columns = (messages.channel, messages.sequence)
         numbers = zip(*(column[chosen].tolist() for column in columns), strict=True)
-        payloads = chosen_payloads(messages.payloads, chosen)
-        for (channel, sequence), payload in zip(numbers, payloads, strict=True):
+        for place, (channel, sequence) in zip(chosen.tolist(), numbers, strict=True):
+            payload = messages.payloads[place]
             match topics[channel]:
                 case log_topics.EVENTS:
                     self.events.append(event_of(payload))
@@ -81,17 +80,19 @@ class Collector:
                     self.decisions.redone.add_decision(payload)
                 case log_topics.REDONE_MAP:
                     self.decisions.redone.add_map(sequence, payload)
-        states = [number for number, topic in topics.items() if topic == log_topics.AUTOMATON]
-        chosen = np.flatnonzero(np.isin(messages.channel, states))
-        self._add_states(messages.log_time_ns[chosen], chosen_payloads(messages.payloads, chosen))
+        of_states = [number for number, topic in topics.items() if topic == log_topics.AUTOMATON]
+        chosen = np.flatnonzero(np.isin(messages.channel, of_states))
+        states = [messages.payloads[place] for place in chosen.tolist()]
+        self._add_states(messages.log_time_ns[chosen], states)
 
     def _add_states(self, times_ns: Integers, payloads: Sequence[bytes]) -> None:
-        groups: defaultdict[tuple[str, str], list[tuple[Integers, tuple[int, ...]]]] = defaultdict(list)
-        # those that differ in times and truths only have the same states
-        for places, payload in iter_alike(payloads):
-            message = AutomatonState.FromString(payload)
-            groups[message.specification, message.object].append((places, tuple(message.states)))
-        for result, own in groups.items():
+        places: defaultdict[tuple[str, str], defaultdict[tuple[int, ...], list[int]]] = defaultdict(
+            lambda: defaultdict(list)
+        )
+        for place, message in enumerate(map(AutomatonState.FromString, payloads)):
+            places[message.specification, message.object][tuple(message.states)].append(place)
+        for result, of_states in places.items():
+            own = [(np.array(each), states) for states, each in of_states.items()]
             self._paths[result].extend(times_ns, own)
 
     def path(self, name: str, object: str | None) -> StatePath:

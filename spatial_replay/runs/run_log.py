@@ -7,7 +7,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from spatial_replay.annotate.automaton_state import SpecAutomaton
-from spatial_replay.logs.mcap.writer import LogWriter
+from spatial_replay.logs.mcap.write import LogWriter
 from spatial_replay.logs.messages import Messages, merge
 from spatial_replay.logs.output_file import Durability, open_output, refuse_inputs
 from spatial_replay.monitor.verdict import Verdict

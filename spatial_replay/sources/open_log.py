@@ -332,7 +332,7 @@ def _open_messages(path: LogFile, kind: str, options: ReadOptions) -> Source:
 
 def _open_mcap(path: LogFile, kind: str, options: ReadOptions) -> Source:
     """Open our own log, which names its objects, or an external one, given a mapping."""
-    from spatial_replay.logs.mcap.reader import McapSource
+    from spatial_replay.logs.mcap.read import McapSource
 
     source = McapSource(path, kind, options.concave)
     if not options.given():

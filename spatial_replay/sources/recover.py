@@ -18,8 +18,8 @@ from spatial_replay.bags.reader import MessageReader
 from spatial_replay.bags.ros1 import Ros1Bag
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Integers
-from spatial_replay.logs.mcap.reader import is_samples
-from spatial_replay.logs.mcap.writer import WHOLE_CHUNK_NS, LogWriter
+from spatial_replay.logs.mcap.read import is_samples
+from spatial_replay.logs.mcap.write import WHOLE_CHUNK_NS, LogWriter
 from spatial_replay.logs.messages import Channel, Messages, select
 from spatial_replay.logs.objects.decode import decode_objects
 from spatial_replay.logs.output_file import refuse_inputs, replacing

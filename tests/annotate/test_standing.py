@@ -15,9 +15,8 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 
 import spatial_replay as sr
-from spatial_replay.compiled import only
 from spatial_replay.logs import MemorySource
-from spatial_replay.logs.message_numbers import Columns, gathered
+from spatial_replay.logs.objects.wire import rounded
 from spatial_replay.logs.schemas.Robustness_pb2 import (
     FAILS_NOW,
     FAILS_SO_FAR,
@@ -215,22 +214,12 @@ def test_a_fast_log_has_no_topic_for_viewers_above_60_hz(tmp_path: Path) -> None
         assert len(times) <= 60 * 0.4, (topic, kind)
 
 
-def shown_in_tables(numbers: list[float]) -> list[float]:
-    columns = [Columns(np.array(numbers)[:, None], is_rounded=True)]
-    found = []
-    for form in ("interpreted", "compiled"):
-        with only(form):
-            found.append(gathered(columns, len(numbers)))
-    assert found[0].tobytes() == found[1].tobytes()
-    return found[0][:, 0].view(np.float64).tolist()
-
-
 @given(st.floats(1e-15, 1e15, exclude_max=True), st.sampled_from([1.0, -1.0]))
 @example(1e3, 1.0)
 @example(float(np.nextafter(1e-3, 0.0)), 1.0)
 @example(float(np.nextafter(1e12, 0.0)), -1.0)
 def test_numbers_of_tables_have_four_digits(size: float, sign: float) -> None:
-    [shown] = shown_in_tables([sign * size])
+    [shown] = rounded(np.array([sign * size])).tolist()
     # halves may go either way
     assert abs(shown - sign * size) <= 0.5001 * 10.0 ** (np.floor(np.log10(size)) - 3)
     assert shown == float(f"{shown:.4g}")
@@ -238,5 +227,5 @@ def test_numbers_of_tables_have_four_digits(size: float, sign: float) -> None:
 
 def test_what_is_no_usual_number_stays_in_tables() -> None:
     numbers = [np.inf, -np.inf, 0.0, 3e200, 1e-300]
-    assert shown_in_tables(numbers) == numbers
-    assert np.isnan(shown_in_tables([np.nan])).all()
+    assert rounded(np.array(numbers)).tolist() == numbers
+    assert np.isnan(rounded(np.array([np.nan]))).all()

@@ -51,7 +51,7 @@ def test_a_replay_of_a_short_log_loads_no_compiler_and_no_encoder(tmp_path: Path
         "unneeded = {'numba', 'jsonschema', 'matplotlib', 'rich', 'rosbags', 'shapely', 'yaml',\n"
         "    'mcap_protobuf', "
         "'foxglove_schemas_protobuf', 'spatial_replay.annotate.annotator', 'spatial_replay.automata',\n"
-        "    'spatial_replay.bags.open', 'spatial_replay.logs.mcap.writer'} & set(sys.modules)\n"
+        "    'spatial_replay.bags.open', 'spatial_replay.logs.mcap.write'} & set(sys.modules)\n"
         "sys.exit(', '.join(sorted(unneeded)) or 0)\n"
     )
     done = subprocess.run(

@@ -7,7 +7,6 @@ import json
 import math
 import struct
 import tempfile
-import zlib
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -23,7 +22,6 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from examples import examples
 from laws.strategies_trace import traces
 from spatial_replay import LogError, Sample, Trace, read_trace
-from spatial_replay.compiled import only
 from spatial_replay.logs import (
     Channel,
     LogWriter,
@@ -34,18 +32,12 @@ from spatial_replay.logs import (
     encode_objects,
     summarise_mcap,
 )
-from spatial_replay.logs.checksums import joined_checksum
-from spatial_replay.logs.mcap.chunks import iter_records
-from spatial_replay.logs.mcap.writer import CHUNK_BYTES
-from spatial_replay.logs.message_numbers import Columns, gathered
-from spatial_replay.logs.objects.sample_columns import ColumnReader, trace_of
+from spatial_replay.logs.mcap.write import CHUNK_BYTES
 from spatial_replay.logs.objects.wire import WireTemplate
-from spatial_replay.logs.payloads import Payloads
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.topics import OBJECTS, protobuf_channel
 from spatial_replay.sources import open_source
 
-FORMS = st.sampled_from(["compiled", "interpreted"])
 CHANNEL = protobuf_channel(OBJECTS, ObjectStates)
 
 
@@ -194,75 +186,17 @@ def test_any_bytes_after_the_magic_are_at_worst_an_error(content):
     read(b"\x89MCAP0\r\n" + content)
 
 
-@given(traces().filter(len), st.lists(st.integers(1, 9), min_size=1, max_size=4), st.data(), FORMS)
-@examples(80)
-def test_samples_in_columns_are_what_their_messages_hold(trace, repeats, data, form):
-    """Some samples of each of a few layouts, one of whose bytes may be another."""
-    chosen = data.draw(st.lists(st.integers(0, len(trace) - 1), min_size=len(repeats), max_size=len(repeats)))
-    listed = list(trace.samples())
-    samples = [listed[index] for index, count in zip(chosen, repeats, strict=True) for _ in range(count)]
-    samples = [Sample(7 * k, each.objects, each.signals, each.unknown) for k, each in enumerate(samples)]
-    payloads = encode_objects(Trace.from_samples(samples))
-    times = np.array([sample.time_ns for sample in samples])
-    if is_changed := data.draw(st.booleans()):
-        sample = data.draw(st.integers(0, len(samples) - 1))
-        place = data.draw(st.integers(0, len(payloads[sample]) - 1))
-        changed = bytearray(payloads[sample])
-        changed[place] ^= data.draw(st.integers(1, 255))
-        payloads[sample] = bytes(changed)
-    with only(form):
-        columns = ColumnReader().read(Payloads.of(payloads), times)
-    is_sound = all(sample.objects and not sample.unknown for sample in samples)
-    assert columns is not None or is_changed or not is_sound
-    if columns is not None:
-        decoded, faults = decode_objects(payloads, times)
-        assert not faults
-        assert columns_of(trace_of(columns)) == columns_of(decoded)
-
-
-def columns_of(trace):
-    """All arrays of a trace, bit for bit, and its names."""
-    shapes = trace.footprints
-    numbers = trace.times_ns, trace.rows, trace.yaw, trace.uncertainty, trace.class_code
-    numbers = *numbers, *trace.signals.values()
-    arrays = *numbers, *(getattr(shapes, each) for each in shapes.__slots__)
-    bits = [(array.dtype, array.shape, array.tobytes()) for array in arrays]
-    return trace.names, trace.classes, list(trace.signals), bits
-
-
-@given(traces(max_samples=3).filter(len), st.data())
-@examples(60)
-def test_logs_of_many_chunks_are_read_alike_in_machine_code(trace, data):
-    """Whole, changed, and cut off."""
-    samples = [
-        Sample(1_000_000_000 * k, each.objects, each.signals, each.unknown)
-        for k in range(20)
-        for each in list(trace.samples())[k % len(trace) :][:1]
-    ]
-    content = bytearray(write([Trace.from_samples(samples)]))
-    for _ in range(data.draw(st.integers(0, 3))):
-        place = data.draw(st.integers(8, len(content) - 1))
-        content[place] ^= data.draw(st.integers(1, 255))
-    content = bytes(content[: data.draw(st.one_of(st.none(), st.integers(8, len(content))))])
-    found = []
-    for form in ("compiled", "interpreted"):
-        with only(form):
-            read_trace = read(content)
-        found.append(None if read_trace is None else (columns_of(read_trace), read_trace.faults))
-    assert found[0] == found[1]
-
-
-@given(traces(max_samples=3).filter(len), st.lists(st.integers(0, 4), min_size=1, max_size=9), FORMS)
+@given(traces(max_samples=3).filter(len), st.lists(st.integers(0, 4), min_size=1, max_size=9))
 @examples(30)
-def test_chunks_that_are_named_several_times_are_read_as_often(trace, named, form):
+def test_chunks_that_are_named_several_times_are_read_as_often(trace, named):
     first = next(trace.samples())
     samples = [replace(first, time_ns=k * 10**9) for k in range(5)]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "run.mcap")
         path.write_bytes(write([Trace.from_samples(samples)]))
-        with McapSource(path).open_walk() as walk, only(form):
+        with McapSource(path).open_walk() as walk:
             places = [walk.places[number] for number in named]
-            found = [list(records.messages.payloads) for _, records in iter_records(walk.stream, places)]
+            found = [messages.payloads for _, messages in walk.iter_messages(places)]
     payloads = encode_objects(Trace.from_samples(samples))
     assert [each for several in found for each in several] == [payloads[number] for number in named]
 
@@ -309,9 +243,8 @@ def json_lines(trace):
 
 @given(
     st.lists(st.tuples(st.sampled_from("abc"), st.binary(max_size=40)), min_size=20, max_size=60),
-    st.sampled_from(["compiled", "interpreted"]),
 )
-def test_a_copy_has_each_message_where_the_index_says(written, form):
+def test_a_copy_has_each_message_where_the_index_says(written):
     channels = {number: Channel(f"/{name}", "json", None) for number, name in enumerate("abc")}
     numbers = np.array([ord(name) - ord("a") for name, _ in written], np.int64)
     times_ns = np.arange(len(written), dtype=np.int64) * 10**8
@@ -322,7 +255,7 @@ def test_a_copy_has_each_message_where_the_index_says(written, form):
         writer.write_messages(
             Messages(channels, numbers, np.arange(len(written)), times_ns, times_ns, payloads)
         )
-    with tempfile.TemporaryDirectory() as folder, only(form):
+    with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "run.mcap")
         path.write_bytes(original.getvalue())
         with LogWriter(copy) as writer:
@@ -357,9 +290,8 @@ def test_a_copy_has_each_message_where_the_index_says(written, form):
         max_size=40,
     ),
     st.lists(st.integers(0, 40)),
-    st.sampled_from(["compiled", "interpreted"]),
 )
-def test_chunks_end_at_the_same_messages_however_these_are_divided_among_calls(given_ones, cuts, form):
+def test_chunks_end_at_the_same_messages_however_these_are_divided_among_calls(given_ones, cuts):
     topics = sorted({topic for topic, _, _ in given_ones})
     channels = {number: Channel(topic, "json", None) for number, topic in enumerate(topics)}
     numbers = np.array([topics.index(topic) for topic, _, _ in given_ones])
@@ -367,7 +299,7 @@ def test_chunks_end_at_the_same_messages_however_these_are_divided_among_calls(g
     payloads = [bytes(size) for _, _, size in given_ones]
     whole, pieces = io.BytesIO(), io.BytesIO()
     for stream, ends in ((whole, []), (pieces, sorted(cut for cut in cuts if cut < len(payloads)))):
-        with only(form), LogWriter(stream) as writer:
+        with LogWriter(stream) as writer:
             for begin, end in pairwise([0, *ends, len(payloads)]):
                 own = slice(begin, end)
                 given_at = np.arange(begin, end), times_ns[own], times_ns[own], payloads[own]
@@ -378,31 +310,3 @@ def test_chunks_end_at_the_same_messages_however_these_are_divided_among_calls(g
             messages = [each for each in breakup_chunk(record) if isinstance(each, Message)]
             assert all(each.log_time < messages[0].log_time + 10**9 for each in messages)
             assert sum(len(each.data) + 31 for each in messages[:-1]) < CHUNK_BYTES
-
-
-@given(st.lists(st.binary(max_size=200), max_size=6), st.sampled_from(["compiled", "interpreted"]))
-def test_checksums_of_contents_join_to_that_of_all(contents, form):
-    with only(form):
-        joined = joined_checksum(list(map(zlib.crc32, contents)), list(map(len, contents)))
-    assert joined == zlib.crc32(b"".join(contents))
-
-
-@given(st.data(), st.sampled_from([np.uint8, np.uint64]), st.sampled_from(["compiled", "interpreted"]))
-def test_numbers_gathered_from_columns_of_any_strides_are_all_of_them_side_by_side(data, kind, form):
-    count = data.draw(st.integers(1, 300))
-    columns = []
-    for seed in range(data.draw(st.integers(1, 4))):
-        width, step = data.draw(st.integers(1, 3)), data.draw(st.sampled_from([1, 2, 8]))
-        made = np.random.default_rng(seed).integers(1, 256, (width, count * step)).astype(kind)
-        # side by side, one below the other, or with others between them
-        numbers = data.draw(st.sampled_from([made[:, ::step].T, np.ascontiguousarray(made[:, ::step].T)]))
-        rows = data.draw(st.sampled_from([None, np.arange(count)[::-1]]))
-        columns.append((numbers, rows))
-    # an array of one column may have any stride from that to the next
-    odd = np.lib.stride_tricks.as_strided(np.full(8 * count, 7, kind), (count, 1), (kind().itemsize, 8))
-    columns.append((odd, None))
-    with only(form):
-        found = gathered([Columns(*each) for each in columns], count, kind)
-    assert np.array_equal(
-        found, np.concatenate([each if rows is None else each[rows] for each, rows in columns], axis=1)
-    )

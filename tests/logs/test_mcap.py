@@ -45,7 +45,7 @@ from spatial_replay.logs import (
     encode_objects,
     summarise_mcap,
 )
-from spatial_replay.logs.mcap.writer import CHUNK_BYTES
+from spatial_replay.logs.mcap.write import CHUNK_BYTES
 from spatial_replay.logs.messages import BLOCK_SAMPLES, select
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.topics import OBJECTS, ROBUSTNESS, protobuf_channel
@@ -352,7 +352,7 @@ def test_what_is_read_and_written_does_not_depend_on_the_number_of_cores(log, tm
 
 def test_blocks_may_end_within_chunks_of_samples_that_others_overlap(tmp_path):
     trace, path = moving_cup(2_600, 10**7), tmp_path / "run.mcap"
-    camera = messages(Channel("/camera", "json", None), trace.times_ns + 1, [b"0" * 9_000] * len(trace))
+    camera = messages(Channel("/camera", "json", None), trace.times_ns + 1, [b"0" * 30_000] * len(trace))
     with path.open("wb") as stream, LogWriter(stream) as writer:
         for begin in range(0, len(trace), 10):
             part = trace.slice(begin, begin + 10)

@@ -15,7 +15,7 @@ import spatial_replay as sr
 from planning.kinematics import BLOCKS, block
 from planning.plans import PUSH, record_plan_of
 from spatial_replay import LogError, Settings, UsageError, load_specification
-from spatial_replay.logs.mcap.writer import LogWriter
+from spatial_replay.logs.mcap.write import LogWriter
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.topics import GRADIENT_MAP, PLAN_METADATA, PLAN_PATH
 from spatial_replay.planning import (

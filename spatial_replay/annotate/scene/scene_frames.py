@@ -14,10 +14,8 @@ from spatial_replay.annotate.rings import Rings
 from spatial_replay.annotate.scene.scene_template import OBJECT, REGION, Banner, CauseText, Region, border_of
 from spatial_replay.annotate.scene.scene_text import ArrowTexts
 from spatial_replay.annotate.violations import Violations
-from spatial_replay.compiled import copying_kernel, floats_at
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.geometry.footprint import FootprintBatch
-from spatial_replay.logs.message_numbers import nearest_whole
 from spatial_replay.palette import NEGATIVE, NEUTRAL, POSITIVE
 
 _LEAST: Final = 0.4
@@ -37,38 +35,12 @@ def colours(robustness: ArrayLike, scale: ArrayLike) -> Floats:
     Args:
         scale: above 0, in the unit of the robustness; one, or an array that goes with it.
     """
-    values = np.asarray(robustness, np.float64, order="C")
-    full_at = np.ascontiguousarray(np.broadcast_to(scale, values.shape), np.float64)
-    mixed = np.empty((*values.shape, 3))
-    if values.size:
-        _mix(values.ctypes.data, full_at.ctypes.data, mixed.reshape(-1, 3))
-    return mixed
-
-
-def _mix_together(values_at: int, full_at: int, mixed: Floats) -> None:
-    """Do what `_mix` does, all colours together."""
-    values, full = floats_at(values_at, len(mixed)), floats_at(full_at, len(mixed))
-    share = _LEAST + (1.0 - _LEAST) * np.minimum(np.abs(values) / full, 1.0)
+    values = np.asarray(robustness, np.float64)
+    share = _LEAST + (1.0 - _LEAST) * np.minimum(np.abs(values) / scale, 1.0)
     share = np.where(np.isnan(values), 0.0, share)
-    mixed[:] = _FROM_GREY.take((values >= 0.0).astype(np.intp), axis=0)
-    mixed *= share[:, None]
-    mixed += NEUTRAL
-    mixed *= 255.0
-    np.round(mixed, out=mixed)
-    mixed /= 255.0
-
-
-@copying_kernel(_mix_together)
-def _mix(values_at: int, full_at: int, mixed: Floats) -> None:
-    """Fill in colours (n, 3), to the steps of a screen: finer ones are invisible and compress badly."""
-    values, full = floats_at(values_at, mixed.shape[0]), floats_at(full_at, mixed.shape[0])
-    for i in range(mixed.shape[0]):
-        share = abs(values[i]) / full[i]
-        share = _LEAST + (1.0 - _LEAST) * (share if share < 1.0 else 1.0) if share == share else 0.0
-        which = 1 if values[i] >= 0.0 else 0
-        for k in range(3):
-            step = (_FROM_GREY[which, k] * share + NEUTRAL[k]) * 255.0
-            mixed[i, k] = nearest_whole(step) / 255.0
+    mixed = _FROM_GREY[(values >= 0.0).astype(np.intp)] * share[..., None] + NEUTRAL
+    # to the steps of a screen: finer ones are invisible and compress badly
+    return np.asarray(np.round(mixed * 255.0) / 255.0)
 
 
 def shade_codes(robustness: Floats, scale: ArrayLike) -> NDArray[np.uint8]:

@@ -14,7 +14,7 @@ from spatial_replay.annotate.scene.scene_template import (
     numbers_of_witness,
 )
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.logs.message_numbers import Columns, runs
+from spatial_replay.logs.objects.wire import Words, words_of
 
 LIFT: Final = 0.01
 """Height of flat objects above the plane, by the scale of the scene."""
@@ -48,19 +48,24 @@ class SceneNumbers:
             top, bottom = content.footprints.top, content.footprints.bottom
             self._of_objects.append(np.stack([top, bottom, top - bottom, top + LIFT * scale], axis=-1))
 
-    def of_messages(self, layout: SceneLayout, samples: Integers) -> list[Columns]:
-        """Return what to fill in a layout's template, each number once, in some messages (K,)."""
-        columns = [Columns(self._stamps, samples), Columns(self._regions, samples)]
+    def of_messages(self, layout: SceneLayout, samples: Integers) -> Words:
+        """Return (K, N) what to fill in a layout's template, each number once, in some messages (K,)."""
+        columns = [self._stamps[samples], self._regions[samples]]
         content, count = self._content, len(layout.objects)
         if count:
             # those that are shown follow each other
             first = content.observations[samples, content.names.index(layout.objects[0].name)]
             corners = sum(sum(drawn.form.rings) for drawn in layout.objects)
-            columns.append(Columns(runs(content.rings.points, corners), content.rings.start[first]))
+            columns.append(_runs(content.rings.points, content.rings.start[first], corners))
             of_objects = self._of_objects[: 3 if layout.has_heights else 2]
-            columns += [Columns(runs(each, count), first) for each in of_objects]
+            columns += [_runs(each, first, count) for each in of_objects]
         if isinstance(layout.witness, CauseText):
             found, labels = content.violations, [content.numbers[index] for index in samples.tolist()]
             z = np.fmax(found.top[samples], 0.0) + 3.0 * LIFT * self._scale
             columns += numbers_of_witness(found.points[samples], z, self._scale, labels, layout.witness.words)
-        return columns
+        return words_of(columns)
+
+
+def _runs(rows: Floats, first: Integers, count: int) -> Floats:
+    """Return rows (R, k) side by side, `count` from each of the first ones (K,) on: (K, count * k)."""
+    return np.asarray(rows[first[:, None] + np.arange(count)].reshape(len(first), -1))

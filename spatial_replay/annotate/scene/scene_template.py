@@ -30,9 +30,7 @@ from spatial_replay.annotate.scene.scene_entities import (
     point_at,
 )
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.logs.message_numbers import Columns, gathered
-from spatial_replay.logs.objects.wire import WireTemplate
-from spatial_replay.logs.payloads import Filled, Words
+from spatial_replay.logs.objects.wire import WireTemplate, Words
 from spatial_replay.spec.formula import Outline
 
 OBJECT_OPACITY: Final = 0.55
@@ -146,9 +144,9 @@ class SceneTemplate:
     template: WireTemplate
     order: Integers
 
-    def filled(self, columns: Sequence[Columns], count: int) -> Filled:
-        """Return as many messages, whose numbers are those of the columns, one after the other."""
-        return Filled(self.template, gathered(columns, count), np.empty((count, 0), np.uint8), self.order)
+    def encode(self, numbers: Words) -> list[bytes]:
+        """Encode messages by their numbers (K, N)."""
+        return self.template.encode(numbers.take(self.order, axis=1))
 
 
 class EncodedRegions(NamedTuple):
@@ -289,7 +287,7 @@ _ARROW_NUMBERS: Final = 10
 
 def numbers_of_witness(
     points: Floats, z: Floats, scale: float, labels: Sequence[bytes], words: int
-) -> list[Columns]:
+) -> list[Floats]:
     """Return what to fill in for the arrow at the worst violation.
 
     Args:
@@ -307,7 +305,7 @@ def numbers_of_witness(
     middle = [(begin + end) / 2.0, z + ARROW_HEAD * scale]
     text = b"".join([label.ljust(8 * words) for label in labels])
     label = np.frombuffer(text, "<f8")
-    return [Columns(column.reshape(len(points), -1)) for column in (*arrow, *middle, label)]
+    return [column.reshape(len(points), -1) for column in (*arrow, *middle, label)]
 
 
 def _add_entity(message: SceneUpdate, identifier: str) -> SceneEntity:

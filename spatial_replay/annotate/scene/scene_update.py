@@ -48,7 +48,7 @@ from spatial_replay.annotate.violations import (
     worst_robustness,
 )
 from spatial_replay.geometry.arrays import Floats, Integers, combined, equal_places
-from spatial_replay.logs.payloads import filled_in
+from spatial_replay.logs.objects.wire import placed
 from spatial_replay.monitor.atoms.terms import footprint_from_outline
 from spatial_replay.spec.formula import Outline
 from spatial_replay.trace.trace import Trace
@@ -170,12 +170,11 @@ class SceneEncoder:
         shown = shades[0].reshape(-1, 3) if (rows >= 0).all() else shades[0][rows >= 0]
         columns = SceneNumbers(times_ns, shades[1], shown, content, scale)
         templates = dict(state.templates)
-        filled = []
+        encoded = []
         for layout, samples in _by_layout(content):
             if layout not in templates:
                 templates[layout] = make_template(layout, self._encoded, LIFT * scale)
-            own = columns.of_messages(layout, samples)
-            filled.append((samples, templates[layout].filled(own, len(samples))))
+            encoded.append((samples, templates[layout].encode(columns.of_messages(layout, samples))))
         last = content.forms[-1] >= FIRST_FORM
         after = SceneState(
             first_ns=state.first_ns,
@@ -193,7 +192,7 @@ class SceneEncoder:
         frames = SceneFrames(
             times_ns, objects, regions, *shades, scale, content, self._drawn, find_arrows, find_shades
         )
-        return SceneMessages(times_ns, filled_in(len(written), filled), after, frames)
+        return SceneMessages(times_ns, placed(len(written), encoded), after, frames)
 
     def scaled(self, state: SceneState, trace: Trace, rows: Integers) -> tuple[SceneState, Floats, int]:
         """Return the state with its scale and place, once an object is shown, the scale (S, 1) of each

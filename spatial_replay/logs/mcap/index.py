@@ -8,34 +8,109 @@ from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from heapq import merge
-from itertools import repeat
+from io import BytesIO
 from types import MappingProxyType
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple, TypeVar
+from zlib import crc32
 
-import numpy as np
 from mcap import records
+from mcap.data_stream import ReadDataStream, RecordBuilder
+from mcap.exceptions import EndOfFile
 from mcap.opcode import Opcode
 
-from spatial_replay.logs.checksums import crc32
-from spatial_replay.logs.mcap.chunk_records import RECORD_HEAD, DamageError, decoded
-from spatial_replay.logs.mcap.chunks import ChunkPlace, chunk_place
 from spatial_replay.logs.messages import Attachment
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.logs.topics import LIBRARY, MAGIC
 from spatial_replay.text import Instant, Sentence
+
+RECORD_HEAD = struct.Struct("<BQ")
+"""Opcode and length of the body that follows."""
+CHUNK_HEAD = struct.Struct("<QQQII")
+"""Times of the first and the last message, size, checksum, and the length of the compression's name."""
+LARGEST_CHUNK = 2**30
+"""Bytes, uncompressed; a chunk that claims more is damaged."""
+
+_Record = TypeVar("_Record")
+
+
+class DamageError(Exception):
+    """Bytes that are not what they should be. The text says what is wrong; the catcher knows where."""
+
+
+def encoded(*several: records.McapRecord) -> bytes:
+    """Encode records one after the other, each with its head."""
+    builder = RecordBuilder()
+    for record in several:
+        record.write(builder)
+    return bytes(builder.end())  # type: ignore[no-untyped-call]
+
+
+def decoded(read: Callable[[ReadDataStream], _Record], body: bytes) -> _Record:
+    """Decode the record in a body.
+
+    Raises:
+        DamageError: the body is too short, or holds impossible lengths or texts that are not UTF-8.
+    """
+    try:
+        return read(ReadDataStream(BytesIO(body)))
+    except (EndOfFile, struct.error, UnicodeDecodeError, OverflowError) as error:
+        raise DamageError(f"a record cannot be read ({type(error).__name__}: {error})") from None
+
+
+class ChunkPlace(NamedTuple):
+    """Where some records are in the file.
+
+    Attributes:
+        offset, length: of the record with its head, in bytes.
+        start_ns, end_ns: log times of its first and last message.
+        compressed: whether it is a chunk; else records outside chunks.
+        channels: those with messages in it, by the index; None where it does not say.
+        has_checksum: whether a chunk must have a checksum, as those of our own logs do.
+        size: bytes that a chunk decompresses to, by the index or by its head; 0 for records outside chunks.
+    """
+
+    offset: int
+    length: int
+    start_ns: int
+    end_ns: int
+    compressed: bool = True
+    channels: frozenset[int] | None = None
+    has_checksum: bool = False
+    size: int = 0
+
+
+def chunk_place(offset: int, record: bytes, length: int) -> ChunkPlace:
+    """Return the place of a chunk by the beginning of its record, if that is consistent in itself.
+
+    Args:
+        record: the first bytes of the record, at least 64 unless the file ends.
+        length: of the record with its head.
+
+    Raises:
+        DamageError: it is not.
+    """
+    fixed = RECORD_HEAD.size + CHUNK_HEAD.size
+    if len(record) < fixed:
+        raise DamageError("a chunk breaks off")
+    start, end, size, _, name_length = CHUNK_HEAD.unpack_from(record, RECORD_HEAD.size)
+    data_length = fixed + name_length
+    if name_length > 16 or len(record) < data_length + 8:
+        raise DamageError("a chunk's head is inconsistent")
+    stored = int.from_bytes(record[data_length : data_length + 8], "little")
+    if data_length + 8 + stored != length or size > LARGEST_CHUNK or not start <= end < 2**63:
+        raise DamageError("a chunk's head is inconsistent")
+    return ChunkPlace(offset, length, start, end, size=size)
+
 
 _FOOTER_BYTES = RECORD_HEAD.size + 20
 _CHUNK_HEAD_BYTES = 64
 _CHUNK_INDEX = struct.Struct("<QQQQI")
 _SIZE_BYTES = 8
 """At the end of the index of a chunk: what it decompresses to."""
-_CHUNK_INDEX_HEAD = RECORD_HEAD.size + _CHUNK_INDEX.size
-_MOST_ALIKE = 128
-"""Indexes of chunks that are taken in together, at most."""
 _MESSAGE_INDEX = struct.Struct("<H8x")
 """Of which only the channel matters here."""
 _LOOSE_BYTES = 2**22
@@ -134,9 +209,6 @@ def _from_summary(stream: BinaryIO, size: int) -> Directory:
         raise DamageError("the summary's checksum does not fit")
     position = 0
     while position < len(section):
-        if count := _take_in_alike(directory, section, position):
-            position += count * (RECORD_HEAD.size + RECORD_HEAD.unpack_from(section, position)[1])
-            continue
         opcode, body = _body(section, position)
         _take_in(directory, opcode, body)
         position += RECORD_HEAD.size + len(body)
@@ -166,45 +238,6 @@ def _body(section: bytes, position: int) -> tuple[int, bytes]:
     if length > len(section) - position:
         raise DamageError("the summary breaks off")
     return opcode, section[position : position + length]
-
-
-def _take_in_alike(directory: Directory, section: bytes, position: int) -> int:
-    """Take in the indexes of chunks at a position, as long as they have the channels of the first.
-
-    Together they take a third of the time: a long log has very many, and nothing is read before them.
-
-    Returns:
-        How many there are; 0 where the first two are not alike.
-    """
-    record = section[position : position + _CHUNK_INDEX_HEAD]
-    if len(record) < _CHUNK_INDEX_HEAD or record[0] != Opcode.CHUNK_INDEX:
-        return 0
-    size = RECORD_HEAD.size + RECORD_HEAD.unpack_from(record)[1]
-    if section[position + size : position + size + RECORD_HEAD.size] != record[: RECORD_HEAD.size]:
-        return 0
-    indexed = _CHUNK_INDEX.unpack_from(record, RECORD_HEAD.size)[-1]
-    count = min((len(section) - position) // size, _MOST_ALIKE)
-    if count < 2 or _CHUNK_INDEX_HEAD + indexed > size:
-        return 0
-    bodies = (section[at + RECORD_HEAD.size : at + size] for at in (position, position + size))
-    channels, following = (_indexed_channels(body, indexed) for body in bodies)
-    if channels != following:
-        return 0
-    rows = np.frombuffer(section, np.uint8, count * size, position).reshape(count, size)
-    is_same = np.zeros(_CHUNK_INDEX_HEAD + indexed, np.bool_)
-    # opcode and length, the length of the message indexes, and of each of these its channel
-    is_same[: RECORD_HEAD.size] = is_same[_CHUNK_INDEX_HEAD - 4 : _CHUNK_INDEX_HEAD] = True
-    is_same[_CHUNK_INDEX_HEAD :: _MESSAGE_INDEX.size] = True
-    is_same[_CHUNK_INDEX_HEAD + 1 :: _MESSAGE_INDEX.size] = True
-    known = rows[:, : len(is_same)][:, is_same]
-    differing = np.flatnonzero((known != known[0]).any(axis=1))
-    count = int(differing[0]) if len(differing) else count
-    numbers = rows[:count, RECORD_HEAD.size : _CHUNK_INDEX_HEAD - 4].copy().view("<u8")
-    start_ns, end_ns, offset, length = numbers.T.tolist()
-    beside = repeat(True), repeat(channels), repeat(_is_own(directory.header))
-    sizes = rows[:count, -_SIZE_BYTES:].copy().view("<u8")[:, 0].tolist()
-    directory.chunks += map(ChunkPlace, offset, length, start_ns, end_ns, *beside, sizes)
-    return count
 
 
 def _take_in(directory: Directory, opcode: int, body: bytes) -> None:

@@ -6,9 +6,8 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from spatial_replay.logs.mcap.chunk_walk import ChunkWalk
 from spatial_replay.logs.mcap.index import iter_attachments, iter_metadata
-from spatial_replay.logs.mcap.reader import McapSource
+from spatial_replay.logs.mcap.read import ChunkWalk, McapSource
 from spatial_replay.logs.messages import Channel
 from spatial_replay.logs.remote import file_size
 from spatial_replay.logs.topics import OBJECTS

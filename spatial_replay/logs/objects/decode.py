@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from spatial_replay.geometry.arrays import Floats, Integers, starts_from_counts
 from spatial_replay.geometry.footprint import Concave, FootprintBatch
-from spatial_replay.logs.objects.wire import LayoutError, WireTemplate, rows_of
-from spatial_replay.logs.payloads import Bytes, Payloads, Words
+from spatial_replay.logs.objects.wire import Bytes, LayoutError, WireTemplate, Words, rows_of
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectState, ObjectStates
 from spatial_replay.text import Instant, Sentence
 from spatial_replay.trace.observations import Observations, trace_from_observations
@@ -179,10 +178,10 @@ class _Pieces:
     """Encodings, each of a message or of fields of one, with the samples that they belong to."""
 
     samples: Integers
-    payloads: Payloads
+    payloads: Sequence[bytes]
 
     def take(self, places: Integers) -> _Pieces:
-        return _Pieces(self.samples[places], self.payloads.take(places))
+        return _Pieces(self.samples[places], [self.payloads[place] for place in places.tolist()])
 
 
 def decode_objects(
@@ -199,7 +198,7 @@ def decode_objects(
         the trace of the messages that can be used, and what is wrong with the others, each with its time.
     """
     faults: dict[int, str] = {}
-    groups = _groups(Payloads.of(payloads), faults)
+    groups = _groups(payloads, faults)
     faults = _wrong_times(groups, times_ns) | _signals_given_twice(groups) | faults
     trace, wrong = trace_from_observations(_observations(groups, times_ns), concave=concave)
     faults = wrong | faults
@@ -213,7 +212,7 @@ def decode_objects(
     ]
 
 
-def _groups(payloads: Payloads, faults: dict[int, str]) -> list[_Group]:
+def _groups(payloads: Sequence[bytes], faults: dict[int, str]) -> list[_Group]:
     """Group all numbers of all messages by layout; payloads that are not messages go to `faults`.
 
     Where most messages have a layout of their own, their objects do not: these are read piece by piece.
@@ -223,7 +222,7 @@ def _groups(payloads: Payloads, faults: dict[int, str]) -> list[_Group]:
     if len(left.samples):
         split = [_fields(payload) or [payload] for payload in left.payloads]
         samples = np.repeat(left.samples, [len(fields) for fields in split])
-        pieces = _Pieces(samples, Payloads.of([piece for fields in split for piece in fields]))
+        pieces = _Pieces(samples, [piece for fields in split for piece in fields])
         groups += _grouped(pieces, faults, 0)[0]
     return groups
 
@@ -237,14 +236,14 @@ def _grouped(pieces: _Pieces, faults: dict[int, str], worth: int) -> tuple[list[
     groups: list[_Group] = []
     left: list[Integers] = []
     tried = served = 0
-    lengths = pieces.payloads.lengths
+    lengths = np.fromiter(map(len, pieces.payloads), np.int64, len(pieces.payloads))
     values, counts = np.unique(lengths, return_counts=True)
     for length in values[np.argsort(-counts, kind="stable")].tolist():
         places = np.flatnonzero(lengths == length)
         if (tried - FIRST_LAYOUTS) * worth > served:
             left.append(places)
             continue
-        rows = pieces.payloads.take(places).rows()
+        rows = rows_of(pieces.take(places).payloads)
         while len(places) and (tried - FIRST_LAYOUTS) * worth <= served:
             tried += 1
             group, same = _first_group(pieces.take(places[:1]), rows, faults)

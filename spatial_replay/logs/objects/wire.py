@@ -8,17 +8,20 @@ for all of its layout: only the slots differ, and those of many messages are fil
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any, TypeAlias
 
 import numpy as np
 from google.protobuf.descriptor import FieldDescriptor
 from google.protobuf.message import Message
 from numpy.typing import NDArray
 
-from spatial_replay.geometry.arrays import Integers
-from spatial_replay.logs.payloads import Bytes, Words
+from spatial_replay.geometry.arrays import Floats, Integers
+
+Bytes: TypeAlias = NDArray[np.uint8]
+Words: TypeAlias = NDArray[np.uint64]
 
 _WIDE = (FieldDescriptor.TYPE_DOUBLE, FieldDescriptor.TYPE_FIXED64)
 _NARROW = FieldDescriptor.TYPE_ENUM
@@ -79,11 +82,6 @@ class WireTemplate:
         return len(self.payload)
 
     @cached_property
-    def pattern(self) -> bytes:
-        """The payload as bytes."""
-        return self.payload.tobytes()
-
-    @cached_property
     def fixed(self) -> Bytes:
         """(L,) uint8, 0 in all slots, 0xFF elsewhere."""
         fixed = np.full(len(self), 0xFF, np.uint8)
@@ -104,6 +102,10 @@ class WireTemplate:
             rows[:, self.mark_offsets] = marks
         return rows
 
+    def encode(self, words: Words, marks: Bytes | None = None) -> list[bytes]:
+        """Encode n messages as `fill` does, each by itself."""
+        return payloads_of(self.fill(words, marks))
+
     def matches(self, rows: Bytes) -> NDArray[np.bool_]:
         """Return (n,) which of n encoded messages (n, L) have this layout."""
         same = np.ones(len(rows), np.bool_)
@@ -122,7 +124,7 @@ class WireTemplate:
         return np.asarray(anywhere[:, self.word_offsets], np.uint64)
 
 
-def rows_of(payloads: list[bytes]) -> Bytes:
+def rows_of(payloads: Sequence[bytes]) -> Bytes:
     """Return n payloads of one length L as (n, L) uint8."""
     return np.frombuffer(b"".join(payloads), np.uint8).reshape(len(payloads), -1)
 
@@ -134,6 +136,36 @@ def payloads_of(rows: Bytes) -> list[bytes]:
         return [b""] * count
     joined = rows.tobytes()
     return [joined[begin : begin + length] for begin in range(0, count * length, length)]
+
+
+def words_of(columns: Sequence[NDArray[Any]]) -> Words:
+    """Return columns of 8-byte numbers, (n, k) each, side by side: (n, W)."""
+    return np.concatenate([np.ascontiguousarray(each).view(np.uint64) for each in columns], axis=1)
+
+
+def placed(count: int, groups: Sequence[tuple[Integers, Sequence[bytes]]]) -> list[bytes]:
+    """Return messages by their places among `count`, each group with its own places."""
+    payloads = [b""] * count
+    for places, own in groups:
+        for place, payload in zip(places.tolist(), own, strict=True):
+            payloads[place] = payload
+    return payloads
+
+
+_POWERS = np.array([float(f"1e{digits}") for digits in range(20)])
+_POWERS.flags.writeable = False
+
+
+def rounded(numbers: Floats) -> Floats:
+    """Return numbers with four digits, so that viewers print them short; very large and small ones stay."""
+    size = np.abs(numbers)
+    is_usual = (size >= 1e-15) & (size < 1e15)
+    usual = np.where(is_usual, numbers, 1.0)
+    digits = (3.0 - np.floor(np.log10(np.abs(usual)))).astype(np.int64)
+    power = _POWERS[np.abs(digits)]
+    # quotients and products of whole numbers, so that the result is the number nearest to those digits
+    shown = np.where(digits < 0, np.round(usual / power) * power, np.round(usual * power) / power)
+    return np.where(is_usual, shown, numbers)
 
 
 def _encoded(message: Message, word: int, mark: int) -> Bytes:

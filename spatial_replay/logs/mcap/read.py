@@ -1,0 +1,615 @@
+"""Read our own MCAP logs, whole or damaged, in blocks of samples with their messages.
+
+The reader is our own because the MCAP library fails 112 of the 416 files of the format's conformance suite
+and gives up on truncated and unindexed files, which crashed recorders leave behind.
+
+Chunks may overlap in time. So they are read in the order of their first message, and a message is handed
+out only when no later chunk can hold an earlier one.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from copy import deepcopy
+from dataclasses import dataclass, replace
+from functools import cached_property
+from threading import Lock
+from types import MappingProxyType
+from typing import Any, BinaryIO, Final, TypeAlias
+from zlib import crc32
+
+import lz4.frame
+import numpy as np
+import zstandard
+from mcap import records
+from mcap.opcode import Opcode
+
+from spatial_replay.cores import cores
+from spatial_replay.errors import LogError, UsageError
+from spatial_replay.geometry.arrays import Integers
+from spatial_replay.geometry.footprint import Concave
+from spatial_replay.logs.byte_ranges import plan_reads
+from spatial_replay.logs.mcap.index import (
+    CHUNK_HEAD,
+    RECORD_HEAD,
+    ChunkPlace,
+    DamageError,
+    Directory,
+    check_attachments,
+    chunk_place,
+    decoded,
+    iter_attachments,
+    iter_metadata,
+    read_directory,
+)
+from spatial_replay.logs.messages import (
+    BLOCK_SAMPLES,
+    Attachment,
+    Block,
+    Channel,
+    Messages,
+    Schema,
+    select,
+)
+from spatial_replay.logs.objects.decode import decode_objects
+from spatial_replay.logs.read_options import FaultList
+from spatial_replay.logs.remote import LogFile, RemoteFile, open_file
+from spatial_replay.logs.topics import ALL, DERIVED, METADATA, OBJECTS, RECOVERY, is_kept
+from spatial_replay.text import Instant, Sentence, counted, encodable
+from spatial_replay.trace.axes import Axes
+from spatial_replay.trace.declared_units import signal_units_from_metadata
+from spatial_replay.trace.sample import LATEST_NS
+from spatial_replay.trace.trace import Trace
+
+ALWAYS_ALLOWED, MOST_TIMES_LARGER = 2**26, 1_000
+"""Bytes, and times its own size, that a chunk or a message may decompress to: no recorder's needs more."""
+_ALWAYS_WAITING, _MOST_TIMES_WAITING = 2**28, 20
+"""Bytes, and times the size of the log, of messages that wait until all chunks before them are read."""
+_AHEAD_BYTES: Final = 2**24
+"""Bytes of chunks, decompressed, that are read ahead; one chunk for each core at least."""
+BLOCK_BYTES = 64 * 2**20
+"""A block of messages is closed when it holds this much, however few its samples are."""
+AFTER_ALL_NS = 2**64
+_SAMPLES = "spatial_replay.ObjectStates"
+_LEAST_BOUND: Final = 2**20
+"""Bytes that a chunk may hold whatever the index says: some writers leave the size out."""
+_LONGEST_HEAD: Final = 80
+_CHANNELS: Final = 2**16
+"""As many as a file can have."""
+
+
+def most_waiting(lengths: Iterable[int]) -> int:
+    """Return the bytes of messages that may wait for others, by the lengths of all chunks."""
+    return max(_ALWAYS_WAITING, _MOST_TIMES_WAITING * sum(lengths))
+
+
+def too_many_waiting(name: str, most: int) -> LogError:
+    """Return the error that more messages wait than that."""
+    return LogError(
+        f"{name}: chunks that overlap in time hold more than {most} bytes of messages, far more than the log;"
+        " give a part of it by --start and --end, or fewer topics"
+    )
+
+
+def read_records(stream: BinaryIO, place: ChunkPlace) -> bytes:
+    """Read the records in a place, decompressed.
+
+    Raises:
+        DamageError: the chunk is cut off, does not decompress, or has another checksum than it says.
+    """
+    stream.seek(place.offset)
+    return _content(place, stream.read(place.length))
+
+
+def _content(place: ChunkPlace, record: bytes) -> bytes:
+    """Return the records in what was read of a place; see `read_records`."""
+    if len(record) < place.length:
+        raise DamageError("the chunk breaks off")
+    if not place.compressed:
+        return record
+    chunk_place(place.offset, record[:_LONGEST_HEAD], len(record))
+    _, _, size, checksum, name_length = CHUNK_HEAD.unpack_from(record, RECORD_HEAD.size)
+    if size > max(place.size, _LEAST_BOUND):
+        raise DamageError(f"the chunk claims to hold {size} bytes, and the index {place.size}")
+    begin = RECORD_HEAD.size + CHUNK_HEAD.size
+    data = begin + name_length + 8
+    content = _decompressed(record[begin : begin + name_length], memoryview(record)[data:], size)
+    if len(content) != size:
+        raise DamageError(f"the chunk holds {len(content)} bytes instead of {size}")
+    if (checksum or place.has_checksum) and crc32(content) != checksum:
+        if not checksum:
+            raise DamageError("the chunk has no checksum, and every log of ours has one")
+        raise DamageError("the chunk's checksum does not fit its content")
+    return content
+
+
+def _decompressed(compression: bytes, data: memoryview, size: int) -> bytes:
+    if compression and size > max(ALWAYS_ALLOWED, MOST_TIMES_LARGER * len(data)):
+        raise DamageError(f"the chunk claims to hold {size} bytes in {len(data)}")
+    try:
+        if compression == b"zstd":
+            if zstandard.frame_content_size(data) > size:
+                raise DamageError("the chunk holds more than it says")
+            return zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
+        if compression == b"lz4":
+            return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1))
+    except (zstandard.ZstdError, RuntimeError, EOFError) as error:
+        raise DamageError(f"the chunk does not decompress ({error})") from None
+    if compression:
+        raise DamageError(f"the chunk is compressed as {compression!r}; known are zstd and lz4")
+    return bytes(data)
+
+
+def iter_records(
+    stream: BinaryIO, places: Sequence[ChunkPlace]
+) -> Iterator[tuple[ChunkPlace, bytes | DamageError]]:
+    """Yield places with their records, or with the damage that `read_records` raises, in this order.
+
+    While the caller processes one, other threads read the next ones, so it must not use the stream.
+    """
+    plan_reads(stream, ((place.offset, place.offset + place.length) for place in places))
+    reading = Lock()
+
+    def read(place: ChunkPlace) -> bytes | DamageError:
+        with reading:
+            stream.seek(place.offset)
+            record = stream.read(place.length)
+        try:
+            return _content(place, record)
+        except DamageError as damage:
+            return damage
+
+    waiting: deque[tuple[ChunkPlace, Future[bytes | DamageError]]] = deque()
+    ahead = 0
+    with ThreadPoolExecutor(cores(), "reading") as threads:
+        try:
+            for place in places:
+                waiting.append((place, threads.submit(read, place)))
+                ahead += max(place.length, place.size)
+                while ahead > _AHEAD_BYTES and len(waiting) > cores():
+                    first, reading_first = waiting.popleft()
+                    ahead -= max(first.length, first.size)
+                    yield first, reading_first.result()
+            while waiting:
+                first, reading_first = waiting.popleft()
+                yield first, reading_first.result()
+        finally:
+            # a caller that has seen enough does not wait for the rest
+            threads.shutdown(cancel_futures=True)
+
+
+MessageHeads: TypeAlias = np.ndarray[Any, np.dtype[np.void]]
+"""(M,) with the fields channel, sequence, log_time and publish_time."""
+_SCHEMA, _CHANNEL, _MESSAGE = int(Opcode.SCHEMA), int(Opcode.CHANNEL), int(Opcode.MESSAGE)
+_HEAD: Final = np.dtype(
+    [("channel", "<u2"), ("sequence", "<u4"), ("log_time", "<u8"), ("publish_time", "<u8")]
+)
+_HEAD_BYTES: Final = _HEAD.itemsize
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Records:
+    """The records in some bytes that a reader needs, in their order.
+
+    Attributes:
+        heads: (M,) of the messages.
+        payloads: of each, where it begins and ends.
+        declarations: opcodes and bodies of schemas and channels.
+        breaks_off: whether the last record is not whole.
+    """
+
+    heads: MessageHeads
+    payloads: Sequence[slice]
+    declarations: Sequence[tuple[int, bytes]]
+    breaks_off: bool
+
+
+def split_records(content: bytes, passed_over: Collection[int] = ()) -> Records:
+    """Return the messages and declarations in decompressed records, up to where one breaks off.
+
+    Args:
+        passed_over: channels whose messages are left out.
+    """
+    heads, payloads = list[bytes](), list[slice]()
+    declarations = list[tuple[int, bytes]]()
+    position, size, unpack = 0, len(content), RECORD_HEAD.unpack_from
+    while position + RECORD_HEAD.size <= size:
+        opcode, length = unpack(content, position)
+        begin = position + RECORD_HEAD.size
+        if length > size - begin:
+            break
+        position = begin + length
+        if opcode == _MESSAGE:
+            if length >= _HEAD_BYTES and content[begin] | content[begin + 1] << 8 not in passed_over:
+                after = begin + _HEAD_BYTES
+                heads.append(content[begin:after])
+                payloads.append(slice(after, position))
+        elif opcode in (_SCHEMA, _CHANNEL):
+            declarations.append((opcode, content[begin:position]))
+    return Records(np.frombuffer(b"".join(heads), _HEAD), payloads, declarations, position < size)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RawMessages:
+    """M messages of chunks."""
+
+    heads: MessageHeads
+    payloads: Sequence[bytes]
+
+    @classmethod
+    def join(cls, several: Sequence[RawMessages]) -> RawMessages:
+        """Join messages, one after the other."""
+        heads = np.concatenate([np.empty(0, _HEAD), *(each.heads for each in several)])
+        return cls(heads, [payload for each in several for payload in each.payloads])
+
+    def __len__(self) -> int:
+        return len(self.payloads)
+
+    @property
+    def nbytes(self) -> int:
+        """The size of the messages in bytes."""
+        return sum(map(len, self.payloads))
+
+    def take(self, chosen: Integers) -> RawMessages:
+        """Return the messages with the given indices, in that order."""
+        return RawMessages(self.heads[chosen], [self.payloads[index] for index in chosen.tolist()])
+
+    def divided(self, count: int) -> tuple[RawMessages, RawMessages]:
+        """Return the first messages, and the others."""
+        first, rest = self.heads[:count], self.heads[count:]
+        return RawMessages(first, self.payloads[:count]), RawMessages(rest, self.payloads[count:])
+
+
+class ChunkWalk:
+    """The messages of a log by chunk, with the channels that have been declared so far."""
+
+    def __init__(self, stream: BinaryIO, directory: Directory, faults: FaultList, name: str) -> None:
+        self.stream = stream
+        self.faults = faults
+        self.name = name
+        self.directory = directory
+        self._schemas = dict(directory.schemas)
+        self.channels: dict[int, Channel] = {}
+        self._is_declared, self._is_objects = np.zeros(_CHANNELS, np.bool_), np.zeros(_CHANNELS, np.bool_)
+        self.places = sorted(directory.chunks, key=lambda place: (place.start_ns, place.offset))
+        for channel in directory.channels.values():
+            self._declare(channel)
+        if directory.statistics is None:
+            self._find_channels()
+
+    @property
+    def sees_objects(self) -> bool:
+        """Whether a channel with samples has been declared."""
+        return any(channel.topic == OBJECTS for channel in self.channels.values())
+
+    def iter_messages(
+        self, places: Sequence[ChunkPlace], is_wanted: Callable[[str], bool] = lambda topic: True
+    ) -> Iterator[tuple[ChunkPlace, RawMessages]]:
+        """Yield the messages of some topics in each place; what is lost of them goes to the faults."""
+        declared, passed_over = -1, set[int]()
+        for place, found in iter_records(self.stream, places):
+            if declared < len(self.channels):
+                declared = len(self.channels)
+                passed_over = {n for n, each in self.channels.items() if not is_wanted(each.topic)}
+            if isinstance(found, DamageError):
+                self._fault(place, f"{found}; the ", " are lost")
+                yield place, RawMessages.join([])
+                continue
+            messages = self._messages(place, split_records(found, passed_over), found)
+            if declared < len(self.channels):
+                # those that were declared in this chunk
+                topics = [self.channels[n].topic for n in messages.heads["channel"].tolist()]
+                messages = messages.take(np.flatnonzero(np.fromiter(map(is_wanted, topics), np.bool_)))
+            yield place, messages
+
+    def sample_count(self, messages: RawMessages) -> int:
+        """Count the samples among messages."""
+        return int(np.count_nonzero(self._is_objects[messages.heads["channel"]]))
+
+    def _messages(self, place: ChunkPlace, split: Records, content: bytes) -> RawMessages:
+        """Return the messages among the records of a place that can be used."""
+        damage = self._take_in(split.declarations) or ("a record breaks off" if split.breaks_off else "")
+        if damage:
+            self._fault(place, f"{damage}; of the ", f", {len(split.heads)} could be read")
+        messages = RawMessages(split.heads, [content[own] for own in split.payloads])
+        is_usable = self._is_declared[split.heads["channel"]] & (split.heads["log_time"] <= LATEST_NS)
+        if is_usable.all():
+            return messages
+        lost = len(messages) - np.count_nonzero(is_usable)
+        self._fault(place, f"{lost} of the ", " have no channel, or a time beyond 2**63 - 1 ns")
+        return messages.take(np.flatnonzero(is_usable))
+
+    def _find_channels(self) -> None:
+        """Declare all channels of a log without a summary: chunks need not come in the order of time."""
+        for place in sorted(self.places, key=lambda each: each.offset):
+            # the chunk is read again for its messages, and its damage reported then
+            with suppress(DamageError):
+                self._take_in(split_records(read_records(self.stream, place)).declarations)
+
+    def _take_in(self, declarations: Iterable[tuple[int, bytes]]) -> str:
+        """Store declarations that are new; return what is wrong with one, or ""."""
+        damage = ""
+        for opcode, body in declarations:
+            number = int.from_bytes(body[:2], "little")
+            try:
+                if opcode == Opcode.CHANNEL and number not in self.channels:
+                    self._declare(decoded(records.Channel.read, body))
+                elif opcode == Opcode.SCHEMA and number not in self._schemas:
+                    self._schemas[number] = decoded(records.Schema.read, body)
+            except DamageError as error:
+                damage = damage or str(error)
+        return damage
+
+    def _declare(self, channel: records.Channel) -> None:
+        schema = self._schemas.get(channel.schema_id)
+        self._is_declared[channel.id], self._is_objects[channel.id] = True, channel.topic == OBJECTS
+        self.channels[channel.id] = Channel(
+            channel.topic,
+            channel.message_encoding,
+            Schema(schema.name, schema.encoding, schema.data) if schema else None,
+            MappingProxyType(channel.metadata),
+        )
+
+    def _fault(self, place: ChunkPlace, before: str, after: str) -> None:
+        """Report what happened to the messages in a place, in words before and after their times."""
+        span = "messages between ", Instant(place.start_ns, 0), " and ", Instant(place.end_ns, 0)
+        where = f"{self.name}: at byte {place.offset}: "
+        self.faults.add(Sentence(where, Sentence(before, *span, after)))
+
+
+@dataclass(frozen=True)
+class McapSource:
+    """An MCAP log with the topic /spatial/objects; its index is read once for all uses of the source.
+
+    Attributes:
+        keep: which of its other messages its blocks hold, as `is_kept` takes them. What they do not hold is
+            not read, where chunks say what they hold.
+    """
+
+    path: LogFile
+    kind: str = "MCAP"
+    concave: Concave = "decompose"
+    keep: tuple[str, ...] = (ALL,)
+
+    @property
+    def name(self) -> str:
+        return encodable(self.path.name)
+
+    def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
+        """See `Source.iter_blocks`; derived topics, and those that `keep` does not name, are left out.
+
+        Only chunks that reach into the window are read, if the log has an index.
+        """
+        with self.open_walk() as walk:
+            window = (0 if start_ns is None else start_ns, AFTER_ALL_NS if end_ns is None else end_ns)
+            decoder = _BlockDecoder(self, walk)
+            for messages in _blocks(walk, window, self.is_wanted):
+                yield decoder.block(messages)
+            if not isinstance(self.path, RemoteFile) or window == (0, AFTER_ALL_NS):
+                # some seconds of a log elsewhere are not worth all its attachments
+                check_attachments(walk.stream, walk.directory, walk.faults, self.name)
+            rest = walk.faults.take(last=True)
+            fault = decoder.first_fault or next(iter(rest), None)
+            if not decoder.any_sample and not walk.sees_objects:
+                raise self._without_objects(walk, fault)
+            if not decoder.any_sample and window == (0, AFTER_ALL_NS) and fault is not None:
+                raise LogError(f"{self.name} holds no sample: {fault}")
+            remarks = directory_remarks(self.name, walk.directory, self.metadata())
+            if rest or remarks:
+                yield Block(replace(Trace.from_samples(()), faults=rest), remarks=remarks)
+
+    def iter_payloads(self, topic: str) -> Iterator[tuple[list[bytes], tuple[str, ...]]]:
+        """Yield the payloads of one topic in order, in lists of bounded size, each with what was lost."""
+        with self.open_walk() as walk:
+            for messages in _blocks(walk, (0, AFTER_ALL_NS), topic.__eq__):
+                yield list(messages.payloads), walk.faults.take()
+            yield [], walk.faults.take(last=True)
+
+    def attachments(self) -> tuple[Attachment, ...]:
+        """See `Source.attachments`; those that are damaged are left out."""
+        return self._beside[0]
+
+    def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
+        """See `Source.metadata`; records that are damaged are left out."""
+        return self._beside[1]
+
+    @property
+    def axes(self) -> Axes:
+        """Those of what the log was recorded from; its samples have ours."""
+        return Axes.from_metadata(dict(self.metadata()).get(METADATA, {}))
+
+    @property
+    def signal_units(self) -> Mapping[str, str]:
+        """The units that are declared, by signal."""
+        return signal_units_from_metadata(dict(self.metadata()).get(METADATA, {}))
+
+    @property
+    def begin_ns(self) -> int | None:
+        """When the first chunk with samples begins, if the index says so."""
+        with self.open_walk() as walk:
+            numbers = {number for number, channel in walk.channels.items() if channel.topic == OBJECTS}
+            return next((p.start_ns for p in walk.places if p.channels and p.channels & numbers), None)
+
+    @property
+    def has_samples(self) -> bool:
+        """Whether the log has the topic of our samples."""
+        with self.open_walk() as walk:
+            return any(
+                channel.topic == OBJECTS and channel.schema is not None and channel.schema.name == _SAMPLES
+                for channel in walk.channels.values()
+            )
+
+    def is_wanted(self, topic: str) -> bool:
+        """Return whether the blocks hold messages of a topic."""
+        return topic == OBJECTS or (topic not in DERIVED and is_kept(topic, self.keep, ()))
+
+    @contextmanager
+    def open_walk(self) -> Iterator[ChunkWalk]:
+        """Open the file for a walk over its chunks, whose faults begin with those of the index."""
+        directory, faults = self._index
+        with open_file(self.path) as stream:
+            yield ChunkWalk(stream, directory, deepcopy(faults), self.name)
+
+    @cached_property
+    def _index(self) -> tuple[Directory, FaultList]:
+        """The directory and its faults, read once: without a summary, it takes a scan of the whole file."""
+        faults = FaultList()
+        with open_file(self.path) as stream:
+            return read_directory(stream, faults, self.name), faults
+
+    @cached_property
+    def _beside(self) -> tuple[tuple[Attachment, ...], tuple[tuple[str, Mapping[str, str]], ...]]:
+        directory, _ = self._index
+        with open_file(self.path) as stream:
+            beside = [*directory.attachments, *directory.metadata]
+            plan_reads(stream, ((offset, offset + length) for offset, length in beside))
+            attachments = tuple(iter_attachments(stream, directory, FaultList(), self.name))
+            return attachments, tuple(iter_metadata(stream, directory, FaultList(), self.name))
+
+    def _without_objects(self, walk: ChunkWalk, fault: str | None) -> LogError | UsageError:
+        topics = sorted({channel.topic for channel in walk.channels.values()})
+        if not topics:
+            return LogError(f"{self.name} holds no message" + (f": {fault}" if fault else ""))
+        listed = ", ".join(map(repr, topics[:8])) + (", …" if len(topics) > 8 else "")
+        what = f"no topic {OBJECTS!r} in {self.name}; it has {listed}"
+        if fault:
+            return LogError(f"{what}: {fault}")
+        if METADATA in dict(self.metadata()):
+            remedy = (
+                "no sample was recorded in it, or it is a layer: give the log that the layer was made from"
+            )
+            return UsageError(f"{what}; {remedy}")
+        return UsageError(f"{what}; a mapping file says which of them carry objects")
+
+
+def is_samples(channel: Channel) -> bool:
+    """Return whether the messages of a channel are samples of ours."""
+    schema = channel.schema.name if channel.schema else ""
+    return (channel.topic, channel.encoding, schema) == (OBJECTS, "protobuf", _SAMPLES)
+
+
+def directory_remarks(
+    name: str, directory: Directory, metadata: Sequence[tuple[str, Mapping[str, str]]]
+) -> tuple[str, ...]:
+    """Return what to say about a log with skipped records, or one recovered from a damaged one."""
+    skipped = (
+        (f"{name}: {counted(directory.skipped, 'record')} of kinds that MCAP reserves for later skipped",)
+        if directory.skipped
+        else ()
+    )
+    return skipped + tuple(
+        f"{name} was recovered from {data.get('source', 'a damaged log')}:"
+        f" {data.get('losses', 'how much is missing is not known')}"
+        for record, data in metadata
+        if record == RECOVERY
+    )
+
+
+def _blocks(
+    walk: ChunkWalk, window: tuple[int, int], is_wanted: Callable[[str], bool]
+) -> Iterator[RawMessages]:
+    """Yield the messages of the topics wanted, in order, in blocks of bounded size."""
+    start_ns, end_ns = window
+    numbers = {number for number, channel in walk.channels.items() if is_wanted(channel.topic)}
+    places = [
+        place
+        for place in walk.places
+        if place.start_ns < end_ns
+        and place.end_ns >= start_ns
+        and (place.channels is None or not place.channels.isdisjoint(numbers))
+    ]
+    waiting: list[RawMessages] = []
+    most = most_waiting(place.length for place in places)
+    size = samples = 0
+    for number, (place, messages) in enumerate(walk.iter_messages(places, is_wanted), 1):
+        if place.start_ns < start_ns or place.end_ns >= end_ns:
+            times = messages.heads["log_time"]
+            messages = messages.take(np.flatnonzero((times >= start_ns) & (times < end_ns)))
+        waiting.append(messages)
+        size += messages.nbytes
+        samples += walk.sample_count(messages)
+        if number < len(places) and (size >= BLOCK_BYTES or samples >= BLOCK_SAMPLES):
+            ordered = _in_order(waiting)
+            ready = int(np.searchsorted(ordered.heads["log_time"], places[number].start_ns))
+            waiting = [ordered]
+            if ready:
+                block, rest = ordered.divided(ready)
+                yield block
+                waiting, size, samples = [rest], rest.nbytes, walk.sample_count(rest)
+            if size > most:
+                raise too_many_waiting(walk.name, most)
+    rest = _in_order(waiting)
+    if len(rest):
+        yield rest
+
+
+def _in_order(several: Sequence[RawMessages]) -> RawMessages:
+    """Join messages by log time, channel and sequence; those that share all three keep their order."""
+    joined = RawMessages.join(several)
+    times = joined.heads["log_time"]
+    if (times[1:] > times[:-1]).all():
+        return joined
+    return joined.take(np.lexsort((joined.heads["sequence"], joined.heads["channel"], times)))
+
+
+class _BlockDecoder:
+    """Decodes messages to blocks; remembers the latest sample, after which the next one has to come."""
+
+    def __init__(self, source: McapSource, walk: ChunkWalk) -> None:
+        self._source = source
+        self._walk = walk
+        self._latest_ns = -1
+        self.any_sample = False
+        self.first_fault: str | None = None
+
+    def block(self, messages: RawMessages) -> Block:
+        """Decode the samples among some messages."""
+        columns = self._columns(messages)
+        samples = [number for number, channel in columns.channels.items() if self._is_objects(channel)]
+        is_own = np.isin(columns.channel, samples)
+        own = np.flatnonzero(is_own)
+        times = columns.log_time_ns[own]
+        before = np.maximum.accumulate(np.concatenate([[self._latest_ns], times]))
+        for time_ns in times[times <= before[:-1]].tolist():
+            self._fault(Sentence("sample at ", Instant(time_ns, 0), ": there is one at this time already"))
+        own, self._latest_ns = own[times > before[:-1]], int(before[-1])
+        payloads = [messages.payloads[index] for index in own.tolist()]
+        trace, faults = decode_objects(payloads, columns.log_time_ns[own], concave=self._source.concave)
+        for fault in faults:
+            self._fault(fault)
+        if len(trace) < int(is_own.sum()):
+            # a copy holds the samples that were read, and is sound
+            read = own[np.isin(columns.log_time_ns[own], trace.times_ns)]
+            columns = select(columns, np.union1d(np.flatnonzero(~is_own), read))
+        self.any_sample = self.any_sample or len(trace) > 0
+        lost = self._walk.faults.take()
+        self.first_fault = self.first_fault or next(iter(lost), None)
+        return Block(replace(trace, faults=lost), columns)
+
+    def _is_objects(self, channel: Channel) -> bool:
+        if channel.topic != OBJECTS or is_samples(channel):
+            return channel.topic == OBJECTS
+        schema = channel.schema.name if channel.schema else "none"
+        raise LogError(
+            f"{self._source.name}: {OBJECTS!r} has messages of the schema {schema!r}, encoded as"
+            f" {channel.encoding!r}; give {_SAMPLES} in protobuf"
+        )
+
+    def _columns(self, messages: RawMessages) -> Messages:
+        declared = self._walk.channels.items()
+        is_wanted = self._source.is_wanted
+        heads = messages.heads
+        return Messages(
+            channels=MappingProxyType({n: each for n, each in declared if is_wanted(each.topic)}),
+            channel=heads["channel"].astype(np.int64),
+            sequence=heads["sequence"].astype(np.int64),
+            log_time_ns=heads["log_time"].astype(np.int64),
+            publish_time_ns=heads["publish_time"].astype(np.int64),
+            payloads=messages.payloads,
+        )
+
+    def _fault(self, what: str) -> None:
+        self._walk.faults.add(Sentence(f"{self._source.name}: ", what))

@@ -1,0 +1,456 @@
+"""Write MCAP logs: messages in compressed chunks, each with its index, then the summary.
+
+The writer is our own because chunks have to be the same bytes for the same messages, however these were
+divided among calls.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections import deque
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from functools import cache
+from itertools import chain
+from pathlib import Path
+from threading import local
+from types import TracebackType
+from typing import Any, BinaryIO, Final, NamedTuple, Self
+from zlib import crc32
+
+import numpy as np
+import zstandard
+from mcap import records
+from mcap.opcode import Opcode
+
+from spatial_replay.cores import cores
+from spatial_replay.errors import OutputError
+from spatial_replay.geometry.arrays import Integers
+from spatial_replay.logs.mcap.index import RECORD_HEAD, encoded
+from spatial_replay.logs.messages import Channel, Messages, Schema, messages_of
+from spatial_replay.logs.output_file import output_error
+from spatial_replay.logs.topics import LIBRARY, MAGIC, OWN_PREFIX
+from spatial_replay.trace.sample import FOREVER
+
+CHUNK_BYTES = 512 * 2**10
+"""A chunk is closed when it holds this much, uncompressed."""
+CHUNK_NS = 10**9
+"""A chunk is closed before a message this much later than its first one."""
+WHOLE_CHUNK_NS = 10 * CHUNK_NS
+"""The same for a log that appears only when it is whole: fewer chunks are quicker and smaller."""
+REPEAT_NS = 5 * 10**9
+"""A channel is declared again in the second chunk with its messages, and in one this much after the last that
+declares it. In every chunk, schemas would add 15 % to an annotated log; so they add up to 5 %."""
+WAITING_BYTES = 64 * 2**20
+"""Bytes of chunks that may wait for their compression: pictures and clouds of points make large ones."""
+COMPRESSION_LEVEL: Final = 1
+"""Coordinates hardly shrink further at higher levels, which take several times as long."""
+_OWN_LEVEL, _OWN_HASH_LOG = -1, 12
+"""The same for our own messages, of which each is much like the one before: a small table finds what repeats,
+in three quarters of the time for a twentieth more bytes."""
+
+_HEAD: Final = np.dtype(
+    [
+        ("opcode", "u1"),
+        ("length", "<u8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("log_time", "<u8"),
+        ("publish_time", "<u8"),
+    ]
+)
+_HEAD_BYTES: Final = _HEAD.itemsize
+_INDEX_HEAD: Final = struct.Struct("<BQHI")
+_INDEX_ENTRY: Final = 16
+_ZSTD: Final = b"zstd"
+_CHUNK: Final = struct.Struct("<BQQQQII4sQ")
+
+
+@dataclass(slots=True)
+class _Lane:
+    """The open chunk of some topics.
+
+    Attributes:
+        is_own: whether the messages are ours, and so each much like the one before.
+        records: heads and payloads of its messages in turn.
+        channels, times_ns, sizes: of each message: number of its channel, log time, bytes of its record.
+        size: of all records, in bytes.
+        began_s: when it began by the clock.
+    """
+
+    is_own: bool
+    records: list[bytes] = field(default_factory=list)
+    channels: list[int] = field(default_factory=list)
+    times_ns: list[int] = field(default_factory=list)
+    sizes: list[int] = field(default_factory=list)
+    size: int = 0
+    began_s: float = 0.0
+
+
+class _PackedChunk(NamedTuple):
+    """A chunk with its index, ready to be written, and what the summary says of it.
+
+    Attributes:
+        record_bytes, index_bytes: how long its record is, and its index of messages, which follows.
+        offsets: channels with the places of their indexes, one after the other, from the chunk on.
+        counts: how many messages there are, by channel.
+    """
+
+    data: bytes
+    record_bytes: int
+    index_bytes: int
+    offsets: list[int]
+    counts: dict[int, int]
+    compressed_size: int
+    uncompressed_size: int
+    start_ns: int
+    end_ns: int
+
+
+def _packed(lane: _Lane, declaring: bytes) -> _PackedChunk:
+    """Compress the chunk of a lane, which begins with some declarations, and make its index."""
+    content = b"".join([declaring, *lane.records])
+    compressed = _compressor(lane.is_own).compress(content)
+    start_ns, end_ns = min(lane.times_ns), max(lane.times_ns)
+    length = _CHUNK.size - RECORD_HEAD.size + len(compressed)
+    about = start_ns, end_ns, len(content), crc32(content), len(_ZSTD), _ZSTD, len(compressed)
+    parts = [_CHUNK.pack(Opcode.CHUNK, length, *about), compressed]
+    channels, sizes = np.array(lane.channels), np.array(lane.sizes)
+    entries = np.stack([lane.times_ns, len(declaring) + np.cumsum(sizes) - sizes], axis=1).astype("<u8")
+    record_bytes = at = RECORD_HEAD.size + length
+    offsets, counts = list[int](), dict[int, int]()
+    for channel in np.unique(channels).tolist():
+        own = entries[channels == channel].tobytes()
+        offsets += channel, at
+        counts[channel] = len(own) // _INDEX_ENTRY
+        parts += _INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, len(own) + 6, channel, len(own)), own
+        at += _INDEX_HEAD.size + len(own)
+    sizes_in_file = len(compressed), len(content)
+    return _PackedChunk(
+        b"".join(parts), record_bytes, at - record_bytes, offsets, counts, *sizes_in_file, start_ns, end_ns
+    )
+
+
+_local = local()
+
+
+def _compressor(is_own: bool) -> zstandard.ZstdCompressor:
+    """Return a compressor of this thread: one serves one thread at a time."""
+    if not hasattr(_local, "compressors"):
+        own = zstandard.ZstdCompressionParameters.from_level(_OWN_LEVEL, hash_log=_OWN_HASH_LOG)
+        _local.compressors = (
+            zstandard.ZstdCompressor(level=COMPRESSION_LEVEL),
+            zstandard.ZstdCompressor(compression_params=own),
+        )
+    compressors: tuple[zstandard.ZstdCompressor, zstandard.ZstdCompressor] = _local.compressors
+    return compressors[is_own]
+
+
+@dataclass(slots=True)
+class _Summary:
+    """What a log holds, collected while it is written."""
+
+    schemas: list[records.Schema] = field(default_factory=list)
+    channels: list[records.Channel] = field(default_factory=list)
+    chunks: list[bytes] = field(default_factory=list)
+    attachments: list[records.AttachmentIndex] = field(default_factory=list)
+    metadata: list[records.MetadataIndex] = field(default_factory=list)
+    counts: dict[int, int] = field(default_factory=dict)
+    start_ns: int = FOREVER
+    end_ns: int = 0
+
+    def add(self, chunk: _PackedChunk, offset: int) -> None:
+        """Add a chunk that is written at a place in the file."""
+        self.chunks.append(_chunk_index(chunk, offset))
+        for channel, count in chunk.counts.items():
+            self.counts[channel] = self.counts.get(channel, 0) + count
+        self.start_ns = min(self.start_ns, chunk.start_ns)
+        self.end_ns = max(self.end_ns, chunk.end_ns)
+
+    def section(self, offset: int) -> bytes:
+        """Encode the section and the footer for a place in the file."""
+        groups = (
+            (Opcode.SCHEMA, encoded(*self.schemas)),
+            (Opcode.CHANNEL, encoded(*self.channels)),
+            (Opcode.STATISTICS, encoded(self._statistics())),
+            (Opcode.CHUNK_INDEX, b"".join(self.chunks)),
+            (Opcode.ATTACHMENT_INDEX, encoded(*self.attachments)),
+            (Opcode.METADATA_INDEX, encoded(*self.metadata)),
+        )
+        section, offsets = b"", []
+        for opcode, content in groups:
+            if content:
+                offsets.append(records.SummaryOffset(opcode, offset + len(section), len(content)))
+                section += content
+        footer = struct.pack("<BQQQ", Opcode.FOOTER, 20, offset, offset + len(section))
+        section += encoded(*offsets) + footer
+        return section + struct.pack("<I", crc32(section))
+
+    def _statistics(self) -> records.Statistics:
+        return records.Statistics(
+            attachment_count=len(self.attachments),
+            channel_count=len(self.channels),
+            channel_message_counts=self.counts,
+            chunk_count=len(self.chunks),
+            message_count=sum(self.counts.values()),
+            message_end_time=self.end_ns,
+            message_start_time=self.start_ns if self.chunks else 0,
+            metadata_count=len(self.metadata),
+            schema_count=len(self.schemas),
+        )
+
+
+_CHUNK_INDEX: Final = "<BQQQQQI{}QI4sQQ"
+
+
+def _chunk_index(chunk: _PackedChunk, offset: int) -> bytes:
+    """Encode the index of a chunk as `encoded` does, in a tenth of the time: long logs have very many."""
+    record = _chunk_index_record(len(chunk.offsets) // 2)
+    places = list(chunk.offsets)
+    places[1::2] = [offset + at for at in places[1::2]]
+    about = chunk.start_ns, chunk.end_ns, offset, chunk.record_bytes, len(places) // 2 * 10
+    sizes = chunk.index_bytes, len(_ZSTD), _ZSTD, chunk.compressed_size, chunk.uncompressed_size
+    return record.pack(Opcode.CHUNK_INDEX, record.size - RECORD_HEAD.size, *about, *places, *sizes)
+
+
+@cache
+def _chunk_index_record(channels: int) -> struct.Struct:
+    return struct.Struct(_CHUNK_INDEX.format("HQ" * channels))
+
+
+@dataclass(slots=True)
+class _Declaration:
+    """A channel and its schema as records, in how many chunks they were declared, and from when on the next
+    one does."""
+
+    schema: bytes
+    channel: bytes
+    count: int = 0
+    due_ns: int = -FOREVER
+
+
+class LogWriter:
+    """Writes one MCAP log to a stream, from its first byte to its last.
+
+    Equal calls give equal bytes. How messages are divided among calls makes no difference; a `clock`
+    makes one, because then a chunk is also closed when a second of its time has passed.
+
+    Raises:
+        OutputError: from any method, when the stream cannot take what is written to it.
+    """
+
+    def __init__(
+        self,
+        stream: BinaryIO,
+        *,
+        profile: str = "",
+        library: str = LIBRARY,
+        chunk_ns: int = CHUNK_NS,
+        clock: Callable[[], float] | None = None,
+    ) -> None:
+        """Begin a log.
+
+        Args:
+            stream: takes bytes; need not seek. It is flushed after each chunk, and left open.
+            chunk_ns: a chunk is closed before a message this much later than its first one.
+            clock: seconds, for a log whose samples come in real time.
+        """
+        self._stream = stream
+        self._path = Path(str(getattr(stream, "name", "the log")))
+        self._chunk_ns = chunk_ns
+        self._clock = clock
+        self._offset = 0
+        self._summary = _Summary()
+        self._channels: dict[Channel, int] = {}
+        self._schemas: dict[Schema, int] = {}
+        self._declarations: dict[int, _Declaration] = {}
+        self._lanes = [_Lane(is_own=True), _Lane(is_own=False)]
+        self._threads = ThreadPoolExecutor(cores(), "packing")
+        self._packing: deque[tuple[int, Future[_PackedChunk]]] = deque()
+        self._packing_bytes = 0
+        self._closed = False
+        self._write(MAGIC)
+        self._write_record(records.Header(profile, library))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if isinstance(error, OutputError):
+            self._threads.shutdown(cancel_futures=True)
+        else:
+            self.close()
+
+    def write(self, channel: Channel, log_time_ns: int, payload: bytes, *, sequence: int = 0) -> None:
+        """Add one message, published at its log time."""
+        self.write_messages(messages_of(channel, np.array([log_time_ns], np.int64), (payload,), sequence))
+
+    def write_messages(self, messages: Messages) -> None:
+        """Add messages in the order given."""
+        if not len(messages):
+            return
+        numbers, lanes = self._numbers(messages)
+        for number, lane in enumerate(self._lanes):
+            if lane.records and self._clock and (self._clock() - lane.began_s) * 1e9 >= CHUNK_NS:
+                self._end(number)
+        sizes = np.fromiter(map(len, messages.payloads), np.int64, len(messages)) + _HEAD_BYTES
+        heads = np.zeros(len(messages), _HEAD)
+        heads["opcode"] = Opcode.MESSAGE
+        heads["length"] = sizes - RECORD_HEAD.size
+        heads["channel"] = numbers
+        heads["sequence"] = messages.sequence
+        heads["log_time"] = messages.log_time_ns
+        heads["publish_time"] = messages.publish_time_ns
+        encoded_heads, at = heads.tobytes(), 0
+        columns = lanes.tolist(), numbers.tolist(), messages.log_time_ns.tolist(), sizes.tolist()
+        due_ns = self._due_ns()
+        for payload, number, channel, time_ns, size in zip(messages.payloads, *columns, strict=True):
+            if time_ns >= due_ns:
+                for other, lane in enumerate(self._lanes):
+                    if lane.records and time_ns - lane.times_ns[0] >= self._chunk_ns:
+                        self._end(other)
+                due_ns = self._due_ns()
+            lane = self._lanes[number]
+            if not lane.records:
+                due_ns = min(due_ns, time_ns + self._chunk_ns)
+                lane.began_s = self._clock() if self._clock else 0.0
+            lane.records += encoded_heads[at : at + _HEAD_BYTES], payload
+            lane.channels.append(channel)
+            lane.times_ns.append(time_ns)
+            lane.sizes.append(size)
+            lane.size += size
+            at += _HEAD_BYTES
+            if lane.size >= CHUNK_BYTES:
+                self._end(number)
+                due_ns = self._due_ns()
+
+    def _due_ns(self) -> int:
+        """Return the time from which on a message closes a chunk."""
+        return (
+            min((lane.times_ns[0] for lane in self._lanes if lane.records), default=FOREVER) + self._chunk_ns
+        )
+
+    def add_metadata(self, name: str, data: Mapping[str, str]) -> None:
+        """Add a metadata record, its keys in the order given, after closing the chunk."""
+        self.flush()
+        offset, length = self._write_record(records.Metadata(name, dict(data)))
+        self._summary.metadata.append(records.MetadataIndex(offset=offset, length=length, name=name))
+
+    def add_attachment(
+        self, name: str, media_type: str, data: bytes, *, log_time_ns: int = 0, create_time_ns: int = 0
+    ) -> None:
+        """Add an attachment, after closing the chunk; its times are left open unless given."""
+        self.flush()
+        about: dict[str, Any] = {
+            "create_time": create_time_ns,
+            "log_time": log_time_ns,
+            "name": name,
+            "media_type": media_type,
+        }
+        offset, length = self._write_record(records.Attachment(data=data, **about))
+        index = records.AttachmentIndex(offset=offset, length=length, data_size=len(data), **about)
+        self._summary.attachments.append(index)
+
+    def flush(self) -> None:
+        """Close the chunks and hand everything written so far to the operating system."""
+        for number, lane in enumerate(self._lanes):
+            if lane.records:
+                self._end(number)
+        self._write_packed(0)
+
+    def close(self) -> None:
+        """Finish the log: summary, index and footer. Closing twice does nothing."""
+        if self._closed:
+            return
+        self._closed = True
+        try:
+            self.flush()
+            self._write_record(records.DataEnd(0))
+            self._write(self._summary.section(self._offset) + MAGIC)
+            self._flush_stream()
+        finally:
+            self._threads.shutdown(cancel_futures=True)
+
+    def _numbers(self, messages: Messages) -> tuple[Integers, Integers]:
+        """Return (M,) channel numbers and (M,) lanes; channels that are new are numbered as they come."""
+        known, first = np.unique(messages.channel, return_index=True)
+        number = np.zeros(int(known.max()) + 1, np.int64)
+        lane = np.zeros(len(number), np.int64)
+        for local_number in known[np.argsort(first)].tolist():
+            channel = messages.channels[local_number]
+            lane[local_number] = not channel.topic.startswith(OWN_PREFIX)
+            if channel not in self._channels:
+                self._declare(channel)
+            number[local_number] = self._channels[channel]
+        return number[messages.channel], lane[messages.channel]
+
+    def _declare(self, channel: Channel) -> None:
+        """Number a channel and its schema, and prepare the records that chunks declare them with."""
+        schema, described = channel.schema, b""
+        if schema is not None:
+            is_new = schema not in self._schemas
+            number = self._schemas.setdefault(schema, len(self._schemas) + 1)
+            record = records.Schema(id=number, data=schema.data, encoding=schema.encoding, name=schema.name)
+            if is_new:
+                self._summary.schemas.append(record)
+            described = encoded(record)
+        self._channels[channel] = len(self._channels) + 1
+        declared = records.Channel(
+            id=self._channels[channel],
+            topic=channel.topic,
+            message_encoding=channel.encoding,
+            metadata=dict(channel.metadata),
+            schema_id=0 if schema is None else self._schemas[schema],
+        )
+        self._summary.channels.append(declared)
+        self._declarations[declared.id] = _Declaration(described, encoded(declared))
+
+    def _end(self, number: int) -> None:
+        """Have the open chunk of a lane packed on another thread, and write those that are ready."""
+        lane = self._lanes[number]
+        self._lanes[number] = _Lane(lane.is_own)
+        self._packing.append((lane.size, self._threads.submit(_packed, lane, self._declaring(lane))))
+        self._packing_bytes += lane.size
+        self._write_packed(WAITING_BYTES)
+
+    def _declaring(self, lane: _Lane) -> bytes:
+        """Return the declarations that a chunk begins with; each schema is in it once."""
+        start_ns = lane.times_ns[0]
+        own = [self._declarations[number] for number in sorted(set(lane.channels))]
+        due = [each for each in own if start_ns >= each.due_ns]
+        for each in due:
+            each.count += 1
+            each.due_ns = -FOREVER if each.count < 2 else start_ns + REPEAT_NS
+        return b"".join(chain(dict.fromkeys(each.schema for each in due), (each.channel for each in due)))
+
+    def _write_packed(self, waiting_bytes: int) -> None:
+        """Write chunks in their order until no more bytes are waiting, and those that are ready."""
+        while self._packing and (self._packing_bytes > waiting_bytes or self._packing[0][1].done()):
+            size, packing = self._packing.popleft()
+            chunk = packing.result()
+            self._packing_bytes -= size
+            self._summary.add(chunk, self._offset)
+            self._write(chunk.data)
+            self._flush_stream()
+
+    def _write_record(self, record: records.McapRecord) -> tuple[int, int]:
+        """Write a record; return its place and length."""
+        offset, content = self._offset, encoded(record)
+        self._write(content)
+        return offset, len(content)
+
+    def _write(self, data: bytes) -> None:
+        try:
+            self._stream.write(data)
+        except OSError as error:
+            raise output_error(self._path, error) from error
+        self._offset += len(data)
+
+    def _flush_stream(self) -> None:
+        try:
+            self._stream.flush()
+        except OSError as error:
+            raise output_error(self._path, error) from error
