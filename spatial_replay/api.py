@@ -394,8 +394,7 @@ def evaluate_logs(
         OutputError: results cannot be written; those written so far stay.
         ClusterError: the scheduler is lost; the results written so far stay.
     """
-    from spatial_replay.batch.prepare import prepare
-    from spatial_replay.batch.run import run_batch, workers_of
+    from spatial_replay.batch.run import prepare, run_batch, workers_of
     from spatial_replay.batch.suite import Conditions, Suite, load_suite
 
     _refuse_unknown(reading, Reading)
@@ -432,7 +431,7 @@ def read_results(folder: PathName) -> pa.Table:
         UsageError: no such folder, no results in it, or those of another version; pyarrow is not installed.
         LogError: the table is damaged.
     """
-    from spatial_replay.batch.data_set import ResultsFolder
+    from spatial_replay.batch.store import ResultsFolder
 
     return ResultsFolder.open(folder).read_run()
 

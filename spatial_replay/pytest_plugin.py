@@ -39,8 +39,8 @@ class SuiteFile(pytest.File):
 
     def collect(self) -> Iterable[pytest.Item]:
         """Yield a test for each case, log and spec; faults of the suite end the collection."""
-        from spatial_replay.batch.prepare import prepare
         from spatial_replay.batch.rows import Task
+        from spatial_replay.batch.run import prepare
         from spatial_replay.batch.suite import load_suite
         from spatial_replay.errors import SpatialReplayError
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from spatial_replay.annotate.specification import ReportedTree
 from spatial_replay.automata.automaton import FALSE, TRUE, UNKNOWN, Automaton, TransitionTable
 from spatial_replay.automata.compile import automaton, stored_text
-from spatial_replay.automata.dot_hoa import size_words
 from spatial_replay.automata.guards import Transition
+from spatial_replay.automata.text import size_words
 from spatial_replay.errors import NoAutomatonError
 from spatial_replay.geometry.arrays import Flags, Integers, combined, equal_places
 from spatial_replay.logs.messages import Attachment

@@ -12,8 +12,8 @@ from spatial_replay.lazy import loaded_when_used
 if TYPE_CHECKING:
     from spatial_replay.automata.automaton import TransitionTable
     from spatial_replay.automata.compile import Compiler, automaton_from, chosen_spec, stored_text
-    from spatial_replay.automata.dot_hoa import dot_text, hoa_text, svg_text, words_text
     from spatial_replay.automata.guards import Transition
+    from spatial_replay.automata.text import dot_text, hoa_text, svg_text, words_text
 
 __all__ = [
     "Compiler",
@@ -33,7 +33,7 @@ __getattr__, __dir__ = loaded_when_used(
     {
         "automaton": ("TransitionTable",),
         "compile": ("Compiler", "automaton_from", "chosen_spec", "stored_text"),
-        "dot_hoa": ("dot_text", "hoa_text", "svg_text", "words_text"),
+        "text": ("dot_text", "hoa_text", "svg_text", "words_text"),
         "guards": ("Transition",),
     },
 )

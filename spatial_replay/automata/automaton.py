@@ -10,9 +10,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from spatial_replay.automata.guards import Moves, Successors, Transition, guard_words
+from spatial_replay.automata.guards import Moves, Proposition, Successors, Transition, guard_words
 from spatial_replay.automata.minimise import Machine, above_of, sources_of
-from spatial_replay.automata.propositions import Proposition
 from spatial_replay.compiled import elementwise, kernel
 from spatial_replay.errors import NoAutomatonError, UsageError
 from spatial_replay.geometry.arrays import Flags, Integers
@@ -238,13 +237,13 @@ class Automaton(Displayed):
 
     def to_dot(self) -> str:
         """Return the automaton in the language of Graphviz; see `dot_hoa.dot_text`."""
-        from spatial_replay.automata.dot_hoa import dot_text
+        from spatial_replay.automata.text import dot_text
 
         return dot_text(self)
 
     def to_hoa(self) -> str:
         """Return the automaton in the Hanoi format for tools of automata theory; see `dot_hoa.hoa_text`."""
-        from spatial_replay.automata.dot_hoa import hoa_text
+        from spatial_replay.automata.text import hoa_text
 
         return hoa_text(self)
 

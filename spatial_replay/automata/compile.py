@@ -1,29 +1,382 @@
-"""Compile a spec to its automaton, by this package or by MONA; read and write compiled automata.
-
-MONA is slow and may not be installed where a log is replayed, so a compiled automaton can be stored.
-"""
+"""Formulas to automata: by progression, by products of operands, or by MONA."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
+from heapq import heapify, heappop, heappush
 from types import MappingProxyType
-from typing import Literal, TypeAlias, get_args
+from typing import Literal, NamedTuple, TypeAlias, get_args
+
+import numpy as np
 
 from spatial_replay.automata.automaton import MAX_PROPOSITIONS, MAX_ROWS, Automaton, automaton_of
-from spatial_replay.automata.ltlf import Node, Skeleton, counts_seconds, no_automaton
-from spatial_replay.automata.minimise import Machine, least
+from spatial_replay.automata.guards import LEAF, NO, YES, Diagrams, Propositions, copied
+from spatial_replay.automata.ltlf import FALSE, TRUE, Node, Skeleton, counts_seconds, no_automaton
+from spatial_replay.automata.minimise import Machine, least, machine_of, merged
 from spatial_replay.automata.mona import compiled_by_mona
-from spatial_replay.automata.products import composed
-from spatial_replay.automata.propositions import Propositions
 from spatial_replay.errors import NoAutomatonError, UsageError
 from spatial_replay.spec.diagnostics import SourceText, nearest_hint
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import NamedSpec, Specification
 from spatial_replay.spec.load import require_specification
+
+Obligation: TypeAlias = tuple[int, bool]
+"""A subformula's number, and whether there has to be a next sample."""
+
+
+class Chain(NamedTuple):
+    """Obligations, each of which is implied by the one before.
+
+    Attributes:
+        members: numbers of their subformulas.
+        strong: whether there has to be a next sample.
+        first: the first of the variables that hold, as a number in binary, how many members do not hold.
+        bits: how many variables these are; the most significant bit comes first.
+    """
+
+    members: tuple[int, ...]
+    strong: bool
+    first: int
+    bits: int
+
+
+class Obligations:
+    """The variables of obligations, allotted to a chain when the first of its members is needed."""
+
+    def __init__(self, diagrams: Diagrams, first: int, longer: Mapping[Obligation, int]) -> None:
+        """Begin without obligations.
+
+        Args:
+            first: the first variable to allot.
+            longer: as `chains` of a skeleton.
+        """
+        self._diagrams = diagrams
+        self._first = first
+        self._chains: list[Chain] = []
+        self._members = _members(longer)
+        self._places: dict[Obligation, tuple[Chain, int]] = {}
+
+    def diagram(self, obligation: Obligation) -> int:
+        """Return the diagram of an obligation: true where it is met."""
+        if obligation not in self._places:
+            self._begin(obligation)
+        chain, index = self._places[obligation]
+        node = YES
+        for bit in range(chain.bits):
+            # it holds iff at most the members before it do not: the count in the bits is at most its index
+            branches = (YES, node) if index >> bit & 1 else (node, NO)
+            node = self._diagrams.decide(chain.first + chain.bits - 1 - bit, *branches)
+        return node
+
+    def chain(self, variable: int) -> Chain:
+        """Return the chain that a variable is one of."""
+        return self._chains[variable - self._first]
+
+    def cases(self, chain: Chain, node: int) -> list[tuple[int, int]]:
+        """Split a function that decides on a chain first into cases.
+
+        Returns:
+            Pairs of a count and the function that is left where fewer than so many of the chain's members do
+            not hold, and not as few as in the pair before.
+        """
+        found: list[tuple[int, int]] = []
+        below = 0
+        for count, rest in self._rests(chain, node, 0):
+            below += count
+            if found and found[-1][1] == rest:
+                found.pop()
+            found.append((below, rest))
+        return found
+
+    def _rests(self, chain: Chain, node: int, bit: int) -> Iterator[tuple[int, int]]:
+        """Yield the functions that are left, each with the number of counts in a row that it holds for."""
+        if self._diagrams[node].variable >= chain.first + chain.bits:
+            yield 1 << (chain.bits - bit), node
+            return
+        for branch in self._diagrams.branches(node, chain.first + bit):
+            yield from self._rests(chain, branch, bit + 1)
+
+    def _begin(self, obligation: Obligation) -> None:
+        number, strong = obligation
+        members = self._members.get(obligation, (number,))
+        bits = len(members).bit_length()
+        chain = Chain(members, strong, self._first + len(self._chains), bits)
+        self._chains += [chain] * bits
+        self._places.update({(each, strong): (chain, index) for index, each in enumerate(members)})
+
+
+def _members(longer: Mapping[Obligation, int]) -> dict[Obligation, tuple[int, ...]]:
+    """Return for each obligation that is in a chain, the chain's members."""
+    later = {(number, strong) for (_, strong), number in longer.items()}
+    chains: dict[Obligation, tuple[int, ...]] = {}
+    for begin, strong in longer:
+        if (begin, strong) in later:
+            continue
+        members = [begin]
+        while (after := longer.get((members[-1], strong))) is not None and (after, strong) not in chains:
+            members.append(after)
+        # until by a sooner deadline implies until by a later one; holding longer implies holding shorter
+        ordered = tuple(members if strong else reversed(members))
+        chains.update({(each, strong): ordered for each in members})
+    return chains
+
+
+MAX_STATES = 5000
+"""States explored at most, before equivalent ones are merged."""
+
+MAX_DECISIONS = 150_000
+"""How many nodes the decision diagrams may have."""
+
+
+def progressed(
+    skeleton: Skeleton,
+    propositions: int,
+    number: int | None = None,
+    *,
+    states: int = MAX_STATES,
+    decisions: int = MAX_DECISIONS,
+) -> Machine:
+    """Return an automaton of a skeleton over so many propositions.
+
+    Args:
+        number: the subformula that it is of; without it, the whole formula.
+        states, decisions: how many it takes at most.
+
+    Raises:
+        NoAutomatonError: it would take more.
+    """
+    root = skeleton.root if number is None else number
+    try:
+        return _Progression(skeleton, propositions, states, decisions).machine(root)
+    except RecursionError:
+        raise NoAutomatonError("the automaton takes decisions that are nested too deeply") from None
+
+
+class _Progression:
+    """The states of a skeleton, explored from the first one."""
+
+    def __init__(self, skeleton: Skeleton, propositions: int, states: int, decisions: int) -> None:
+        self._skeleton = skeleton
+        self._propositions = propositions
+        self._most = states
+        self._diagrams = Diagrams(decisions)
+        self._obligations = Obligations(self._diagrams, propositions, skeleton.chains)
+        self._now: dict[int, int] = {FALSE: NO, TRUE: YES}
+        self._next: dict[int, int] = {NO: NO, YES: YES}
+
+    def machine(self, root: int) -> Machine:
+        states: dict[int, int] = {}
+        waiting: list[int] = []
+
+        def number(node: int) -> int:
+            if node not in states:
+                if len(waiting) == self._most:
+                    raise NoAutomatonError(f"the automaton takes more than {self._most} states")
+                states[node] = len(waiting)
+                waiting.append(node)
+            return states[node]
+
+        result = Diagrams()
+        copy = copied(self._diagrams, result, self._propositions, number)
+        start = copy(self._read(root))
+        # the list grows while it is iterated: moves lead to new states
+        moves = [copy(self._after(node)) for node in waiting]
+        return machine_of(result, moves, [self._accepts(node) for node in waiting], start)
+
+    def _read(self, number: int) -> int:
+        """Return what a subformula requires of this sample and, as obligations, of the next."""
+        if number not in self._now:
+            self._now[number] = self._reading(number)
+        return self._now[number]
+
+    def _reading(self, number: int) -> int:
+        diagrams = self._diagrams
+        kind, first, second = self._skeleton.nodes[number]
+        match kind:
+            case "literal":
+                variable = diagrams.variable(first)
+                return variable if second else diagrams.complement(variable)
+            case "and":
+                return diagrams.both(self._read(first), self._read(second))
+            case "or":
+                return diagrams.either(self._read(first), self._read(second))
+            case "X" | "WX":
+                return self._obligations.diagram((first, kind == "X"))
+            case "U":
+                later = diagrams.both(self._read(first), self._obligations.diagram((number, True)))
+                return diagrams.either(self._read(second), later)
+            case "R":
+                later = diagrams.either(self._read(first), self._obligations.diagram((number, False)))
+                return diagrams.both(self._read(second), later)
+        raise ValueError(kind)
+
+    def _after(self, node: int) -> int:
+        """Return the states that follow a state, under decisions on propositions."""
+        if node not in self._next:
+            chain = self._obligations.chain(self._diagrams[node].variable)
+            *cases, (_, rest) = self._obligations.cases(chain, node)
+            result = self._after(rest)
+            for below, rest in reversed(cases):
+                obliged = self._read(chain.members[below - 1])
+                result = self._diagrams.choose(obliged, self._after(rest), result)
+            self._next[node] = result
+        return self._next[node]
+
+    def _accepts(self, node: int) -> bool:
+        """Return whether nothing is left to hold if the run has ended."""
+        while node not in (NO, YES):
+            variable, low, high = self._diagrams[node]
+            # at the end strong obligations fail, and weak ones hold
+            node = high if self._obligations.chain(variable).strong else low
+        return node == YES
+
+
+MAX_PAIRS = 400_000
+"""Pairs of decisions that are visited at most to join two automata."""
+
+MAX_PRODUCT = 50_000
+"""States that two joined automata have at most, before equivalent ones are merged."""
+
+_FEW_STATES, _FEW_DECISIONS = 1_000, 20_000
+"""A formula that takes no more is compiled at once, without a look at its operands."""
+
+
+def composed(skeleton: Skeleton, propositions: int) -> Machine:
+    """Return an automaton of a skeleton over so many propositions.
+
+    Raises:
+        NoAutomatonError: it would take more states or decisions than are explored.
+    """
+    return _Composition(skeleton, propositions).machine(skeleton.root)
+
+
+class _Composition:
+    """The automata of parts of a skeleton."""
+
+    def __init__(self, skeleton: Skeleton, propositions: int) -> None:
+        self._skeleton = skeleton
+        self._propositions = propositions
+        self._known: dict[int, Machine] = {}
+
+    def machine(self, number: int) -> Machine:
+        """Return the automaton of a subformula."""
+        if number not in self._known:
+            self._known[number] = self._compiled(number)
+        return self._known[number]
+
+    def _compiled(self, number: int) -> Machine:
+        try:
+            return self._progressed(number, _FEW_STATES, _FEW_DECISIONS)
+        except NoAutomatonError:
+            kind, operands = self._skeleton.split(number)
+        if len(operands) > 1:
+            try:
+                return self._joined(operands, kind == "and")
+            except NoAutomatonError:
+                pass
+        return self._progressed(number, MAX_STATES, MAX_DECISIONS)
+
+    def _progressed(self, number: int, states: int, decisions: int) -> Machine:
+        return progressed(self._skeleton, self._propositions, number, states=states, decisions=decisions)
+
+    def _joined(self, operands: tuple[int, ...], both: bool) -> Machine:
+        machines = [merged(self.machine(each)) for each in operands]
+        waiting = [(each.size, number) for number, each in enumerate(machines)]
+        heapify(waiting)
+        while len(waiting) > 1:
+            first, second = (machines[heappop(waiting)[1]] for _ in range(2))
+            machines.append(merged(joined(first, second, both)))
+            heappush(waiting, (machines[-1].size, len(machines) - 1))
+        return machines[-1]
+
+
+def joined(first: Machine, second: Machine, both: bool) -> Machine:
+    """Return the automaton of the runs that both machines accept or, if not `both`, that one of them does.
+
+    Args:
+        first, second: machines without equivalent states.
+
+    Raises:
+        NoAutomatonError: it takes more than `MAX_PAIRS` or `MAX_PRODUCT`.
+    """
+    return _Joining(first, second, both).machine()
+
+
+class _Joining:
+    """The pairs of places that are visited."""
+
+    def __init__(self, first: Machine, second: Machine, both: bool) -> None:
+        self._machines = first, second
+        self._both = both
+        self._left, self._right = first.decisions.tolist(), second.decisions.tolist()
+        # a trap of one loses for both, and what accepts whatever comes wins for either
+        self._decided = _decided(first, not both), _decided(second, not both)
+        self._rows: list[tuple[int, int, int]] = []
+        self._known: dict[tuple[int, int], int] = {}
+        self._states: dict[tuple[int, int], int] = {}
+        self._pairs: list[tuple[int, int]] = []
+
+    def machine(self) -> Machine:
+        first, second = self._machines
+        left, right = first.moves.tolist(), second.moves.tolist()
+        start = self._place(first.start, second.start)
+        # the list grows while it is iterated: moves lead to new pairs
+        moves = [
+            ~state if one < 0 else self._place(left[one], right[other])
+            for state, (one, other) in enumerate(self._pairs)
+        ]
+        join = np.logical_and if self._both else np.logical_or
+        pairs = np.array(self._pairs, np.int64)
+        accepting = join(first.accepting[pairs[:, 0]], second.accepting[pairs[:, 1]])
+        accepting[pairs[:, 0] < 0] = not self._both
+        rows = np.array(self._rows, np.int64).reshape(-1, 3)
+        return Machine(np.array(moves, np.int64), rows, accepting, start)
+
+    def _place(self, one: int, other: int) -> int:
+        if one in self._decided[0] or other in self._decided[1]:
+            return self._state(-1, -1)
+        if one < 0 and other < 0:
+            return self._state(~one, ~other)
+        place = self._known.get((one, other))
+        if place is None:
+            place = self._known[one, other] = self._decision(one, other)
+            if len(self._known) > MAX_PAIRS:
+                raise NoAutomatonError(f"joining its operands takes more than {MAX_PAIRS} steps")
+        return place
+
+    def _decision(self, one: int, other: int) -> int:
+        before, low, high = self._left[one] if one >= 0 else (LEAF, one, one)
+        after, low_other, high_other = self._right[other] if other >= 0 else (LEAF, other, other)
+        if before < after:
+            low_other = high_other = other
+        elif after < before:
+            low = high = one
+        when_false, when_true = self._place(low, low_other), self._place(high, high_other)
+        if when_false == when_true:
+            return when_false
+        self._rows.append((min(before, after), when_false, when_true))
+        return len(self._rows) - 1
+
+    def _state(self, one: int, other: int) -> int:
+        """Return the place of a pair of states; (-1, -1) are those in which one has decided already."""
+        number = self._states.get((one, other))
+        if number is None:
+            number = self._states[one, other] = len(self._pairs)
+            if number >= MAX_PRODUCT:
+                raise NoAutomatonError(f"joining its operands takes more than {MAX_PRODUCT} states")
+            self._pairs.append((one, other))
+        return ~number
+
+
+def _decided(machine: Machine, accepts: bool) -> frozenset[int]:
+    """Return the places of states that accept, or never accept, whatever comes."""
+    stays = machine.moves == ~np.arange(len(machine.moves))
+    return frozenset((~np.flatnonzero(stays & (machine.accepting == accepts))).tolist())
+
 
 _VERSION = 1
 _LONGEST = 16 * 2**20

@@ -1,18 +1,272 @@
-"""The moves of an automaton: which states lead to which others, and under what guards.
-
-Moves are kept as decision diagrams. A guard is a disjunction of few cubes, which is computed from them when
-it is asked for: an automaton may have far more transitions, and these more cubes, than anyone will look at.
-"""
+"""Guards of automata: decision diagrams over propositions, and their cubes."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias, overload
 
-from spatial_replay.automata.diagrams import LEAF, NO, YES, Diagrams
-from spatial_replay.automata.propositions import Proposition
 from spatial_replay.errors import NoAutomatonError
+from spatial_replay.spec.format import format_formula
+from spatial_replay.spec.formula import (
+    Atom,
+    Boolean,
+    Formula,
+    Quantified,
+    Temporal,
+    Truth,
+    expand,
+    operands_of,
+)
+from spatial_replay.spec.walks import is_spatial
+
+LEAF = 1 << 60
+"""The variable of a leaf: it orders after all others."""
+
+
+class Decision(NamedTuple):
+    """A node; of a leaf, `low` is its number.
+
+    Attributes:
+        low, high: the nodes where the variable is false, and true.
+    """
+
+    variable: int
+    low: int
+    high: int
+
+
+NO, YES = 0, 1
+"""The nodes of the Boolean constants, which are leaves 0 and 1."""
+
+
+class Diagrams:
+    """Nodes, each once."""
+
+    def __init__(self, limit: int = LEAF) -> None:
+        """Begin with the constants.
+
+        Args:
+            limit: more nodes are an error.
+        """
+        self._nodes: list[Decision] = []
+        self._numbers: dict[Decision, int] = {}
+        self._chosen: dict[tuple[int, int, int], int] = {}
+        self._limit = limit
+        self.leaf(0), self.leaf(1)
+
+    def __len__(self) -> int:
+        return len(self._nodes)
+
+    def __getitem__(self, node: int) -> Decision:
+        return self._nodes[node]
+
+    def leaf(self, number: int) -> int:
+        """Return the node of a leaf."""
+        return self._add(Decision(LEAF, number, number))
+
+    def decide(self, variable: int, low: int, high: int) -> int:
+        """Return the node that decides on a variable, which orders before those of `low` and `high`."""
+        return low if low == high else self._add(Decision(variable, low, high))
+
+    def variable(self, variable: int) -> int:
+        """Return the function that is true where a variable is."""
+        return self._add(Decision(variable, NO, YES))
+
+    def choose(self, condition: int, then: int, otherwise: int) -> int:
+        """Return the function that is `then` where a condition holds, and `otherwise` elsewhere."""
+        if condition == YES or then == otherwise:
+            return then
+        if condition == NO:
+            return otherwise
+        if then == YES and otherwise == NO:
+            return condition
+        key = (condition, then, otherwise)
+        result = self._chosen.get(key)
+        if result is None:
+            nodes = self._nodes
+            variable = min(nodes[condition].variable, nodes[then].variable, nodes[otherwise].variable)
+            lows, highs = zip(*(self.branches(node, variable) for node in key), strict=True)
+            result = self._chosen[key] = self.decide(variable, self.choose(*lows), self.choose(*highs))
+        return result
+
+    def both(self, first: int, second: int) -> int:
+        """Return the conjunction."""
+        return self.choose(first, second, NO)
+
+    def either(self, first: int, second: int) -> int:
+        """Return the disjunction."""
+        return self.choose(first, YES, second)
+
+    def complement(self, node: int) -> int:
+        """Return the negation."""
+        return self.choose(node, NO, YES)
+
+    def branches(self, node: int, variable: int) -> tuple[int, int]:
+        """Return the cofactors of a function: with a variable false, and true. None before it may matter."""
+        decision = self._nodes[node]
+        return decision[1:] if decision.variable == variable else (node, node)
+
+    def _add(self, decision: Decision) -> int:
+        number = self._numbers.get(decision)
+        if number is None:
+            if len(self._nodes) >= self._limit:
+                raise NoAutomatonError(f"the automaton takes more than {self._limit} decisions")
+            number = self._numbers[decision] = len(self._nodes)
+            self._nodes.append(decision)
+        return number
+
+
+def copied(
+    source: Diagrams, target: Diagrams, variables: int, leaf: Callable[[int], int]
+) -> Callable[[int], int]:
+    """Return a function that copies nodes from one collection into another, with other leaves.
+
+    Args:
+        variables: nodes that decide on none of the first so many variables count as leaves.
+        leaf: the number of the leaf in the target for such a node of the source.
+    """
+    known: dict[int, int] = {}
+
+    def copy(node: int) -> int:
+        if node not in known:
+            variable, low, high = source[node]
+            if variable < variables:
+                known[node] = target.decide(variable, copy(low), copy(high))
+            else:
+                known[node] = target.leaf(leaf(node))
+        return known[node]
+
+    return copy
+
+
+@dataclass(frozen=True)
+class Proposition:
+    """A subformula without temporal operators; true in a sample iff its robustness there is at least 0.
+
+    Attributes:
+        text: its canonical text.
+        name: the name that the specification gives to it, or None.
+    """
+
+    formula: Formula
+    text: str
+    name: str | None = None
+
+    @property
+    def label(self) -> str:
+        """Its name or, without one, its text."""
+        return self.name or self.text
+
+    def literal(self, value: bool) -> str:
+        """Return the sentence that it is true, or that it is not."""
+        if self.name is not None:
+            return self.name if value else f"not {self.name}"
+        if isinstance(self.formula, Boolean) and self.formula.operator == "not":
+            # the opposite of a negation is what it negates
+            return self.text if value else _bracketed(self.formula.operands[0])
+        return _bracketed(self.formula) if value else f"not ({self.text})"
+
+
+def _bracketed(formula: Formula) -> str:
+    text = format_formula(formula)
+    return f"({text})" if isinstance(formula, (Boolean, Quantified)) else text
+
+
+class Propositions:
+    """The propositions of a formula, numbered in the order of the text.
+
+    Equal ones, however they are written (`a and b`, `b and a`; `a -> b`, `not a or b`), are one. So are a
+    proposition and its negation where a formula holds both: the second is the first, negated.
+    """
+
+    def __init__(self, formula: Formula) -> None:
+        self._shapes = _Shapes()
+        self._numbers: dict[int, int] = {}
+        self._literals: dict[int, tuple[int, bool]] = {}
+        self.all: list[Proposition] = []
+        for each in _maximal(formula):
+            self._add(each)
+
+    def literal(self, formula: Formula) -> tuple[int, bool] | None:
+        """Return a maximal spatial subformula's proposition and whether it is that or its negation.
+
+        None for all other formulas, those that expansions are made of included.
+        """
+        return self._literals.get(id(formula))
+
+    def _add(self, formula: Formula) -> None:
+        number = self._numbers.get(self._shapes.of(formula, True))
+        if number is not None:
+            self._literals[id(formula)] = number, True
+            return
+        negated = self._shapes.of(formula, False)
+        if negated in self._numbers:
+            self._literals[id(formula)] = self._numbers[negated], False
+            return
+        number = self._numbers[self._shapes.of(formula, True)] = len(self.all)
+        self._literals[id(formula)] = number, True
+        self.all.append(Proposition(formula, format_formula(formula), formula.name))
+
+
+def _maximal(formula: Formula) -> Iterator[Formula]:
+    """Yield the largest subformulas about one sample, in the order of the text; constants are none."""
+    if isinstance(formula, Truth):
+        return
+    if is_spatial(formula):
+        yield formula
+        return
+    for operand in operands_of(formula):
+        yield from _maximal(operand)
+
+
+class _Shapes:
+    """Numbers of spatial formulas: one for all that are equal up to the way they are written."""
+
+    def __init__(self) -> None:
+        self._interned: dict[tuple[object, ...], int] = {}
+        self._known: dict[tuple[int, bool], int] = {}
+        self._joined: dict[tuple[bool, int], frozenset[int]] = {}
+
+    def of(self, formula: Formula, positive: bool) -> int:
+        """Return the number of a formula, or of its negation, in negation normal form."""
+        formula = expand(formula)
+        key = (id(formula), positive)
+        if key not in self._known:
+            self._known[key] = self._shape(formula, positive)
+        return self._known[key]
+
+    def _shape(self, formula: Formula, positive: bool) -> int:
+        match formula:
+            case Truth():
+                return self._intern("truth", formula.value == positive)
+            case Atom():
+                return self._intern("atom", formula.expression, positive)
+            case Boolean(operator="not"):
+                return self.of(formula.operands[0], not positive)
+            case Boolean():
+                is_both = (formula.operator == "and") == positive
+                return self._join(is_both, *(self.of(each, positive) for each in formula.operands))
+            case Quantified():
+                body = self.of(formula.body, positive)
+                is_every = (formula.quantifier == "forall") == positive
+                return self._intern("members", is_every, formula.variables, formula.group, body)
+            case Temporal():
+                raise ValueError(f"{formula.operator} is not an operator about one sample")
+
+    def _join(self, is_both: bool, *operands: int) -> int:
+        """Return the number of a conjunction or disjunction; order, repetition and brackets do not count."""
+        parts = (self._joined.get((is_both, each), frozenset({each})) for each in operands)
+        chosen = frozenset[int]().union(*parts)
+        if len(chosen) == 1:
+            return next(iter(chosen))
+        number = self._intern(is_both, chosen)
+        self._joined[is_both, number] = chosen
+        return number
+
+    def _intern(self, *key: object) -> int:
+        return self._interned.setdefault(key, len(self._interned))
+
 
 Literal: TypeAlias = tuple[int, bool]
 """A proposition's number, and whether it has to be true."""

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from functools import reduce
 from typing import Literal, NamedTuple
 
-from spatial_replay.automata.propositions import Propositions
+from spatial_replay.automata.guards import Propositions
 from spatial_replay.errors import NoAutomatonError
 from spatial_replay.spec.diagnostics import SourceText
 from spatial_replay.spec.format import format_bound

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from spatial_replay.automata.diagrams import LEAF, Diagrams
+from spatial_replay.automata.guards import LEAF, Diagrams
 from spatial_replay.geometry.arrays import Flags, Integers
 
 _ROUNDS = 8

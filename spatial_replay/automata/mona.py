@@ -18,7 +18,7 @@ from threading import Timer
 from types import MappingProxyType
 from typing import NamedTuple
 
-from spatial_replay.automata.diagrams import Diagrams
+from spatial_replay.automata.guards import Diagrams
 from spatial_replay.automata.ltlf import Kind, Node, Skeleton
 from spatial_replay.automata.minimise import Machine, machine_of
 from spatial_replay.errors import NoAutomatonError

@@ -1,8 +1,7 @@
 """Many logs: a suite of cases in, rows of results out.
 
-`suite` says what is evaluated, `prepare` checks it all, with `spec_files` and `log_files`; `rows`
-evaluates one log with all its specifications, `run` does so for all of them with the processes of `workers`,
-and `data_set` keeps what comes out. The other modules show it.
+`suite` reads the cases, and `logs` finds logs and specifications. `rows` evaluates one log. `run` does so for all,
+with the processes of `workers`. `store` keeps the rows; `outputs` and `baseline` show and compare them.
 
 Names are loaded when they are first used.
 """

@@ -1,7 +1,7 @@
 """Suites: which logs are evaluated with which specifications, and what is expected of them.
 
 A suite is a YAML file, or what a command line says. It names logs as people write them: patterns, folders,
-addresses; `log_files` finds them.
+addresses; `logs` finds them.
 """
 
 from __future__ import annotations

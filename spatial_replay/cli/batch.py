@@ -38,8 +38,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from spatial_replay.batch.baseline import Difference, Tolerance
-    from spatial_replay.batch.prepare import PreparedCase
-    from spatial_replay.batch.run import BatchResult
+    from spatial_replay.batch.run import BatchResult, PreparedCase
     from spatial_replay.batch.suite import Suite
     from spatial_replay.batch.workers import Workers
     from spatial_replay.monitor.semantics import Semantics
@@ -128,11 +127,14 @@ def batch(
     """
     # imported here so that --help stays fast
     from spatial_replay.batch.baseline import compare, edited_files, with_baseline
-    from spatial_replay.batch.github import is_github, worst_annotations, write_summary
-    from spatial_replay.batch.junit import write_junit
-    from spatial_replay.batch.prepare import prepare
-    from spatial_replay.batch.reports import write_pages
-    from spatial_replay.batch.run import workers_of
+    from spatial_replay.batch.outputs import (
+        is_github,
+        worst_annotations,
+        write_junit,
+        write_pages,
+        write_summary,
+    )
+    from spatial_replay.batch.run import prepare, workers_of
 
     if dask is not None and jobs is not None:
         raise UsageError("--jobs is for this machine, and a cluster has its own; remove --jobs or --dask")
@@ -178,7 +180,7 @@ def batch(
     if differences is not None and _print_differences(differences, outputs.json_file == "-"):
         code = most_severe([code, ExitCode.VIOLATED])
     if outputs.update_baseline and outputs.baseline is not None:
-        from spatial_replay.batch.data_set import ResultsFolder
+        from spatial_replay.batch.store import ResultsFolder
 
         ResultsFolder.create(outputs.baseline).write_run(found.table)
         show(f"wrote {outputs.baseline}", err=outputs.json_file == "-")
@@ -268,8 +270,7 @@ def _check_outputs(outputs: BatchOutputs, suite: Suite) -> None:
 def _baseline(outputs: BatchOutputs) -> tuple[Tolerance, pa.Table | None]:
     """Return the tolerance, and the table of the baseline if there is one."""
     from spatial_replay.batch.baseline import Tolerance
-    from spatial_replay.batch.data_set import ResultsFolder
-    from spatial_replay.batch.result_files import result_files
+    from spatial_replay.batch.store import ResultsFolder, result_files
 
     if outputs.baseline is None:
         if outputs.tolerance is not None or outputs.update_baseline:

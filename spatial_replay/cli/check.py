@@ -312,8 +312,8 @@ def _write_automata(
         OutputError: the file cannot be written.
     """
     from spatial_replay.automata.compile import automaton, chosen_spec
-    from spatial_replay.automata.dot_hoa import dot_text, hoa_text, size_words, svg_text
     from spatial_replay.automata.ltlf import bounds_in_samples
+    from spatial_replay.automata.text import dot_text, hoa_text, size_words, svg_text
     from spatial_replay.logs.output_file import replacing
 
     if file == _STANDARD_OUTPUT:
@@ -333,8 +333,8 @@ def _write_automata(
 
 def _print_automata(specification: Specification, names: Sequence[str], hz: float | None) -> None:
     from spatial_replay.automata.compile import automaton, chosen_spec
-    from spatial_replay.automata.dot_hoa import words_text
     from spatial_replay.automata.ltlf import bounds_in_samples
+    from spatial_replay.automata.text import words_text
 
     faults = []
     for name in names:

@@ -42,13 +42,13 @@ def show_findings(form: Form, path: str, diagnoses: Sequence[Diagnosis]) -> None
     """
     if form == "github":
         # imported here so that --help stays fast
-        from spatial_replay.batch.github import annotation, repository_path
+        from spatial_replay.batch.outputs import annotation, repository_path
 
         for each in diagnoses:
             file = repository_path(path)
             show(annotation(_level(each), file, each.line, _message(each), column=each.column))
     elif form == "sarif":
-        from spatial_replay.batch.github import repository_path
+        from spatial_replay.batch.outputs import repository_path
 
         show_json(_sarif(repository_path(path), diagnoses))
 

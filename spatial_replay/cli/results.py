@@ -35,8 +35,8 @@ def results(folder: str, worst: int, where: str | None, by: By, json_file: str |
       spatial-replay results results --where '"door" in log' --json -
     """
     # imported here so that --help stays fast
-    from spatial_replay.batch.data_set import ResultsFolder
     from spatial_replay.batch.run_table import rows_where, summary_text
+    from spatial_replay.batch.store import ResultsFolder
 
     table = ResultsFolder.open(folder).read_run()
     if where is not None:

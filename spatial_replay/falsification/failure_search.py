@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spatial_replay import __version__
-from spatial_replay.batch.result_files import LocalFolder
 from spatial_replay.batch.run import workers_of
+from spatial_replay.batch.store import LocalFolder
 from spatial_replay.batch.workers import Progress, WorkerLost, Workers, no_progress
 from spatial_replay.compare.clips import cut_clip
 from spatial_replay.errors import LogError, OutputError, UsageError

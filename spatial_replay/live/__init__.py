@@ -16,17 +16,13 @@ from typing import TYPE_CHECKING
 from spatial_replay.lazy import loaded_when_used
 
 if TYPE_CHECKING:
-    from spatial_replay.live.live_session import LiveSession
-    from spatial_replay.live.live_update import LiveUpdate, SessionStatus
-    from spatial_replay.live.monitoring import monitor, open_recorders
+    from spatial_replay.live.session import LiveSession, LiveUpdate, SessionStatus, monitor, open_recorders
 
 __all__ = ["LiveSession", "LiveUpdate", "SessionStatus", "monitor", "open_recorders"]
 
 __getattr__, __dir__ = loaded_when_used(
     globals(),
     {
-        "live_update": ("LiveUpdate", "SessionStatus"),
-        "monitoring": ("monitor", "open_recorders"),
-        "live_session": ("LiveSession",),
+        "session": ("LiveSession", "LiveUpdate", "SessionStatus", "monitor", "open_recorders"),
     },
 )

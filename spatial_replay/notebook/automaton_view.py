@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Final
 
 from spatial_replay.automata.automaton import Automaton
-from spatial_replay.automata.dot_hoa import (
+from spatial_replay.automata.text import (
     abbreviated,
     layout_text,
     meanings,

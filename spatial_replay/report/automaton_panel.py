@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from spatial_replay.automata.automaton import Automaton
-from spatial_replay.automata.dot_hoa import abbreviated, meanings
-from spatial_replay.automata.drawing import draw_automaton
+from spatial_replay.automata.text import abbreviated, draw_automaton, meanings
 from spatial_replay.geometry.arrays import Integers
 
 

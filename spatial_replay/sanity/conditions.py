@@ -13,7 +13,7 @@ from itertools import product
 from math import isfinite
 from typing import Final, Literal, NamedTuple, TypeAlias
 
-from spatial_replay.automata.diagrams import NO, YES, Diagrams
+from spatial_replay.automata.guards import NO, YES, Diagrams
 from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.sanity.linear import Inequality

@@ -13,7 +13,7 @@ from itertools import chain, combinations, count, islice, product
 from typing import Final, NamedTuple, TypeAlias
 
 from spatial_replay.automata.automaton import Automaton
-from spatial_replay.automata.diagrams import LEAF, NO, YES, Diagrams
+from spatial_replay.automata.guards import LEAF, NO, YES, Diagrams
 from spatial_replay.errors import NoAutomatonError
 from spatial_replay.sanity.conditions import Fact, FactDiagrams, is_negated, terms_in
 from spatial_replay.sanity.laws import laws

@@ -13,7 +13,7 @@ from spatial_replay import Footprint, Recorder, Sample, Trace, automaton, parse_
 from spatial_replay.annotate.specification import ReportedTree, encode_specification
 from spatial_replay.automata import stored_text
 from spatial_replay.automata.automaton import Automaton
-from spatial_replay.automata.propositions import Propositions
+from spatial_replay.automata.guards import Propositions
 from spatial_replay.logs import Attachment, MemorySink
 from spatial_replay.logs.schemas import AutomatonState_pb2
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState

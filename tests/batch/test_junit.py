@@ -17,8 +17,8 @@ import spatial_replay as sr
 from batch.fleet import batch, write_fleet
 from examples import examples
 from spatial_replay.batch.baseline import Tolerance
-from spatial_replay.batch.data_set import run_columns
-from spatial_replay.batch.junit import write_junit
+from spatial_replay.batch.outputs import write_junit
+from spatial_replay.batch.store import run_columns
 
 SCHEMA = xmlschema.XMLSchema(Path(__file__).with_name("xunit2.xsd"))
 

@@ -13,12 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import spatial_replay as sr
-from spatial_replay.batch.data_set import ResultsFolder, run_columns
-from spatial_replay.batch.prepare import prepare
+from spatial_replay.batch.logs import read_specification_text
 from spatial_replay.batch.rows import Task, rows_from_task
-from spatial_replay.batch.run import run_batch
+from spatial_replay.batch.run import prepare, run_batch
 from spatial_replay.batch.run_table import worst_rows
-from spatial_replay.batch.spec_files import read_specification_text
+from spatial_replay.batch.store import ResultsFolder, run_columns
 from spatial_replay.batch.suite import Suite
 from spatial_replay.batch.workers import LocalProcesses, ThisProcess, Workers
 from spatial_replay.compiled import only

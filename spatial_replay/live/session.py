@@ -1,4 +1,4 @@
-"""A running robot, monitored: what its server sends becomes samples, and each sample verdicts."""
+"""Monitoring a running robot: messages to samples, verdicts, a log and clips."""
 
 from __future__ import annotations
 
@@ -7,12 +7,17 @@ import gc
 import itertools
 import math
 import time
-from collections.abc import AsyncIterator, Sequence
-from contextlib import suppress
+from collections.abc import AsyncIterator, Collection, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
+from functools import cached_property
 from os import PathLike
-from typing import Final
+from pathlib import Path
+from typing import ClassVar, Final
 
-from spatial_replay.bags.columns import Message
+import numpy as np
+
+from spatial_replay.bags.columns import DISORDER_NS, Message
 from spatial_replay.bags.decoders import decoder_of, topic_of, topics_by_name
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.live.client import (
@@ -24,23 +29,169 @@ from spatial_replay.live.client import (
     Received,
     Warned,
 )
-from spatial_replay.live.live_update import LiveUpdate, SessionStatus
-from spatial_replay.live.objects_topic import ObjectsAssembler
 from spatial_replay.logs.messages import Channel
+from spatial_replay.logs.objects.decode import decode_objects
+from spatial_replay.logs.read_options import FaultKinds
 from spatial_replay.logs.topics import OBJECTS, is_kept
 from spatial_replay.mapping import LiveAssembler, LogMapping, ReadingPlan, load_mapping
 from spatial_replay.mapping.live_assembler import rehearse
 from spatial_replay.mapping.message_types import TRANSFORM_TYPES, short_type
-from spatial_replay.monitor.monitor import Ending, Monitor
-from spatial_replay.recording.changes import VerdictChanges
+from spatial_replay.monitor.monitor import Ending, Monitor, NodeUpdate, SpecUpdate, Update
+from spatial_replay.monitor.result import no_such_node
+from spatial_replay.monitor.verdict import Verdict, worst_verdict
+from spatial_replay.monitor.violation import Violation
+from spatial_replay.recording.changes import VerdictChange, VerdictChanges
 from spatial_replay.recording.recorder import Recorder, SampleWriter
 from spatial_replay.recording.recording import RunEvent
+from spatial_replay.recording.trigger import Trigger
 from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import listed_specifications
 from spatial_replay.text import counted
 from spatial_replay.trace.sample import Sample
-from spatial_replay.trace.trace import Trace
+from spatial_replay.trace.trace import ABSENT, Trace
+
+
+class ObjectsAssembler:
+    """Decodes samples as they come; what it offers is that of `LiveAssembler`."""
+
+    overdue = 0
+    jump = None
+    topics = (OBJECTS,)
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._faults = FaultKinds()
+        self._newest_ns = -1
+        self._classes: dict[str, str | None] = {}
+        self.is_finished = False
+
+    def add(self, messages: Sequence[Message], now_s: float) -> Trace:
+        """Add messages as they came; return their samples. Those that come late or twice are left out."""
+        kept: list[Message] = []
+        for message in messages:
+            if message.log_time_ns < self._newest_ns - DISORDER_NS:
+                self.is_finished = True
+            if self.is_finished:
+                break
+            if message.log_time_ns > self._newest_ns:
+                kept.append(message)
+                self._newest_ns = message.log_time_ns
+        times_ns = np.array([message.log_time_ns for message in kept], np.int64)
+        trace, faults = decode_objects([message.payload for message in kept], times_ns)
+        for fault in faults:
+            self._faults.add(f"{self._name}: {fault}")
+        if len(trace):
+            rows = zip(trace.names, trace.rows[-1].tolist(), strict=True)
+            present = {name: row if row >= 0 else -2 - row for name, row in rows if row != ABSENT}
+            self._classes = {name: trace.classes[int(trace.class_code[row])] for name, row in present.items()}
+        return trace
+
+    def due_s(self) -> None:
+        """Nothing waits."""
+
+    def lose(self, topics: Collection[str], now_s: float) -> Trace:
+        """Return a sample right after the newest, in which every object is unknown."""
+        if self._newest_ns < 0 or not self._classes:
+            return Trace.empty()
+        self._newest_ns += 1
+        unknown, self._classes = self._classes, {}
+        return Trace.from_samples([Sample(self._newest_ns, unknown=unknown)])
+
+    def finish(self) -> Trace:
+        """Return the remaining samples: none."""
+        return Trace.empty()
+
+    def take_faults(self, *, last: bool = False) -> tuple[str, ...]:
+        """Return what was lost since the last call, the first of each kind; at last, how many more."""
+        return self._faults.take(last=last)
+
+    def take_remarks(self) -> tuple[str, ...]:
+        """Return what is remarkable where nothing was lost: nothing."""
+        return ()
+
+
+@dataclass(frozen=True, slots=True)
+class SessionStatus:
+    """How a session goes.
+
+    Attributes:
+        server: the name that the server gives itself, or None before it is connected.
+        is_connected: whether the connection stands.
+        waits_for: topics that the server does not offer yet.
+        samples, messages: evaluated, and received.
+        dropped: samples that were dropped because evaluation fell behind.
+        messages_dropped: messages that were dropped before they made samples.
+        overdue: observations whose transforms did not come within `max_delay`.
+        delay_s: of the newest sample, from the arrival of its message to its verdict; NaN before.
+        time_ns: of the newest sample; None before the first.
+    """
+
+    server: str | None
+    is_connected: bool
+    waits_for: tuple[str, ...]
+    samples: int
+    messages: int
+    dropped: int
+    messages_dropped: int
+    overdue: int
+    delay_s: float
+    time_ns: int | None
+
+
+@dataclass(frozen=True, eq=False)
+class LiveUpdate:
+    """What one sample gives.
+
+    Attributes:
+        sample: the objects and signals.
+        changes: verdicts and signs that changed with this sample, each with its reason.
+        notes: what happened besides since the last update: a connection that was lost, a topic that fell
+            silent.
+        delay_s: from the arrival of the message that completed it to its verdict.
+        dropped: how many samples were dropped so far.
+        updates: of each specification file, what its monitor gives.
+    """
+
+    sample: Sample
+    changes: tuple[VerdictChange, ...]
+    notes: tuple[str, ...]
+    delay_s: float
+    dropped: int
+    updates: tuple[Update, ...] = field(repr=False)
+
+    @property
+    def time_ns(self) -> int:
+        """The time of the sample."""
+        return self.sample.time_ns
+
+    @property
+    def verdict(self) -> Verdict:
+        """The worst of the specs'."""
+        return worst_verdict(each.verdict for each in self.updates)
+
+    @property
+    def specs(self) -> tuple[SpecUpdate, ...]:
+        """Every result spec."""
+        return tuple(spec for update in self.updates for spec in update.specs)
+
+    @cached_property
+    def violations(self) -> tuple[Violation, ...]:
+        """What is violated whatever comes; see `Update.violations`."""
+        return tuple(each for update in self.updates for each in update.violations)
+
+    def node(self, name: str) -> NodeUpdate:
+        """Return the root node of a named spec, wherever it occurs.
+
+        Raises:
+            UsageError: no node has the name.
+        """
+        for update in self.updates:
+            if name in update.places:
+                return update.node(name)
+        known = sorted(each for update in self.updates for each in update.places)
+        raise UsageError(no_such_node(name, known))
+
 
 MAX_DELAY_S: Final = 0.2
 """How long a sample waits for transforms, and for topics that lag behind, by default."""
@@ -457,3 +608,115 @@ class LiveSession:
         trace = self._assembler.finish()
         self.remarks = self._assembler.take_remarks()
         return trace
+
+
+_WAITING = 65_536
+"""Samples, and messages, that may wait for a recorder: a robot waits for no disk."""
+
+
+class _RunRecorder(Recorder):
+    """A recorder of a run that goes on whatever the disk does: it leaves out nothing that it can hold."""
+
+    most_lost_s: ClassVar[float] = math.inf
+
+
+@contextmanager
+def open_recorders(
+    files: Sequence[Specification],
+    mapping: LogMapping | None,
+    output: Path | None = None,
+    trigger: Trigger | None = None,
+    clips: Path | None = None,
+    *,
+    overwrite: bool = False,
+) -> Iterator[list[Recorder]]:
+    """Open the log of a whole run, and the recorder of clips, as far as they are wanted.
+
+    Raises:
+        UsageError: a trigger without a folder, or the other way around, or one that is not understood; an
+            output that exists, unless it may be overwritten.
+        OutputError: something cannot be written.
+    """
+    if (trigger is None) != (clips is None):
+        raise UsageError("clips take a trigger and a folder; give both")
+    about = _about(mapping)
+    with ExitStack() as opened:
+        recorders: list[Recorder] = [
+            opened.enter_context(
+                _RunRecorder(
+                    path,
+                    specifications=files,
+                    about=about,
+                    waiting=_WAITING,
+                    block=False,
+                    trigger=own,
+                    overwrite=overwrite,
+                )
+            )
+            for path, own in ((output, None), (clips, trigger))
+            if path is not None
+        ]
+        yield recorders
+
+
+def _about(mapping: LogMapping | None) -> Mapping[str, str]:
+    """Return what a log says about a run: nothing that depends on where it took place."""
+    if mapping is None:
+        return {"source": "live"}
+    named = {"mapping": mapping.name, "mapping_sha256": mapping.sha256}
+    return {"source": "live", **named, **mapping.metadata()}
+
+
+async def monitor(
+    address: str,
+    specifications: Specification | Sequence[Specification],
+    mapping: LogMapping | str | PathLike[str] | None = None,
+    *,
+    output: str | PathLike[str] | None = None,
+    trigger: Trigger | None = None,
+    clips: str | PathLike[str] | None = None,
+    topics: Sequence[str] = (),
+    max_delay_s: float = MAX_DELAY_S,
+    dead_man_s: float | None = None,
+    overwrite: bool = False,
+) -> AsyncIterator[LiveUpdate]:
+    """Monitor a running robot; yield an update for each sample.
+
+    The connection is made again whenever it is lost; everything is unknown until it is back. Leave the loop
+    to end; what happened last is then evaluated and the log closed.
+
+    Args:
+        address: of foxglove_bridge or another server of Foxglove's WebSocket protocol: ws://robot:8765.
+        mapping: as for a log of the same topics; without one, the server has the topic /spatial/objects.
+        output: a log to write, as `Recorder` does, with the messages that came beside the samples.
+        trigger, clips: when to write which part of the run to a log of its own, and the folder of these.
+        topics: patterns of the topics whose messages are written; those that are mapped by default.
+        max_delay_s: how long a sample waits for transforms, and for topics whose stamps lag behind.
+        dead_man_s: after so much silence of a topic, what it reported is unknown.
+        overwrite: replace an output that exists.
+
+    Raises:
+        UsageError: a template, options that do not work, a mapping that does not fit what is sent, an output
+            that exists.
+        RemoteError: the first connection fails.
+        LogError: time jumps back by more than a second.
+        OutputError: the log cannot be written.
+    """
+    files = listed_specifications(specifications)
+    if mapping is not None and not isinstance(mapping, LogMapping):
+        mapping = load_mapping(mapping)
+    written = None if output is None else Path(output), trigger, None if clips is None else Path(clips)
+    with open_recorders(files, mapping, *written, overwrite=overwrite) as recorders:
+        session = LiveSession(
+            address,
+            files,
+            mapping,
+            recorders=recorders,
+            topics=topics,
+            max_delay_s=max_delay_s,
+            dead_man_s=dead_man_s,
+        )
+        async for update in session.updates():
+            yield update
+        if session.failure is not None:
+            raise session.failure

@@ -1,0 +1,645 @@
+"""Reports of a batch: JUnit, annotations of GitHub, and pages."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import os
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Literal
+from urllib.parse import quote
+from xml.sax.saxutils import escape, quoteattr
+
+import numpy as np
+
+from spatial_replay import __version__
+from spatial_replay.batch.baseline import BASELINE_ROBUSTNESS
+from spatial_replay.batch.rows import Task, opened_task, parsed_specifications
+from spatial_replay.batch.run import BatchResult, Wanted
+from spatial_replay.batch.run_table import (
+    Total,
+    Values,
+    counts_of,
+    damage_word,
+    requirement_of,
+    result_name,
+    summary_text,
+    totals,
+    verdict_word,
+    worst_rows,
+)
+from spatial_replay.batch.workers import Progress, Workers, no_progress
+from spatial_replay.errors import OutputError, SpatialReplayError, UsageError
+from spatial_replay.logs.output_file import output_error, replacing
+from spatial_replay.logs.remote import is_address
+from spatial_replay.notebook.figures import Html, element
+from spatial_replay.report.compact import sentence_parts
+from spatial_replay.report.page import policy, text, theme
+from spatial_replay.report.write import write_report
+from spatial_replay.text import counted, printable
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+    from spatial_replay.batch.run_table import Values
+    from spatial_replay.geometry.arrays import Floats
+
+
+_ANNOTATIONS: Final = 10
+"""GitHub shows no more of one kind for a step."""
+_WORST: Final = 10
+_MOST_COMPARED: Final = 10_000
+"""Of the worst rows, so many are looked through for failures of different kinds."""
+
+
+def is_github(environment: Mapping[str, str] = os.environ) -> bool:
+    """Return whether this process is a step of a GitHub job."""
+    return environment.get("GITHUB_ACTIONS") == "true"
+
+
+def annotation(
+    severity: Literal["error", "warning"],
+    file: str,
+    line: int,
+    message: str,
+    *,
+    column: int = 0,
+    title: str = "",
+) -> str:
+    """Return the workflow command that marks a line of a file."""
+    place = {"file": file, "line": str(line), "col": str(column) if column else "", "title": title}
+    properties = ",".join(f"{name}={_property(value)}" for name, value in place.items() if value)
+    return f"::{severity} {properties}::{_data(message)}"
+
+
+def repository_path(file: str | Path, environment: Mapping[str, str] = os.environ) -> str:
+    """Return the path of a file as the tools of its repository know it: relative to the repository.
+
+    The repository is the folder of the job on GitHub, else the nearest folder above with a `.git`, else the
+    current one. A file elsewhere keeps its whole path, and an address stays.
+    """
+    if is_address(file):
+        return str(file)
+    path, here = Path(file).absolute(), Path.cwd()
+    job = environment.get("GITHUB_WORKSPACE")
+    above = next((each for each in (here, *here.parents) if (each / ".git").exists()), here)
+    for base in (Path(job) if job else above, above):
+        for own, root in ((Path(os.path.normpath(path)), base), (path.resolve(), base.resolve())):
+            if own.is_relative_to(root):
+                return own.relative_to(root).as_posix()
+    return path.as_posix()
+
+
+def worst_annotations(table: pa.Table, folder: Path = Path()) -> Iterator[str]:
+    """Yield an annotation for each of the worst rows that fail, at the line of its spec.
+
+    Rows of one spec and verdict repeat only where there are not enough others.
+
+    Args:
+        folder: what the paths of specifications are relative to.
+    """
+    rows = [row for row in worst_rows(table, _MOST_COMPARED) if row["failure"] is not None]
+    kinds = Counter[tuple[str, str, str]]()
+    ranks = []
+    for row in rows:
+        kind = (row["file"], row["spec"], verdict_word(row))
+        ranks.append(kinds[kind])
+        kinds[kind] += 1
+    order = sorted(range(len(rows)), key=lambda place: ranks[place])
+    for row in (rows[place] for place in order[:_ANNOTATIONS]):
+        about = requirement_of(row)
+        name = f"{row['spec']} ({about})" if about else row["spec"]
+        message = f"{row['log']}: {row['failure']}. {row['reason']}".rstrip()
+        file = row["file"] if is_address(row["file"]) else folder / row["file"]
+        yield annotation("error", repository_path(file), row["line"], message, title=name)
+
+
+def write_summary(table: pa.Table, environment: Mapping[str, str] = os.environ) -> None:
+    """Add the totals and the worst rows to the summary of the job, if there is one.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    file = environment.get("GITHUB_STEP_SUMMARY")
+    if not file:
+        return
+    try:
+        with Path(file).open("a", encoding="utf-8") as stream:
+            stream.write(markdown(table))
+    except OSError as error:
+        raise OutputError(f"{file}: the summary could not be written: {error.strerror}") from error
+
+
+def markdown(table: pa.Table) -> str:
+    """Return the totals and the worst rows as Markdown."""
+    rows = totals(table)
+    columns = counts_of(rows)
+    lines = [
+        "### spatial-replay\n",
+        f"{summary_text(table)}\n",
+        f"| case | spec | requirement | {' | '.join(columns)} | least robustness |",
+        f"|---|---|---|{'--:|' * (len(columns) + 1)}",
+    ]
+    for place, each in enumerate(rows):
+        names = [
+            each.group["case"],
+            each.group["spec"] or each.group["file"],
+            each.about,
+        ]
+        numbers = [f"{own[place]:,}" for own in columns.values()]
+        least = "" if each.least is None else f"{each.least:.6g}"
+        lines.append(_line([*names, *numbers, least]))
+    failing = [row for row in worst_rows(table, _WORST) if row["failure"] is not None]
+    if failing:
+        count = len(table) - table.column("failure").null_count
+        lines += [
+            "",
+            f"{counted(count, 'result')} failed; the worst:",
+            "",
+            "| log | spec | requirement | verdict | failure | reason |",
+            "|---|---|---|---|---|---|",
+        ]
+        for row in failing:
+            names = [row["log"], result_name(row["spec"], row["object"]), requirement_of(row)]
+            verdict = f"{verdict_word(row)}{damage_word(row)}"
+            lines.append(_line([*names, verdict, row["failure"], row["reason"]]))
+    return "\n".join([*lines, "", ""])
+
+
+def _line(cells: list[str]) -> str:
+    shown = (printable(cell, 500) for cell in cells)
+    # no cell ends another one, or becomes markup
+    safe = (
+        cell.replace("\\", "\\\\").replace("|", "\\|").replace("<", "&lt;").replace("[", "\\[")
+        for cell in shown
+    )
+    return f"| {' | '.join(safe)} |"
+
+
+def _data(text: str) -> str:
+    """Escape the message of a workflow command: a line break would begin another one."""
+    return text.replace("%", "%25").replace("\r", "%0D").replace("\n", "%0A")
+
+
+def _property(text: str) -> str:
+    return _data(text).replace(":", "%3A").replace(",", "%2C")
+
+
+LARGEST: Final = 30_000_000
+"""Bytes: GitLab refuses larger reports."""
+_SHORT: Final = 300
+"""Characters of a failure where the full texts would be too long."""
+
+
+def write_junit(
+    path: Path,
+    table: pa.Table,
+    name: str,
+    reports: Mapping[tuple[str, str], str] | None = None,
+    *,
+    inputs: Sequence[Path] = (),
+    largest: int = LARGEST,
+) -> None:
+    """Write the table of a run as a JUnit report.
+
+    A report that would be too large has shorter texts and, if that is not enough, lacks test cases that pass;
+    each test suite says how many.
+
+    Args:
+        name: of the whole: that of the suite.
+        reports: for cases and logs by name, the path of a page about them.
+        inputs: files that the output must not be.
+        largest: bytes of the report, at most.
+
+    Raises:
+        UsageError, OutputError: the file cannot be written.
+    """
+    text = ""
+    for limit, keeps in ((None, True), (_SHORT, True), (_SHORT, False)):
+        text = "".join(_lines(table, name, reports or {}, limit, keeps))
+        if len(text.encode()) <= largest:
+            break
+    with replacing(path, inputs) as stream:
+        stream.write(text.encode())
+
+
+def _lines(
+    table: pa.Table, name: str, reports: Mapping[tuple[str, str], str], limit: int | None, keeps: bool
+) -> Iterator[str]:
+    suites: dict[tuple[str, ...], list[Values]] = {}
+    wanted = ("case", "file", "spec", "requirement", "title", "log", "object", "failure", "error")
+    texts = ("explanation", "vacuous", "seconds", "error_kind", "verdict", "line", "faults", "untested")
+    for row in table.select([*wanted, *texts]).to_pylist():
+        suites.setdefault((row["case"], row["file"], row["spec"]), []).append(row)
+    failures, errors = _counts(row for rows in suites.values() for row in rows)
+    yield '<?xml version="1.0" encoding="utf-8"?>\n'
+    yield (
+        f'<testsuites name={_quoted(name)} tests="{len(table)}" failures="{failures}" errors="{errors}" '
+        f'time="{_time(row for rows in suites.values() for row in rows)}">\n'
+    )
+    for (case, file, spec), rows in suites.items():
+        shown = rows if keeps else [row for row in rows if row["failure"] is not None]
+        failures, errors = _counts(rows)
+        title = f"{case}.{spec or file}"
+        yield (
+            f'<testsuite name={_quoted(title)} tests="{len(rows)}" failures="{failures}" errors="{errors}" '
+            f'skipped="0" file={_quoted(file)} time="{_time(rows)}">\n<properties>\n'
+        )
+        properties = {"specification": f"{file}:{rows[0]['line']}"}
+        properties |= {key: rows[0][key] for key in ("requirement", "title") if rows[0][key]}
+        for key, value in properties.items():
+            yield f"<property name={_quoted(key)} value={_quoted(value)}/>\n"
+        yield "</properties>\n"
+        # two files may have a spec of one name
+        class_name = f"{case}.{Path(file).stem}.{spec}" if spec else f"{case}.{Path(file).stem}"
+        for row in shown:
+            yield from _case(row, class_name, reports, limit)
+        if len(shown) < len(rows):
+            left_out = counted(len(rows) - len(shown), "test case")
+            yield f"<system-out>{left_out} that passed left out, to keep this report small</system-out>\n"
+        yield "</testsuite>\n"
+    yield "</testsuites>\n"
+
+
+def _case(
+    row: Values, class_name: str, reports: Mapping[tuple[str, str], str], limit: int | None
+) -> Iterator[str]:
+    name = row["log"] if row["object"] is None else f"{row['log']}[{row['object']}]"
+    yield f'<testcase classname={_quoted(class_name)} name={_quoted(name)} time="{row["seconds"]:.3f}">\n'
+    if row["failure"] is not None:
+        # errors are about the test, failures about what it tests
+        tag = "failure" if row["error"] is None else "error"
+        kind = row["error_kind"] or f"{verdict_word(row)}{damage_word(row)}"
+        texts = [*row["explanation"], *row["vacuous"]] or [row["failure"]]
+        text = "\n".join(filter(None, [requirement_of(row), *texts]))
+        text = text if limit is None or len(text) <= limit else text[: limit - 1] + "…"
+        message = printable(row["failure"], limit or 1_000)
+        yield f"<{tag} type={_quoted(kind)} message={_quoted(message)}>{_text(text)}</{tag}>\n"
+        if (row["case"], row["log"]) in reports:
+            yield f"<system-out>[[ATTACHMENT|{_text(reports[row['case'], row['log']])}]]</system-out>\n"
+    elif row["untested"] and limit is None:
+        own = _text("\n".join(row["untested"]))
+        yield f"<system-out>{own}</system-out>\n"
+    yield "</testcase>\n"
+
+
+def _counts(rows: Any) -> tuple[int, int]:
+    """Return how many rows fail, and how many have errors."""
+    kinds = [row["error"] is None for row in rows if row["failure"] is not None]
+    return sum(kinds), len(kinds) - sum(kinds)
+
+
+def _time(rows: Any) -> str:
+    """Return the seconds that rows took; those of one log took them together."""
+    return f"{sum({(row['case'], row['log']): row['seconds'] for row in rows}.values()):.3f}"
+
+
+def _text(text: str) -> str:
+    """Return a text that XML can hold."""
+    return escape("\n".join(printable(line, len(line)) for line in text.split("\n")))
+
+
+def _quoted(text: str) -> str:
+    return quoteattr(printable(str(text), 1_000))
+
+
+_MOST_LOGS: Final = 2_000
+"""Rows of the matrix; a page with more is slow to open."""
+_MOST_SPECS: Final = 60
+"""Columns of the matrix, and distributions."""
+_BINS: Final = 24
+_WIDTH: Final = 240.0
+_HEIGHT: Final = 60.0
+_STYLES: Final = ("report:browser/page.css", "batch:overview.css")
+
+
+def overview_page(table: pa.Table, name: str, reports: Mapping[tuple[str, str], str]) -> bytes:
+    """Return the page, in UTF-8; equal tables give equal bytes.
+
+    Args:
+        table: of a run.
+        name: of the suite.
+        reports: for cases and logs by name, the address of the page about them, relative to this one.
+    """
+    style = "\n".join([theme(), *map(_asset, _STYLES)])
+    script = _asset("batch:overview.js")
+    parts = [
+        '<!doctype html>\n<html lang="en" data-read><head><meta charset="utf-8">',
+        f'<meta http-equiv="Content-Security-Policy" content="{policy([script], style)}">',
+        '<meta name="viewport" content="width=device-width, initial-scale=1">',
+        '<meta name="color-scheme" content="light dark">',
+        element("title", text(f"{name}: {_headline(table)}")),
+        f"<style>{style}</style></head><body>",
+        _header(table, name),
+        element("main", *_panels(table, reports)),
+        f"<script>{script}</script></body></html>\n",
+    ]
+    return "".join(parts).encode("utf-8")
+
+
+def _asset(name: str) -> str:
+    room, _, file = name.partition(":")
+    return files(f"spatial_replay.{room}").joinpath(file).read_text("utf-8")
+
+
+def _headline(table: pa.Table) -> str:
+    failures = len(table) - table.column("failure").null_count
+    return f"{failures:,} of {counted(len(table), 'result')} failed" if failures else "everything passed"
+
+
+def _header(table: pa.Table, name: str) -> Html:
+    failed = table.column("failure").null_count < len(table)
+    chip = element("span", _headline(table), **{"class": f"chip is-{'violated' if failed else 'satisfied'}"})
+    logs = len(set(table.column("log").to_pylist()))
+    about = " · ".join([counted(logs, "log"), summary_text(table), f"spatial-replay {__version__}"])
+    title = element("div", element("h1", text(name)), chip, **{"class": "title"})
+    return element("header", title, element("p", text(about), **{"class": "about"}), **{"class": "top"})
+
+
+def _panels(table: pa.Table, reports: Mapping[tuple[str, str], str]) -> Iterator[Html]:
+    by_spec = totals(table)
+    yield _panel("Specifications", _totals(by_spec))
+    worst = [row for row in worst_rows(table, _WORST) if row["failure"] is not None]
+    if worst:
+        yield _panel("The worst", _worst(worst, reports))
+    yield _panel("Robustness", element("div", *_plots(table, by_spec[:_MOST_SPECS]), **{"class": "plots"}))
+    yield _panel("Logs", *_matrix(table, by_spec[:_MOST_SPECS], reports))
+
+
+def _panel(title: str, *content: Html) -> Html:
+    return element("section", element("h2", title), *content, **{"class": "panel"})
+
+
+def _totals(by_spec: Sequence[Total]) -> Html:
+    names = ("case", "spec", "requirement")
+    columns = counts_of(by_spec)
+    numbers = (*columns, "least robustness")
+    head = [*(element("th", each) for each in names), *(_number("th", each) for each in numbers)]
+    rows = []
+    for place, each in enumerate(by_spec):
+        group = each.group
+        cells = [group["case"], group["spec"] or group["file"], each.about]
+        counts = [f"{own[place]:,}" for own in columns.values()]
+        least = "" if each.least is None else f"{each.least:.6g}"
+        rows.append(
+            element(
+                "tr",
+                *(element("td", text(cell)) for cell in cells),
+                *(_number("td", count) for count in (*counts, least)),
+            )
+        )
+    return element("table", element("thead", element("tr", *head)), element("tbody", *rows))
+
+
+def _worst(rows: Sequence[Values], reports: Mapping[tuple[str, str], str]) -> Html:
+    names = [element("th", each) for each in ("log", "spec")]
+    texts = [element("th", each) for each in ("failure", "reason")]
+    head = element("tr", *names, _number("th", "robustness"), *texts)
+    body = [
+        element(
+            "tr",
+            element("td", _linked((row["case"], row["log"]), reports), **{"class": "log"}),
+            element("td", *_named(row)),
+            _number("td", "" if math.isnan(row["robustness"]) else f"{row['robustness']:.4g}"),
+            element("td", text(row["failure"])),
+            element("td", *_with_code(row["reason"])),
+        )
+        for row in rows
+    ]
+    return element("table", element("thead", head), element("tbody", *body))
+
+
+def _named(row: Values) -> Iterator[Html]:
+    """Yield the name of a result, and below it the requirement that it is about."""
+    yield text(result_name(row["spec"] or row["file"], row["object"]))
+    if about := requirement_of(row):
+        yield element("div", text(about), **{"class": "requirement"})
+
+
+def _with_code(sentence: str) -> Iterator[Html]:
+    """Yield a sentence, its formulas as code."""
+    for number, piece in enumerate(sentence_parts(sentence)):
+        yield element("code", text(piece)) if number % 2 else text(piece)
+
+
+def _plots(table: pa.Table, by_spec: Sequence[Total]) -> Iterator[Html]:
+    import pyarrow.compute as pc
+
+    has_cases = len({each.group["case"] for each in by_spec}) > 1
+    for each in by_spec:
+        group = each.group
+        fits = pc.and_(
+            pc.and_(pc.equal(table["case"], group["case"]), pc.equal(table["file"], group["file"])),
+            pc.equal(table["spec"], group["spec"]),
+        )
+        numbers = np.asarray(table.filter(fits).column("robustness").to_numpy(), np.float64)
+        finite = numbers[np.isfinite(numbers)]
+        if len(finite):
+            case = group["case"] if has_cases else None
+            title = " · ".join(filter(None, (case, each.requirement, group["spec"])))
+            caption = element("figcaption", text(title), **_tip(each.about))
+            yield element("figure", caption, _histogram(finite))
+
+
+def _histogram(numbers: Floats) -> Html:
+    """Return a distribution as a drawing; a bin lies on one side of 0, where the verdict changes."""
+    low, high = min(float(numbers.min()), 0.0), max(float(numbers.max()), 0.0)
+    if low == high:
+        high = low + 1.0
+    width = (high - low) / _BINS
+    below = math.ceil(-low / width) if low < 0.0 else 0
+    edges = (np.arange(_BINS + 2) - below) * width
+    counts, _ = np.histogram(numbers, edges)
+    tallest, step = max(1, int(counts.max())), _WIDTH / len(counts)
+    bars = []
+    for number, count in enumerate(counts.tolist()):
+        height = _HEIGHT * count / tallest
+        side = "bad" if number < below else "good"
+        place = {"x": number * step + 0.5, "y": _HEIGHT - height, "width": step - 1.0, "height": height}
+        # what is read is the text beside the drawing, so the tip of a bar says its count
+        tip = element("title", f"{count:,} from {edges[number]:.4g} to {edges[number + 1]:.4g}")
+        attributes = {name: f"{value:.2f}" for name, value in place.items()}
+        bars.append(element("rect", tip, **attributes, **{"class": side}))
+    zero = f"{below * step:.2f}"
+    axis = element("line", x1=zero, x2=zero, y1="0", y2=f"{_HEIGHT + 3:.0f}")
+    labels = [
+        element("text", f"{low:.4g}", x="0", y=f"{_HEIGHT + 12:.0f}"),
+        element("text", f"{high:.4g}", x=f"{_WIDTH:.0f}", y=f"{_HEIGHT + 12:.0f}", **{"text-anchor": "end"}),
+    ]
+    name = f"Distribution of robustness from {low:.4g} to {high:.4g}"
+    view = f"0 0 {_WIDTH:.0f} {_HEIGHT + 16:.0f}"
+    return element("svg", *bars, axis, *labels, viewBox=view, role="img", **{"aria-label": name})
+
+
+def _matrix(
+    table: pa.Table, by_spec: Sequence[Total], reports: Mapping[tuple[str, str], str]
+) -> Iterator[Html]:
+    """Yield a row for each log, the worst first, and a column for each spec."""
+    columns = [(each.group["case"], each.group["file"], each.group["spec"]) for each in by_spec]
+    cells: dict[str, dict[tuple[str, str, str], Values]] = {}
+    for row in worst_rows(table, len(table)):
+        column = (row["case"], row["file"], row["spec"])
+        log = cells.get(row["log"])
+        if log is None:
+            if len(cells) >= _MOST_LOGS:
+                continue
+            log = cells[row["log"]] = {}
+        # of a template, the worst object
+        log.setdefault(column, row)
+    logs = len(set(table.column("log").to_pylist()))
+    if logs > len(cells):
+        words = f"The {len(cells):,} worst of {counted(logs, 'log')}; the table of the run has them all."
+        yield element("p", words)
+    cases = {case for case, _, _ in columns}
+    yield element("p", "Marked results fail.")
+    titles = [f"{case} · {spec or file}" if len(cases) > 1 else spec or file for case, file, spec in columns]
+    abouts = [each.about for each in by_spec]
+    head = [_sortable("log", ""), *map(_sortable, titles, ["number"] * len(titles), abouts)]
+    body = []
+    for name, of_log in cells.items():
+        shown = [_cell(of_log.get(column)) for column in columns]
+        own = next(((case, name) for case, _, _ in columns if (case, name) in reports), ("", name))
+        body.append(element("tr", element("td", _linked(own, reports)), *shown))
+    yield element("table", element("thead", element("tr", *head)), element("tbody", *body), id="matrix")
+
+
+def _cell(row: Values | None) -> Html:
+    if row is None:
+        return element("td", "", **{"class": "number", "data-value": "1e400"})
+    number, verdict, fails = row["robustness"], verdict_word(row), row["failure"] is not None
+    kind = f"number is-{verdict}{' fails' if fails else ''}"
+    was = row.get(BASELINE_ROBUSTNESS)
+    before = (
+        f" (was {was:.4g})" if fails and was is not None and was != number and not math.isnan(was) else ""
+    )
+    if row["verdict"] is None:
+        return element(
+            "td", f"{verdict}{before}", title=row["failure"], **{"class": kind, "data-value": "-1e400"}
+        )
+    shown = verdict if math.isnan(number) or verdict == "untested" else f"{number:.4g}"
+    value = "0" if math.isnan(number) else f"{max(-1e300, min(1e300, number)):.17g}"
+    why = f": {row['failure']}" if fails else ""
+    tip = f"{result_name(row['spec'], row['object'])} is {verdict}{damage_word(row)}{why}. {row['reason']}"
+    tip = " ".join([tip, *(row["untested"] or ())])
+    shown = f"{shown}{damage_word(row)}{before}"
+    return element("td", shown, title=tip, **{"class": kind, "data-value": value})
+
+
+def _sortable(title: str, kind: str, about: str = "") -> Html:
+    button = element("button", text(title), type="button", **_tip(about))
+    return element("th", button, scope="col", **{"class": kind})
+
+
+def _tip(about: str) -> dict[str, str]:
+    """Return the attribute with which a name shows the requirement that it is about."""
+    return {"title": about} if about else {}
+
+
+def _number(tag: str, words: str) -> Html:
+    return element(tag, words, **{"class": "number"})
+
+
+def _linked(log: tuple[str, str], reports: Mapping[tuple[str, str], str]) -> Html:
+    """Return the name of a log, given with its case, linked to the page about it."""
+    return element("a", text(log[1]), href=quote(reports[log])) if log in reports else text(log[1])
+
+
+INDEX: Final = "index.html"
+_FOLDER: Final = "reports"
+_LONGEST: Final = 80
+_UNSAFE: Final = re.compile(r"[^A-Za-z0-9._-]+")
+
+
+@dataclass(frozen=True, slots=True)
+class _Page:
+    """A page to write about one log of one case."""
+
+    task: Task
+    path: Path
+
+
+def write_pages(
+    result: BatchResult,
+    folder: Path,
+    name: str,
+    workers: Workers,
+    *,
+    progress: Progress = no_progress,
+) -> dict[tuple[str, str], Path]:
+    """Write the page over all logs, and one about each log with a verdict that fails.
+
+    A page that an earlier run has written of the same log and specifications stays.
+
+    Args:
+        folder: made if need be; the page over all is its `index.html`.
+        name: of the suite.
+        progress: shows how many pages have been written.
+
+    Returns:
+        The pages, by case and log.
+
+    Raises:
+        UsageError: the folder is a file.
+        OutputError: a page cannot be written.
+    """
+    failing = _failing(result)
+    pages = {key: folder / _FOLDER / _file_name(key[1], wanted) for key, wanted in failing.items()}
+    try:
+        (folder / _FOLDER).mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise UsageError(f"{folder} is a file; give --html the name of a folder") from None
+    except OSError as error:
+        raise output_error(folder, error) from error
+    missing = {
+        path: _Page(_task(failing[key]), path.resolve()) for key, path in pages.items() if not path.exists()
+    }
+    with progress("reports", len(missing)) as advance:
+        for _ in workers.results(_write_page, missing.values()) if missing else ():
+            advance(1)
+    pages = {key: path for key, path in pages.items() if path.exists()}
+    links = {key: path.relative_to(folder).as_posix() for key, path in pages.items()}
+    with replacing(folder / INDEX) as stream:
+        stream.write(overview_page(result.table, name, links))
+    return pages
+
+
+def _failing(result: BatchResult) -> dict[tuple[str, str], list[Wanted]]:
+    """Return what is wanted of each log with a failing verdict, by case and log."""
+    names = ("case", "log", "failure", "error")
+    rows = zip(*(result.table.column(name).to_pylist() for name in names), strict=True)
+    found: dict[tuple[str, str], list[Wanted]] = {
+        (case, log): [] for case, log, failure, error in rows if failure and not error
+    }
+    for each in result.wanted:
+        if (each.case.name, each.log.name) in found:
+            found[each.case.name, each.log.name].append(each)
+    # a result that is gone may have no log any more
+    return {key: wanted for key, wanted in found.items() if wanted}
+
+
+def _task(wanted: list[Wanted]) -> Task:
+    first = wanted[0]
+    return Task(first.log.path, tuple(each.file.text for each in wanted), first.case.conditions)
+
+
+def _file_name(log: str, wanted: list[Wanted]) -> str:
+    """Return a name that says which log it is, and changes with what the page shows."""
+    digest = hashlib.sha256("".join(each.key or "" for each in wanted).encode()).hexdigest()[:12]
+    return f"{_UNSAFE.sub('-', log).strip('-.')[-_LONGEST:]}-{digest}.html"
+
+
+def _write_page(page: _Page) -> None:
+    """Write one page; a log that cannot be read any more has none."""
+    try:
+        files = parsed_specifications(page.task.specs, page.task.conditions)
+        source, options = opened_task(page.task, files)
+        write_report(source, files, page.path, options)
+    except OutputError:
+        raise
+    except (SpatialReplayError, OSError):
+        return
