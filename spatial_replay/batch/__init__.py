@@ -1,7 +1,7 @@
 """Many logs: a suite of cases in, rows of results out.
 
-`suite` reads the cases, and `logs` finds logs and specifications. `rows` evaluates one log. `run` does so for all,
-with the processes of `workers`. `store` keeps the rows; `outputs` and `baseline` show and compare them.
+`suite` reads the cases, `logs` finds logs and specifications, and `rows` evaluates one log. `run` does all of
+them with the processes of `workers`. `store` keeps rows; `outputs` and `baseline` show and compare them.
 
 Names are loaded when they are first used.
 """
