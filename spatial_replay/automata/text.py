@@ -9,7 +9,6 @@ from dataclasses import replace
 from textwrap import wrap
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.guards import Transition
 from spatial_replay.errors import OutputError, UsageError
 from spatial_replay.palette import NEGATIVE, POSITIVE, hexadecimal, light
