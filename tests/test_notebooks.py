@@ -43,7 +43,7 @@ EXPECTED = {
         (
             "■ violated",
             "table_set is violated: spoon dist plate <= 0.08 at 4.000 s",
-            "with 0.2352 in place of 0.08",
+            "with 0.2353 instead of 0.08",
             "satisfied from a deadline of 5 s on",
             "patient: satisfied",
         ),

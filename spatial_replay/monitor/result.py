@@ -498,9 +498,7 @@ class SpecResult(Displayed):
             return self.witness(node)
         count = int(np.searchsorted(self.times_ns, settled_ns, side="right"))
         leaves, times_ns = self.leaves[:, :, :count], self.times_ns[:count]
-        # where a satisfied result would flip is a matter of the whole log
-        is_satisfied = final_verdict(*self.final[node].tolist()) is Verdict.SATISFIED
-        whole = (self.leaves, self.times_ns) if is_satisfied else None
+        whole = (self.leaves, self.times_ns)
         return find_witness(self.evidence, leaves, times_ns, node, goes_on=True, whole=whole)
 
     def _leaves(self, what: str) -> Floats:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
 from types import MappingProxyType
 
 from spatial_replay.monitor.causes import Cause, LeastPart
@@ -20,8 +19,6 @@ from spatial_replay.spec.formula import Atom, Formula
 from spatial_replay.spec.units import declared_unit
 from spatial_replay.spec.walks import iter_expressions, iter_formulas
 from spatial_replay.text import (
-    DIGITS,
-    LARGEST_PLAIN,
     Instant,
     Sentence,
     counted,
@@ -324,49 +321,26 @@ def _flip(
             case "limits":
                 return f"No number that can stand in it makes that {opposite}."
         return f"No number of this atom alone makes it {opposite}: other atoms decide it, too."
-    change = _change(threshold)
     would = f"It would be {threshold.verdict}"
     if is_open:
         would = f"So far it would {'fail' if witness.verdict is Verdict.SATISFIED else 'hold'}"
-    elif witness.is_settled and witness.verdict is Verdict.VIOLATED:
+    elif threshold.verdict is Verdict.UNKNOWN:
         would = "It would not have been violated then"
+    number = format_number(threshold.flips_at)
+    side = "or more" if threshold.flips_at > threshold.value else "or less"
+    limit = f"exactly {number}" if threshold.is_exact else f"{number} {side}"
     if threshold.is_written:
-        limit = f"{change} in place of {format_number(threshold.value)}"
-        return f"{would} with {limit} in `{deciding.text}`."
-    margin = change.removeprefix("-").removesuffix(" or less").removesuffix(" or more")
-    if change.startswith("anything"):
-        margin = f"more than {number_text(abs(threshold.flips_at))}"
-    if divisor_of(deciding.atom) != 1.0:
-        margin = amount_text(abs(threshold.flips_at), deciding.atom, witness.units)
-    elif (unit := declared_unit(deciding.atom, witness.units)) not in ("", "1"):
-        margin = f"{margin} {unit}"
+        limit = f"{limit} instead of {format_number(threshold.value)}"
+        return f"{would} with {limit} {_place(deciding, threshold)}."
+    unit = declared_unit(deciding.atom, witness.units, is_scaled=False)
+    margin = format_number(abs(threshold.flips_at)) + ("" if unit in ("", "1") else f" {unit}")
     how = "were allowed to fail by" if threshold.flips_at < 0.0 else "had to hold by"
     return f"{would} if `{deciding.text}` {how} {margin}."
 
 
-def _change(threshold: Threshold) -> str:
-    """Return the numbers that flip a verdict."""
-    if threshold.is_exact:
-        return f"exactly {threshold.flips_at!r}"
-    rises = threshold.flips_at > threshold.value
-    if threshold.flips_at == 0.0:
-        return "0"
-    nearest = float(number_text(threshold.flips_at))
-    for limit in (threshold.value, 0.0, nearest):
-        # a change that is only a rounding error is left out of the number
-        if abs(threshold.flips_at - limit) <= 1e-12 * max(abs(threshold.value), 1.0):
-            if limit >= threshold.flips_at if rises else limit <= threshold.flips_at:
-                return f"{format_number(limit)} or {'more' if rises else 'less'}"
-            return f"anything {'above' if rises else 'below'} {format_number(limit)}"
-    return f"{_rounded(threshold.flips_at, up=rises)} or {'more' if rises else 'less'}"
-
-
-def _rounded(number: float, *, up: bool) -> str:
-    """Return four digits, rounded so that the change is no smaller."""
-    rounding = ROUND_CEILING if up else ROUND_FLOOR
-    rounded = Context(prec=DIGITS, rounding=rounding).create_decimal(Decimal(number))
-    is_plain = rounded.adjusted() >= -5 and abs(rounded) < LARGEST_PLAIN
-    return f"{rounded.normalize():f}" if is_plain else str(rounded.normalize()).lower()
+def _place(deciding: DecidingAtom, threshold: Threshold) -> str:
+    """Return where the number is written that would flip a verdict."""
+    return f"for `{threshold.constant}`" if threshold.constant else f"in `{deciding.text}`"
 
 
 def _unknown(witness: Witness, deciding: DecidingAtom, first_ns: int) -> Sentence:

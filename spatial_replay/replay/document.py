@@ -183,6 +183,7 @@ def witness_document(witness: Witness, first_ns: int) -> dict[str, Any]:
             "written": threshold.is_written,
             "exact": threshold.is_exact,
             "verdict": str(threshold.verdict),
+            "constant": threshold.constant or None,
         }
     return value
 

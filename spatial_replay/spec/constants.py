@@ -12,6 +12,7 @@ from typing import TypeAlias
 from spatial_replay.errors import UsageError
 from spatial_replay.spec.builder import MAX_DURATION_NS, StatementError, read_number
 from spatial_replay.spec.diagnostics import nearest_hint
+from spatial_replay.spec.expressions import NamedNumber
 from spatial_replay.spec.format import format_duration, format_number
 from spatial_replay.spec.formula import Constant, Span
 from spatial_replay.spec.syntax import Arithmetic, ConstStatement, Duration, Name, NumberSyntax, Quantity
@@ -44,12 +45,15 @@ def value_of(
     if any(value is None for value in values):
         return None
     try:
-        return _computed(written, [value for value in values if value is not None])
+        result = _computed(written, [value for value in values if value is not None])
     except _ImpossibleError as fault:
         report(written.span, str(fault), "durations are added to durations, and multiplied by numbers")
     except (OverflowError, ZeroDivisionError) as fault:
         what = "division by zero" if isinstance(fault, ZeroDivisionError) else "a result that is too large"
         report(written.span, what, "numbers reach up to about 1.7e308, durations up to 9e9s")
+    else:
+        names = [name for value in values if isinstance(value, NamedNumber) for name in value.constants]
+        return NamedNumber(result, tuple(names)) if names and isinstance(result, float) else result
     return None
 
 

@@ -455,7 +455,7 @@ class Elaborator:
             local = scope.values.get(written.text)
             if local is not None:
                 return local
-            constant = self.names.constant(written.text)
+            constant = self.names.traced(written.text, self.names.constant(written.text))
             if constant is not None:
                 self.names.used.add(written.text)
                 return constant

@@ -3,10 +3,31 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import Literal, Self, TypeAlias
 
 Axis: TypeAlias = Literal["x", "y", "z"]
 Side: TypeAlias = Literal["min", "max"]
+
+# -------------------------------------------------------------------------------------------- numbers
+
+
+class NamedNumber(float):
+    """A number that constants give, which stays equal to the number alone.
+
+    Attributes:
+        constants: the names of the constants that it is computed from.
+        is_plain: whether it is the value of the only one of them.
+    """
+
+    __slots__ = ("constants", "is_plain")
+    constants: tuple[str, ...]
+    is_plain: bool
+
+    def __new__(cls, value: float, constants: tuple[str, ...] = (), *, is_plain: bool = False) -> Self:
+        made = super().__new__(cls, value)
+        made.constants, made.is_plain = constants, is_plain
+        return made
+
 
 # ---------------------------------------------------------------------------------------------- terms
 
@@ -228,7 +249,7 @@ def as_expression(value: object) -> Expression:
     if isinstance(value, bool) or not isinstance(value, (int, float, _Arithmetic)):
         raise TypeError(f"{value!r} is neither a number nor an expression over terms")
     if isinstance(value, (int, float)):
-        return Number(float(value))
+        return Number(value if isinstance(value, float) else float(value))
     return value  # type: ignore[return-value]
 
 

@@ -10,6 +10,7 @@ from typing import Literal, TypeAlias
 from spatial_replay.spec import regions as outline
 from spatial_replay.spec.constants import constant_of, names_in, range_fault, value_of
 from spatial_replay.spec.diagnostics import Faults
+from spatial_replay.spec.expressions import NamedNumber
 from spatial_replay.spec.format import format_number
 from spatial_replay.spec.formula import (
     ANY_CLASS,
@@ -74,6 +75,7 @@ class Namespace:
         definitions: statements by name; of a name given twice, the first.
         regions, groups: the values of those definitions.
         used: names that something refers to.
+        entangled: those of them that constants, regions or scales refer to.
         scales: what `scale` lines divide numbers by.
     """
 
@@ -82,6 +84,7 @@ class Namespace:
     regions: dict[str, Outline] = field(default_factory=dict)
     groups: dict[str, Group] = field(default_factory=dict)
     used: set[str] = field(default_factory=set)
+    entangled: frozenset[str] = frozenset()
     constants: dict[str, float | Duration | None] = field(default_factory=dict)
     scales: list[Scale] = field(default_factory=list)
 
@@ -102,6 +105,7 @@ class Namespace:
                     self.regions[name] = self._region(statement, effort)
                 case GroupStatement():
                     self.groups[name] = self._group(statement)
+        self.entangled = frozenset(self.used)
 
     def _declare(self, statement: Statement) -> None:
         name = statement.name
@@ -201,6 +205,12 @@ class Namespace:
             self._report_not_a_number(name, statement)
             return None
         return self.constant(name.text)
+
+    def traced(self, name: str, value: float | Duration | None) -> float | Duration | None:
+        """Return the value of a constant with its name, unless more than formulas depends on the constant."""
+        if isinstance(value, float) and name not in self.entangled:
+            return NamedNumber(value, (name,), is_plain=True)
+        return value
 
     def plain_number(self, written: Quantity) -> float:
         """Return a number written outside of formulas; 0 after a fault."""
@@ -410,7 +420,7 @@ class Resolver:
         def named(name: Name) -> float | Duration | None:
             value = scope.values.get(name.text)
             if value is None:
-                return self.names.named(name)
+                return self.names.traced(name.text, self.names.named(name))
             if isinstance(value, (float, Duration)):
                 return value
             if not isinstance(value, Anything):
@@ -421,7 +431,8 @@ class Resolver:
         def report(span: Span, message: str, hint: str) -> None:
             self.fault(span, scope, message, hint)
 
-        return value_of(written, named, report) or 0.0
+        value = value_of(written, named, report)
+        return 0.0 if value is None else value
 
     def is_number(self, name: Name, scope: Scope) -> bool:
         """Return whether a name is that of a constant, or of a number that a macro was given."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 
 import numpy as np
 from hypothesis import assume, given
@@ -13,12 +14,13 @@ from examples import examples
 from laws.strategies_monitor import formulas_of_leaves, leaf_runs, recordings, specifications
 from laws.strategies_spec import Vocabulary
 from laws.test_monitor_laws import observed_in
-from spatial_replay import Sample, Trace, Verdict, evaluate, parse_specification
+from spatial_replay import Sample, Specification, Trace, Verdict, evaluate, parse_specification
 from spatial_replay.monitor.offline import evaluate_offline
 from spatial_replay.monitor.online.program import compile_formula
 from spatial_replay.monitor.sentences import sentences_of
 from spatial_replay.monitor.witness.path import End, deciding_path
-from spatial_replay.spec.formula import Number, iter_nodes
+from spatial_replay.monitor.witness.threshold import rewritten
+from spatial_replay.spec.formula import Number, Sum, iter_nodes
 
 SIGNALS = Vocabulary(objects=(), signals=("p", "q"), max_depth=4, delays=False)
 NUMBER = re.compile(r"(?<![\w.])-?\d+(\.\d+)?(?![\w.])")
@@ -139,7 +141,7 @@ def test_the_threshold_flips_the_verdict(text, trace):
     assert threshold.is_written
     assert verdict_with(text, trace, witness, threshold.flips_at) is threshold.verdict
     assert threshold.verdict is not witness.verdict
-    nearer = threshold.value + 0.999 * (threshold.flips_at - threshold.value)
+    nearer = threshold.value + 0.98 * (threshold.flips_at - threshold.value)
     if abs(threshold.flips_at - threshold.value) > 1e-9:
         assert verdict_with(text, trace, witness, nearer) is witness.verdict
     reported = REPORTED.search(sentences[2])
@@ -147,7 +149,7 @@ def test_the_threshold_flips_the_verdict(text, trace):
         assert verdict_with(text, trace, witness, float(reported[1])) is threshold.verdict
 
 
-REPORTED = re.compile(r"(?:with|exactly) (-?[0-9.e-]+)(?: or more| or less|) in place of")
+REPORTED = re.compile(r"(?:with|exactly) (-?[0-9.e-]+)(?: or more| or less|) instead of")
 
 
 def verdict_with(text: str, trace: Trace, witness, new: float) -> Verdict:
@@ -164,10 +166,11 @@ def flips_somewhere(text: str, trace: Trace, witness) -> bool:
     """Whether the deciding atom alone can make another verdict."""
     if witness.deciding is None or not math.isfinite(witness.deciding.value):
         return False
-    return any(verdict_with(text, trace, witness, new) is not witness.verdict for new in (-1000.0, 1000.0))
+    opposite = Verdict.SATISFIED if witness.verdict is Verdict.VIOLATED else Verdict.VIOLATED
+    return any(verdict_with(text, trace, witness, new) is opposite for new in (-1000.0, 1000.0))
 
 
-DISTANCES = [
+TEMPLATES = [
     "G (a dist b >= {})",
     "F (a closeto[{}] b)",
     "G (a farfrom[{}] goal)",
@@ -184,6 +187,11 @@ DISTANCES = [
     "forall r in pair: F (r closeto[{}] goal)",
     "G (a oriented[{}] b)",
     "F (a enclosedin enlarge(goal, {}))",
+    "(G a dist b >= {0}) and (G a dist goal >= {0})",
+    "(G a dist b >= {0}) and (F (a closeto[{0}] goal))",
+    "G (a dist b >= {0} -> (F b farfrom[{0}] goal))",
+    "(a dist b >= {0}) <-> F (enlarge(a, {0}) ovlp goal)",
+    "F (a leftof b and a ovlp goal)",
 ]
 HEADER = """\
 region goal = box(-2, -2, 3, 2)
@@ -191,26 +199,66 @@ group pair = a, b
 group people = class "person"
 group everyone = all
 """
+WRITTEN = re.compile(
+    r"It would be (satisfied|violated) with (?:exactly )?(\S+)(?: or more| or less)? instead of (\S+)"
+    r" (?:for `(\w+)`|in `.*`)"
+)
+MARGIN = re.compile(r"It would be (satisfied|violated) if `.*` (were allowed to fail|had to hold) by (\S+)\.")
 
 
 @examples(80)
-@given(text=st.sampled_from(DISTANCES), number=st.sampled_from([0.5, 2.25, 7.125]), recording=recordings())
-def test_the_threshold_of_a_relation_flips_the_verdict(text, number, recording):
+@given(
+    template=st.sampled_from(TEMPLATES),
+    number=st.sampled_from([0.5, 2.25, 7.125]),
+    is_constant=st.booleans(),
+    recording=recordings(),
+)
+def test_advice_of_an_explanation_leads_to_the_verdict_that_it_claims(
+    template, number, is_constant, recording
+):
     trace = recording.trace()
+    text = f"{HEADER}const c = {number}\nspec s = {template.format('c' if is_constant else number)}\n"
+    specification = parse_specification(text)
+    result = evaluate(specification, trace).result()
+    witnesses = {cause.node: cause.witness for cause in result.causes} or {0: result.worst}
+    for node, witness in witnesses.items():
+        explained = result.explain(first_ns=0)
+        said = " ".join(each for each in sentences_of(witness, first_ns=0) if each in explained)
+        written, margin = WRITTEN.search(said), MARGIN.search(said)
+        assert bool(written or margin) == (witness.threshold is not None)
+        if written:
+            claimed, new, old, constant = written.groups()
+            assert witness.threshold.flips_at == float(new)
+            if constant:
+                followed = parse_specification(text, constants={constant: float(new)})
+            else:
+                followed = with_number(specification, witness.deciding.atom, old, new)
+        elif margin:
+            claimed, how, size = margin.groups()
+            followed = with_margin(specification, witness, float(size) * (1 if how == "had to hold" else -1))
+        if written or margin:
+            assert evaluate(followed, trace).result().nodes[node].verdict == claimed
 
-    def evaluated(value: float):
-        return evaluate(parse_specification(f"{HEADER}spec s = {text.format(repr(value))}\n"), trace)
 
-    evaluation = evaluated(number)
-    witnesses = [evaluation.witness()]
-    if evaluation.verdict is Verdict.SATISFIED:
-        # what settled it names the number that would have led to another verdict in the end
-        witnesses.append(evaluation.result().worst)
-    for witness in witnesses:
-        threshold = witness.threshold
-        reported = REPORTED.search(sentences_of(witness, first_ns=0)[-1])
-        if reported and threshold is not None and threshold.value == number:
-            assert evaluated(float(reported[1])).verdict is not evaluation.verdict
-        if threshold is not None and threshold.is_written and threshold.value == number:
-            assert evaluated(threshold.flips_at).verdict is threshold.verdict
-            assert threshold.verdict is not evaluation.verdict
+def with_number(specification, atom, old, new):
+    """The specification with another number in an atom, wherever that place of the text is."""
+    span = atom.span
+    written = specification.source[span.start : span.end]
+    changed = re.sub(rf"(?<![\d.]){re.escape(old)}(?![\d.])", new, written)
+    if changed == written:
+        changed = re.sub(r"\bc\b", new, written)
+    assert changed != written
+    return parse_specification(
+        specification.source[: span.start] + changed + specification.source[span.end :]
+    )
+
+
+def with_margin(specification, witness, margin):
+    """The specification with an atom that has to hold by a margin."""
+
+    def change(atom):
+        return replace(atom, expression=Sum(atom.expression, Number(-margin)))
+
+    (spec,) = specification.specs
+    formula = rewritten(spec.formula, lambda atom: atom.span == witness.deciding.atom.span, change)
+    return Specification((replace(spec, formula=formula),), "paper", regions=specification.regions)

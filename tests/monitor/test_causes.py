@@ -104,16 +104,15 @@ def test_explanations_name_every_cause_and_what_would_have_prevented_it() -> Non
         "`safe` is violated since 3.000 s, whatever came after.",
         "What decides is `red dist vase >= 0.1`, which fails by 0.03 at 3.000 s (within `safe`): "
         "red and vase are 0.07 apart.",
-        "It would not have been violated then with anything below 0.07 in place of 0.1 in "
-        "`red dist vase >= 0.1`.",
+        "It would be satisfied with -0.2401 or less instead of 0.1 in `red dist vase >= 0.1`.",
         "`charged` is violated since 4.000 s, whatever came after.",
         "What decides is `battery >= 0.2`, which fails by 0.06 at 4.000 s (within `charged`): "
         "battery is 0.14.",
-        "It would not have been violated then with anything below 0.14 in place of 0.2 in `battery >= 0.2`.",
+        "It would be satisfied with 0.14 or less instead of 0.2 in `battery >= 0.2`.",
         "`deliver` is violated, for the log has ended: robustness -7.76.",
         "What decides is `red enclosedin bin`, which fails by 7.76 at 4.000 s (its greatest within "
         "`deliver`): red sticks out of bin by 7.76.",
-        "It would be satisfied if `red enclosedin bin` were allowed to fail by more than 7.76.",
+        "It would be satisfied if `red enclosedin bin` were allowed to fail by 7.76.",
     ]
 
 
@@ -273,3 +272,16 @@ def test_a_violation_says_amounts_in_the_units_of_the_log_and_the_time_of_its_at
     assert soft.startswith("force is 0.2 too high: `force <= 14` fails") and soft.endswith("at 1.000 s")
     # the best attempt before the window closed
     assert soon.startswith("force is 5.8 too low: `force >= 20` fails") and soon.endswith("at 1.000 s")
+
+
+def test_advice_on_a_constant_changes_every_place_that_names_it():
+    text = "const near = 0.1\nspec safe = G (red dist vase >= near and battery >= near)\n"
+    (cause,) = evaluated(text).result().causes
+    assert cause.witness is not None and cause.witness.threshold is not None
+    threshold = cause.witness.threshold
+    assert (threshold.constant, threshold.value, threshold.flips_at) == ("near", 0.1, -0.2401)
+    # a region follows from the constant, too: the advice is then on the number of one atom
+    region = "region here = box(0, 0, near, near)\n"
+    (cause,) = evaluated(f"{region}{text}").result().causes
+    assert cause.witness is not None and cause.witness.threshold is not None
+    assert cause.witness.threshold.constant == ""

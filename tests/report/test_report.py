@@ -153,7 +153,7 @@ def test_verdicts_and_explanations_can_be_read_without_scripts(violated: Page) -
     said = violated.within("section#verdicts")
     assert "violatedtable_setrobustness -0.1552," in said
     assert "which fails by 0.1552 at 4.000 s" in said
-    assert "with 0.2353 or more in place of 0.08" in said
+    assert "with 0.2353 or more instead of 0.08" in said
 
 
 def test_the_page_says_which_run_it_is_of(violated: Page) -> None:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from decimal import ROUND_CEILING, ROUND_FLOOR, ROUND_HALF_EVEN, Context, Decimal
 from itertools import pairwise
 from typing import Literal, TypeAlias
 
@@ -19,6 +20,7 @@ from spatial_replay.monitor.witness.atom import DecidingAtom
 from spatial_replay.monitor.witness.evidence import Evidence
 from spatial_replay.monitor.witness.path import End
 from spatial_replay.monitor.witness.unfinished import evaluate_unfinished
+from spatial_replay.spec.expressions import NamedNumber
 from spatial_replay.spec.formula import (
     Atom,
     Boolean,
@@ -40,8 +42,10 @@ from spatial_replay.spec.formula import (
     Temporal,
     Term,
     Truth,
+    iter_nodes,
 )
-from spatial_replay.spec.walks import iter_formulas, map_leaves, map_terms
+from spatial_replay.spec.walks import iter_expressions, iter_formulas, map_leaves, map_terms, operand_signs
+from spatial_replay.text import DIGITS
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,40 +56,96 @@ class Dial:
         kind: a number that the atom compares with; the radius by which a term is enlarged; or, where the
             text has neither, the margin that the relation has to hold by, which is 0.
         value: the number.
-        slope: what adding 1 to it adds to the robustness of the atom's deciding branch.
-        is_uniform: whether it adds that in every sample, whichever branch decides.
         is_exact: whether the atom holds at one number only (`a dist b == c`).
+        constant: the constant whose value it is, if every atom with that constant is changed; else "".
     """
 
     kind: Literal["number", "radius", "margin"]
     value: float
-    slope: float
-    is_uniform: bool
     is_exact: bool
+    constant: str = ""
 
     @classmethod
     def of(cls, deciding: DecidingAtom) -> Dial:
         """Choose the first number of the deciding branch written in the atom, else a radius, else 0."""
         atom = deciding.atom
         is_exact = "==" in atom.parameters
-        divisor = atom.expression.divisor if isinstance(atom.expression, Scaled) else 1.0
-        for sign, part in deciding.branch:
-            if isinstance(part, Number) and part.value in atom.parameters:
-                slopes = _slopes(atom.expression, part.value)
-                slope = sign / divisor
-                return cls("number", part.value, slope, slopes == {slope}, is_exact)
-        for sign, part in deciding.branch:
-            for radius in _radii(part):
-                # of prisms, how high they are may decide instead
-                slope = sign * _slope_of_radius(part, radius) / divisor
-                return cls("radius", radius, slope, False, is_exact)
-        return cls("margin", 0.0, -1, True, is_exact)
+        parts = [part for _, part in deciding.branch]
+        numbers = [part.value for part in parts if isinstance(part, Number)]
+        for number in numbers:
+            if number in atom.parameters:
+                return cls("number", number, is_exact)
+        for radius in (radius for part in parts for radius in _radii(part)):
+            return cls("radius", radius, is_exact)
+        return cls("margin", 0.0, is_exact)
+
+    def with_constant(self, formula: Formula) -> Dial | None:
+        """Return the dial of the constant whose value it is; None if more depends on that than numbers."""
+        if not isinstance(self.value, NamedNumber) or not self.value.is_plain:
+            return None
+        (constant,) = self.value.constants
+        used = [number for atom in _atoms_of(formula) for number in _numbers(atom.expression)]
+        is_entangled = any(
+            constant in number.constants and not number.is_plain
+            for number in used
+            if isinstance(number, NamedNumber)
+        )
+        return None if is_entangled else replace(self, constant=constant)
+
+    def is_at(self, kind: Literal["number", "radius"], number: float) -> bool:
+        """Return whether the dial changes a number of that kind."""
+        if self.constant:
+            return isinstance(number, NamedNumber) and self.constant in number.constants
+        return kind == self.kind and number == self.value
 
     def turned(self, expression: Expression, value: float) -> Expression:
         """Return the expression with another number in its place."""
         if self.kind == "margin":
-            return Sum(expression, Number(-value))
-        return _replaced(expression, self.kind, self.value, value)
+            divisor = expression.divisor if isinstance(expression, Scaled) else 1.0
+            return Sum(expression, Number(-value / divisor))
+
+        def term(old: Term) -> Term:
+            if not isinstance(old, Enlarged):
+                return old
+            return Enlarged(term(old.term), value if self.is_at("radius", old.radius) else old.radius)
+
+        def leaf(part: Number | Signal | Measurement) -> Expression:
+            match part:
+                case Number():
+                    return Number(value) if self.is_at("number", part.value) else part
+                case SignedDistance() | Protrusion() | Projection():
+                    return map_terms(part, term)
+            # these take no radius: turning and centroids are the same for an enlarged term
+            return part
+
+        return map_leaves(expression, leaf)
+
+    def slopes(self, expression: Expression) -> set[float]:
+        """Return what adding 1 to the number adds to the expression, for each branch that may decide."""
+        if self.kind == "margin":
+            return {-1.0 / (expression.divisor if isinstance(expression, Scaled) else 1.0)}
+        match expression:
+            case Number():
+                return {int(self.is_at("number", expression.value))}
+            case Sum():
+                first, second = self.slopes(expression.first), self.slopes(expression.second)
+                return {a + b for a in first for b in second}
+            case Negative():
+                return {-slope for slope in self.slopes(expression.operand)}
+            case Scaled(operand, divisor):
+                return {slope / divisor for slope in self.slopes(operand)}
+            case Minimum() | Maximum():
+                return {slope for each in expression.operands for slope in self.slopes(each)}
+            case SignedDistance():
+                return {-self._radii_in(expression.first) - self._radii_in(expression.second)}
+            case Protrusion():
+                return {self._radii_in(expression.inner) - self._radii_in(expression.outer)}
+            case Projection() if expression.axis != "z":
+                return {self._radii_in(expression.term) * (1 if expression.side == "max" else -1)}
+        return {0}
+
+    def _radii_in(self, term: Term) -> int:
+        return sum(self.is_at("radius", each) for each in _radii_of(term))
 
 
 def rewritten(formula: Formula, is_meant: Callable[[Atom], bool], change: Callable[[Atom], Atom]) -> Formula:
@@ -102,39 +162,8 @@ def rewritten(formula: Formula, is_meant: Callable[[Atom], bool], change: Callab
             return replace(formula, operands=operands)
 
 
-def _slopes(expression: Expression, number: float) -> set[float]:
-    """Return what adding 1 to every such number adds to the expression, for each branch that may decide."""
-    match expression:
-        case Number():
-            return {int(expression.value == number)}
-        case Sum():
-            first, second = _slopes(expression.first, number), _slopes(expression.second, number)
-            return {a + b for a in first for b in second}
-        case Negative():
-            return {-slope for slope in _slopes(expression.operand, number)}
-        case Scaled(operand, divisor):
-            return {slope / divisor for slope in _slopes(operand, number)}
-        case Minimum() | Maximum():
-            return {slope for each in expression.operands for slope in _slopes(each, number)}
-    return {0}
-
-
-def _slope_of_radius(expression: Expression, radius: float) -> int:
-    def count(term: Term) -> int:
-        return sum(each == radius for each in _radii_of(term))
-
-    match expression:
-        case SignedDistance():
-            return -count(expression.first) - count(expression.second)
-        case Protrusion():
-            return count(expression.inner) - count(expression.outer)
-        case Projection() if expression.axis != "z":
-            return count(expression.term) * (1 if expression.side == "max" else -1)
-    return 0
-
-
 def _radii(expression: Expression) -> list[float]:
-    """Iterate over the radii that a measurement depends on, in the order written."""
+    """Return the radii that a measurement depends on, in the order written."""
     match expression:
         case SignedDistance():
             return _radii_of(expression.first) + _radii_of(expression.second)
@@ -153,23 +182,22 @@ def _radii_of(term: Term) -> list[float]:
     return radii
 
 
-def _replaced(expression: Expression, kind: str, old: float, new: float) -> Expression:
-    def term(old_term: Term) -> Term:
-        if not isinstance(old_term, Enlarged):
-            return old_term
-        is_meant = kind == "radius" and old_term.radius == old
-        return Enlarged(term(old_term.term), new if is_meant else old_term.radius)
+def _numbers(expression: Expression) -> Iterator[float]:
+    for part in iter_expressions(expression):
+        yield from [part.value] if isinstance(part, Number) else _radii(part)
 
-    def leaf(part: Number | Signal | Measurement) -> Expression:
-        match part:
-            case Number():
-                return Number(new) if kind == "number" and part.value == old else part
-            case SignedDistance() | Protrusion() | Projection():
-                return map_terms(part, term)
-        # these take no radius: turning and centroids are the same for an enlarged term
-        return part
 
-    return map_leaves(expression, leaf)
+def _signed_atoms(formula: Formula, signs: frozenset[int] = frozenset({1})) -> Iterator[tuple[Atom, int]]:
+    """Iterate over the atoms of a formula, each with the signs in which the formula can have its number."""
+    match formula:
+        case Atom():
+            yield from ((formula, sign) for sign in signs)
+        case Quantified():
+            yield from _signed_atoms(formula.body, signs)
+        case Boolean() | Temporal():
+            for place, operand in enumerate(formula.operands):
+                below = {sign * own for sign in signs for own in operand_signs(formula, place)}
+                yield from _signed_atoms(operand, frozenset(below))
 
 
 _FAR = 1e300
@@ -177,6 +205,8 @@ _DOUBLINGS = 40
 _ROUNDS, _PARTS = 4, 16
 """Search for a number that does not move all samples alike: each round reads the log once, and divides the
 interval between a number that does not flip the verdict and one that does into so many parts."""
+_AT_FIRST = 64
+"""Of numbers that flip the verdict or not in no order, so many are tried before those in between."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,11 +216,11 @@ class Threshold:
     Attributes:
         value: the number as written in the specification. Without one (`a leftof b`), 0: the margin by
             which the relation has to hold.
-        flips_at: the nearest number that changes the verdict, up to rounding (for a relation under an open
-            quantifier, or between two limits, to within 0.01 %).
+        flips_at: the nearest number that flips the verdict, rounded to a few digits beyond.
         is_written: whether the number is in the text.
-        is_exact: whether only this number flips it, and none beyond (`a dist b == c`).
+        is_exact: whether numbers beyond `flips_at` need not flip it (`a dist b == c`).
         verdict: the verdict at `flips_at`.
+        constant: the constant whose value the number is, if `flips_at` is a value of that; else "".
     """
 
     value: float
@@ -198,6 +228,7 @@ class Threshold:
     is_written: bool
     is_exact: bool
     verdict: Verdict
+    constant: str = ""
 
 
 Obstacle: TypeAlias = Literal["others", "limits", "infinity"]
@@ -217,8 +248,8 @@ def threshold_of(
 ) -> Threshold | Obstacle | None:
     """Compute how far the deciding atom's number has to move to flip a verdict, or why no number does.
 
-    All atoms that were written in the same place move together: those that a quantifier over a named group,
-    or a macro, made of one text.
+    A constant moves in all atoms. A number that is no constant moves in all atoms that were written in the
+    same place: those that a quantifier over a named group, or a macro, made of one text.
 
     Args:
         leaves: (C, A, T), the instance's leaves in each sample.
@@ -232,13 +263,14 @@ def threshold_of(
         return None
     if not math.isfinite(deciding.lower) or not math.isfinite(deciding.upper):
         return "infinity"
-    search = _Search(evidence, leaves, times_ns, node, verdict, deciding, goes_on=goes_on)
-    flips_at = search.number()
-    if flips_at is None:
-        return "limits" if search.would_flip() else "others"
-    dial = search.dial
-    flipped = search.verdicts([flips_at])[0]
-    return Threshold(dial.value, flips_at, dial.kind != "margin", dial.is_exact, flipped)
+    own = Dial.of(deciding)
+    for dial in (own.with_constant(evidence.instance.formula), own):
+        if dial is not None:
+            search = _Search(evidence, leaves, times_ns, node, verdict, deciding, dial, goes_on=goes_on)
+            found = search.threshold()
+            if found is not None:
+                return found
+    return "limits" if search.would_flip() else "others"
 
 
 class _Search:
@@ -250,6 +282,7 @@ class _Search:
         node: int,
         verdict: Verdict,
         deciding: DecidingAtom,
+        dial: Dial,
         *,
         goes_on: bool,
     ) -> None:
@@ -258,89 +291,149 @@ class _Search:
         self._verdict_of = online_verdict if goes_on else final_verdict
         self._formula, self._order = evidence.instance.formula, evidence.instance.program.leaves
         self._leaves, self._times, self._node = leaves, times_ns, node
-        self._verdict, self._deciding = verdict, deciding
-        self.dial = Dial.of(deciding)
+        self._deciding, self._dial, self._goes_on, self._verdict = deciding, dial, goes_on, verdict
+        atoms = filter(self._is_meant, _atoms_of(self._formula))
+        slopes = {each.expression: dial.slopes(each.expression) for each in atoms}
         # from the formula: equal leaves share the place of the first, wherever it was written
-        meant = {each.expression for each in _atoms_of([self._formula]) if self._is_meant(each)}
         self._moving = {
             index: leaf
             for index, leaf in enumerate(self._order)
-            if isinstance(leaf, Atom) and leaf.expression in meant
+            if isinstance(leaf, Atom) and leaf.expression in slopes
         }
-        quantifiers = [each for each in iter_formulas(self._formula) if isinstance(each, Quantified)]
-        in_group = any(map(self._is_meant, _atoms_of(quantifiers)))
-        self._is_uniform = self.dial.is_uniform and not in_group
-        self._rises = deciding.end is End.HIGH
+        self._slopes = {index: max(slopes[leaf.expression]) for index, leaf in self._moving.items()}
+        bodies = [each for each in iter_formulas(self._formula) if isinstance(each, Quantified)]
+        # bodies of quantifiers are no leaves, and the height of a prism may decide instead of a radius
+        self._is_uniform = (
+            all(len(each) == 1 for each in slopes.values())
+            and not any(self._is_meant(atom) for body in bodies for atom in _atoms_of(body))
+            and not any(dial.is_at("radius", radius) for each in slopes for radius in _radii_in(each))
+        )
+        whole = next(each for identifier, _, each in iter_nodes(self._formula) if identifier == node)
+        signs = {
+            math.copysign(1.0, sign * slope)
+            for atom, sign in _signed_atoms(whole)
+            if self._is_meant(atom)
+            for slope in slopes[atom.expression]
+            if slope
+        }
+        self._directions = [sign if verdict is Verdict.VIOLATED else -sign for sign in sorted(signs)]
+        low, high = self._evaluate(self._formula, self._order, leaves, times_ns).ends(node)
+        end = abs(float(high[0] if verdict is Verdict.VIOLATED else low[0]))
+        steepest = max((abs(slope) for each in slopes.values() for slope in each), default=0.0)
+        # robustness changes by at most the slope
+        self._least = end / steepest if steepest and math.isfinite(end) else 0.0
 
-    def number(self) -> float | None:
-        """Return the nearest number that flips the verdict."""
-        if self.dial.slope == 0:
-            return None
-        nearest = abs(self._deciding.lower if self._deciding.end is End.LOW else self._deciding.upper)
-        if self._flips([nearest])[0]:
-            return self._moved(nearest)
-        size = self._size_by_samples(nearest) if self._is_uniform else self._size_by_rounds(nearest)
-        return None if size is None else self._moved(size)
+    def threshold(self) -> Threshold | None:
+        """Return the nearest number that flips the verdict, or None."""
+        dial = self._dial
+        found = [number for each in self._directions if (number := self._nearest(each)) is not None]
+        for number in sorted(found, key=lambda number: abs(number - dial.value)):
+            candidates = [each for each in _rounded(number, dial.value) if self._is_possible(each)]
+            verdicts = self._verdicts(candidates, is_shifted=False)
+            for candidate, verdict in zip(candidates, verdicts, strict=True):
+                if self._is_flipped(verdict):
+                    is_exact = dial.is_exact or len(self._directions) > 1
+                    is_written = dial.kind != "margin"
+                    return Threshold(dial.value, candidate, is_written, is_exact, verdict, dial.constant)
+        return None
 
     def would_flip(self) -> bool:
         """Return whether the verdict flips if the atom is moved arbitrarily far."""
-        far = _FAR if self._rises else -_FAR
+        far = _FAR if self._deciding.end is End.HIGH else -_FAR
 
         def change(atom: Atom) -> Atom:
             return replace(atom, expression=Sum(atom.expression, Number(far)))
 
         formula = rewritten(self._formula, self._is_meant, change)
         added = new_leaves(formula, self._order)
-        return self._evaluated(formula, added, self._columns(added)) is not self._verdict
+        return self._is_flipped(self._evaluated(formula, added, self._columns(added)))
 
-    def verdicts(self, numbers: Sequence[float]) -> list[Verdict]:
-        """Return the verdict with each number in place of the dial's."""
-        formulas = [self._turned(number) for number in numbers]
-        added = [new_leaves(formula, self._order) for formula in formulas]
-        if self._is_uniform:
-            columns = [self._shifted(leaves, number) for leaves, number in zip(added, numbers, strict=True)]
-        else:
-            every = self._columns([leaf for leaves in added for leaf in leaves])
-            ends = np.cumsum([0, *map(len, added)]).tolist()
-            columns = [every[:, begin:end] for begin, end in pairwise(ends)]
-        return [self._evaluated(*each) for each in zip(formulas, added, columns, strict=True)]
+    def _is_flipped(self, verdict: Verdict) -> bool:
+        """Return whether a verdict is the opposite one or, of a log that goes on, another one."""
+        return verdict is not self._verdict and (self._goes_on or verdict is not Verdict.UNKNOWN)
 
-    def _flips(self, sizes: Sequence[float]) -> list[bool]:
-        numbers = [self._moved(size) for size in sizes]
-        possible = [number for number in numbers if math.isfinite(number)]
-        verdicts = dict(zip(possible, self.verdicts(possible), strict=True)) if possible else {}
-        return [verdicts.get(number, self._verdict) is not self._verdict for number in numbers]
+    def _is_possible(self, number: float) -> bool:
+        return math.isfinite(number) and (self._dial.kind != "radius" or number >= 0.0)
 
-    def _moved(self, size: float) -> float:
-        """Return the number that moves the atom by `size` and a little more, so that rounding cannot undo it.
+    def _nearest(self, direction: float) -> float | None:
+        """Return the nearest number in one direction that flips the verdict, perhaps a little beyond."""
+        find = self._size_by_samples if self._is_uniform else self._size_by_rounds
+        size = find(direction)
+        return None if size is None else self._moved(size, direction)
 
-        A radius goes no lower than 0.
-        """
-        value, slope = self.dial.value, self.dial.slope
-        beyond = 0.0 if self.dial.is_exact else 8.0 * float(np.spacing(max(abs(value) + size, 1.0)))
-        number = value + math.copysign((size + beyond) / slope, slope if self._rises else -slope)
-        return max(number, 0.0) if self.dial.kind == "radius" else number
+    def _size_by_samples(self, direction: float) -> float | None:
+        """Where the dial moves an atom alike in every sample, one of them decides when the verdict flips."""
+        moves = [
+            -direction * self._leaves[:, index].ravel() / slope
+            for index, slope in self._slopes.items()
+            if slope
+        ]
+        sizes = np.sort(np.concatenate(moves))
+        sizes = sizes[np.isfinite(sizes) & (sizes >= self._least * (1.0 - 1e-9))]
+        listed = [self._least, *sizes.tolist()]
 
-    def _size_by_samples(self, nearest: float) -> float | None:
-        """Where the dial moves the atom alike in every sample, one of them decides when the verdict flips."""
-        sizes = np.unique(np.abs(self._leaves[:, list(self._moving)]))
-        listed = sizes[np.isfinite(sizes) & (sizes > nearest)].tolist()
-        at = bisect_left(listed, True, key=lambda size: self._flips([size])[0])
-        return listed[at] if at < len(listed) else None
+        def flips(size: float) -> bool:
+            return self._flips([size], direction)[0]
 
-    def _size_by_rounds(self, nearest: float) -> float | None:
-        unit = max(nearest, 1e-6 * (abs(self.dial.value) + 1.0))
-        sizes = [nearest, *(unit * 2.0**k for k in range(1, _DOUBLINGS))]
+        begin, stop = 0, len(listed)
+        step = max(stop // _AT_FIRST, 1) if len(self._directions) > 1 else stop
+        for end in (0, *range(step, stop, step), stop - 1):
+            if flips(listed[end]):
+                return listed[bisect_left(listed, True, begin, end, key=flips)]
+            begin = end + 1
+        return None
+
+    def _size_by_rounds(self, direction: float) -> float | None:
+        unit = max(self._least, 1e-6 * (abs(self._dial.value) + 1.0))
+        sizes = [self._least, *(unit * 2.0**k for k in range(1, _DOUBLINGS))]
         for _ in range(_ROUNDS):
-            flips = self._flips(sizes)
+            flips = self._flips(sizes, direction)
             if not any(flips):
                 return None
-            first = max(flips.index(True), 1)
+            if flips[0]:
+                return sizes[0]
+            first = flips.index(True)
             sizes = np.linspace(sizes[first - 1], sizes[first], _PARTS + 1).tolist()
         return sizes[-1]
 
+    def _flips(self, sizes: Sequence[float], direction: float) -> list[bool]:
+        numbers = [self._moved(size, direction) for size in sizes]
+        possible = [number for number in numbers if self._is_possible(number)]
+        verdicts = dict(zip(possible, self._verdicts(possible), strict=True))
+        return [self._is_flipped(verdicts.get(number, self._verdict)) for number in numbers]
+
+    def _moved(self, size: float, direction: float) -> float:
+        """Return the number that is further by `size` and a little more, so that rounding cannot undo it.
+
+        A radius goes no lower than 0.
+        """
+        value = self._dial.value
+        beyond = 0.0 if self._dial.is_exact else 8.0 * float(np.spacing(max(abs(value) + size, 1.0)))
+        number = value + direction * (size + beyond)
+        return max(number, 0.0) if self._dial.kind == "radius" else number
+
+    def _verdicts(self, numbers: Sequence[float], *, is_shifted: bool = True) -> list[Verdict]:
+        """Return the verdict with each number in place of the dial's.
+
+        Args:
+            is_shifted: whether numbers of atoms may be shifted, but for rounding, instead of measured again.
+        """
+        formulas = [self._turned(number) for number in numbers]
+        added = [new_leaves(formula, self._order) for formula in formulas]
+        if self._is_uniform and is_shifted:
+            columns = [self._shifted(leaves, number) for leaves, number in zip(added, numbers, strict=True)]
+        elif numbers:
+            every = self._columns([leaf for leaves in added for leaf in leaves])
+            ends = np.cumsum([0, *map(len, added)]).tolist()
+            columns = [every[:, begin:end] for begin, end in pairwise(ends)]
+        else:
+            columns = []
+        return [self._evaluated(*each) for each in zip(formulas, added, columns, strict=True)]
+
     def _is_meant(self, atom: Atom) -> bool:
-        """Return whether an atom was written where the deciding one was."""
+        """Return whether the constant is in an atom or, of another number, it was written where that was."""
+        if self._dial.constant:
+            return any(self._dial.is_at("number", each) for each in _numbers(atom.expression))
         meant = self._deciding.atom
         if meant.span.start == meant.span.end:
             return atom.expression == meant.expression
@@ -350,13 +443,14 @@ class _Search:
         return rewritten(self._formula, self._is_meant, lambda atom: self._turned_atom(atom, number))
 
     def _turned_atom(self, atom: Atom, number: float) -> Atom:
-        return replace(atom, expression=self.dial.turned(atom.expression, number))
+        return replace(atom, expression=self._dial.turned(atom.expression, number))
 
     def _shifted(self, added: Sequence[Formula], number: float) -> Floats:
         """Return columns of turned atoms, shifted from those of the original ones."""
-        shift = self.dial.slope * (number - self.dial.value)
         indices = {self._turned_atom(atom, number).expression: index for index, atom in self._moving.items()}
-        return self._leaves[:, [indices[leaf.expression] for leaf in added if isinstance(leaf, Atom)]] + shift
+        found = [indices[leaf.expression] for leaf in added if isinstance(leaf, Atom)]
+        shifts = [self._slopes[index] * (number - self._dial.value) for index in found]
+        return self._leaves[:, found] + np.array(shifts).reshape(1, -1, 1)
 
     def _columns(self, formulas: Sequence[Formula]) -> Floats:
         return self._evidence.columns(formulas)[:, :, : len(self._times)]
@@ -369,9 +463,21 @@ class _Search:
         return self._verdict_of(float(low[0]), float(high[0]))
 
 
-def _atoms_of(formulas: Iterable[Formula]) -> Iterator[Atom]:
-    """Iterate over every atom in some formulas, those in the bodies of quantifiers too."""
-    for formula in formulas:
-        for each in iter_formulas(formula):
-            if isinstance(each, Atom):
-                yield each
+def _atoms_of(formula: Formula) -> Iterator[Atom]:
+    return (each for each in iter_formulas(formula) if isinstance(each, Atom))
+
+
+def _radii_in(expression: Expression) -> list[float]:
+    return [radius for part in iter_expressions(expression) for radius in _radii(part)]
+
+
+def _rounded(number: float, value: float) -> Iterator[float]:
+    """Iterate over short numbers near one, and beyond it as seen from a value; the number itself is last."""
+    exact, change = Decimal(number), Decimal(number) - Decimal(value)
+    beyond = ROUND_CEILING if change > 0 else ROUND_FLOOR
+    last_digit = min(exact.adjusted() - DIGITS, change.adjusted() - DIGITS + 1) + 1
+    for place in (last_digit, last_digit - DIGITS):
+        for rounding in (ROUND_HALF_EVEN, beyond):
+            digits = max(exact.adjusted() - place + 1, 1)
+            yield float(Context(prec=digits, rounding=rounding).create_decimal(exact))
+    yield number
