@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, redirect_stdout
 from textwrap import wrap
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
 
 import click
 
@@ -137,7 +137,7 @@ def printing_to(output: Path | None, inputs: Iterable[Path] = ()) -> Iterator[No
         printed = io.TextIOWrapper(io.BytesIO(), encoding="utf-8", write_through=True)
         with redirect_stdout(printed):
             yield
-        stream.write(cast(io.BytesIO, printed.buffer).getvalue())
+        stream.write(printed.buffer.getvalue())
 
 
 def show_diagnostics(diagnostics: Iterable[Diagnosis]) -> None:
