@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from spatial_replay import LogError
+from spatial_replay import LogError, Verdict
 from spatial_replay.annotate.robustness import decode_robustness, encode_robustness
 from spatial_replay.logs.schemas.Robustness_pb2 import (
     FAILS_SO_FAR,
@@ -18,7 +18,7 @@ from spatial_replay.logs.schemas.Robustness_pb2 import (
     VIOLATED,
     Robustness,
 )
-from spatial_replay.monitor.verdict import Verdict, online_verdict
+from spatial_replay.monitor.verdict import online_verdict
 
 NAMES = st.lists(st.none() | st.text(min_size=1, max_size=5), min_size=1, max_size=6)
 NUMBERS = st.floats(width=64)

@@ -11,7 +11,7 @@ import random
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 
-from spatial_replay.spec.format import format_formula
+from spatial_replay.spec import format_formula
 from spatial_replay.spec.formula import Formula, Temporal, Truth, expand, operands_of, operator_of
 
 

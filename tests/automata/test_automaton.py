@@ -5,9 +5,8 @@ from __future__ import annotations
 import pytest
 
 from spatial_replay import UsageError, automaton, parse_specification
-from spatial_replay.automata import dot_text, hoa_text, words_text
+from spatial_replay.automata import Transition, dot_text, hoa_text, words_text
 from spatial_replay.automata.automaton import Automaton
-from spatial_replay.automata.guards import Transition
 
 TASK = """\
 spec safe = not (robot ovlp hand)

@@ -19,7 +19,7 @@ import spatial_replay as sr
 from browser.viewer_page import differences, write_viewer_page
 from spatial_replay.cli import run
 from spatial_replay.monitor.result import SpecResult
-from spatial_replay.planning.read import read_decisions
+from spatial_replay.planning import read_decisions
 from spatial_replay.spec.formula import iter_nodes
 
 RECORDINGS = Path(__file__).parent.parent.parent / "recordings"

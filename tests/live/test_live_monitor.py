@@ -40,7 +40,7 @@ from live.robots import (
 )
 from spatial_replay import LogError, Sample, Trace, Trigger, UsageError
 from spatial_replay.bags import open_messages
-from spatial_replay.cli.application import run
+from spatial_replay.cli import run
 from spatial_replay.live import LiveSession, LiveUpdate, monitor
 from spatial_replay.live.client import LARGEST_FRAME
 from spatial_replay.logs.topics import OBJECTS, ROBUSTNESS, SCENE

@@ -15,20 +15,20 @@ import spatial_replay as sr
 from planning.kinematics import BLOCKS, block
 from planning.plans import PUSH, record_plan_of
 from spatial_replay import LogError, Settings, UsageError, load_specification
-from spatial_replay.logs.mcap.write import LogWriter
+from spatial_replay.logs import LogWriter
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.topics import GRADIENT_MAP, PLAN_METADATA, PLAN_PATH
 from spatial_replay.planning import (
     Grid,
     Reason,
     Workspace,
+    map_fields,
     planner_of,
     read_decisions,
     recompute_decisions,
     settings_from_text,
     text_from_settings,
 )
-from spatial_replay.planning.decision_log import map_fields
 from spatial_replay.replay import ReplayOptions, Window, load_files, run_replay, verify_certificate
 from spatial_replay.sources import open_source
 

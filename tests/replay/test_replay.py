@@ -27,6 +27,7 @@ from spatial_replay import (
 from spatial_replay.logs import Block
 from spatial_replay.recording import record_source
 from spatial_replay.replay import (
+    Replayed,
     ReplayOptions,
     Window,
     document_from_replay,
@@ -34,7 +35,6 @@ from spatial_replay.replay import (
     load_files,
     run_replay,
 )
-from spatial_replay.replay.engine import Replayed
 from spatial_replay.sources import open_source
 
 SPEC = parse_specification(SPECIFICATION, filename="blocks.spatial")

@@ -11,8 +11,7 @@ import pytest
 
 from replay.runs import SPECIFICATION, PiecewiseSource, record, run
 from spatial_replay import UsageError, parse_specification
-from spatial_replay.replay import QUANTITIES, ReplayOptions, Window, export_table, run_replay
-from spatial_replay.replay.engine import Replayed
+from spatial_replay.replay import QUANTITIES, Replayed, ReplayOptions, Window, export_table, run_replay
 from spatial_replay.sources import open_source
 
 
