@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import hashlib
 import math
 import re
 from collections.abc import Iterable
@@ -160,6 +161,21 @@ def requirement_text(identifier: str | None, title: str | None) -> str:
 def names_of(title: str, requirement: str | None) -> tuple[str, ...]:
     """Return what a reader may call a result or node: by its title, or with the id of its requirement."""
     return (title,) if requirement is None else (title, f"{requirement} {title}", f"{title} [{requirement}]")
+
+
+TEXTS: Final = -(2.0**1000)
+"""The greatest of the numbers that stand for texts in signals; no measured number is anywhere near them."""
+
+
+def text_number(text: str) -> float:
+    """Return the number that stands for a text in signals: 48 bits of its digest."""
+    digest = hashlib.blake2b(text.encode("utf-8", "surrogatepass"), digest_size=6).digest()
+    return TEXTS * (1.0 + int.from_bytes(digest, "little") / 2**48)
+
+
+def is_text_number(number: float) -> bool:
+    """Return whether a number stands for a text."""
+    return -math.inf < number <= TEXTS
 
 
 def nearest_hint(name: str, known: Iterable[str]) -> str:

@@ -28,7 +28,7 @@ from spatial_replay.spec.formula import (
     Variable,
 )
 from spatial_replay.spec.relations import PROFILES
-from spatial_replay.text import counted
+from spatial_replay.text import TEXTS, counted
 from spatial_replay.trace.trace import ABSENT, Trace
 
 MOST_OBJECTS: Final = 60
@@ -125,6 +125,7 @@ def scope_of(traces: Sequence[Trace], profile: str) -> Comparable:
             f"{counted(missing, 'pair')} of objects that come less near than {len(kept):,} others"
         )
     signals = sorted(set(traces[0].signals).intersection(*(trace.signals for trace in traces[1:])))
+    signals = [each for each in signals if not any((trace.signals[each] <= TEXTS).any() for trace in traces)]
     if len(signals) > MOST_SIGNALS:
         left_out.append(f"{counted(len(signals) - MOST_SIGNALS, 'signal')} beyond the first {MOST_SIGNALS}")
     taken = common | {each for trace in traces for each in trace.names}

@@ -35,6 +35,7 @@ from spatial_replay.mapping.model import SignalMapping
 from spatial_replay.mapping.names import Codes
 from spatial_replay.mapping.reading_plan import PlannedTopic
 from spatial_replay.mapping.transforms import TransformReader
+from spatial_replay.text import text_number
 from spatial_replay.trace.sample import LATEST_NS
 
 MISFITS = (FieldError, AttributeError, LookupError, TypeError, ValueError, OverflowError)
@@ -295,9 +296,8 @@ class TopicReader:
             return number_of
         try:
             _number(value)
-        except (TypeError, ValueError, OverflowError):
-            remedy = "give `names: {TEXT: NUMBER}`" if isinstance(value, str) else "give the path of one"
-            raise FieldError(f"{signal.field}: its value is not a number; {remedy}") from None
+        except (TypeError, OverflowError):
+            raise FieldError(f"{signal.field}: its value is neither a number nor a text") from None
         return lambda message: _number(get(message))
 
     def _stamp(self, message: object) -> int | None:
@@ -422,7 +422,11 @@ class PendingMessages:
 
 
 def _number(value: object) -> float:
-    return float("nan") if value is None else float(value)  # type: ignore[arg-type]
+    """Return a signal's value; that of a text which is no number is its `text_number`."""
+    try:
+        return float("nan") if value is None else float(value)  # type: ignore[arg-type]
+    except ValueError:
+        return text_number(str(value))
 
 
 def _skip(payload: bytes) -> None:

@@ -22,6 +22,7 @@ from spatial_replay.text import (
     Instant,
     Sentence,
     counted,
+    is_text_number,
     number_text,
     requirement_text,
     shortened_formula,
@@ -61,7 +62,7 @@ def sentences_of(
         # how well a condition held is not how badly its response failed
         is_measured = witness.missed.is_condition and is_decided
         measured = (
-            f": {_what_was_measured(witness.deciding, witness.units)}"
+            f": {what_was_measured(witness.deciding, witness.units)}"
             if is_measured and witness.deciding
             else ""
         )
@@ -194,7 +195,7 @@ def reason_sentence(witness: Witness, *, first_ns: int) -> Sentence:
         return Sentence(missed, ". ", reason) if missed else reason
     if witness.missed is not None and witness.missed.is_condition:
         # how well the condition held is not what went wrong
-        said = Sentence(missed, f": {_what_was_measured(deciding, witness.units)}.")
+        said = Sentence(missed, f": {what_was_measured(deciding, witness.units)}.")
         if witness.closest is None:
             return said
         return Sentence(said, " ", _closest(*witness.closest, first_ns, witness.units))
@@ -210,7 +211,7 @@ def missed_text(missed: MissedResponse, first_ns: int) -> Sentence:
 
 def _closest(best: DecidingAtom, time_ns: int, first_ns: int, units: Mapping[str, str]) -> Sentence:
     """Return a sentence on what a missed response came to at best."""
-    what = f": {_what_was_measured(best, units)}."
+    what = f": {what_was_measured(best, units)}."
     return Sentence(f"The nearest that it came to `{best.text}` was at ", Instant(time_ns, first_ns), what)
 
 
@@ -231,11 +232,15 @@ def _how_it_decides(
     where = _in_time(witness)
     if witness.path[-1].operator == deciding.atom.relation:
         where = _in_time_of_all(witness, deciding, "so far " if is_open else "")
-    what = _what_was_measured(deciding, witness.units)
+    what = what_was_measured(deciding, witness.units)
     return Sentence(f"{how} at ", Instant(witness.time_ns, first_ns), f"{where}: {what}.")
 
 
-def _what_was_measured(deciding: DecidingAtom, units: Mapping[str, str]) -> str:
+def what_was_measured(deciding: DecidingAtom, units: Mapping[str, str]) -> str:
+    if any(is_text_number(each.value) for each in deciding.measured):
+        signal, sign, text = deciding.atom.parameters
+        is_equal = (deciding.value > 0.0) == (sign == "==")
+        return f"{signal} is {text if is_equal else 'another text'}"
     return " and ".join(_measured(each, units) for each in deciding.measured)
 
 

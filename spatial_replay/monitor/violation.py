@@ -19,6 +19,7 @@ from spatial_replay.monitor.sentences import (
     divisor_of,
     missed_text,
     sentences_of,
+    what_was_measured,
     without_residue,
 )
 from spatial_replay.monitor.verdict import Verdict
@@ -31,7 +32,7 @@ from spatial_replay.spec.checks import object_names, signal_names
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import NamedSpec, Number, Specification
 from spatial_replay.spec.units import declared_unit
-from spatial_replay.text import Instant, Sentence, number_text, with_unit
+from spatial_replay.text import Instant, Sentence, with_unit
 from spatial_replay.trace.sample import FOREVER, Sample
 from spatial_replay.trace.trace import Trace
 
@@ -130,7 +131,7 @@ def _short(atom: DecidingAtom, spec: str, amount: str) -> str:
             where = f"too close to {second}" if needs_more else f"too far from {second}"
             return f"{first} is {amount} {where}"
         if measured.quantity == "signal" and not isfinite(_settling(atom)):
-            return f"{measured.names[0]} is {number_text(measured.value)}"
+            return what_was_measured(atom, {})
         if measured.quantity == "signal":
             return f"{measured.names[0]} is {amount} too {'low' if needs_more else 'high'}"
     return f"`{spec}` is violated"

@@ -52,6 +52,7 @@ from spatial_replay.spec.formula import (
 )
 from spatial_replay.spec.relations import compare
 from spatial_replay.spec.walks import base_of, iter_formulas, measured_terms
+from spatial_replay.text import is_text_number
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
 
@@ -105,6 +106,8 @@ def _built(expression: Expression, regions: Mapping[str, Outline]) -> Tree:
         case Negative():
             return _times(_built(expression.operand, regions), Fraction(-1))
         case Equality(signal, value):
+            if is_text_number(value):
+                raise OverflowError("a text")
             return _built(compare(signal, "==", value), regions)
         case Scaled():
             return _times(_built(expression.operand, regions), 1 / exact(expression.divisor))

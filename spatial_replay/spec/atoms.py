@@ -37,8 +37,10 @@ from spatial_replay.spec.syntax import (
     Quantity,
     RelationSyntax,
 )
+from spatial_replay.spec.tokens import quoted
 from spatial_replay.spec.units import scaled
 from spatial_replay.spec.walks import base_of, iter_expressions, terms_of
+from spatial_replay.text import text_number
 
 _MIRRORED = MappingProxyType({">=": "<=", ">": "<"})
 _AXES: tuple[str, ...] = get_args(Axis)
@@ -97,11 +99,21 @@ class AtomBuilder:
 
     def comparison(self, written: ComparisonSyntax, scope: Scope) -> Atom:
         """Return the atom of `signal >= c`, signal - c; `==` and `!=` are exact."""
-        limit_first = isinstance(written.limit, Name) and not self.resolver.is_number(written.limit, scope)
-        if isinstance(written.limit, Name) and limit_first and self.resolver.is_number(written.signal, scope):
-            turned = written._replace(signal=written.limit, limit=written.signal)
-            return self.comparison(turned._replace(operator=MIRRORED[written.operator]), scope)
-        name, limit = written.signal, self.resolver.number(written.limit, scope)
+        limit_name = written.limit if isinstance(written.limit, Name) else None
+        if limit_name is not None and self.resolver.is_number(limit_name, scope):
+            limit_name = None
+        name, shown = written.signal, None
+        if limit_name is not None and (
+            self.resolver.is_number(name, scope) or (name.is_quoted and not limit_name.is_quoted)
+        ):
+            turned = ComparisonSyntax(limit_name, MIRRORED[written.operator], name, written.span)
+            return self.comparison(turned, scope)
+        if limit_name is not None and limit_name.is_quoted:
+            shown, limit = quoted(limit_name.text), text_number(limit_name.text)
+            if written.operator not in ("==", "!="):
+                self.resolver.fault(written.span, scope, "a text has no order", "compare it by == or !=")
+        else:
+            limit = self.resolver.number(written.limit, scope)
         defined = self.resolver.names.definitions.get(name.text)
         if name.text in scope.values:
             message = f"{name.text!r} is a parameter or variable here; a signal of the log is expected"
@@ -112,7 +124,8 @@ class AtomBuilder:
         signal, is_equal = Signal(name.text), Equality(Signal(name.text), limit)
         exact: Mapping[str, Expression] = {"==": is_equal, "!=": -is_equal}
         expression = exact.get(written.operator) or compare(signal, written.operator, limit)
-        return self._atom("signal", expression, (), (name.text, written.operator, limit), written, scope)
+        parameters = (name.text, written.operator, limit if shown is None else shown)
+        return self._atom("signal", expression, (), parameters, written, scope)
 
     def _atom(
         self,

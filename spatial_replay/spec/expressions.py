@@ -193,7 +193,10 @@ class Signal(_Arithmetic):
 
 @dataclass(frozen=True, slots=True)
 class Equality(_Arithmetic):
-    """+inf where a signal is equal to a number, -inf where it is not."""
+    """+inf where a signal is equal to a number, -inf where it is not.
+
+    A text is its `text_number`; whether a number is equal to a text is unknown.
+    """
 
     signal: Signal
     value: float

@@ -106,7 +106,7 @@ class Atom:
 
     Attributes:
         text: its canonical text, in the profile of its specification.
-        relation: the relation's name ("closeto", "dist", ...; "signal" for a numeric comparison).
+        relation: the relation's name ("closeto", "dist", ...; "signal" for a comparison of a signal).
         expression: its robustness.
         terms: what the relation is about, in the order written; none for a signal.
         parameters: what is written besides: numbers, an axis, a comparison's operators.

@@ -187,7 +187,8 @@ class Namespace:
         elif statement is None:
             consts = (each for each, what in self.definitions.items() if isinstance(what, ConstStatement))
             hint = self.faults.nearest(name.text, consts) or (
-                f"define it: const {name.text} = 1.0; a signal is compared with a number, not with a signal"
+                f"define it: const {name.text} = 1.0; a text stands in quotes, mode == {quoted(name.text)}; "
+                "a signal is not compared with a signal"
             )
             self.faults.add(name.span, f"unknown constant {name.text!r}", hint)
         elif not isinstance(statement, BrokenStatement):

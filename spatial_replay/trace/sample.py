@@ -6,12 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from reprlib import repr as shortened
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
 from spatial_replay.errors import TraceError, UsageError
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
-from spatial_replay.text import is_encodable
+from spatial_replay.text import is_encodable, text_number
 
 LATEST_NS = 2**63 - 1
 """The latest time of a sample."""
@@ -51,6 +52,20 @@ _EXAMPLES = MappingProxyType(
 )
 
 
+def _signal_value(name: str, value: Any) -> float:
+    """Return a number as it is, and that of a text that is none."""
+    is_number = not isinstance(value, (bool, np.bool_, bytes))
+    try:
+        number = float(value) if is_number else None
+    except (TypeError, ValueError, OverflowError) as error:
+        if isinstance(value, str):
+            return text_number(value)
+        raise TraceError(f"signal {name!r} is {shortened(value)}; give a number or a text") from error
+    if number is None or isinstance(value, str):
+        raise TraceError(f"signal {name!r} is {shortened(value)}; give a number, such as 1.0 for true")
+    return number
+
+
 @dataclass(frozen=True, slots=True)
 class Sample:
     """Every object and signal at one time.
@@ -58,7 +73,7 @@ class Sample:
     Attributes:
         time_ns: nanoseconds, 0 to 2**63 - 1.
         objects: the detected objects by name; a bare footprint stands for a `TrackedObject` with it.
-        signals: numeric signals by name; NaN for an unknown value.
+        signals: numbers by name, NaN for an unknown value; a text is stored as its `text_number`.
         unknown: the objects that are there, but not known where: their classes by name, None without one.
             Unlike an object that is left out, they stay members of open groups, and make atoms over these
             unknown.
@@ -90,17 +105,11 @@ class Sample:
             elif not isinstance(tracked, TrackedObject):
                 raise TraceError(f"object {name!r} is {tracked!r}; give a Footprint or a TrackedObject")
             objects[name] = tracked
+        given: Mapping[str, object] = self.signals
         signals: dict[str, float] = {}
-        for name, value in self.signals.items():
+        for name, value in given.items():
             _require_name(name, "a signal")
-            if isinstance(value, (bool, np.bool_, str, bytes)):
-                raise TraceError(
-                    f"signal {name!r} is {shortened(value)}; give a number, such as 1.0 for true"
-                )
-            try:
-                signals[name] = float(value)
-            except (TypeError, ValueError, OverflowError) as error:
-                raise TraceError(f"signal {name!r} is {shortened(value)}; give a number") from error
+            signals[name] = _signal_value(name, value)
         for name, class_name in self.unknown.items():
             _require_name(name, "an object")
             if name in objects:

@@ -89,7 +89,7 @@ def test_a_sample_says_everything_about_an_object(jsonl):
         (line(1, cup(height=[1])), "[bottom, top]"),
         (line(1, cup(uncertainty=-1)), "negative uncertainty"),
         (line(1, cup(**{"class": 3})), "class is 3"),
-        (line(1, signals={"force": "high"}), "signal 'force'"),
+        (line(1, signals={"force": [1]}), "signal 'force'"),
         (line(1, signals=[1]), "signals are a list"),
     ],
 )

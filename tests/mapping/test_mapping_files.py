@@ -189,7 +189,7 @@ def test_a_mapped_topic_that_cannot_be_decoded_is_refused() -> None:
         ("shape: {disc: size}", "has no field 'size'"),
         ("uncertainty: {covariance: pose}", "expected a covariance"),
         ("name: p, signals: {speed: speed}", "has no field 'speed'"),
-        ("name: p, signals: {speed: header.frame_id}", "its value is not a number"),
+        ("name: p, signals: {speed: header.stamp}", "its value is neither a number nor a text"),
         ("yaw: $.header.stamp.sec", "give a field of the object"),
     ],
 )

@@ -13,7 +13,7 @@ from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 from mapping.feeding import SECOND, Feed, Made, header, make, pose, pose_stamped, ros, tf, transform
-from spatial_replay import Footprint, TrackedObject, UsageError
+from spatial_replay import Footprint, TrackedObject, UsageError, evaluate, parse_specification
 
 QUARTER = (0.0, 0.0, sin(pi / 4), cos(pi / 4))
 
@@ -399,8 +399,11 @@ def test_texts_become_signals_by_their_names() -> None:
     assert made.trace.signals["mode"].tolist()[:2] == [1, 0]
     assert np.isnan(made.trace.signals["mode"][2])
     assert "lacks 'HOLD'; it is unknown there" in made.remarks[0]
-    with pytest.raises(UsageError, match="give `names: "):
-        make("topics: {/m: {signals: {mode: mode}}}", feed)
+    compared = make("topics: {/m: {signals: {mode: mode}}}", feed).trace
+    assert (
+        evaluate(parse_specification('G (mode == "AUTO" or mode == "HOLD")'), compared).verdict == "violated"
+    )
+    assert evaluate(parse_specification('F[3, 3] mode == "AUTO"'), compared).verdict == "satisfied"
 
 
 def test_objects_that_only_places_distinguish_are_remarked() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from monitor.scenes import SECOND, judged, numbers, root
-from spatial_replay import Sample, Trace
+from spatial_replay import Monitor, Sample, Trace, parse_specification
 
 P = [1, -2, 3, -4, 5]
 Q = [-5, 4, -3, 2, -1]
@@ -166,3 +166,24 @@ def test_a_reason_about_a_mode_has_no_margin():
     text = evaluation.explain()
     assert "which holds at 1.000 s (within `spec`): mode is 2." in text
     assert "inf" not in text.split("What decides")[1] and "No number" not in text
+
+
+@pytest.mark.parametrize(
+    ("formula", "verdict", "reason"),
+    [
+        ('G (mode == "AUTO" -> gap >= 0)', "violated", "gap is -2"),
+        ('G (mode != "MANUAL")', "violated", 'mode is "MANUAL"'),
+        ('F ("HOLD" == mode)', "violated", "mode is another text"),
+        ("G (mode == 2)", "unknown", "signal 'mode' is a text, not a number"),
+        ("G (mode >= 2)", "unknown", "signal 'mode' is a text, not a number"),
+        ('G (gap == "AUTO")', "unknown", "signal 'gap' is a number, not a text; leave out `names`"),
+    ],
+)
+def test_texts_are_compared_with_texts_alone(formula, verdict, reason):
+    trace = numbers(mode=["AUTO", "MANUAL", "AUTO"], gap=[1, -3, -2])
+    evaluation = judged(formula, trace)
+    assert evaluation.verdict == verdict
+    assert reason in evaluation.explain()
+    monitor = Monitor(parse_specification(formula))
+    updates = [monitor.update(sample).specs[0].numbers for sample in trace.samples()]
+    assert np.stack(updates, axis=-1).tobytes() == evaluation.result().series.tobytes()

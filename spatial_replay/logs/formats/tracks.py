@@ -21,7 +21,7 @@ from spatial_replay.geometry.arrays import starts_from_counts
 from spatial_replay.geometry.footprint import Concave, FootprintBatch
 from spatial_replay.logs.messages import BLOCK_SAMPLES
 from spatial_replay.logs.read_options import FaultList
-from spatial_replay.text import Sentence, is_encodable, times_apart
+from spatial_replay.text import Sentence, is_encodable, text_number, times_apart
 from spatial_replay.trace.observations import Observations, trace_from_observations
 from spatial_replay.trace.sample import LATEST_NS
 from spatial_replay.trace.trace import Trace
@@ -299,7 +299,10 @@ def _signals(entry: Any) -> dict[str, float]:
     for name in entry:
         if not _is_text(name):
             raise _NoSampleError(f"a signal's name is {_short(name)}; give a string that is not empty")
-    return {name: _number(value, f"signal {name!r}") for name, value in entry.items()}
+    return {
+        name: text_number(value) if isinstance(value, str) else _number(value, f"signal {name!r}")
+        for name, value in entry.items()
+    }
 
 
 def _number(value: Any, what: str) -> float:

@@ -43,6 +43,7 @@ from spatial_replay.spec.formula import (
     operator_of,
 )
 from spatial_replay.spec.walks import map_terms, substitute_term
+from spatial_replay.text import TEXTS
 
 # instructions: operation, a, b, c
 CONSTANT, MEASURED, SIGNAL = 0, 1, 2  # number a of its kind
@@ -52,7 +53,7 @@ AND, OR = 8, 9  # intervals
 AND_MEMBER, OR_MEMBER = 10, 11  # a, and b where members c is 1, anything where it is -1
 DIVIDE = 12  # a by constant b, which is positive
 CLOSEST = 13  # closest pair a, as an interval
-EQUAL = 14  # signal a and constant b: +inf or -inf; not a number where the signal is not
+EQUAL = 14  # signal a and constant b: +inf or -inf; not a number where one of them is a text, or none
 
 TILE = 128
 """Samples processed together: few, so that their columns stay in the processor's cache."""
@@ -121,7 +122,9 @@ def run_instructions(
                         for k in range(count):
                             target[k] += sign * spreads[a, t + k]
                 elif op == SIGNAL:
-                    _copy_to(signals, a, t, count, target)
+                    for k in range(count):
+                        value = signals[a, t + k]
+                        target[k] = np.nan if -np.inf < value <= TEXTS else value
                 elif op == CLOSEST:
                     for k in range(count):
                         target[k] = closest[a, channel, t + k]
@@ -151,8 +154,10 @@ def run_instructions(
                         target[k] = min(first[k], second[k])
                 elif op == EQUAL:
                     for k in range(count):
-                        equal = np.inf if first[k] == constants[b] else -np.inf
-                        target[k] = equal if first[k] == first[k] else np.nan
+                        value = signals[a, t + k]
+                        equal = np.inf if value == constants[b] else -np.inf
+                        is_alike = value == value and (value <= TEXTS) == (constants[b] <= TEXTS)
+                        target[k] = equal if is_alike else np.nan
                 elif op == DIVIDE:
                     for k in range(count):
                         target[k] = first[k] / constants[b]
@@ -266,7 +271,7 @@ class LeafCode:
                 return self._row(NEGATE, self._expression(expression.operand, bindings))
             case Equality(signal, value):
                 constant = self.constants.setdefault(value, len(self.constants))
-                return self._row(EQUAL, self._expression(signal, bindings), constant)
+                return self._row(EQUAL, self.signals.setdefault(signal.name, len(self.signals)), constant)
             case Scaled(operand, divisor):
                 constant = self.constants.setdefault(divisor, len(self.constants))
                 return self._row(DIVIDE, self._expression(operand, bindings), constant)

@@ -22,6 +22,7 @@ from spatial_replay.geometry.kernels import measure_rows
 from spatial_replay.geometry.measure import closest_rows, misalignment_of
 from spatial_replay.monitor.atoms.instructions import run_instructions
 from spatial_replay.monitor.atoms.plan_arrays import PlacedPlan, PlanArrays, plan_at
+from spatial_replay.text import TEXTS
 
 ABSENT = -1
 ANY = -1
@@ -262,9 +263,14 @@ def _members(plan: PlanArrays, classes: Integers, members: Flags) -> None:
 
 
 @inlined
-def _channels_of(values: Floats, spreads: Floats, signals: Floats, closest: Floats, members: Flags) -> int:
+def _channels_of(
+    values: Floats, spreads: Floats, signals: Floats, closest: Floats, members: Flags, constants: Floats
+) -> int:
     """Return the number of channels needed: 4 with uncertainty, 2 with anything unknown, else 1."""
     channels = 1
+    for k in range(len(constants)):
+        if -np.inf < constants[k] <= TEXTS:
+            channels = 2
     for k in range(len(closest)):
         if closest[k, 2, 0] != closest[k, 0, 0] or closest[k, 3, 0] != closest[k, 1, 0]:
             return 4
@@ -276,7 +282,7 @@ def _channels_of(values: Floats, spreads: Floats, signals: Floats, closest: Floa
         if not np.isfinite(values[k, 0]):
             channels = 2
     for k in range(len(signals)):
-        if not np.isfinite(signals[k, 0]):
+        if not np.isfinite(signals[k, 0]) or signals[k, 0] <= TEXTS:
             channels = 2
     for k in range(len(members)):
         if members[k, 0] < 0:
@@ -310,7 +316,7 @@ def _measured(table_at: int, sample_at: int, parts: int, corners: int, room_at: 
     _closest(plan, rows, work_at, closest)
     _measure(plan, rows, work_at, values, spreads)
     signals = floats_at(sample_at + 8 * plan.extent[0], (plan.extent[3], 1))
-    channels = _channels_of(values, spreads, signals, closest, members)
+    channels = _channels_of(values, spreads, signals, closest, members, plan.constants)
     leaves = floats_at(leaves_at, (channels, len(plan.outputs), 1))
     run_instructions(
         plan.code, plan.constants, values, spreads, signals, closest, members, plan.outputs, leaves, 0, 1

@@ -36,6 +36,7 @@ from spatial_replay.spec.formula import (
     Term,
 )
 from spatial_replay.spec.walks import base_of, map_terms, measured_terms
+from spatial_replay.text import TEXTS
 from spatial_replay.trace.trace import ABSENT
 
 _SHARE = 200_000
@@ -240,6 +241,11 @@ class _Code:
         self._rows = np.array(list(code.rows), np.int64).reshape(len(code.rows), 4)
         self._constants = np.array(list(code.constants), np.float64)
         self._is_sure = scene.is_sure
+        # whether a number is equal to a text is not known
+        self._has_texts = bool(
+            (self._signals <= TEXTS).any()
+            or (np.isfinite(self._constants) & (self._constants <= TEXTS)).any()
+        )
 
     def run(self, values: Floats, spreads: Floats, closest: Floats) -> Floats:
         """Compute the leaves, (C, A, T) as `leaf_values` does, from what was measured.
@@ -251,7 +257,7 @@ class _Code:
         signals, members, count = self._signals, self._members, values.shape[1]
         closest = closest.reshape(len(self.closest), 4, count)
         is_known = np.isfinite(values).all() and np.isfinite(signals).all() and not (members < 0).any()
-        is_known = is_known and (closest[:, 0] == closest[:, 1]).all()
+        is_known = is_known and not self._has_texts and (closest[:, 0] == closest[:, 1]).all()
         is_sure = (self._is_sure or not spreads.any()) and (closest[:, :2] == closest[:, 2:]).all()
         channels = 4 if not is_sure else 1 if is_known else 2
         result = np.empty((channels, len(self._outputs), count))

@@ -52,24 +52,31 @@ from spatial_replay.spec.walks import (
     terms_of,
     without_enlargement,
 )
+from spatial_replay.text import is_text_number
 from spatial_replay.trace.trace import ABSENT
 
 
 def unknowns_of(scene: TraceScene, atom: Atom) -> tuple[str, ...]:
     """Return what is unknown in the one sample of a scene, each reason once, in the order of the atom."""
-    parts = iter_expressions(atom.expression)
-    return tuple(dict.fromkeys(reason for part in parts for reason in _reasons(scene, part)))
+    parts = list(iter_expressions(atom.expression))
+    exact = [part.signal for part in parts if isinstance(part, Equality)]
+    reasons = (reason for part in parts if part not in exact for reason in _reasons(scene, part))
+    return tuple(dict.fromkeys(reasons))
 
 
 def _reasons(scene: TraceScene, part: Expression) -> Iterator[str]:
     match part:
-        case Signal():
-            values = scene.trace.signals.get(part.name)
+        case Signal() | Equality():
+            name, compared = (part.name, 0.0) if isinstance(part, Signal) else (part.signal.name, part.value)
+            values = scene.trace.signals.get(name)
             if values is None:
-                yield f"there is no signal {part.name!r}"
+                yield f"there is no signal {name!r}"
             elif not np.isfinite(values[scene.skip]):
-                yield f"signal {part.name!r} has no finite value in the sample"
-        case Number() | Equality() | Sum() | Negative() | Minimum() | Maximum() | Scaled():
+                yield f"signal {name!r} has no finite value in the sample"
+            elif is_text_number(compared) != is_text_number(values[scene.skip]):
+                kinds = "a number, not a text; leave out `names` of its mapping to compare texts"
+                yield f"signal {name!r} is {kinds if is_text_number(compared) else 'a text, not a number'}"
+        case Number() | Sum() | Negative() | Minimum() | Maximum() | Scaled():
             return
         case _:
             for term in terms_of(part):
