@@ -190,6 +190,7 @@ def _below(result: SpecResult, first_ns: int) -> Iterator[str]:
     for label, parts in (("vacuous", result.vacuous), ("cut", cut)):
         for message in counted_from((part.message for part in parts), first_ns):
             yield f"{label}: {message}"
+    yield from result.goals_at_the_start
 
 
 def _over_window(result: SpecResult, first_ns: int, window_ns: int) -> str:

@@ -27,6 +27,7 @@ from spatial_replay.monitor.vacuity import (
     UntestedPart,
     find_cut_window,
     find_vacuous,
+    goals_at_the_start,
     is_tested_by_nothing,
 )
 from spatial_replay.monitor.verdict import Verdict, final_verdict
@@ -327,10 +328,16 @@ class SpecResult(Displayed):
 
     @property
     def remarks(self) -> tuple[Sentence, ...]:
-        """Sentences on the parts that decided nothing, and on the window that the end of the log cut."""
+        """Sentences on the parts that decided nothing, the window that the end of the log cut, and goals that
+        hold in the first sample already."""
         parts = [*self.vacuous, *(() if self._is_untested else self.untested)]
         own = [_UNTESTED] if self._is_untested else []
-        return (*own, *(each.message for each in parts))
+        return (*own, *(each.message for each in parts), *self.goals_at_the_start)
+
+    @cached_property
+    def goals_at_the_start(self) -> tuple[Sentence, ...]:
+        """Sentences on the goals (`F`) that hold in the first sample already."""
+        return goals_at_the_start(self.evidence, *self._stored)
 
     @cached_property
     def _is_untested(self) -> bool:

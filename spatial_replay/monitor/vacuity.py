@@ -28,6 +28,7 @@ from spatial_replay.spec.formula import (
     Boolean,
     Bound,
     Earlier,
+    Equality,
     Formula,
     Group,
     Quantified,
@@ -37,8 +38,22 @@ from spatial_replay.spec.formula import (
     iter_nodes,
     operands_of,
 )
-from spatial_replay.spec.walks import iter_terms, without_enlargement
-from spatial_replay.text import Instant, Sentence, counted, nearest_hint, printable, time_text
+from spatial_replay.spec.walks import (
+    is_spatial,
+    iter_expressions,
+    iter_formulas,
+    iter_terms,
+    without_enlargement,
+)
+from spatial_replay.text import (
+    Instant,
+    Sentence,
+    counted,
+    nearest_hint,
+    printable,
+    shortened_formula,
+    time_text,
+)
 
 Tested: TypeAlias = Literal["full", "cut", "nothing"]
 """By how much of the log a verdict was tested; see `SpecResult.tested`."""
@@ -314,9 +329,37 @@ def _infinite(identifier: int, node: Formula, when: Instant) -> Iterator[_Idle]:
         side = "past the end" if node.operator in FUTURE_OPERATORS else "before the start"
         what = ("decides at ", when, f", where it looks {side} of the log.")
         yield _Idle(identifier, "past the end", what, when.time_ns)
-    elif isinstance(node, Atom | Quantified):
+    elif isinstance(node, Atom | Quantified) and not _compares_exactly(node):
         what = ("decides at ", when, ", where no object is in its group.")
         yield _Idle(identifier, "no members", what, when.time_ns)
+
+
+def _compares_exactly(node: Formula) -> bool:
+    """Return whether a leaf compares a mode, which makes it infinite with members in its groups, too."""
+    atoms = (each for each in iter_formulas(node) if isinstance(each, Atom))
+    return any(isinstance(part, Equality) for atom in atoms for part in iter_expressions(atom.expression))
+
+
+def goals_at_the_start(evidence: Evidence, leaves: Floats, times_ns: Integers) -> tuple[Sentence, ...]:
+    """Return remarks on the goals of a formula (`F`) that hold in its first sample already."""
+    order = evidence.instance.program.leaves
+    found: list[Sentence] = []
+    waiting = [evidence.instance.formula]
+    while waiting:
+        node = waiting.pop()
+        if isinstance(node, Boolean) and node.operator in ("and", "spec"):
+            waiting += reversed(node.operands)
+        elif (
+            isinstance(node, Temporal)
+            and node.operator == "F"
+            and (node.bound is None or not node.bound.lower)
+        ):
+            (goal,) = node.operands
+            if is_spatial(goal):
+                low, _ = evaluate_offline(goal, order, leaves[..., :1], times_ns[:1]).ends(0)
+                name = node.name or shortened_formula(format_formula(node))
+                found += [Sentence(f"`{name}` is already true at the first sample.")] if low[0] >= 0.0 else []
+    return tuple(found)
 
 
 # ------------------------------------------------------------------------------------- tested by nothing

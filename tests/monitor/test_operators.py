@@ -161,6 +161,12 @@ def test_modes_are_compared_exactly_and_unknown_where_they_are_missing(formula, 
     assert (result.lower, result.upper) == (lower, upper)
 
 
+@pytest.mark.parametrize("formula", ["G (mode != 3)", "F (mode == 2)", "G (mode == 2 or gap >= 9)"])
+def test_an_infinite_comparison_of_a_mode_tests_something(formula):
+    result = judged(formula, numbers(mode=[2, 2, 2], gap=[1, 2, 3])).result()
+    assert (result.lower, result.tested, result.vacuous) == (inf, "full", ())
+
+
 def test_a_reason_about_a_mode_has_no_margin():
     evaluation = judged("G (not (mode == 2))", numbers(mode=[0, 2, 2]))
     text = evaluation.explain()
@@ -187,3 +193,17 @@ def test_texts_are_compared_with_texts_alone(formula, verdict, reason):
     monitor = Monitor(parse_specification(formula))
     updates = [monitor.update(sample).specs[0].numbers for sample in trace.samples()]
     assert np.stack(updates, axis=-1).tobytes() == evaluation.result().series.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("formula", "remarks"),
+    [
+        ("F (p >= 1)", ["`spec` is already true at the first sample."]),
+        ("F (p >= 2)", []),
+        ("F[1, 3] (p >= 1)", []),
+        ("G (p >= -9 -> F (p >= 1))", []),
+        ("spec go = F (p >= 1)\nspec s = go and F (q >= 2)", ["`go` is already true at the first sample."]),
+    ],
+)
+def test_goals_that_the_first_sample_fulfils_are_remarked(formula, remarks):
+    assert [str(each) for each in judged(formula, numbers(p=P, q=Q)).result().remarks] == remarks

@@ -65,7 +65,12 @@ spec template(ego) = ego ovlp goal
         ("spec moved = a ovlp b", "moved", "'moved' is a relation, so no name for a spec", "another name"),
         ("const F = 3", "F", "'F' is a reserved word, so no name for a const", "another name"),
         ("spec s: G a ovlp b", ":", "':' stands where = is missing", "write spec s = ..."),
-        ("spec s = battery > force", "force", "unknown constant 'force'", "a signal is not compared with a signal"),
+        (
+            "spec s = battery > force",
+            "force",
+            "unknown constant 'force'",
+            "a signal is not compared with a signal",
+        ),
         ("spec s = G (force)", "(force)", "no spec is named 'force'", "such as force >= 1.0"),
         ("spec s = G True", "True", "no spec is named 'True'", "truth values are written true"),
         ("spec s = 5 <= battery < 8", "<", "a range of a signal", "battery >= 5 and battery < 8"),
