@@ -422,7 +422,7 @@ class PendingMessages:
 
 
 def _number(value: object) -> float:
-    """Return a signal's value; that of a text which is no number is its `text_number`."""
+    """Return the value of a signal, and the `text_number` of a text."""
     try:
         return float("nan") if value is None else float(value)  # type: ignore[arg-type]
     except ValueError:
