@@ -87,13 +87,13 @@ class Transport:
         played_ns = round((now - self._since) * self._speed * 1e9)
         return min(self._from_ns + max(played_ns, 0), self.end_ns)
 
-    def state(self, now: float, *, did_seek: bool = False) -> PlaybackState:
+    def state(self, now: float) -> PlaybackState:
         """Return the state to show."""
         time_ns = self.time_ns(now)
         status = Status.PLAYING if self._is_playing else Status.PAUSED
         if not self._is_playing and time_ns >= self.end_ns:
             status = Status.ENDED
-        return PlaybackState(status, time_ns, self._speed, did_seek)
+        return PlaybackState(status, time_ns, self._speed)
 
     def play(self, now: float) -> None:
         """Play from the present time; at the end, that is over at once."""

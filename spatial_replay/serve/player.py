@@ -14,7 +14,7 @@ from spatial_replay.logs.messages import Messages, messages_of, select
 from spatial_replay.logs.topics import CURVES_TOPIC
 from spatial_replay.replay.loaded_log import EditedFiles, constant_values
 from spatial_replay.replay.playback import Playback
-from spatial_replay.serve.pace import PlaybackState
+from spatial_replay.serve.pace import PlaybackState, Status
 from spatial_replay.serve.requests import PendingRequests, Values
 from spatial_replay.serve.session import ARROW, Session
 from spatial_replay.serve.thinning import PlaybackThinning
@@ -61,6 +61,9 @@ class Viewers(Protocol):
     def send_note(self, note: Note) -> None:
         """Send a note."""
 
+    def remove_note(self, about: str) -> None:
+        """Remove the note about a subject."""
+
 
 _MOST_NAMED: Final = 10
 """The most results that a note lists."""
@@ -92,11 +95,12 @@ class Player:
         self._viewers = viewers
         self._thinning = PlaybackThinning()
         self._turns = 0
+        self._shows_again = False
 
     def run(self) -> None:
         """Do what is requested until the session is stopped."""
         try:
-            while not (requests := self._session.next_requests(PERIOD_S)).stop:
+            while not (requests := self._next_requests()).stop:
                 try:
                     self._do(requests)
                     self._play_on()
@@ -106,18 +110,23 @@ class Player:
         finally:
             self._session.end()
 
+    def _next_requests(self) -> PendingRequests:
+        return self._session.next_requests(PERIOD_S, is_due=self._shows_again)
+
     def _do(self, requests: PendingRequests) -> None:
+        shows_again, self._shows_again = self._shows_again, False
         time_ns = self._playback.time_ns if requests.seek_ns is None else requests.seek_ns
-        if requests.edited is not None:
-            self._evaluate(requests.edited, time_ns)
+        is_changed = requests.edited is not None and self._evaluate(requests.edited)
         is_moved = requests.arrow is not None and self._point_at(requests.arrow)
-        if is_moved or requests.edited is not None or requests.seek_ns is not None:
+        if is_moved or is_changed or requests.seek_ns is not None:
             self._seek(time_ns)
+        elif shows_again and self._session.state.status is not Status.PLAYING:
+            self._show(time_ns)
         if requests.topics:
             self._resend(requests.topics)
         self._session.provide_evaluation(self._playback.evaluated)
 
-    def _evaluate(self, edited: EditedFiles, time_ns: int) -> None:
+    def _evaluate(self, edited: EditedFiles) -> bool:
         """Evaluate the whole log with other constants; after an error, restore the former values."""
         before = self._playback.evaluated
         try:
@@ -125,12 +134,12 @@ class Player:
         except SpatialReplayError as error:
             self._viewers.send_note(Note(CONSTANTS, Level.ERROR, str(error)))
             self._viewers.send_values(self._session.restore(before.edited, error))
-            return
+            return False
         if edited.loaded is not before.loaded:
             # viewers know the constants that they set, not those of a file that was saved
             self._viewers.send_values(constant_values(edited.constants))
-        # viewers drop what they show of the log when the playback jumps, even to the same time
-        self._viewers.send_state(self._session.state._replace(time_ns=time_ns, did_seek=True))
+        self._viewers.remove_note(CONSTANTS)
+        return True
 
     def _point_at(self, arrow: str) -> bool:
         """Choose the result that the arrow is about; say whether there is such a one."""
@@ -147,11 +156,21 @@ class Player:
         return True
 
     def _seek(self, time_ns: int) -> None:
-        """Send what is shown at a time, and go on from there."""
+        """Send what is shown at a time, and go on from there.
+
+        Viewers drop what they have when time steps back, or a state says that it jumped: both come first. A
+        viewer that drops messages later than that is sent them once more while it is paused.
+        """
+        self._viewers.send_time(time_ns)
+        self._viewers.send_state(self._session.state._replace(time_ns=time_ns, did_seek=True))
+        self._show(time_ns)
+        self._session.continue_from(time_ns)
+        self._shows_again = True
+
+    def _show(self, time_ns: int) -> None:
         self._send_curves(time_ns)
         self._viewers.publish(self._playback.seek(time_ns))
         self._viewers.send_time(time_ns)
-        self._session.continue_from(time_ns)
 
     def _resend(self, topics: Collection[str]) -> None:
         """Send again what is shown of some topics."""

@@ -142,7 +142,7 @@ class PublishingServer:
         self._server.publish_status(note.text[:_LONGEST_NOTE], _LEVELS[note.level], note.about)
 
     def remove_note(self, about: str) -> None:
-        """Remove the note about a subject."""
+        """See `Viewers.remove_note`."""
         self._server.remove_status([about])
 
     @property

@@ -121,7 +121,8 @@ class Session:
             (self._transport.play if is_playing else self._transport.pause)(now)
             self._pending.is_controlled = True
             self._requested.notify()
-            return self._transport.state(now, did_seek=seek_ns is not None)
+            # the player says that it jumped, right before it sends what is there
+            return self._transport.state(now)
 
     def _plays(self, now: float) -> bool:
         return self._transport.state(now).status is Status.PLAYING
@@ -227,12 +228,13 @@ class Session:
 
     # -------------------------------------------------------------------------- called by the player
 
-    def next_requests(self, patience_s: float) -> PendingRequests:
-        """Return what was requested; wait for a request, but while it plays, only so long."""
+    def next_requests(self, patience_s: float, *, is_due: bool = False) -> PendingRequests:
+        """Return what was requested; wait for a request, but while it plays or work is due, only so long."""
         with self._requested:
             is_playing = self._transport.state(self._pace.now()).status is Status.PLAYING
             self._requested.wait_for(
-                lambda: self._pending or self._awaited is not None, patience_s if is_playing else None
+                lambda: self._pending or self._awaited is not None,
+                patience_s if is_playing or is_due else None,
             )
             pending, self._pending = self._pending, PendingRequests()
             return pending

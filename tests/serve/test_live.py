@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import random
 import socket
 import struct
 from collections.abc import Awaitable, Callable, Iterator
@@ -27,6 +28,7 @@ from serve.viewer import (
     PLAYING,
     PROTOCOL,
     Message,
+    Received,
     State,
     Viewer,
     viewer,
@@ -155,16 +157,60 @@ def test_play_pause_seek_and_speed_get_a_reply(server: Serving) -> None:
     async def looking(own: Viewer) -> None:
         await own.subscribe([ROBUSTNESS])
         sought = await own.control(seek_ns=3 * STEP_NS + 1, request="seek")
-        assert sought == State(PAUSED, 3 * STEP_NS + 1, 1.0, True, "seek")
+        assert sought == State(PAUSED, 3 * STEP_NS + 1, 1.0, False, "seek")
+        assert (await own.next_of(State, lambda each: each.did_seek)).time_ns == 3 * STEP_NS + 1
         assert (await own.message(ROBUSTNESS, lambda each: each.time_ns > 0)).time_ns == 3 * STEP_NS
         playing = await own.control(play=True, speed=FAST, request="play")
         assert (playing.status, playing.speed, playing.did_seek) == (PLAYING, FAST, False)
         ended = await own.next_of(State, lambda each: each.status == ENDED)
         assert (ended.time_ns, ended.request) == (END_NS, "")
         again = await own.control(play=True, speed=1.0, request="again")
-        assert again == State(PLAYING, 0, 1.0, True, "again")
+        assert again == State(PLAYING, 0, 1.0, False, "again")
         paused = await own.control(speed=1.0, request="pause")
         assert (paused.status, paused.did_seek) == (PAUSED, False)
+
+    watch(server, looking)
+
+
+def test_every_seek_leaves_all_that_is_shown_at_its_time(server: Serving) -> None:
+    """A viewer drops what it has when the time steps back, or when a state says that it jumped."""
+    shown: dict[str, Message] = {}
+    now = 0
+
+    def show(received: Received) -> None:
+        nonlocal now
+        match received:
+            case int():
+                if received < now:
+                    shown.clear()
+                now = received
+            case State(did_seek=True):
+                shown.clear()
+            case Message():
+                shown[received.topic] = received
+
+    def shows(seek_ns: int, request: str) -> Callable[[Received], bool]:
+        answers: list[Received] = []
+
+        def is_complete(received: Received) -> bool:
+            show(received)
+            if received == seek_ns or (isinstance(received, State) and received.request == request):
+                answers.append(received)
+            there = {seek_ns, seek_ns - seek_ns % STEP_NS}
+            drawn = {topic for topic, each in shown.items() if each.time_ns in there}
+            # the answer, the time before and after what is shown, and after it is shown once more
+            return len(answers) >= 4 and drawn >= {SCENE, STANDING, ROBUSTNESS, CURVES_TOPIC}
+
+        return is_complete
+
+    async def looking(own: Viewer) -> None:
+        await own.subscribe([SCENE, STANDING, ROBUSTNESS, SPECIFICATION, CURVES_TOPIC])
+        draw = random.Random(5)
+        for number in range(100):
+            seek_ns = draw.randrange(END_NS)
+            await own.ask(seek_ns=seek_ns, request=f"{number}")
+            await own.until(shows(seek_ns, f"{number}"))
+            assert SPECIFICATION in shown
 
     watch(server, looking)
 
@@ -567,7 +613,9 @@ def test_a_log_that_can_no_longer_be_read_is_reported(tmp_path: Path) -> None:
         async def looking(own: Viewer) -> None:
             await own.control(play=True, seek_ns=10 * STEP_NS)
             assert "could not be read" in await own.note("log")
-            assert (await own.next_of(State, lambda each: each.request == "")).status == PAUSED
+            assert (
+                await own.next_of(State, lambda each: not each.request and not each.did_seek)
+            ).status == PAUSED
             assert await own.constants() == {"far": 0.5, "soon": "10s"}
 
         watch(server, looking)

@@ -141,10 +141,16 @@ class Viewer:
         self, *, play: bool = False, speed: float = 1.0, seek_ns: int | None = None, request: str = "control"
     ) -> State:
         """Play or pause; the state that answers it."""
-        head = struct.pack("<BBfBQ", _CONTROL, not play, speed, seek_ns is not None, seek_ns or 0)
-        await self.connection.send(head + struct.pack("<I", len(request)) + request.encode())
+        await self.ask(play=play, speed=speed, seek_ns=seek_ns, request=request)
         found: State = await self.next_of(State, lambda each: each.request == request)
         return found
+
+    async def ask(
+        self, *, play: bool = False, speed: float = 1.0, seek_ns: int | None = None, request: str = "control"
+    ) -> None:
+        """Ask to play or pause."""
+        head = struct.pack("<BBfBQ", _CONTROL, not play, speed, seek_ns is not None, seek_ns or 0)
+        await self.connection.send(head + struct.pack("<I", len(request)) + request.encode())
 
     async def set(self, **values: Any) -> dict[str, Any]:
         """Give constants other values; the values that they have then."""
