@@ -58,6 +58,7 @@ class Reading(TypedDict, total=False):
     lost: Literal["drop", "keep"]
     y_down: bool | None
     late: str
+    max_gap: str | None
 
 
 class Evaluating(Reading, total=False):

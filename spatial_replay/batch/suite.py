@@ -33,7 +33,7 @@ from spatial_replay.trace.time_points import time_point_from_text
 LARGEST_SUITE: Final = 8 * 2**20
 """Bytes of a suite file."""
 _Value = TypeVar("_Value")
-_READING: Final = ("on_time_jump", "late", "rate", "lost", "y_down", "concave")
+_READING: Final = ("on_time_jump", "late", "max_gap", "rate", "lost", "y_down", "concave")
 Pairs: TypeAlias = tuple[tuple[str, _Value], ...]
 """A table that can be hashed, and sent to another process."""
 

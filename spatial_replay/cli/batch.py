@@ -233,6 +233,7 @@ def _suite(logs: tuple[str, ...], given: ConditionArguments, semantics: Semantic
 _READING_DEFAULTS: Mapping[str, Any] = {
     "on_time_jump": "error",
     "late": "1s",
+    "max_gap": None,
     "rate": None,
     "lost": "drop",
     "y_down": None,

@@ -41,7 +41,7 @@ _EPOCH_LIKELY_NS = 10**18
 """Later times are taken to count from 1970 (2001 or later), earlier ones from the start of the run."""
 
 
-_OF_MESSAGES = frozenset({"mapping", "on_time_jump", "late"})
+_OF_MESSAGES = frozenset({"mapping", "on_time_jump", "late", "max_gap"})
 """Options of reading that say something about an external log."""
 
 

@@ -213,6 +213,7 @@ class ReadArguments(TypedDict):
     y_down: bool | None
     concave: Literal["decompose", "hull"]
     late: str
+    max_gap: str | None
 
 
 _READING = (
@@ -233,6 +234,11 @@ _READING = (
         metavar="T|all",
         default="1s",
         help="External logs: how late messages may come, such as 2s; all sorts the whole log.  [default: 1s]",
+    ),
+    click.option(
+        "--max-gap",
+        metavar="T",
+        help="What lies in a pause of samples, or of a mapped topic, longer than T is unknown.",
     ),
     click.option(
         "--rate", metavar="N", type=float, help="Drone annotations: frames per second.  [default: 30]"

@@ -6,14 +6,17 @@ numbers, so that equal logs give equal files.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import wraps
 from types import MappingProxyType
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from spatial_replay.geometry.arrays import Integers
+from spatial_replay.text import Sentence
+from spatial_replay.trace.pauses import Pauses
 from spatial_replay.trace.trace import Trace
 
 BLOCK_SAMPLES = 12_288
@@ -211,3 +214,53 @@ class MemorySink:
     def write_messages(self, messages: Messages) -> None:
         """See `Sink`."""
         self.messages.append(messages)
+
+
+_MOST_IN_GAP = 10_000
+"""Samples that fill one gap."""
+
+IterBlocks = Callable[..., Iterator[Block]]
+
+
+def noting_pauses(iter_blocks: IterBlocks) -> IterBlocks:
+    """Let `iter_blocks` of a source remark pauses at the end, and fill those longer than its `max_gap_ns`."""
+
+    @wraps(iter_blocks)
+    def wrapped(self: Any, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
+        pauses, before = Pauses(), Trace.empty()
+        for block in iter_blocks(self, start_ns, end_ns):
+            trace = block.trace
+            pauses.add(trace.times_ns)
+            if self.max_gap_ns is not None and len(trace):
+                block = replace(block, trace=_without_gaps(before, trace, self.max_gap_ns))
+                before = trace.slice(len(trace) - 1, len(trace))
+            yield block
+        remark = pauses.remark("samples")
+        if remark is not None:
+            yield Block(Trace.empty(), remarks=(Sentence(f"{self.name}: ", remark),))
+
+    return wrapped
+
+
+def _without_gaps(before: Trace, trace: Trace, max_gap_ns: int) -> Trace:
+    """Fill gaps between samples with samples in which every object and signal is unknown.
+
+    Args:
+        before: the sample before those of `trace`, or none.
+    """
+    times = np.concatenate([before.times_ns, trace.times_ns])
+    gaps = np.flatnonzero(np.diff(times) > max_gap_ns).tolist()
+    parts, done = [], 0
+    for gap in gaps:
+        begin = gap + 1 - len(before)
+        last = trace.slice(begin - 1, begin) if begin else before
+        first_ns, step_ns = int(times[gap]), int(times[gap + 1] - times[gap]) // _MOST_IN_GAP
+        steps = np.arange(first_ns, int(times[gap + 1]), max(max_gap_ns, step_ns), dtype=np.int64)
+        # right after the last sample, too
+        steps[0] += 1
+        rows = np.repeat(np.where(last.rows >= 0, -2 - last.rows, last.rows), len(steps), axis=0)
+        signals = {name: np.full(len(steps), np.nan) for name in last.signals}
+        unknown = replace(last, times_ns=steps, rows=rows, signals=signals, faults=(), remarks=())
+        parts += [trace.slice(done, begin), unknown]
+        done = begin
+    return Trace.concatenate([*parts, trace.slice(done, len(trace))]) if gaps else trace

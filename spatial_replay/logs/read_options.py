@@ -36,6 +36,7 @@ class ReadOptions:
         mapping: the mapping file, which says which topics carry which objects.
         on_time_jump: whether a clock that jumps back is an error or ends the log.
         late: how late messages may come, such as "2s"; "all" for any lateness: the whole log is sorted.
+        max_gap: what lies in a longer pause of samples or of a topic is unknown, such as "1s"; or None.
         rate: frames a second, for formats that count frames.
         lost: whether rows marked as out of the picture are dropped or kept.
         y_down: whether y points down in the file, as in images; None for what is usual in its format.
@@ -51,6 +52,7 @@ class ReadOptions:
     lost: Lost = "drop"
     y_down: bool | None = None
     late: str = "1s"
+    max_gap: str | None = None
 
     def __post_init__(self) -> None:
         for name, choices in _CHOICES.items():
@@ -62,6 +64,7 @@ class ReadOptions:
         if self.y_down not in (None, True, False):
             raise UsageError(f"y_down is {shortened(self.y_down)}; give True, False or None")
         late_ns(self.late)
+        gap_ns(self.max_gap)
         if self.rate is not None:
             _check_rate(self.rate)
 
@@ -104,10 +107,26 @@ def late_ns(text: object) -> int:
     return int(Fraction(match[1]) * (10**9 if match[2] == "s" else 10**6))
 
 
+def gap_ns(text: object) -> int | None:
+    """Return the longest pause in which things are known, from "2s" or "500ms"; None for no limit.
+
+    Raises:
+        UsageError: anything else.
+    """
+    if text is None:
+        return None
+    match = _LATENESS.fullmatch(text) if isinstance(text, str) else None
+    gap = int(Fraction(match[1]) * (10**9 if match[2] == "s" else 10**6)) if match else 0
+    if not gap:
+        raise UsageError(f"max_gap is {shortened(text)}; give a duration above 0, such as 2s or 500ms")
+    return gap
+
+
 _REASONS = {
     "mapping": "it names its objects itself",
     "on_time_jump": "its times never go back",
     "late": "its times never go back",
+    "max_gap": "it has no samples",
     "rate": "it has times, not numbers of frames",
     "lost": "it has no rows marked as lost",
     "y_down": (

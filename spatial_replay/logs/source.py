@@ -12,8 +12,8 @@ from typing import Any, Protocol, TypeVar, cast
 
 from spatial_replay.errors import LogError
 from spatial_replay.geometry.footprint import Concave
-from spatial_replay.logs.messages import BLOCK_SAMPLES, Attachment, Block
-from spatial_replay.logs.read_options import FaultList
+from spatial_replay.logs.messages import BLOCK_SAMPLES, Attachment, Block, noting_pauses
+from spatial_replay.logs.read_options import FaultList, gap_ns
 from spatial_replay.text import encodable
 from spatial_replay.trace.axes import OUR_AXES, Axes
 from spatial_replay.trace.declared_units import signal_units_metadata
@@ -119,6 +119,11 @@ class TrackSource(_Bare):
     def name(self) -> str:
         return encodable(self.path.name)
 
+    @property
+    def max_gap_ns(self) -> int | None:
+        return gap_ns(cast("str | None", self.options.get("max_gap")))
+
+    @noting_pauses
     def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
         """See `Source.iter_blocks`."""
         faults = FaultList()

@@ -223,7 +223,7 @@ class Assembler:
         if any(self._readers[topic].transforms is not None for topic in topics):
             self._tree.forget_moving()
         self._settled_ns = lost_ns
-        lost = self._tracker.trace(np.array([lost_ns], np.int64))
+        lost = self._tracker.trace(np.array([lost_ns], np.int64), lost_ns)
         self._tracker.forget(lost_ns)
         return Trace.concatenate([so_far, lost])
 
@@ -234,6 +234,8 @@ class Assembler:
             UsageError: the mapping fits no message of a topic, or the log has no such fixed frame.
         """
         trace = self._settle(max(self._newest_ns, self._latest_ns))
+        if self._arrived is None:
+            self._remarks.add_pauses()
         for text in self._tree.remarks():
             self._remarks.add(text)
         # of a system that runs, there is no log to cut
@@ -409,7 +411,9 @@ class Assembler:
         # logs contain NaN and infinity; they make objects unknown, without warnings
         with np.errstate(all="ignore"):
             times_ns = self._sample_times.upto(self._tracker.advance(upto_ns), upto_ns)
-            trace = self._tracker.trace(times_ns[(times_ns >= start_ns) & (times_ns < end_ns)])
+            times_ns = times_ns[(times_ns >= start_ns) & (times_ns < end_ns)]
+            self._remarks.note_samples(times_ns)
+            trace = self._tracker.trace(times_ns, max(self._newest_ns, self._latest_ns))
             self._tracker.forget(upto_ns)
         self._settled_ns = upto_ns
         # looking through all transforms takes longer than a sample

@@ -24,8 +24,8 @@ from spatial_replay.bags.ros_definitions import full_type_name
 from spatial_replay.bags.topic import Topic
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.footprint import Concave
-from spatial_replay.logs.messages import Attachment, Block, Channel, Messages
-from spatial_replay.logs.read_options import FaultList, OnTimeJump, late_ns
+from spatial_replay.logs.messages import Attachment, Block, Channel, Messages, noting_pauses
+from spatial_replay.logs.read_options import FaultList, OnTimeJump, gap_ns, late_ns
 from spatial_replay.logs.remote import LogFile, RemoteFile
 from spatial_replay.logs.topics import DERIVED, MAPPED, OBJECTS, is_kept
 from spatial_replay.mapping.assemble import Assembler
@@ -51,6 +51,7 @@ class MappedSource:
         keep: which messages its blocks hold for a copy, byte for byte: "mapped" for those of the topics that
             the mapping reads, "all", or patterns of topics such as "/camera/*"; several add up.
         late: how late messages may come, or "all".
+        max_gap: what lies in a longer pause is unknown; None for what the mapping says.
     """
 
     path: LogFile
@@ -60,6 +61,11 @@ class MappedSource:
     on_time_jump: OnTimeJump = "error"
     keep: tuple[str, ...] = (MAPPED,)
     late: str = "1s"
+    max_gap: str | None = None
+
+    @property
+    def max_gap_ns(self) -> int | None:
+        return gap_ns(self.max_gap) or self.mapping.max_gap_ns
 
     @property
     def name(self) -> str:
@@ -79,14 +85,16 @@ class MappedSource:
     def options(self) -> Mapping[str, object]:
         """The options of reading, for the metadata of a copy."""
         mapping = {"mapping": self.mapping.name, "mapping_sha256": self.mapping.sha256}
-        given = {} if self.on_time_jump == "error" else {"on_time_jump": self.on_time_jump}
-        return mapping | given | ({} if self.late == "1s" else {"late": self.late})
+        given: dict[str, object] = {} if self.on_time_jump == "error" else {"on_time_jump": self.on_time_jump}
+        given |= {} if self.late == "1s" else {"late": self.late}
+        return mapping | given | ({} if self.max_gap is None else {"max_gap": self.max_gap})
 
     @property
     def begin_ns(self) -> int | None:
         """When the first message was logged, if a log elsewhere says so."""
         return open_messages(self.path).start_ns if isinstance(self.path, RemoteFile) else None
 
+    @noting_pauses
     def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
         """See `Source.iter_blocks`; of an indexed log, only what the window needs is read.
 
@@ -163,7 +171,8 @@ class MappedSource:
         if reasons:
             raise LogError("\n".join(f"{self.name}: {reason}" for reason in reasons))
         try:
-            return ReadingPlan.of(self.mapping, topics, late_ns(self.late))
+            mapping = replace(self.mapping, max_gap_ns=self.max_gap_ns)
+            return ReadingPlan.of(mapping, topics, late_ns(self.late))
         except UsageError as error:
             faults = reader.take_faults()
             if faults:

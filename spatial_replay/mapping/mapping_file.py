@@ -90,6 +90,7 @@ def _mapping(document: Document, name: str) -> LogMapping:
         clock=value.get("clock", "log"),
         sampling=Sampling(sample.get("topic"), duration_ns(sample["every"]) if "every" in sample else None),
         max_age_ns=age_ns(value["max_age"]) if "max_age" in value else None,
+        max_gap_ns=duration_ns(value["max_gap"]) if "max_gap" in value else None,
         origin=_origin(value.get("origin")),
         axes=Axes(
             value.get("axes", {}).get("y", "up"), float(value.get("scale", 1.0)), value.get("unit", "")
@@ -130,6 +131,7 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
 def _durations(value: Any) -> list[tuple[Place, Any]]:
     tables: list[tuple[Place, Any, str]] = [
         ((), value, "max_age"),
+        ((), value, "max_gap"),
         (("sample",), value.get("sample"), "every"),
     ]
     tables += [(("topics", topic), entry, "max_age") for topic, entry in value["topics"].items()]

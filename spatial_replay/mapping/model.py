@@ -161,6 +161,7 @@ class LogMapping:
         sha256: of its content, independent of layout and comments.
         fixed_frame: the frame that coordinates are transformed into; None leaves them as they are.
         topics: in the file's order.
+        max_gap_ns: what lies in a longer pause of a topic is unknown.
         axes: those of the fixed frame, or of the messages without one.
         origin: latitude and longitude in degrees where the fixes of satellite receivers have (0, 0).
     """
@@ -172,6 +173,7 @@ class LogMapping:
     clock: Clock = "log"
     sampling: Sampling = Sampling()
     max_age_ns: int | None = None
+    max_gap_ns: int | None = None
     axes: Axes = OUR_AXES
     origin: tuple[float, float] | None = None
 

@@ -105,7 +105,7 @@ class ReadingPlan:
             topics=tuple(names),
             by_log_time=all(topic.clock == "log" for topic in planned),
             late_ns=late_ns,
-            margin_ns=late_ns + (HISTORY_NS if waits_for_frames else 0),
+            margin_ns=late_ns + max(HISTORY_NS if waits_for_frames else 0, mapping.max_gap_ns or 0),
             planned=planned,
             sampled_topic=sampled,
             lost=tuple(lost),

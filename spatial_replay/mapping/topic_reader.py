@@ -364,6 +364,11 @@ class PendingMessages:
     def __len__(self) -> int:
         return len(self._contents)
 
+    @property
+    def first_ns(self) -> int | None:
+        """The time of the first message that waits."""
+        return min((int(each[0].min()) for each in self._columns if len(each[0])), default=None)
+
     def add(
         self,
         times_ns: Integers,

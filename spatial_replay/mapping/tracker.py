@@ -28,6 +28,7 @@ from spatial_replay.mapping.timeline import (
 from spatial_replay.mapping.topic_reader import ReportFault, TopicReader
 from spatial_replay.mapping.transforms import FrameTree, Transforms
 from spatial_replay.text import Instant, Sentence
+from spatial_replay.trace.pauses import Pauses
 from spatial_replay.trace.trace import ABSENT, Trace, renumbered
 
 _OLD_ADVANCES, _OLD_ROWS = 32, 256
@@ -79,6 +80,7 @@ class Tracker:
         self._rows = ObservationRows.blank(np.empty(0, np.int64))
         self._added: list[ObservationRows] = []
         self._events = {name: Events.none() for name in readers}
+        self._reported: dict[str, Integers] = {}
         self._following: dict[int, _Following] = {}
         self._signals: dict[tuple[str, int], tuple[Integers, Floats]] = {}
         self._topic_of_name: dict[int, str] = {}
@@ -101,6 +103,14 @@ class Tracker:
                     self._count_replaced(name, times_ns, np.flatnonzero(times_ns[1:] == times_ns[:-1]))
                 for index, values in enumerate(columns.signals.T if len(times_ns) else ()):
                     self._take_signal((name, index), times_ns, values)
+            if reader.is_mapped and not (reader.planned.is_lasting or reader.planned.is_latched):
+                before = self._reported.get(name, times_ns[:0])
+                self._reported[name] = np.concatenate([before[-1:], times_ns])
+                start_ns, end_ns = self._window_ns
+                is_inside = (times_ns >= start_ns) & (times_ns < end_ns)
+                self._remarks.note_messages(
+                    name, times_ns[is_inside], is_sampled=name == self._plan.sampled_topic
+                )
             if reader.extractor is not None:
                 self._remarks.note_frames(reader.extractor.noted_frames)
             if self._plan.sampled_topic in (None, name):
@@ -108,11 +118,15 @@ class Tracker:
         self._store_added()
         return np.concatenate(sampled)
 
-    def trace(self, times_ns: Integers) -> Trace:
-        """Return the samples at some times, up to the time of the last `advance`."""
+    def trace(self, times_ns: Integers, newest_ns: int) -> Trace:
+        """Return the samples at some times, up to the time of the last `advance`.
+
+        Args:
+            newest_ns: how far the log has come.
+        """
         if not len(times_ns):
             return Trace.empty()
-        codes, rows, classes = self._states(times_ns)
+        codes, rows, classes = self._states(times_ns, newest_ns)
         self._store_added()
         names = [self._names.by_code[code] for code in codes.tolist()]
         appears = (rows != ABSENT).any(axis=0).tolist()
@@ -143,7 +157,7 @@ class Tracker:
             uncertainty=stored.uncertainty,
             class_code=rank[stored.class_code] if len(rank) else stored.class_code,
             classes=tuple(by_code[i] for i in ordered),
-            signals=self._signal_columns(times_ns),
+            signals=self._signal_columns(times_ns, newest_ns),
         )
 
     def forget(self, upto_ns: int) -> None:
@@ -324,16 +338,31 @@ class Tracker:
         before = self._signals.get(key, (np.empty(0, np.int64), np.empty(0)))
         self._signals[key] = np.concatenate([before[0], times_ns]), np.concatenate([before[1], values])
 
-    def _states(self, times_ns: Integers) -> tuple[Integers, Integers, Integers]:
+    def _in_gap(self, topic: str, times_ns: Integers, newest_ns: int) -> Booleans:
+        """Return at which times a topic pauses for longer than `max_gap`."""
+        most_ns, known = self._plan.mapping.max_gap_ns, self._reported.get(topic)
+        if most_ns is None or known is None or not len(known):
+            return np.zeros(len(times_ns), np.bool_)
+        first = self._readers[topic].pending.first_ns
+        # where no message follows, the time up to now shows whether this is a pause
+        following = newest_ns if first is None else first
+        after = np.searchsorted(known, times_ns, "right")
+        before_ns = known[np.maximum(after - 1, 0)]
+        next_ns = np.append(known, following)[after]
+        return np.asarray((after > 0) & (next_ns - before_ns > most_ns))
+
+    def _states(self, times_ns: Integers, newest_ns: int) -> tuple[Integers, Integers, Integers]:
         """Return the states of the objects of all topics, as `Events.state` does."""
         states = []
         for topic, events in self._events.items():
             state = events.state(times_ns, self._readers[topic].planned.max_age_ns)
             self._count_stale(topic, times_ns, state[0], state[1])
+            rows = state[1]
+            rows[self._in_gap(topic, times_ns, newest_ns)[:, None] & (rows >= 0)] = STALE
             self._place_following(topic, times_ns, state[1])
             states.append(state)
-        codes, rows, classes = zip(*states, strict=True)
-        return np.concatenate(codes), np.concatenate(rows, axis=1), np.concatenate(classes, axis=1)
+        codes, states_of, classes = zip(*states, strict=True)
+        return np.concatenate(codes), np.concatenate(states_of, axis=1), np.concatenate(classes, axis=1)
 
     def _count_stale(self, topic: str, times_ns: Integers, codes: Integers, rows: Integers) -> None:
         stale = rows == STALE
@@ -342,7 +371,7 @@ class Tracker:
             name = self._names.by_code[int(codes[column])]
             self._remarks.count_stale(topic, name, len(at), int(times_ns[at[0]]))
 
-    def _signal_columns(self, times_ns: Integers) -> dict[str, Floats]:
+    def _signal_columns(self, times_ns: Integers, newest_ns: int) -> dict[str, Floats]:
         columns: dict[str, Floats] = {}
         for (topic, index), (reported_ns, values) in self._signals.items():
             planned = self._readers[topic].planned
@@ -350,7 +379,7 @@ class Tracker:
                 continue
             at = np.searchsorted(reported_ns, times_ns, "right") - 1
             is_old = (at < 0) | (times_ns - reported_ns[at] > planned.max_age_ns)
-            column = np.where(is_old, np.nan, values[at])
+            column = np.where(is_old | self._in_gap(topic, times_ns, newest_ns), np.nan, values[at])
             name = planned.mapping.signals[index].name
             # several topics may report one signal: the first that has a value counts
             first = columns.get(name, column)
@@ -370,6 +399,27 @@ class Remarks:
         self._skipped: dict[str, int] = {}
         self._replaced: dict[str, tuple[int, int]] = {}
         self._frames: set[str] = set()
+        self._samples = Pauses()
+        self._messages: dict[str, Pauses] = {}
+
+    def note_samples(self, times_ns: Integers) -> None:
+        self._samples.add(times_ns)
+
+    def note_messages(self, topic: str, times_ns: Integers, *, is_sampled: bool) -> None:
+        """Note when messages of a topic came; the pauses of the one that is sampled are those of samples."""
+        if not is_sampled:
+            self._messages.setdefault(topic, Pauses()).add(times_ns)
+
+    def add_pauses(self) -> None:
+        """Remark pauses of topics, but for those in which there are no samples either."""
+        pauses = self._samples.found()
+        for topic, messages in sorted(self._messages.items()):
+            own = messages.found()
+            is_common = all(
+                any(at < start + length and start < at + long for at, long in pauses) for start, length in own
+            )
+            if not is_common and (remark := messages.remark(f"{topic}: messages")) is not None:
+                self.add(remark)
 
     def add(self, text: str) -> None:
         self._texts.append(text)

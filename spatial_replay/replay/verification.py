@@ -39,7 +39,7 @@ _NOT_COVERED = (
 )
 _NO_PLAN = "no plan settings: the log was planned, and its decisions cannot be recomputed without"
 
-_READING = ("on_time_jump", "late", "rate", "lost", "y_down", "concave")
+_READING = ("on_time_jump", "late", "max_gap", "rate", "lost", "y_down", "concave")
 _WINDOW = ("start_ns", "end_ns", "every")
 
 

@@ -50,6 +50,7 @@ def open_source(
     lost: Lost = "drop",
     y_down: bool | None = None,
     late: str = "1s",
+    max_gap: str | None = None,
 ) -> Source:
     """Open the log in a file of any format; the content decides, not the name.
 
@@ -66,6 +67,7 @@ def open_source(
             default, it points down in drone annotations, and up in all other files.
         late: how late messages of an external log may come, such as "2s"; "all" sorts the whole log, which
             is then in memory.
+        max_gap: what lies in a longer pause of samples, or of a mapped topic, is unknown, such as "1s".
 
     Raises:
         UsageError: no path was given, or an option that means nothing to this format.
@@ -74,7 +76,7 @@ def open_source(
         RemoteError: an address does not answer.
     """
     _require_path(path)
-    options = ReadOptions(concave, mapping, on_time_jump, rate, lost, y_down, late)
+    options = ReadOptions(concave, mapping, on_time_jump, rate, lost, y_down, late, max_gap)
     path = readable_file(path)
     if isinstance(path, Path) and is_bag_folder(path):
         options.refuse_except(_MESSAGES, "ROS 2 bag", path.name)
@@ -102,13 +104,14 @@ def read_trace(
     lost: Lost = "drop",
     y_down: bool | None = None,
     late: str = "1s",
+    max_gap: str | None = None,
     allow_damage: bool = False,
 ) -> Trace:
     """Read a whole log into memory.
 
     Args:
         path: a log in any format that `open_source` knows.
-        mapping, concave, on_time_jump, rate, lost, y_down, late: how to read it, as for `open_source`.
+        mapping, concave, on_time_jump, rate, lost, y_down, late, max_gap: how to read it; see `open_source`.
         allow_damage: return what can be read of a damaged log, with its `faults`.
 
     Raises:
@@ -125,6 +128,7 @@ def read_trace(
         lost=lost,
         y_down=y_down,
         late=late,
+        max_gap=max_gap,
     )
     blocks = reading_only(source).iter_blocks()
     traces = [replace(block.trace, remarks=block.remarks) for block in blocks]
@@ -327,29 +331,39 @@ def _open_messages(path: LogFile, kind: str, options: ReadOptions) -> Source:
     from spatial_replay.mapping import MappedSource, load_mapping
 
     mapping = load_mapping(options.mapping)
-    return MappedSource(path, mapping, kind, options.concave, options.on_time_jump, late=options.late)
+    return MappedSource(
+        path,
+        mapping,
+        kind,
+        options.concave,
+        options.on_time_jump,
+        late=options.late,
+        max_gap=options.max_gap,
+    )
 
 
 def _open_mcap(path: LogFile, kind: str, options: ReadOptions) -> Source:
     """Open our own log, which names its objects, or an external one, given a mapping."""
     from spatial_replay.logs.mcap.read import McapSource
 
-    source = McapSource(path, kind, options.concave)
-    if not options.given():
+    source = McapSource(path, kind, options.concave, max_gap=options.max_gap)
+    if not options.given().keys() - {"max_gap"}:
         return source
     if source.has_samples:
-        options.refuse_except(frozenset(), kind, path.name)
+        options.refuse_except(frozenset({"max_gap"}), kind, path.name)
     return _open_messages(path, kind, options)
 
 
-_MESSAGES = frozenset({"mapping", "on_time_jump", "late"})
+_MESSAGES = frozenset({"mapping", "on_time_jump", "late", "max_gap"})
 
 FORMATS: dict[str, Format] = {
     "MCAP": Format(lambda head: head.startswith(MAGIC), _open_mcap, _MESSAGES),
     "ROS 1 bag": Format(lambda head: head.startswith(b"#ROSBAG V2.0\n"), _open_messages, _MESSAGES),
     "ROS 2 bag": Format(lambda head: head.startswith(b"SQLite format 3\x00"), _open_messages, _MESSAGES),
-    "track JSONL": Format(_is_jsonl, _tracks(iter_jsonl), frozenset({"y_down"})),
-    "track CSV": Format(_is_csv, _tracks(iter_csv), frozenset({"y_down"})),
-    "drone annotations": Format(is_annotations, _open_annotations, frozenset({"rate", "lost", "y_down"})),
-    "CommonRoad scenario": Format(_is_scenario, _open_scenario),
+    "track JSONL": Format(_is_jsonl, _tracks(iter_jsonl), frozenset({"y_down", "max_gap"})),
+    "track CSV": Format(_is_csv, _tracks(iter_csv), frozenset({"y_down", "max_gap"})),
+    "drone annotations": Format(
+        is_annotations, _open_annotations, frozenset({"rate", "lost", "y_down", "max_gap"})
+    ),
+    "CommonRoad scenario": Format(_is_scenario, _open_scenario, frozenset({"max_gap"})),
 }

@@ -397,3 +397,41 @@ def test_a_first_message_with_an_unusable_name_affects_no_other() -> None:
     feed = Feed().add("/p", 0, point(0, id="\x00")).add("/p", 1, point(1, id="cup"))
     made = make("topics: {/p: {name: '{id}'}}", feed)
     assert (made.trace.names, len(made.faults)) == (("cup",), 1)
+
+
+def paused(*, every: str = "") -> tuple[str, Feed]:
+    feed = Feed()
+    for tick in range(80):
+        at = SECOND + tick * 100 * MS
+        feed.add("/p", at, point(tick))
+        if not 20 <= tick < 50:
+            feed.add("/q", at + MS, point(tick))
+    return f"sample: {every or '{topic: /p}'}\ntopics: {{/p: {{}}, /q: {{max_age: 10s}}}}\n", feed
+
+
+def test_a_pause_of_a_topic_is_remarked_with_its_place_and_length() -> None:
+    text, feed = paused()
+    made = make(text, feed)
+    assert made.states("q").count("?") == 0
+    assert made.remarks == (
+        "test.bag: /q: messages pause for 3.100 s from 2.901 s on, where one usually comes every 0.1 s;"
+        " `max_gap` makes what lies there unknown",
+    )
+
+
+@pytest.mark.parametrize("batch", [1, 7, 1000])
+def test_what_lies_in_a_pause_longer_than_max_gap_is_unknown(batch: int) -> None:
+    text, feed = paused()
+    made = make(text + "max_gap: 2s", feed, batch=batch)
+    assert made.states("q") == "-" + "+" * 19 + "?" * 31 + "+" * 29
+    part = make(text + "max_gap: 2s", feed, batch=batch, start_ns=4 * SECOND, end_ns=7 * SECOND)
+    inside = (made.trace.times_ns >= 4 * SECOND) & (made.trace.times_ns < 7 * SECOND)
+    assert part.states("q") == "".join(np.array(list(made.states("q")))[inside])
+    assert "?" not in make(text + "max_gap: 4s", feed, batch=batch).states("q")
+
+
+def test_what_comes_irregularly_does_not_pause() -> None:
+    feed, numbers = Feed(), np.random.default_rng(3)
+    for at in np.cumsum(numbers.exponential(SECOND, 200)).astype(int).tolist():
+        feed.add("/p", at, point(0))
+    assert make("sample: {every: 1s}\nmax_age: forever\ntopics: {/p: {}}", feed).remarks == ()

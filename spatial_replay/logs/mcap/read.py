@@ -52,10 +52,11 @@ from spatial_replay.logs.messages import (
     Channel,
     Messages,
     Schema,
+    noting_pauses,
     select,
 )
 from spatial_replay.logs.objects.decode import decode_objects
-from spatial_replay.logs.read_options import FaultList
+from spatial_replay.logs.read_options import FaultList, gap_ns
 from spatial_replay.logs.remote import LogFile, RemoteFile, open_file
 from spatial_replay.logs.topics import ALL, DERIVED, METADATA, OBJECTS, RECOVERY, is_kept
 from spatial_replay.text import Instant, Sentence, counted, encodable
@@ -367,17 +368,24 @@ class McapSource:
     Attributes:
         keep: which of its other messages its blocks hold, as `is_kept` takes them. What they do not hold is
             not read, where chunks say what they hold.
+        max_gap: between samples that are farther apart, everything is unknown.
     """
 
     path: LogFile
     kind: str = "MCAP"
     concave: Concave = "decompose"
     keep: tuple[str, ...] = (ALL,)
+    max_gap: str | None = None
+
+    @property
+    def max_gap_ns(self) -> int | None:
+        return gap_ns(self.max_gap)
 
     @property
     def name(self) -> str:
         return encodable(self.path.name)
 
+    @noting_pauses
     def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
         """See `Source.iter_blocks`; derived topics, and those that `keep` does not name, are left out.
 

@@ -1,0 +1,50 @@
+"""Pauses of samples: remarked in every format, and unknown where that is asked for."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from spatial_replay import UsageError, read_trace, replay_log
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    """Samples every 0.1 s, but for a pause of 5 s after the twentieth."""
+    lines = []
+    for tick in range(40):
+        time_ns = tick * 10**8 + (5 * 10**9 if tick >= 20 else 0)
+        cup = {"name": "cup", "polygon": [[tick, 0], [tick + 1, 0], [tick, 1]]}
+        lines.append({"time_ns": time_ns, "objects": [cup]})
+    path = tmp_path / "run.jsonl"
+    path.write_text("\n".join(map(json.dumps, lines)))
+    return path
+
+
+def test_a_pause_is_remarked_with_its_place_and_length(log: Path) -> None:
+    trace = read_trace(log)
+    assert len(trace) == 40
+    assert trace.remarks == (
+        "run.jsonl: samples pause for 5.100 s from 1.900 s on, where one usually comes every 0.1 s; `max_gap`"
+        " makes what lies there unknown",
+    )
+
+
+def test_everything_in_a_longer_pause_is_unknown(log: Path, tmp_path: Path) -> None:
+    trace = read_trace(log, max_gap="2s")
+    inside = [time_ns / 1e9 for time_ns in trace.times_ns.tolist() if 1.9e9 < time_ns < 7e9]
+    assert inside == [1.900000001, 3.9, 5.9]
+    assert len(trace) == 43
+    assert (trace.rows[20:23] <= -2).all()
+    assert read_trace(log, max_gap="6s") == read_trace(log)
+    spec = tmp_path / "far.spatial"
+    spec.write_text("region wall = box(50, 0, 51, 1)\nspec far = G (cup dist wall >= 1)\n")
+    verdicts = [replay_log(log, spec, max_gap=each).results[0].verdict for each in (None, "2s")]
+    assert verdicts == ["satisfied", "unknown"]
+
+
+def test_a_limit_has_a_unit(log: Path) -> None:
+    with pytest.raises(UsageError, match=r"max_gap is '2'; give a duration above 0, such as 2s or 500ms"):
+        read_trace(log, max_gap="2")
