@@ -84,7 +84,7 @@ class LazyCommands(click.Group):
 
     def invoke(self, ctx: click.Context) -> Any:
         # imported here so that --help stays fast
-        from spatial_replay.cli.progress import progress
+        from spatial_replay.cli.terminal import progress
         from spatial_replay.logs.downloads import showing_downloads
 
         with showing_downloads(progress):

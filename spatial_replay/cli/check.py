@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from urllib.parse import quote
 
 import click
 
-from spatial_replay.cli.findings import Form, finding_format_option, findings_of, show_findings
+from spatial_replay import __version__
 from spatial_replay.cli.options import (
     JsonCommand,
     LogPath,
@@ -21,9 +23,8 @@ from spatial_replay.cli.options import (
     require_choice,
     strict_names_option,
 )
-from spatial_replay.cli.progress import progress
-from spatial_replay.cli.terminal import show, show_diagnostics, show_json, warn
-from spatial_replay.errors import NoAutomatonError, SpecificationError, UsageError
+from spatial_replay.cli.terminal import PROGRAM, progress, show, show_diagnostics, show_json, warn
+from spatial_replay.errors import Diagnosis, NoAutomatonError, SpecificationError, UsageError
 from spatial_replay.logs.remote import LogFile, local_files
 from spatial_replay.spec import format_formula
 from spatial_replay.spec.diagnostics import Diagnostic
@@ -34,6 +35,86 @@ from spatial_replay.text import counted, counted_from, json_number
 
 if TYPE_CHECKING:
     from spatial_replay.monitor.plausibility import ThresholdRange
+
+
+Form: TypeAlias = Literal["text", "github", "sarif"]
+
+finding_format_option = click.option(
+    "--format",
+    "form",
+    type=click.Choice(["text", "github", "sarif"]),
+    default="text",
+    help="Print only errors and warnings, for GitHub's annotations or for code scanning.  [default: text]",
+)
+
+
+@contextmanager
+def findings_of(specification: str, form: Form) -> Iterator[None]:
+    """Print the errors of a specification that cannot be parsed in the form that was asked for, too."""
+    try:
+        yield
+    except SpecificationError as error:
+        show_findings(form, specification, error.diagnoses)
+        raise
+
+
+def show_findings(form: Form, path: str, diagnoses: Sequence[Diagnosis]) -> None:
+    """Print errors and warnings as workflow commands of GitHub, or as one SARIF object; not as text.
+
+    Args:
+        path: the file that they are about, or its address, as it was given.
+    """
+    if form == "github":
+        # imported here so that --help stays fast
+        from spatial_replay.batch.outputs import annotation, repository_path
+
+        for each in diagnoses:
+            file = repository_path(path)
+            show(annotation(_level(each), file, each.line, _message(each), column=each.column))
+    elif form == "sarif":
+        from spatial_replay.batch.outputs import repository_path
+
+        show_json(_sarif(repository_path(path), diagnoses))
+
+
+def _level(diagnosis: Diagnosis) -> Literal["error", "warning"]:
+    return "warning" if getattr(diagnosis, "severity", "error") == "warning" else "error"
+
+
+def _message(diagnosis: Diagnosis) -> str:
+    hint = getattr(diagnosis, "hint", "")
+    return f"{diagnosis.message}; {hint}" if hint else diagnosis.message
+
+
+def _sarif(path: str, diagnoses: Sequence[Diagnosis]) -> dict[str, Any]:
+    """Return a SARIF 2.1.0 log with one run."""
+    driver = {"name": PROGRAM, "version": __version__, "rules": [{"id": "specification"}]}
+    results = [
+        {
+            "ruleId": "specification",
+            "level": _level(each),
+            "message": {"text": _message(each)},
+            "locations": [
+                {
+                    "physicalLocation": {
+                        "artifactLocation": {"uri": quote(path)},
+                        "region": {
+                            "startLine": each.line,
+                            "startColumn": each.column,
+                            "endColumn": each.column + getattr(each, "width", 1),
+                        },
+                    }
+                }
+            ],
+        }
+        for each in diagnoses
+    ]
+    return {
+        "$schema": "https://json.schemastore.org/sarif-2.1.0.json",
+        "version": "2.1.0",
+        "runs": [{"tool": {"driver": driver}, "columnKind": "unicodeCodePoints", "results": results}],
+    }
+
 
 _STANDARD_OUTPUT = "-"
 _AUTOMATON_FILES = (".dot", ".hoa", ".svg")

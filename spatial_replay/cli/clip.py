@@ -17,8 +17,7 @@ from spatial_replay.cli.options import (
     warn_of_input,
 )
 from spatial_replay.cli.output import print_verdicts
-from spatial_replay.cli.progress import progress
-from spatial_replay.cli.terminal import show, warn
+from spatial_replay.cli.terminal import progress, show, warn
 from spatial_replay.text import counted, time_text
 from spatial_replay.trace.time_points import duration_ns_from_text
 

@@ -19,8 +19,7 @@ from spatial_replay.cli.options import (
     output_option,
     semantics_option,
 )
-from spatial_replay.cli.progress import progress
-from spatial_replay.cli.terminal import show, show_diagnostics, show_json, warn
+from spatial_replay.cli.terminal import progress, show, show_diagnostics, show_json, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import LogFile, local_files
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 import click
 
 from spatial_replay.cli.application import ExitCode
-from spatial_replay.cli.findings import Form, finding_format_option, findings_of, show_findings
+from spatial_replay.cli.check import Form, finding_format_option, findings_of, show_findings
 from spatial_replay.cli.options import (
     JsonCommand,
     LogPath,

@@ -22,8 +22,7 @@ from spatial_replay.cli.options import (
     warn_of_input,
 )
 from spatial_replay.cli.output import MANY, VERDICT_COLOURS, counts_text, others_text, worst_of
-from spatial_replay.cli.progress import progress
-from spatial_replay.cli.terminal import Coloured, Line, fitted, show, show_json, warn
+from spatial_replay.cli.terminal import Coloured, Line, fitted, progress, show, show_json, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.text import requirement_text, time_text
 from spatial_replay.trace.time_points import time_point_from_text

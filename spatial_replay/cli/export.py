@@ -16,8 +16,7 @@ from spatial_replay.cli.options import (
     output_option,
     warn_of_input,
 )
-from spatial_replay.cli.progress import progress
-from spatial_replay.cli.terminal import show, warn
+from spatial_replay.cli.terminal import progress, show, warn
 from spatial_replay.text import counted
 
 if TYPE_CHECKING:

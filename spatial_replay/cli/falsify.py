@@ -17,9 +17,8 @@ from spatial_replay.cli.options import (
     profile_option,
     specs_option,
 )
-from spatial_replay.cli.progress import progress
 from spatial_replay.cli.record import SCENARIOS
-from spatial_replay.cli.terminal import show, show_json
+from spatial_replay.cli.terminal import progress, show, show_json
 from spatial_replay.logs.remote import LogFile
 from spatial_replay.text import counted, with_unit
 

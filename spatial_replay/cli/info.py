@@ -24,8 +24,7 @@ from spatial_replay.cli.options import (
     reading_options,
 )
 from spatial_replay.cli.output import MANY, WORST_FIRST, counts_text
-from spatial_replay.cli.progress import progress
-from spatial_replay.cli.terminal import printing_to, show, show_bytes, show_file, show_json, warn
+from spatial_replay.cli.terminal import printing_to, progress, show, show_bytes, show_file, show_json, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import LogFile
 from spatial_replay.text import counted, counted_from, escaped, requirement_text

@@ -17,8 +17,7 @@ from spatial_replay.cli.options import (
     profile_option,
     reading_options,
 )
-from spatial_replay.cli.progress import progress
-from spatial_replay.cli.terminal import show, show_file, show_json
+from spatial_replay.cli.terminal import progress, show, show_file, show_json
 from spatial_replay.cli.tune import ManyLogs
 from spatial_replay.logs.remote import LogFile
 from spatial_replay.text import counted

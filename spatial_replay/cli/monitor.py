@@ -15,17 +15,18 @@ from click.core import ParameterSource
 
 from spatial_replay.cli.application import ExitCode, exit_code_from_verdicts
 from spatial_replay.cli.options import (
+    ServingArguments,
     constants_option,
     load_spec_options,
     naming_option,
     output_option,
     overwrite_option,
     profile_option,
+    serving_options,
     specs_option,
 )
 from spatial_replay.cli.output import change_line, ending_lines
 from spatial_replay.cli.terminal import Line, StatusLine, show, show_diagnostics, show_file, warn
-from spatial_replay.cli.viewer_options import ServingArguments, serving_options
 from spatial_replay.errors import UsageError
 from spatial_replay.text import counted, time_text
 from spatial_replay.trace.time_points import duration_ns_from_text

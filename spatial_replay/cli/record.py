@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypedDict
 
 import click
 
-from spatial_replay.cli.application import ExitCode
+from spatial_replay.cli.application import ExitCode, exit_code_from_verdicts
 from spatial_replay.cli.options import (
     LogPath,
     ReadArguments,
@@ -20,14 +20,15 @@ from spatial_replay.cli.options import (
     input_files,
     load_spec_options,
     log_output_option,
+    naming_option,
+    overwrite_option,
     profile_option,
     reading_options,
     specs_option,
     warn_of_input,
 )
-from spatial_replay.cli.progress import progress
-from spatial_replay.cli.record_video import video
-from spatial_replay.cli.terminal import show
+from spatial_replay.cli.output import change_line, ending_lines
+from spatial_replay.cli.terminal import progress, show, show_diagnostics, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import LogFile, local_files
 from spatial_replay.text import counted
@@ -35,7 +36,205 @@ from spatial_replay.trace.time_points import duration_ns_from_text
 
 if TYPE_CHECKING:
     from spatial_replay.logs.output_file import Durability
+    from spatial_replay.recording.changes import VerdictChange
+    from spatial_replay.runs.record_video import FrameSource, KeepVideo
     from spatial_replay.simulation.world import Injection, Start
+
+
+def duration_ns(context: click.Context, parameter: click.Parameter, text: str | None) -> int | None:
+    """Return the value of an option that is a duration, in nanoseconds."""
+    if text is None:
+        return None
+    with naming_option(parameter.opts[0]):
+        return duration_ns_from_text(text)
+
+
+@click.command()
+@click.argument("sources", metavar="[FILE|LOG]...", type=LogPath(), nargs=-1)
+@click.option("--camera", metavar="N", type=click.IntRange(0), help="Camera of this machine, such as 0.")
+@click.option(
+    "--topic",
+    "topics",
+    metavar="TOPIC",
+    multiple=True,
+    help="Of a log: its topic with images or AprilTag detections; repeat for several cameras.  [default: the"
+    " only one]",
+)
+@click.option(
+    "--offset",
+    "offsets",
+    metavar="NAME=T",
+    multiple=True,
+    help="Of several cameras: shift the stamps of a video or topic, such as right.mp4=0.12s, or by its"
+    " number, 2=-40ms.",
+)
+@click.option(
+    "--tags",
+    "tags_file",
+    metavar="TAGS",
+    type=LogPath(),
+    required=True,
+    help="Tags file (YAML): which tag is on which object, and where the plane is.",
+)
+@log_output_option("Log to write (MCAP).")
+@overwrite_option
+@durability_option
+@specs_option("Specification to evaluate while recording; repeat for several.")
+@constants_option
+@profile_option
+@click.option(
+    "--keep-video",
+    "keep",
+    type=click.Choice(["copy", "h264", "none"]),
+    help="Keep the picture as it came, encode it as H.264, or leave it out."
+    "  [default: copy where possible, else h264]",
+)
+@click.option(
+    "--hold",
+    "hold_ns",
+    metavar="T",
+    callback=duration_ns,
+    help="Keep a hidden object where it was for so long, ever less certain, such as 200ms."
+    "  [default: hold of the tags file, or 0s]",
+)
+@click.option(
+    "--rate", metavar="HZ", type=float, help="Frames a second of a video, instead of its own stamps."
+)
+@click.option(
+    "--for", "length_ns", metavar="T", callback=duration_ns, help="Of a camera: end after so much time."
+)
+def video(
+    sources: tuple[LogFile, ...],
+    camera: int | None,
+    topics: tuple[str, ...],
+    offsets: tuple[str, ...],
+    tags_file: LogFile,
+    output: Path,
+    overwrite: bool,
+    durability: Durability,
+    specs: tuple[LogFile, ...],
+    constants: Mapping[str, float | str],
+    profile: str | None,
+    keep: KeepVideo | None,
+    hold_ns: int | None,
+    rate: float | None,
+    length_ns: int | None,
+) -> int:
+    """Record the tagged objects that a camera saw, with verdicts as they change.
+
+    Reads a video file, a topic of a log with images or AprilTag detections, or a camera of this machine.
+    Objects carry AprilTags; the tags file says which. Every footprint comes with its uncertainty, so that
+    a verdict near a threshold is unknown rather than guessed. Several videos or topics are cameras that
+    see the same scene: their frames of one time make one sample. Needs the extra `vision`.
+
+    Exits with 0 if all specifications are satisfied, 1 if any is violated, 4 if none is violated and any is
+    unknown, 3 if the video is damaged: what was recorded up to then is whole.
+
+    \b
+    Examples:
+      spatial-replay record video table.mp4 --tags tags.yaml --spec table.spatial -o run.mcap
+      spatial-replay record video left.mp4 right.mp4 --tags tags.yaml -o run.mcap --offset right.mp4=0.12s
+      spatial-replay record video drive.bag --topic /camera/image_raw --tags tags.yaml -o run.mcap
+      spatial-replay record video --camera 0 --tags tags.yaml --spec table.spatial -o run.mcap --for 60s
+    """
+    # imported here so that --help stays fast
+    from spatial_replay.logs.output_file import refuse_existing
+    from spatial_replay.perception.observer import camera_names
+    from spatial_replay.perception.tags_file import load_tags
+    from spatial_replay.runs.record_video import record_seen
+
+    if bool(sources) == (camera is not None):
+        raise UsageError("give either videos or a log, or --camera N")
+    if length_ns is not None and camera is None:
+        raise UsageError("--for ends a run with --camera; leave it out")
+    if camera is not None and not overwrite:
+        refuse_existing(output)
+    files = load_spec_options(specs, profile, constants)
+    show_diagnostics(warning for file in files for warning in file.warnings)
+    tags = load_tags(tags_file)
+    cameras = _opened(sources, camera, topics, rate, length_ns)
+    offsets_ns = _offsets_ns(offsets, camera_names(cameras))
+    first_ns: list[int] = []
+
+    def show_change(change: VerdictChange) -> None:
+        show(change_line(change, first_ns[0] if first_ns else change.time_ns))
+
+    given = [*sources, tags_file, *specs]
+    with progress("frames") as advance:
+        seen = record_seen(
+            cameras,
+            tags,
+            output,
+            files,
+            offsets_ns=offsets_ns,
+            hold_ns=hold_ns,
+            keep=keep,
+            inputs=local_files(given),
+            begin=first_ns.append,
+            show=show_change,
+            advance=advance,
+            durability=durability,
+        )
+    warn(*seen.remarks, *seen.faults)
+    show(f"wrote {output}: {counted(seen.samples, 'sample')} over {seen.seconds:.3f} s")
+    for name, fit in seen.fits:
+        if fit is not None:
+            number, off = fit.worst
+            where = f" in {name}" if len(seen.fits) > 1 else ""
+            fits = f"reference tags fit within {fit.rms:.2f} pixels{where}"
+            show(f"{fits}; tag {number} is off most, by {off:.2f}")
+    show(*ending_lines(seen.endings))
+    verdicts = [str(each.verdict) for each in seen.endings]
+    return exit_code_from_verdicts(verdicts or ["satisfied"], damaged=bool(seen.faults))
+
+
+def _opened(
+    sources: Sequence[LogFile],
+    camera: int | None,
+    topics: Sequence[str],
+    rate: float | None,
+    length_ns: int | None,
+) -> list[FrameSource]:
+    from spatial_replay.perception.image_sources import CameraFrames, open_frames
+
+    if camera is None:
+        if len(sources) > 1 and topics:
+            raise UsageError(
+                "--topic names topics of one log; give that log alone, or videos without --topic"
+            )
+        if len(set(topics)) < len(topics) or len({str(source) for source in sources}) < len(sources):
+            raise UsageError("a video or topic is given twice; each camera counts once")
+        wanted: list[str | None] = [*topics] or [None] * len(sources)
+        each_source = [*sources] * len(topics) if topics else sources
+        opened = [
+            open_frames(source, topic=topic, rate=rate)
+            for source, topic in zip(each_source, wanted, strict=True)
+        ]
+        warn(*(each.remark for each in opened if each.remark is not None))
+        return [*opened]
+    for option, is_given in (("--topic", bool(topics)), ("--rate", rate is not None)):
+        if is_given:
+            raise UsageError(f"{option} does not apply to a camera; leave it out")
+    return [CameraFrames(camera, length_ns=length_ns)]
+
+
+def _offsets_ns(texts: Sequence[str], names: Sequence[str]) -> list[int]:
+    """Return by how much the stamps of each camera are shifted, so that none is before the start."""
+    offsets = [0] * len(names)
+    for text in texts:
+        name, _, value = text.rpartition("=")
+        places = [place for place, each in enumerate(names, 1) if name in (each, str(place))]
+        if len(places) != 1:
+            listed = ", ".join(f"{place} ({each})" for place, each in enumerate(names, 1))
+            what = "is no camera" if not places else "is the name of several cameras"
+            raise UsageError(
+                f"--offset {text}: {name or text!r} {what}; write the number and a time: {listed}"
+            )
+        with naming_option("--offset"):
+            duration_ns = duration_ns_from_text(value.removeprefix("-"))
+        offsets[places[0] - 1] = -duration_ns if value.startswith("-") else duration_ns
+    return [offset - min(0, *offsets) for offset in offsets]
+
 
 SCENARIOS: Mapping[str, str] = MappingProxyType(
     {

@@ -10,8 +10,7 @@ import click
 
 from spatial_replay.cli.application import ExitCode
 from spatial_replay.cli.options import LogPath, log_output_option
-from spatial_replay.cli.progress import progress
-from spatial_replay.cli.terminal import show, warn
+from spatial_replay.cli.terminal import progress, show, warn
 from spatial_replay.logs.remote import LogFile
 from spatial_replay.text import counted, time_text
 

@@ -17,7 +17,7 @@ from spatial_replay.cli.options import (
     warn_of_input,
 )
 from spatial_replay.cli.output import print_verdicts
-from spatial_replay.cli.progress import progress
+from spatial_replay.cli.terminal import progress
 
 if TYPE_CHECKING:
     from spatial_replay.monitor.semantics import Semantics

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from spatial_replay.cli.batch_output import print_totals, print_worst, write_json_lines
+from spatial_replay.cli.batch import print_totals, print_worst, write_json_lines
 from spatial_replay.cli.terminal import show
 
 if TYPE_CHECKING:

@@ -9,15 +9,16 @@ import click
 from spatial_replay.cli.application import ExitCode
 from spatial_replay.cli.options import (
     EvaluationArguments,
+    ServingArguments,
     evaluation_options,
     keep_option,
     open_inputs,
     semantics_option,
+    serving_options,
     warn_of_input,
 )
 from spatial_replay.cli.output import print_verdicts
 from spatial_replay.cli.terminal import show, show_file
-from spatial_replay.cli.viewer_options import ServingArguments, serving_options
 from spatial_replay.cli.watching import files_to_watch, follow_saves, load_log, watch_option
 
 if TYPE_CHECKING:

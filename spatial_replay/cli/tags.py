@@ -11,8 +11,7 @@ import click
 
 from spatial_replay.cli.application import ExitCode
 from spatial_replay.cli.options import LogPath, output_option
-from spatial_replay.cli.progress import progress
-from spatial_replay.cli.terminal import show, show_file, warn
+from spatial_replay.cli.terminal import progress, show, show_file, warn
 from spatial_replay.errors import OutputError, UsageError
 from spatial_replay.logs.remote import LogFile, local_files
 from spatial_replay.text import counted

@@ -22,8 +22,7 @@ from spatial_replay.cli.options import (
     profile_option,
     reading_options,
 )
-from spatial_replay.cli.progress import progress
-from spatial_replay.cli.terminal import show, show_diagnostics, show_json
+from spatial_replay.cli.terminal import progress, show, show_diagnostics, show_json
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.downloads import local_copy
 from spatial_replay.logs.remote import LogFile, is_address

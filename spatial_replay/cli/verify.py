@@ -8,8 +8,7 @@ import click
 
 from spatial_replay.cli.application import ExitCode
 from spatial_replay.cli.options import LogPath, ReadArguments, reading_options
-from spatial_replay.cli.progress import progress
-from spatial_replay.cli.terminal import show, warn
+from spatial_replay.cli.terminal import progress, show, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import LogFile, local_files
 from spatial_replay.text import counted, counted_from

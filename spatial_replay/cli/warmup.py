@@ -6,8 +6,7 @@ import os
 
 import click
 
-from spatial_replay.cli.progress import progress
-from spatial_replay.cli.terminal import show
+from spatial_replay.cli.terminal import progress, show
 from spatial_replay.errors import OutputError
 
 

@@ -15,8 +15,7 @@ import click
 from spatial_replay.cli.application import ExitCode, report_error
 from spatial_replay.cli.options import EvaluationArguments, EvaluationInputs, open_inputs, warn_of_input
 from spatial_replay.cli.output import print_verdicts
-from spatial_replay.cli.progress import progress
-from spatial_replay.cli.terminal import show, show_diagnostics
+from spatial_replay.cli.terminal import progress, show, show_diagnostics
 from spatial_replay.errors import MissingFileError, SpatialReplayError, SpecificationError
 from spatial_replay.logs.downloads import local_copy
 

@@ -158,7 +158,7 @@ def test_a_shell_completes_commands_and_options(tmp_path: Path) -> None:
 
 _WORK = """
 import sys, time
-from spatial_replay.cli.progress import progress
+from spatial_replay.cli.terminal import progress
 with progress("samples", total=3) as advance:
     for _ in range(3):
         time.sleep({pause})
@@ -175,7 +175,7 @@ def test_long_work_shows_a_bar_on_a_terminal_and_short_work_nothing(tmp_path: Pa
 
 
 def test_a_slow_first_step_already_shows_the_bar(tmp_path: Path) -> None:
-    work = "import time\nfrom spatial_replay.cli.progress import progress\n"
+    work = "import time\nfrom spatial_replay.cli.terminal import progress\n"
     work += "with progress('samples'):\n    time.sleep(2.5)\n"
     assert "samples" in standard_error_on_terminal((sys.executable, "-c", work), tmp_path, {})
 
@@ -194,7 +194,7 @@ def test_long_work_shows_nothing_in_a_pipe(tmp_path: Path) -> None:
 
 _COMPILED = """
 import time
-from spatial_replay.cli.progress import progress
+from spatial_replay.cli.terminal import progress
 from spatial_replay.compiled import compile_ahead, kernel
 
 @kernel
