@@ -53,8 +53,8 @@ def _notebook() -> Any:
 
 
 def data_frame(value: object) -> Any:
-    """Return results as a pandas DataFrame; see `spatial_replay.notebook.data_frame`."""
-    return import_module("spatial_replay.notebook.data_frame").data_frame(value)
+    """Return results as a pandas DataFrame; see `spatial_replay.notebook.evaluation_view`."""
+    return import_module("spatial_replay.notebook.evaluation_view").data_frame(value)
 
 
 def drawn_as_svg(value: Displayed) -> str | None:

@@ -234,6 +234,6 @@ def _row(constant: TunedConstant) -> tuple[str, str, str, str]:
 
 
 def _write_picture(tuning: Tuning, output: Path) -> None:
-    from spatial_replay.notebook.tuning_view import write_surface
+    from spatial_replay.notebook.study_view import write_surface
 
     write_surface(tuning, output)

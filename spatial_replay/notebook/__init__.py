@@ -17,19 +17,19 @@ from spatial_replay.errors import UsageError
 _VIEWS: Mapping[str, str] = MappingProxyType(
     {
         "spatial_replay.automata.automaton": "automaton_view",
-        "spatial_replay.compare.runs": "diff_view",
-        "spatial_replay.compare.specifications": "diff_view",
+        "spatial_replay.compare.runs": "study_view",
+        "spatial_replay.compare.specifications": "study_view",
         "spatial_replay.falsification.failures": ".falsification.failures",
-        "spatial_replay.learning.learned": "learned_view",
+        "spatial_replay.learning.learned": "study_view",
         "spatial_replay.monitor.evaluate": "evaluation_view",
         "spatial_replay.monitor.result": "evaluation_view",
         "spatial_replay.planning.decisions": "planning_view",
         "spatial_replay.planning.maps": "planning_view",
         "spatial_replay.planning.read": "planning_view",
-        "spatial_replay.sanity.examine": "examination_view",
-        "spatial_replay.spec.formula": "specification_view",
-        "spatial_replay.trace.trace": "trace_view",
-        "spatial_replay.tuning.tuned": "tuning_view",
+        "spatial_replay.sanity.examine": "study_view",
+        "spatial_replay.spec.formula": "evaluation_view",
+        "spatial_replay.trace.trace": "evaluation_view",
+        "spatial_replay.tuning.tuned": "study_view",
     }
 )
 """The view that registers the types of a module, relative to this package; a room above has its own."""

@@ -1,22 +1,27 @@
-"""Evaluations in notebooks: verdicts with trees of final numbers, and robustness as curves over time."""
+"""Formulas, traces and evaluations in notebooks: as HTML, as figures and as tables."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from functools import singledispatch
 from itertools import islice
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
+from spatial_replay.annotate.rings import outlines_of, rings_of
 from spatial_replay.annotate.specification import unit_of, unit_words
-from spatial_replay.errors import UsageError
-from spatial_replay.geometry.arrays import Floats
+from spatial_replay.errors import UsageError, importing
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.monitor.atoms.terms import footprint_from_outline
 from spatial_replay.monitor.evaluate import Evaluation
 from spatial_replay.monitor.result import SpecResult, worst_first
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.notebook import html, plot
 from spatial_replay.notebook.figures import (
+    INK,
     Html,
+    code,
     element,
     folded,
     new_panel,
@@ -26,14 +31,305 @@ from spatial_replay.notebook.figures import (
     table,
     verdict_mark,
 )
-from spatial_replay.notebook.specification_view import tree_cell
 from spatial_replay.palette import CURVES, NEGATIVE, NEUTRAL, POSITIVE, hexadecimal
-from spatial_replay.spec.format import iter_branches
-from spatial_replay.spec.formula import iter_nodes
-from spatial_replay.text import counted, with_unit
+from spatial_replay.spec.format import iter_branches, label_of, title_of
+from spatial_replay.spec.formula import Formula, NamedSpec, Specification, iter_nodes, operands_of
+from spatial_replay.text import counted, time_text, with_unit
+from spatial_replay.trace.trace import Trace
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+
+_MOST_FORMULAS: Final = 200
+"""The most nodes in a table."""
+_MOST_DRAWN: Final = 60
+"""The most nodes in a figure."""
+_DEEPEST: Final = 40
+"""The most levels that a table indents."""
+_ROW_GAP: Final = 0.6
+"""Distance of two trees in a figure, in rows."""
+_PAPER: Final = (0.95, 0.95, 0.95)
+
+
+@html.register(Specification)
+def specification_html(specification: Specification) -> Html:
+    """Return the declarations of a specification, and the trees of its results."""
+    title = element("b", specification.filename)
+    results = specification.results
+    about = quiet(f" {counted(len(results), 'result')}, profile {specification.profile}")
+    kinds = ("constants", "regions", "groups")
+    names = {kind: ", ".join(getattr(specification, kind)) for kind in kinds}
+    declared = [element("div", f"{kind}: {listed}") for kind, listed in names.items() if listed]
+    warnings = [element("div", f"warning: {each.message}") for each in specification.warnings[:5]]
+    return element("div", element("div", title, about), *declared, _formula_trees(results), *warnings)
+
+
+def _formula_trees(results: Sequence[NamedSpec]) -> Html:
+    """Return the trees one below the other, up to the most nodes."""
+    left = _MOST_FORMULAS
+    rows: list[tuple[str]] = []
+    for spec in results:
+        shown = [(tree_cell(stem, node),) for _, stem, node in islice(iter_branches(spec.formula), left)]
+        left -= len(shown)
+        rows += shown
+    return element("div", table(["tree"], rows), _left_out(results, len(rows)))
+
+
+def tree_cell(stem: str, node: Formula) -> Html:
+    """Return a node of a tree, with its name in bold."""
+    indented = stem if len(stem) <= 3 * _DEEPEST else "⋯" + stem[-3:]
+    name = [] if node.name is None else [element("b", node.name), " = "]
+    return code(indented, *name, title_of(node))
+
+
+def _left_out(results: Sequence[NamedSpec], shown: int) -> Html:
+    nodes = _size(results)
+    return quiet(f"… and {counted(nodes - shown, 'node')} more") if shown < nodes else Html("")
+
+
+class _Place(NamedTuple):
+    """The position of a node, in levels to the right and rows down, and that of its parent."""
+
+    node: Formula
+    x: float
+    y: float
+    above: tuple[float, float] | None
+
+
+@plot.register(Specification)
+def draw_specification(specification: Specification, ax: Axes | None = None) -> Axes:
+    """Draw the trees of a specification's results, roots to the left.
+
+    Raises:
+        UsageError: matplotlib is not installed.
+    """
+    places = list(_places(specification.results))
+    rows = 1 + max((place.y for place in places), default=0.0)
+    levels = 1 + max((place.x for place in places), default=0.0)
+    if ax is None:
+        ax = new_panel((min(3.0 + 0.85 * levels, 14.0), 0.6 + 0.32 * rows))
+    ax.set_axis_off()
+    ax.set_xlim(-0.2, levels + 2.5)
+    ax.set_ylim(rows - 0.4, -0.9)
+    for place in places:
+        if place.above is not None:
+            (x, y), bend = place.above, place.x - 0.5
+            ax.plot([x, bend, bend, place.x], [y, y, place.y, place.y], color=NEUTRAL, linewidth=1, zorder=1)
+        _draw_node(ax, place)
+    nodes = _size(specification.results)
+    more = f", the first {len(places)} of {counted(nodes, 'node')}" if len(places) < nodes else ""
+    ax.set_title(plain(specification.filename + more), loc="left", fontsize=10)
+    return ax
+
+
+def _places(results: Sequence[NamedSpec]) -> Iterator[_Place]:
+    """Iterate over the positions of the first nodes, one tree below the other."""
+    left, first_row = _MOST_DRAWN, 0.0
+    for spec in results:
+        nodes = list(islice(iter_nodes(spec.formula), left))
+        left -= len(nodes)
+        rows, used = _rows([parent for _, parent, _ in nodes], first_row)
+        first_row += used + _ROW_GAP
+        levels: list[int] = []
+        for identifier, parent, node in nodes:
+            levels.append(0 if parent is None else levels[parent] + 1)
+            above = None if parent is None else (float(levels[parent]), rows[parent])
+            yield _Place(node, float(levels[identifier]), rows[identifier], above)
+
+
+def _rows(parents: Sequence[int | None], first_row: float) -> tuple[list[float], int]:
+    """Return the row of each node, leaves one by one and parents amid their children; and how many rows."""
+    below: list[list[int]] = [[] for _ in parents]
+    for identifier, parent in enumerate(parents):
+        if parent is not None:
+            below[parent].append(identifier)
+    rows = [0.0] * len(parents)
+    leaves = [identifier for identifier, operands in enumerate(below) if not operands]
+    for number, leaf in enumerate(leaves):
+        rows[leaf] = first_row + number
+    # parents come before their children, so that in reverse all children have their row
+    for identifier in reversed(range(len(parents))):
+        if below[identifier]:
+            rows[identifier] = (rows[below[identifier][0]] + rows[below[identifier][-1]]) / 2
+    return rows, len(leaves)
+
+
+def _draw_node(ax: Axes, place: _Place) -> None:
+    node = place.node
+    box = {"boxstyle": "round,pad=0.3", "facecolor": _PAPER, "edgecolor": NEUTRAL, "linewidth": 0.8}
+    is_leaf = not operands_of(node)
+    ax.text(
+        place.x, place.y, plain(label_of(node) if is_leaf else title_of(node)),
+        ha="left" if is_leaf else "center", va="center", fontsize=8.5, color=INK, bbox=box, zorder=2,
+    )  # fmt: skip
+    if node.name is not None and not is_leaf:
+        ax.text(
+            place.x, place.y - 0.36, plain(node.name),
+            ha="center", va="bottom", fontsize=8, fontweight="bold", zorder=2,
+        )  # fmt: skip
+
+
+def _size(results: Sequence[NamedSpec]) -> int:
+    return sum(1 for spec in results for _ in iter_nodes(spec.formula))
+
+
+_MOST_ROWS: Final = 40
+_MOST_POINTS: Final = 2_000
+"""The most objects of a cell's table, and points of a trail."""
+
+_MOST_LABELS: Final = 25
+_NAME_SIZE: Final = 8.0
+"""Of the names of objects, in points."""
+_STEPS: Final = (0.0, 1.2, -1.2, 2.4, -2.4, 3.6, -3.6, 4.8, -4.8)
+"""How far a name may be above its place, in multiples of its size."""
+
+
+@html.register(Trace)
+def trace_html(trace: Trace) -> Html:
+    """Return how long a trace is, and in how many samples each object is."""
+    counts = (trace.rows >= 0).sum(axis=0).tolist()
+    rows = [(name, f"{count:,}") for name, count in zip(trace.names, counts, strict=True) if count]
+    more = [quiet(f"… and {len(rows) - _MOST_ROWS:,} objects more")] if len(rows) > _MOST_ROWS else []
+    return element(
+        "div", element("b", _trace_title(trace)), table(("object", "samples"), rows[:_MOST_ROWS]), *more
+    )
+
+
+@plot.register(Trace)
+def draw_trace(trace: Trace, ax: Axes | None = None, specification: Specification | None = None) -> Axes:
+    """Draw the scene from above: each object's outline at its start (dashed) and end (filled), and its trail.
+
+    Args:
+        ax: axes to draw into; new ones without.
+        specification: whose regions are drawn, too.
+
+    Raises:
+        UsageError: matplotlib is not installed.
+    """
+    ax = new_panel((6.0, 6.0)) if ax is None else ax
+    ax.set_aspect("equal")
+    for name, outline in ({} if specification is None else specification.regions).items():
+        for ring in outlines_of(footprint_from_outline(outline)):
+            ax.fill(*ring.T, facecolor=NEUTRAL, alpha=0.15, edgecolor=NEUTRAL, linewidth=1.0)
+            right, top = ring.max(axis=0).tolist()
+            ax.text(right, top, plain(name), fontsize=8, ha="right", va="bottom")
+    ends: list[tuple[float, float, str]] = []
+    shown = [column for column in range(len(trace.names)) if (trace.rows[:, column] >= 0).any()]
+    for number, column in enumerate(shown):
+        rows = trace.rows[:, column]
+        rows = rows[rows >= 0]
+        colour = CURVES[number % len(CURVES)]
+        kept = rows[np.unique(np.linspace(0, len(rows) - 1, _MOST_POINTS).astype(np.int64))]
+        ax.plot(*_centres(trace, kept).T, color=colour, linewidth=1.0)
+        for ring in _rings(trace, rows[:1]):
+            ax.fill(*ring.T, facecolor="none", edgecolor=colour, linestyle="--", linewidth=1.0)
+        for ring in _rings(trace, rows[-1:]):
+            ax.fill(*ring.T, facecolor=colour, edgecolor=colour, alpha=0.5)
+        if len(shown) <= _MOST_LABELS:
+            [(x, y)] = _centres(trace, rows[-1:]).tolist()
+            ends.append((x, y, plain(trace.names[column])))
+    _write_names(ax, ends)
+    unit = plain(trace.units.get("", "footprint units"))
+    ax.set_xlabel(f"x [{unit}]")
+    ax.set_ylabel(f"y [{unit}]")
+    ax.set_title(plain(_trace_title(trace)), loc="left", fontsize=10)
+    return ax
+
+
+def _write_names(ax: Axes, ends: Sequence[tuple[float, float, str]]) -> None:
+    """Write names at places (x, y, name), each above or below its place if another one is there already."""
+    ax.apply_aspect()
+    inches = ax.transData + ax.figure.dpi_scale_trans.inverted()
+    taken: list[tuple[float, float, float]] = []
+    for x, y, name in ends:
+        across, up = (72.0 * inches.transform((x, y))).tolist()
+        half = 0.3 * _NAME_SIZE * len(name)
+        for step in _STEPS:
+            is_free = all(
+                abs(across - other) > half + other_half or abs(up + step * _NAME_SIZE - row) >= _NAME_SIZE
+                for other, row, other_half in taken
+            )
+            if is_free:
+                break
+        taken.append((across, up + step * _NAME_SIZE, half))
+        ax.annotate(
+            name,
+            (x, y),
+            (0.0, step * _NAME_SIZE),
+            textcoords="offset points",
+            fontsize=_NAME_SIZE,
+            ha="center",
+            va="center",
+        )
+
+
+def _trace_title(trace: Trace) -> str:
+    if not len(trace):
+        return "no samples"
+    span = time_text(int(trace.times_ns[-1]), int(trace.times_ns[0]))
+    return f"{counted(len(trace), 'sample')} over {span}"
+
+
+def _rings(trace: Trace, rows: Integers) -> tuple[Floats, ...]:
+    """Return the outlines of one observation."""
+    return rings_of(trace.footprints.select(rows), 0.0).rings_of(0)
+
+
+def _centres(trace: Trace, rows: Integers) -> Floats:
+    """Return (R, 2) the middle of each observation's bounding box."""
+    rings = rings_of(trace.footprints.select(rows), 0.0)
+    begins = np.asarray(rings.start)[: len(rows)]
+    low, high = (reduce.reduceat(rings.points, begins, axis=0) for reduce in (np.minimum, np.maximum))
+    return np.asarray((low + high) / 2.0)
+
+
+_TIMES: Final = ("first_satisfied_ns", "violated_at_ns", "satisfied_at_ns")
+_COLUMNS: Final = ("name", "object", "verdict", "robustness", "lower", "upper", *_TIMES)
+
+
+@singledispatch
+def data_frame(value: Any) -> Any:
+    """Return a value as a DataFrame.
+
+    Raises:
+        UsageError: pandas is not installed, or what it would hold was not kept.
+    """
+    raise UsageError(f"there is no DataFrame of a {type(value).__name__}")
+
+
+@data_frame.register
+def _of_evaluation(evaluation: Evaluation) -> Any:
+    """Return a row for each result."""
+    pandas = _pandas()
+    rows = [[getattr(each, name) for name in _COLUMNS] for each in evaluation.results]
+    frame = pandas.DataFrame(rows, columns=list(_COLUMNS))
+    # times are whole numbers, or missing
+    return frame.astype({"verdict": str} | dict.fromkeys(_TIMES, "Int64"))
+
+
+@data_frame.register
+def _of_result(result: SpecResult) -> Any:
+    """Return a row for each sample, and four columns for each node."""
+    pandas = _pandas()
+    if not result.has_series:
+        raise UsageError(
+            f"the numbers of each sample of {result.title!r} were not kept; evaluate() keeps them"
+        )
+    columns = {"seconds": (result.times_ns - result.times_ns[:1]) / 1e9}
+    names = [node.name or f"{node.id}: {node.text}" for node in result.nodes]
+    for name, node in zip(names, result.nodes, strict=True):
+        title = name if names.count(name) == 1 else f"{node.id}: {name}"
+        for quantity in ("value", "now", "lower", "upper"):
+            columns[f"{title} {quantity}"] = np.array(getattr(node, quantity))
+    return pandas.DataFrame(columns, index=pandas.Index(np.array(result.times_ns), name="time_ns"))
+
+
+def _pandas() -> Any:
+    with importing("a DataFrame needs pandas", extra="notebook"):
+        import pandas
+    return pandas
+
 
 _MOST_RESULTS: Final = 50
 _MOST_NODES: Final = 300

@@ -15,10 +15,9 @@ from spatial_replay.monitor.result import SpecResult
 from spatial_replay.notebook.figures import Html, element
 from spatial_replay.replay.selection import ReplayOptions
 from spatial_replay.report.compact import json_text
-from spatial_replay.report.contents import RunReport
-from spatial_replay.report.data import page_data
+from spatial_replay.report.data import RunReport, page_data
 from spatial_replay.report.page import chip, document, panel, sentence_html, text
-from spatial_replay.report.tree_panel import shown_nodes
+from spatial_replay.report.panels import shown_nodes
 from spatial_replay.report.write import refuse_output, report_of
 from spatial_replay.spec.formula import Specification
 from spatial_replay.text import Instant, Sentence

@@ -22,9 +22,8 @@ from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.notebook.figures import Html, element
 from spatial_replay.palette import NEGATIVE, NEUTRAL, POSITIVE, hexadecimal
 from spatial_replay.report.compact import json_text, sentence_parts
-from spatial_replay.report.contents import MANY, ReportedResult, RunReport
-from spatial_replay.report.data import page_data
-from spatial_replay.report.tree_panel import final_text
+from spatial_replay.report.data import MANY, ReportedResult, RunReport, page_data
+from spatial_replay.report.panels import final_text
 from spatial_replay.spec.formula import iter_nodes
 from spatial_replay.spec.units import declared_unit, units_text
 from spatial_replay.text import Instant, Sentence, counted, printable

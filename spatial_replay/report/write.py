@@ -29,13 +29,17 @@ from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.monitor.witness.witness import Witness, WitnessStep
 from spatial_replay.replay.engine import Replay, Replayed
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions
-from spatial_replay.report.automaton_panel import StatePath, StatePathCollector
-from spatial_replay.report.contents import Pointer, ReportedResult, RunReport, worst_results
-from spatial_replay.report.decision_panel import DecisionCollector
-from spatial_replay.report.event_panel import ReportedEvent, event_of
+from spatial_replay.report.data import Pointer, ReportedResult, RunReport, worst_results
 from spatial_replay.report.page import page
-from spatial_replay.report.picture_panel import pictures_of
-from spatial_replay.report.scene_panel import SceneCollector
+from spatial_replay.report.panels import (
+    DecisionCollector,
+    ReportedEvent,
+    SceneCollector,
+    StatePath,
+    StatePathCollector,
+    event_of,
+    pictures_of,
+)
 from spatial_replay.spec.formula import Formula, Quantified, Specification, iter_nodes
 from spatial_replay.spec.relations import RELATION_NAMES
 from spatial_replay.spec.units import units_of

@@ -1,0 +1,893 @@
+"""Panels of a report: their facts as JSON, from a replay."""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from foxglove_schemas_protobuf.Event_pb2 import Event
+from foxglove_schemas_protobuf.Grid_pb2 import Grid
+from google.protobuf.message import DecodeError
+from numpy.typing import NDArray
+
+from spatial_replay.annotate.requirements import requirements_of
+from spatial_replay.annotate.scene.scene_frames import (
+    SHADES,
+    DrawnEntity,
+    DrawnViolation,
+    SceneFrame,
+    SceneFrames,
+)
+from spatial_replay.annotate.scene.scene_template import REGION
+from spatial_replay.annotate.specification import unit_of
+from spatial_replay.automata.automaton import Automaton
+from spatial_replay.automata.text import abbreviated, draw_automaton, meanings
+from spatial_replay.bags.open import is_log, open_messages
+from spatial_replay.errors import LogError, UsageError
+from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.logs.remote import LogFile
+from spatial_replay.logs.schemas.PlanDecision_pb2 import (
+    PlanCandidate,
+    PlanDecision,
+    PlanEdge,
+    PlanGuard,
+    PlanTarget,
+)
+from spatial_replay.logs.source import Source
+from spatial_replay.logs.topics import CAMERA_VIDEO, is_image_type
+from spatial_replay.monitor.result import SpecResult
+from spatial_replay.monitor.sentences import divisor_of
+from spatial_replay.monitor.verdict import final_verdict
+from spatial_replay.perception.frame import Image
+from spatial_replay.perception.image_sources import ImageTopic
+from spatial_replay.perception.opencv import encode_jpeg
+from spatial_replay.planning.decision_log import decision_from_payload, latest_decisions, map_fields
+from spatial_replay.planning.decisions import Reason, candidate_lines, cause_text
+from spatial_replay.report.compact import Packing, sentence_parts, singles
+from spatial_replay.spec.format import format_formula
+from spatial_replay.spec.formula import Boolean, Formula, Temporal, iter_nodes, operands_of, operator_of
+from spatial_replay.text import number_text, with_unit
+
+MOST_NODES: Final = 400
+"""Nodes of a tree that a page shows, at most."""
+_LONGEST: Final = 400
+"""Characters after which the text of a node is cut."""
+_PLACE: Final = "…"
+
+
+def shown_nodes(formula: Formula) -> tuple[int, ...]:
+    """Return the ids of the nodes on the page, in order: all of them or, of a large tree, the uppermost."""
+    nodes = list(iter_nodes(formula))
+    if len(nodes) <= MOST_NODES:
+        return tuple(range(len(nodes)))
+    depth: list[int] = []
+    for _, parent, _ in nodes:
+        depth.append(0 if parent is None else depth[parent] + 1)
+    uppermost = sorted(range(len(nodes)), key=lambda identifier: (depth[identifier], identifier))
+    return tuple(sorted(uppermost[:MOST_NODES]))
+
+
+def initial_nodes(formula: Formula) -> frozenset[int]:
+    """Return the ids of the nodes that count at the first sample only: no temporal operator is above them."""
+    initial: set[int] = set()
+    formulas: list[Formula] = []
+    for identifier, parent, node in iter_nodes(formula):
+        formulas.append(node)
+        if parent is None or (parent in initial and not isinstance(formulas[parent], Temporal)):
+            initial.add(identifier)
+    return frozenset(initial)
+
+
+def tree_value(
+    formula: Formula,
+    robustness: Floats,
+    final: Floats,
+    relations: frozenset[str],
+    units: Mapping[str, str],
+    calls: Mapping[int, str],
+) -> list[Mapping[str, Any]]:
+    """Return the shown nodes, each with its text and its final verdict.
+
+    Args:
+        formula: with the object that it is about in place of a template's parameter.
+        robustness: (N,), each node's value on the whole log.
+        final: (N, 2), lower and upper end of each node for the finished log.
+        units: those that are declared.
+        calls: of nodes that are a `def` with its arguments, as the file writes them.
+    """
+    shown, initial = shown_nodes(formula), initial_nodes(formula)
+    place = {identifier: index for index, identifier in enumerate(shown)}
+    return [
+        {
+            "id": identifier,
+            "parent": None if parent is None else place[parent],
+            "name": node.name or "",
+            "head": _cut(calls.get(identifier) or _head(node, relations)),
+            "text": _cut(format_formula(node, relations=relations)),
+            "unit": unit_of(node, units),
+            "divisor": divisor_of(node),
+            "initial": identifier in initial,
+            "verdict": str(final_verdict(*final[identifier].tolist())),
+            "value": final_text(float(robustness[identifier]), *final[identifier].tolist()),
+        }
+        for identifier, parent, node in iter_nodes(formula)
+        if identifier in place
+    ]
+
+
+def requirement_values(result: SpecResult, samples: Integers, packing: Packing) -> list[Mapping[str, Any]]:
+    """Return the requirements of a formula (see `annotate.requirements`) whose nodes are shown.
+
+    Args:
+        samples: (S,) indices of those that the page has.
+    """
+    place = {identifier: index for index, identifier in enumerate(shown_nodes(result.formula))}
+    settles = result.semantics == "ltlf"
+    return [
+        {
+            "node": place[requirement.node],
+            "is_condition": requirement.is_condition,
+            "is_invariant": requirement.is_invariant,
+            "obligation": requirement.obligation
+            and {"node": place[requirement.obligation.node], "sign": requirement.obligation.sign},
+            "standing": packing.add(requirement.standing(result.series, samples), "u1"),
+        }
+        for requirement in requirements_of(result.formula, result.object, settles=settles)
+        if requirement.node in place
+    ]
+
+
+def final_text(robustness: float, lower: float, upper: float, unit: str = "") -> str:
+    """Return a node's final robustness with its unit, or the ends of its interval."""
+    if math.isnan(robustness) or not (lower == upper == robustness):
+        if math.isnan(lower):
+            return "" if math.isnan(robustness) else with_unit(robustness, unit)
+        return f"{with_unit(lower, unit)} … {with_unit(upper, unit)}"
+    return with_unit(robustness, unit)
+
+
+def named_nodes(formula: Formula) -> tuple[int, ...]:
+    """Return the nodes that have curves: the root and the named nodes among those shown."""
+    shown = set(shown_nodes(formula))
+    return tuple(
+        identifier
+        for identifier, parent, node in iter_nodes(formula)
+        if identifier in shown and (parent is None or node.name)
+    )
+
+
+def series_of(series: Floats, formula: Formula, samples: Integers) -> Floats:
+    """Return the numbers (nodes, 4, samples) of the shown nodes at some samples."""
+    return np.asarray(series[list(shown_nodes(formula))][:, :, samples])
+
+
+def _head(node: Formula, relations: frozenset[str]) -> str:
+    """Return a node's text with dots for its operands."""
+    if isinstance(node, Boolean):
+        return operator_of(node)
+    text = format_formula(node, relations=relations)
+    for operand in _operand_texts(node, relations):
+        for written in (f"({operand})", operand):
+            if written in text:
+                text = text.replace(written, _PLACE, 1)
+                break
+    return text
+
+
+def _operand_texts(node: Formula, relations: frozenset[str]) -> Iterator[str]:
+    for operand in operands_of(node):
+        yield format_formula(operand, relations=relations)
+
+
+def _cut(text: str) -> str:
+    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1].rstrip()}…"
+
+
+@dataclass(frozen=True, eq=False)
+class StatePath:
+    """The states of a run after each of some samples.
+
+    Attributes:
+        times_ns: (T,) int64.
+        codes: (T,) int64, index into `sets`.
+        sets: states that the run may be in.
+    """
+
+    times_ns: Integers
+    codes: Integers
+    sets: tuple[tuple[int, ...], ...]
+
+
+class StatePathCollector:
+    """Collects the states of one result from its messages as they come."""
+
+    def __init__(self) -> None:
+        self._times_ns: list[Integers] = []
+        self._codes: list[Integers] = []
+        self._sets: dict[tuple[int, ...], int] = {}
+
+    def extend(self, times_ns: Integers, groups: Sequence[tuple[Integers, tuple[int, ...]]]) -> None:
+        """Take in the states after the next samples: places of samples, each time with their states."""
+        codes = [
+            np.full(len(places), self._sets.setdefault(states, len(self._sets))) for places, states in groups
+        ]
+        places = np.concatenate([places for places, _ in groups])
+        order = np.argsort(places)
+        self._times_ns.append(times_ns[places[order]])
+        self._codes.append(np.concatenate(codes)[order])
+
+    @property
+    def path(self) -> StatePath:
+        """The path so far."""
+        none = [np.empty(0, np.int64)]
+        times_ns, codes = (np.concatenate(none + each) for each in (self._times_ns, self._codes))
+        return StatePath(times_ns, codes, tuple(self._sets))
+
+
+def automaton_value(automaton: Automaton, path: StatePath, named: Callable[[str], str]) -> Mapping[str, Any]:
+    """Return an automaton as the page draws it: states with their places, transitions with their guards.
+
+    Args:
+        named: writes the object in place of a template's parameter.
+    """
+    visited = {state for states in path.sets for state in states}
+    drawing, short = draw_automaton(automaton, visited), abbreviated(automaton)
+    return {
+        "summary": drawing.summary,
+        "left_out": drawing.left_out,
+        "states": [
+            {
+                "number": state.number,
+                "at": (state.column, state.row),
+                "about": state.about,
+                "accepting": state.is_accepting,
+                "lost": state.is_lost,
+                "won": state.is_won,
+            }
+            for state in drawing.states
+        ],
+        # the same words on arrows, and the same legend, as in a drawing by Graphviz
+        "moves": [
+            {**move._asdict(), "guard": named(move.guard), "label": named(brief.guard)}
+            for move, brief in zip(drawing.moves, draw_automaton(short, visited).moves, strict=True)
+        ],
+        "legend": list(map(named, meanings(short))),
+    }
+
+
+MOST_EVENTS: Final = 2_000
+"""Events of a page, at most: the first ones."""
+
+
+class ReportedEvent(NamedTuple):
+    """One change.
+
+    Attributes:
+        start_ns: the first sample of what began.
+        facts: the metadata of the event, by key.
+    """
+
+    start_ns: int
+    facts: Mapping[str, str]
+
+
+def event_of(payload: bytes) -> ReportedEvent:
+    """Decode a message of /spatial/events."""
+    event = Event.FromString(payload)
+    facts = {each.key: each.value for each in event.metadata}
+    return ReportedEvent(event.start_time.ToNanoseconds(), facts)
+
+
+def event_values(events: Sequence[ReportedEvent], first_ns: int) -> list[Mapping[str, Any]]:
+    """Return the list as the page reads it, by start time."""
+    ordered = sorted(events, key=lambda each: each.start_ns)
+    return [
+        {
+            "time": (each.start_ns - first_ns) / 1e9,
+            "status": _status(each.facts),
+            "specification": each.facts.get("specification", ""),
+            "object": each.facts.get("object"),
+            "parts": sentence_parts(each.facts.get("message", "")),
+        }
+        for each in ordered[:MOST_EVENTS]
+    ]
+
+
+def _status(facts: Mapping[str, str]) -> str:
+    if "vacuous" in facts:
+        return "vacuous"
+    if facts.get("verdict") != "pending":
+        return facts.get("verdict", "")
+    return "holding" if facts.get("sign") == "positive" else "pending"
+
+
+MOST_PICTURES: Final = 60
+"""Pictures of a page, at most: those of what decided verdicts, and others at equal distances."""
+MOST_PICTURE_BYTES: Final = 1_500_000
+"""Characters of a page that its pictures take, at most."""
+
+_FORMS: Final = ((320, 70), (320, 45), (200, 45), (120, 40), (60, 30))
+"""Widths in pixels and qualities of JPEG, of which the first is taken that is small enough."""
+
+
+class ReportedPictures(NamedTuple):
+    """What the camera of a run saw.
+
+    Attributes:
+        topic: with the images; "" without any.
+        times_ns: of the pictures, increasing.
+        pictures: each as JPEG.
+        reason: why there is none though the log has images; "" otherwise.
+    """
+
+    topic: str = ""
+    times_ns: tuple[int, ...] = ()
+    pictures: tuple[bytes, ...] = ()
+    reason: str = ""
+
+
+NO_PICTURES: Final = ReportedPictures()
+"""Of a log without images."""
+
+
+def pictures_of(source: Source, start_ns: int, end_ns: int, decided_ns: Collection[int]) -> ReportedPictures:
+    """Return small pictures of what a log's camera saw from `start_ns` to `end_ns`.
+
+    Args:
+        decided_ns: samples whose pictures are among them, as far as there is room.
+    """
+    path = getattr(source, "path", None)
+    if not isinstance(path, LogFile) or (topic := _image_topic(path)) is None:
+        return NO_PICTURES
+    decided = sorted(decided_ns)[: MOST_PICTURES // 2]
+    others = np.linspace(start_ns, end_ns, MOST_PICTURES - len(decided)).astype(np.int64).tolist()
+    try:
+        frames = ImageTopic(path, topic).frames_at(sorted({*decided, *others}))
+        made = [(frame.time_ns, _small(frame.image)) for frame in frames]
+    except (LogError, UsageError) as error:
+        return ReportedPictures(topic, reason=f"The pictures of {topic} are not shown: {error}.")
+    if not made:
+        return ReportedPictures(topic, reason=f"No picture of {topic} can be decoded.")
+    times_ns, pictures = zip(*made, strict=True)
+    return ReportedPictures(topic, times_ns, pictures)
+
+
+def picture_values(seen: ReportedPictures, first_ns: int) -> Mapping[str, Any]:
+    """Return the pictures as the page reads them."""
+    return {
+        "topic": seen.topic,
+        "reason": seen.reason,
+        "times": [(time_ns - first_ns) / 1e9 for time_ns in seen.times_ns],
+        "pictures": [
+            f"data:image/jpeg;base64,{base64.b64encode(each).decode('ascii')}" for each in seen.pictures
+        ],
+    }
+
+
+def _image_topic(path: LogFile) -> str | None:
+    """Return the topic with images that a layout shows, too: our own, or else the first."""
+    if not is_log(path):
+        return None
+    try:
+        topics = [each.name for each in open_messages(path).topics() if is_image_type(each.type)]
+    except LogError:
+        # the replay has said how damaged it is
+        return None
+    return CAMERA_VIDEO if CAMERA_VIDEO in topics else next(iter(topics), None)
+
+
+def _small(image: Image) -> bytes:
+    most = MOST_PICTURE_BYTES * 3 // 4 // MOST_PICTURES - 64
+    data = b""
+    for width, quality in _FORMS:
+        data = encode_jpeg(image, width, quality)
+        if len(data) <= most:
+            break
+    return data
+
+
+MOST_FRAMES: Final = 3_000
+"""Frames of a page, at most."""
+MOST_CORNERS: Final = 2_000_000
+"""Corners of the outlines in all frames together, at most."""
+MOST_ARROWS: Final = 30_000
+"""Arrows in all frames together, at most: of so many results, the worst first, as may have one in each."""
+_ABSENT: Final = 65_535
+_STEPS: Final = 65_535
+"""Steps of a coordinate along each side of the scene: 16 bits, finer than any screen."""
+
+
+@dataclass(frozen=True, eq=False)
+class ReportedScene:
+    """Frames of a scene.
+
+    Attributes:
+        times_ns: (F,) int64.
+        stride: every how many messages there is a frame.
+    """
+
+    times_ns: Integers
+    frames: tuple[SceneFrame, ...]
+    stride: int
+
+    def at(self, times_ns: Integers) -> ReportedScene:
+        """Return the scene with its frames at some times only."""
+        is_kept = np.isin(self.times_ns, times_ns).tolist()
+        frames = tuple(frame for frame, kept in zip(self.frames, is_kept, strict=True) if kept)
+        return replace(self, times_ns=self.times_ns[is_kept], frames=frames)
+
+
+class SceneCollector:
+    """Collects frames as they come; if there are too many, it drops every other one."""
+
+    def __init__(self) -> None:
+        self._frames: list[tuple[int, SceneFrame]] = []
+        self._count, self._stride, self._corners = 0, 1, 0
+        self._last_ns: int | None = None
+
+    def add(self, frames: SceneFrames) -> None:
+        """Take in what the next messages show."""
+        # no others have a place
+        chosen = np.arange(-self._count % self._stride, len(frames.times_ns), self._stride)
+        is_again = len(frames.times_ns) > 0 and int(frames.times_ns[0]) == self._last_ns
+        frames = replace(frames, chosen=np.union1d(chosen, [0]) if is_again else chosen)
+        for index, time_ns in enumerate(frames.times_ns.tolist()):
+            self.add_frame(time_ns, partial(frames.frame, index))
+
+    def add_frame(self, time_ns: int, frame_of: Callable[[], SceneFrame]) -> None:
+        """Take in the next frame, which is made only if it has a place.
+
+        One of the same time as the frame before, that of the finished log, is the last and replaces it.
+        """
+        if time_ns == self._last_ns:
+            while self._frames and self._frames[-1][0] == time_ns:
+                self._frames.pop()
+            self._frames.append((time_ns, frame_of()))
+            return
+        self._last_ns = time_ns
+        if self._count % self._stride == 0:
+            frame = frame_of()
+            self._frames.append((time_ns, frame))
+            self._corners += frame.corners
+        self._count += 1
+        while len(self._frames) > MOST_FRAMES or (self._corners > MOST_CORNERS and len(self._frames) > 2):
+            self._frames = self._frames[::2]
+            self._stride *= 2
+            self._corners = sum(frame.corners for _, frame in self._frames)
+
+    @property
+    def scene(self) -> ReportedScene:
+        """The frames so far."""
+        times_ns = np.array([time_ns for time_ns, _ in self._frames], np.int64)
+        return ReportedScene(times_ns, tuple(frame for _, frame in self._frames), self._stride)
+
+
+class _Box(NamedTuple):
+    """The part of the plane that everything lies in: its lower left corner, and its size, above 0."""
+
+    low: Floats
+    size: Floats
+
+    def steps(self, points: Floats) -> Floats:
+        """Return points (n, 2) in steps of the box."""
+        return np.asarray(np.round((points - self.low) / self.size * _STEPS))
+
+
+def scene_value(
+    scene: ReportedScene, first_ns: int, places: Mapping[tuple[int, int], tuple[int, int]], packing: Packing
+) -> Mapping[str, Any]:
+    """Return the scene as the page reads it; coordinates are in steps of the box that everything lies in.
+
+    Args:
+        places: of results and their nodes, where the page has them.
+    """
+    entities = _entities(scene.frames)
+    # of one result there is one arrow in a frame
+    results = dict(sorted((result, place) for (result, _), (place, _) in places.items()))
+    listed = sorted(results, key=results.__getitem__)
+    most = max(1, MOST_ARROWS // max(len(scene.frames), 1))
+    shown = [
+        (number, arrow)
+        for number, frame in enumerate(scene.frames)
+        for result, place in results.items()
+        if place < most and (arrow := frame.violation(result)) is not None
+    ]
+    arrows = [arrow for _, arrow in shown]
+    box = _box(entities, arrows)
+    return {
+        "times": packing.add((scene.times_ns - first_ns) / 1e9, "f8"),
+        "stride": scene.stride,
+        "shades": packing.add(SHADES, "u1"),
+        "low": box.low.tolist(),
+        "high": (box.low + box.size).tolist(),
+        "entities": [
+            _entity_value(identifier, shown, len(scene.frames), listed, box, packing)
+            for identifier, shown in sorted(entities.items(), key=_drawing_order)
+        ],
+        "violations": {
+            "frames": packing.add(np.array([number for number, _ in shown]), "i4"),
+            "points": packing.add(box.steps(_joined([each.ends for each in arrows])), "u2"),
+            "labels": [each.label for each in arrows],
+            "atoms": [each.atom for each in arrows],
+            "robustness": packing.add(np.array([each.robustness for each in arrows]), "f8"),
+            "holds": packing.add(np.array([each.holds for each in arrows]), "u1"),
+            # of those about an earlier sample
+            "moments": [
+                None if each.moment_ns is None else (each.moment_ns - first_ns) / 1e9 for each in arrows
+            ],
+            # the result and the node of the page, -1 where the page leaves the node out
+            "places": packing.add(
+                np.array(
+                    [places.get((each.result, each.node), (results[each.result], -1)) for each in arrows]
+                ),
+                "i4",
+            ),
+        },
+    }
+
+
+def _drawing_order(item: tuple[str, Any]) -> tuple[bool, str]:
+    """Order regions before objects, which are drawn over them."""
+    return not item[0].startswith(REGION), item[0]
+
+
+def _entities(frames: Sequence[SceneFrame]) -> Mapping[str, dict[int, DrawnEntity]]:
+    """Return what is drawn, by entity and frame."""
+    found: dict[str, dict[int, DrawnEntity]] = {}
+    for number, frame in enumerate(frames):
+        for identifier, drawn in frame.entities.items():
+            found.setdefault(identifier, {})[number] = drawn
+    return found
+
+
+def _box(entities: Mapping[str, Mapping[int, DrawnEntity]], arrows: Sequence[DrawnViolation]) -> _Box:
+    rings = [ring for shown in entities.values() for each in shown.values() for ring in each.rings]
+    everything = _joined([*rings, *(each.ends for each in arrows)])
+    if not len(everything):
+        return _Box(np.zeros(2), np.ones(2))
+    low, size = everything.min(axis=0), np.ptp(everything, axis=0)
+    return _Box(low, np.where(size > 0.0, size, 1.0))
+
+
+def _joined(points: Sequence[Floats]) -> Floats:
+    """Return all points, (n, 2)."""
+    return np.concatenate([np.empty((0, 2)), *points])
+
+
+def _entity_value(
+    identifier: str,
+    shown: Mapping[int, DrawnEntity],
+    frames: int,
+    results: Sequence[int],
+    box: _Box,
+    packing: Packing,
+) -> Mapping[str, Any]:
+    """Return one entity: its form in each frame, and its points and colours in the frames that have it.
+
+    Args:
+        results: those of the page, which it has shades for in this order.
+    """
+    forms: dict[tuple[int, ...], int] = {}
+    of_frame = np.full(frames, _ABSENT, np.int64)
+    for number, each in shown.items():
+        form = tuple(len(ring) for ring in each.rings)
+        of_frame[number] = forms.setdefault(form, len(forms))
+    kind, _, name = identifier.partition("/")
+    rings = [ring for each in shown.values() for ring in each.rings]
+    has_shades = all(each.shades for each in shown.values())
+    shades = [np.frombuffer(each.shades, np.uint8)[list(results)] for each in shown.values() if has_shades]
+    return {
+        "kind": kind,
+        "name": name,
+        "forms": list(forms),
+        "form": packing.add(of_frame, "u2"),
+        "points": packing.add(box.steps(_joined(rings)), "u2"),
+        "colours": packing.add(np.array([each.colour for each in shown.values()]), "u1"),
+        "shades": packing.add(np.array(shades), "u1") if has_shades else None,
+    }
+
+
+MOST_CELLS: Final = 1_500_000
+"""Cells of all maps of a page together, at most; maps of chosen targets come first."""
+_MOST_GUARDS: Final = 4
+_MOST_LAYERED: Final = 50_000
+"""Cells of a map of which a page says what limits and blocks them."""
+
+
+@dataclass(frozen=True, eq=False)
+class ReportedDecisions:
+    """The decisions in a log, with the gradient maps.
+
+    Attributes:
+        decisions: in order, each with its outcome if it has one.
+        maps: by the number by which decisions name them, in the order of the log.
+        redone: what would have been decided otherwise, if the log has that.
+    """
+
+    decisions: tuple[PlanDecision, ...]
+    maps: Mapping[int, Grid]
+    redone: ReportedDecisions | None = None
+
+
+class DecisionCollector:
+    """Collects decisions and maps from messages as they come."""
+
+    def __init__(self) -> None:
+        self._decisions: list[PlanDecision] = []
+        self._maps: dict[int, Grid] = {}
+        self._redone: DecisionCollector | None = None
+
+    @property
+    def redone(self) -> DecisionCollector:
+        """What collects the decisions that would have been made otherwise."""
+        self._redone = self._redone or DecisionCollector()
+        return self._redone
+
+    def add_decision(self, payload: bytes) -> None:
+        """Take in a decision; one that cannot be decoded is skipped."""
+        with suppress(LogError):
+            self._decisions.append(decision_from_payload(payload))
+
+    def add_map(self, number: int, payload: bytes) -> None:
+        """Take in a gradient map; one that cannot be decoded is skipped."""
+        try:
+            self._maps[number] = Grid.FromString(payload)
+        except DecodeError:
+            return
+
+    @property
+    def decisions(self) -> ReportedDecisions:
+        """The decisions and maps so far."""
+        redone = None if self._redone is None else self._redone.decisions
+        return ReportedDecisions(latest_decisions(self._decisions), dict(self._maps), redone)
+
+
+class _Owner(NamedTuple):
+    """The candidate that a map belongs to.
+
+    Attributes:
+        edge, place: of the edge among those considered, and of the candidate among the edge's.
+        turn: how far the object is turned, in radians.
+    """
+
+    edge: int
+    place: int
+    candidate: PlanCandidate
+    turn: float
+
+    @property
+    def target(self) -> PlanTarget | None:
+        """The candidate's target, if it was found on this map: that of the nearest orientation."""
+        candidate = self.candidate
+        if not candidate.HasField("target"):
+            return None
+        nearest = min(
+            (each.turn for each in candidate.maps), key=lambda turn: abs(turn - candidate.target.turn)
+        )
+        return candidate.target if nearest == self.turn else None
+
+
+class _Drawn(NamedTuple):
+    """A gradient map as numbers.
+
+    Attributes:
+        values: (rows, columns), NaN where blocked.
+        low, high: where its corners lie.
+        owner: None if the log does not record it.
+        is_chosen: whether the decision's target was found on it.
+        fields: what the message has of each cell, (rows, columns) by name.
+    """
+
+    values: Floats
+    low: tuple[float, float]
+    high: tuple[float, float]
+    owner: _Owner | None
+    is_chosen: bool
+    fields: Mapping[str, NDArray[Any]]
+
+
+def decisions_value(
+    plan: ReportedDecisions, first_ns: int, packing: Packing, most_cells: int = MOST_CELLS
+) -> Mapping[str, Any]:
+    """Return the decisions as the page reads them, and how many maps did not fit."""
+    drawn = [list(_maps_of(plan, decision)) for decision in plan.decisions]
+    kept = _kept([each for maps in drawn for each in maps], most_cells)
+    redone = {} if plan.redone is None else _redone_by_number(plan, plan.redone)
+    decisions = []
+    for decision, maps in zip(plan.decisions, drawn, strict=True):
+        values = [_map_value(each, packing) for each in maps if id(each) in kept]
+        value = dict(_decision_value(decision, values, first_ns, packing))
+        if plan.redone is not None and (other := redone.get(decision.number)) is not None:
+            chosen = [each for each in _maps_of(plan.redone, other) if each.is_chosen]
+            own = [_map_value(each, packing) for each in chosen]
+            value["redone"] = _decision_value(other, own, first_ns, packing)
+        decisions.append(value)
+    return {"decisions": decisions, "maps_left_out": sum(map(len, drawn)) - len(kept)}
+
+
+def _redone_by_number(plan: ReportedDecisions, redone: ReportedDecisions) -> dict[int, PlanDecision]:
+    """Return the decisions that do something else than those of the log, by number."""
+    done = {each.number: (each.kind, each.reason, each.time_ns) for each in plan.decisions}
+    return {
+        each.number: each
+        for each in redone.decisions
+        if (each.kind, each.reason, each.time_ns) != done.get(each.number)
+    }
+
+
+def _kept(maps: Sequence[_Drawn], most_cells: int) -> set[int]:
+    """Return the maps that fit, by identity: those of chosen targets, then the others, in order."""
+    kept: set[int] = set()
+    cells = 0
+    for each in sorted(maps, key=lambda each: not each.is_chosen):
+        if cells + each.values.size <= most_cells:
+            cells += each.values.size
+            kept.add(id(each))
+    return kept
+
+
+def _maps_of(plan: ReportedDecisions, decision: PlanDecision) -> Iterator[_Drawn]:
+    """Yield the maps of a decision; if the log does not record their owners, those of its time."""
+    owners = {
+        named.number: _Owner(edge, place, candidate, named.turn)
+        for edge, considered in enumerate(decision.considered)
+        for place, candidate in enumerate(considered.candidates)
+        for named in candidate.maps
+    }
+    found: list[tuple[_Owner | None, Grid]] = [
+        (owner, plan.maps[number]) for number, owner in sorted(owners.items()) if number in plan.maps
+    ]
+    if not owners:
+        found = [(None, grid) for _, grid in sorted(plan.maps.items()) if _is_of_time(grid, decision)]
+    for owner, grid in found:
+        drawn = _drawn(grid, owner, _is_chosen(owner, decision, len(found)))
+        if drawn is not None:
+            yield drawn
+
+
+def _is_of_time(grid: Grid, decision: PlanDecision) -> bool:
+    return grid.timestamp.ToNanoseconds() == decision.time_ns
+
+
+def _is_chosen(owner: _Owner | None, decision: PlanDecision, maps: int) -> bool:
+    """Return whether a decision's target was found on a map; without owners, on the only one."""
+    if not decision.HasField("target"):
+        return False
+    if owner is None:
+        return maps == 1
+    is_last = owner.edge == len(decision.considered) - 1
+    return is_last and owner.candidate.chosen and owner.target is not None
+
+
+def _drawn(grid: Grid, owner: _Owner | None, is_chosen: bool) -> _Drawn | None:
+    """Return a map's robustness; None if the sizes in the message are inconsistent or empty."""
+    fields = map_fields(grid)
+    numbers = fields.get("robustness")
+    if numbers is None:
+        return None
+    rows, columns = numbers.shape
+    x, y = grid.pose.position.x, grid.pose.position.y
+    high = x + columns * grid.cell_size.x, y + rows * grid.cell_size.y
+    if not np.isfinite([x, y, *high]).all() or high[0] <= x or high[1] <= y:
+        return None
+    return _Drawn(numbers.astype(np.float64), (x, y), high, owner, is_chosen, fields)
+
+
+def _map_value(drawn: _Drawn, packing: Packing) -> Mapping[str, Any]:
+    known = drawn.values[np.isfinite(drawn.values)]
+    value: dict[str, Any] = {
+        "columns": drawn.values.shape[1],
+        "low": drawn.low,
+        "high": drawn.high,
+        "scale": float(np.abs(known).max(initial=0.0)),
+        "values": packing.add(singles(drawn.values), "f4"),
+        "chosen": drawn.is_chosen,
+        "edge": None,
+        "candidate": None,
+        "title": "",
+        "target": None,
+    }
+    owner = drawn.owner
+    if owner is None:
+        return value
+    candidate = owner.candidate
+    turned = f", turned by {math.degrees(owner.turn):.3g}°" if len(candidate.maps) > 1 else ""
+    value |= _layer_values(drawn, candidate, packing)
+    return value | {
+        "edge": owner.edge,
+        "candidate": owner.place,
+        "title": f"{candidate.object}{turned}",
+        "target": None if owner.target is None else _target_value(owner.target),
+    }
+
+
+def _layer_values(drawn: _Drawn, candidate: PlanCandidate, packing: Packing) -> dict[str, Any]:
+    """Return what limits and what blocks each cell and, of the chosen map, the layer of each conjunct."""
+    if not {"limited_by", "blocked_by"} <= drawn.fields.keys() or drawn.values.size > _MOST_LAYERED:
+        return {}
+    named = {number: f"{number}: {each.text}" for number, each in enumerate(candidate.conjuncts, 1)}
+    shown = [name for name in named.values() if name in drawn.fields] if drawn.is_chosen else []
+    return {
+        "limited": packing.add(drawn.fields["limited_by"], "u2"),
+        "blocked": packing.add(drawn.fields["blocked_by"], "u2"),
+        "limits": [each.text for each in candidate.conjuncts],
+        "blocks": [cause_text(each) for each in candidate.causes],
+        "layers": [{"title": name, "values": packing.add(drawn.fields[name], "f4")} for name in shown],
+    }
+
+
+def _decision_value(
+    decision: PlanDecision, maps: Sequence[Mapping[str, Any]], first_ns: int, packing: Packing
+) -> Mapping[str, Any]:
+    value: dict[str, Any] = {
+        "number": decision.number,
+        "time": (decision.time_ns - first_ns) / 1e9,
+        "specification": decision.specification,
+        "kind": decision.Kind.Name(decision.kind).removeprefix("KIND_").lower().replace("_", " "),
+        "states": list(decision.states),
+        "reason": decision.reason,
+        "edges": [
+            _edge_value(edge, edge is decision.considered[-1] and not edge.pruned)
+            for edge in decision.considered
+        ],
+        "maps": maps,
+        "target": _target_value(decision.target) if decision.HasField("target") else None,
+        "outcome": None,
+    }
+    if decision.HasField("outcome"):
+        outcome = decision.outcome
+        value["outcome"] = {
+            "time": (outcome.end_ns - first_ns) / 1e9,
+            "succeeded": outcome.succeeded,
+            "reason": outcome.reason,
+            "states": list(outcome.states),
+            "travelled": packing.add(np.array(outcome.travelled), "f8"),
+        }
+    return value
+
+
+def _edge_value(edge: PlanEdge, is_aim: bool) -> Mapping[str, Any]:
+    return {
+        "path": list(edge.path),
+        "aim": is_aim,
+        "progress": _guard_texts(edge.progress),
+        "constraints": _guard_texts(edge.constraints),
+        "candidates": [_candidate_value(candidate) for candidate in edge.candidates],
+        "pruned": Reason.from_text(edge.pruned).kind,
+    }
+
+
+def _guard_texts(guards: Sequence[PlanGuard]) -> list[str]:
+    more = [f"and {len(guards) - _MOST_GUARDS} more"] if len(guards) > _MOST_GUARDS else []
+    return [guard.text for guard in guards[:_MOST_GUARDS]] + more
+
+
+def _candidate_value(candidate: PlanCandidate) -> Mapping[str, Any]:
+    return {
+        "object": candidate.object,
+        "best": "nowhere free" if math.isinf(candidate.best) else number_text(candidate.best),
+        "status": "rejected" if candidate.rejected else "chosen" if candidate.chosen else "possible",
+        "rejected": candidate.rejected,
+        "why": [f"{key} {text}" for key, text in candidate_lines(candidate)],
+        "target": _target_value(candidate.target) if candidate.HasField("target") else None,
+    }
+
+
+def _target_value(target: PlanTarget) -> Mapping[str, Any]:
+    """Return a target in words, and as points to draw unless one is not finite."""
+    points = [target.x, target.y, *target.waypoints]
+    is_drawn = bool(np.isfinite(points).all())
+    turned = f", turned by {math.degrees(target.turn):.3g}°" if target.turn else ""
+    return {
+        "object": target.object,
+        "at": points[:2] if is_drawn else None,
+        "words": f"({target.x:.4g}, {target.y:.4g}){turned}",
+        "robustness": number_text(target.robustness),
+        "way": points[2:] if is_drawn else [],
+    }
