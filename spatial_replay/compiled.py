@@ -103,7 +103,7 @@ def inlined(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Re
 
 def inlined_as(interpreted: Callable[_Arguments, _Result]) -> _Making[_Arguments, _Result]:
     """Return what makes an inlined helper; interpreted, it is another function."""
-    options = {"forceinline": True, "_nrt": False, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    options = {"forceinline": True, "no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     return lambda function: _Kernel(function, options, interpreted_as=interpreted)
 
 

@@ -84,21 +84,6 @@ class Compiler:
         What only kernels call is optimised with these, and not before, which takes a third of the time.
         """
         made = self._compile(lambda numba: numba.njit, function, options)
-        # parts of it once all of it is there: threads that import both at the same time block each other
-        from numba.core.compiler_lock import global_compiler_lock
-
-        settings, compile_it = self._compiler.config, made.compile
-        level = type(settings.OPT)(1) if "no_cpython_wrapper" in options else settings.OPT
-
-        def compile_at_level(signature: object) -> object:
-            with cast(Any, global_compiler_lock):
-                before, settings.OPT = settings.OPT, level
-                try:
-                    return compile_it(signature)
-                finally:
-                    settings.OPT = before
-
-        made.compile = compile_at_level
         return made
 
     def compile_entry(self, function: FunctionType, options: dict[str, Any]) -> Any:

@@ -13,7 +13,7 @@ from spatial_replay.compiled import compile_ahead
 from spatial_replay.errors import SpecificationError, TraceError, UsageError
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.geometry.footprint import TrackedObject
-from spatial_replay.monitor.online.live_runs import ROOM
+from spatial_replay.monitor.online.step import ROOM
 from spatial_replay.monitor.result import no_such_node
 from spatial_replay.monitor.semantics import checked_semantics
 from spatial_replay.monitor.stream import LiveStream

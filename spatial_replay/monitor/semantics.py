@@ -10,7 +10,7 @@ import numpy as np
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Empty, Floats, Integers
 from spatial_replay.monitor.online.program import Program
-from spatial_replay.monitor.online.step import OnlineRun
+from spatial_replay.monitor.online.step import ROOM, OnlineRun
 from spatial_replay.monitor.paper.evaluator import PaperRun, check_operators, left_out
 from spatial_replay.spec.formula import Formula, Specification
 
@@ -73,11 +73,11 @@ class Evaluator(NamedTuple):
         """Whether numbers before the end of a log are about its continuations, too."""
         return self.semantics == "ltlf"
 
-    def begin(self) -> Run:
-        """Start a run before the first sample."""
+    def begin(self, *, is_live: bool = False) -> Run:
+        """Start a run before the first sample; samples of a live one come one by one."""
         if self.semantics == "paper":
             return PaperRun(self.formula, self.program.leaves)
-        return OnlineRun(self.program)
+        return OnlineRun(self.program, room=ROOM, tile=1) if is_live else OnlineRun(self.program)
 
     def leaves_within_log(
         self, leaves: Floats, positions: Integers, times_ns: Integers, first_ns: int

@@ -10,6 +10,7 @@ from bisect import bisect_left
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate, pairwise
+from typing import cast
 
 import numpy as np
 
@@ -21,8 +22,8 @@ from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.online.codes import in_channels
-from spatial_replay.monitor.online.live_runs import LiveRuns
 from spatial_replay.monitor.online.program import compile_formula
+from spatial_replay.monitor.online.step import OnlineRun
 from spatial_replay.monitor.semantics import Evaluator, Semantics
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.spec.formula import Outline, Specification
@@ -199,10 +200,9 @@ class LiveStream:
         self._evaluators = [Evaluator(each, compile_formula(each), semantics) for each in formulas]
         programs = [evaluator.program for evaluator in self._evaluators]
         self._leaves = SampleLeaves([program.leaves for program in programs], specification.regions)
-        self._live = LiveRuns(programs) if semantics == "ltlf" else None
-        self._apart = [] if self._live else [evaluator.begin() for evaluator in self._evaluators]
+        self._runs = [evaluator.begin(is_live=True) for evaluator in self._evaluators]
         self._own_leaves = _ranges(len(program.leaves) for program in programs)
-        self._own_nodes = _ranges(len(program.reports) for program in programs)
+        self._is_online = semantics == "ltlf"
         self._start_ns = start_ns
         self._first_ns: int | None = None
         self._position = -1
@@ -211,9 +211,7 @@ class LiveStream:
     def finals(self) -> list[Floats | None]:
         """For each formula (N, 2), lower and upper end of each node's value if the log ends here, or None
         before the first sample that is evaluated."""
-        if self._live is not None:
-            return self._live.finals
-        return [run.final if len(run) else None for run in self._apart]
+        return [run.final if len(run) else None for run in self._runs]
 
     def extend(self, sample: Sample) -> list[Floats | None]:
         """Add the next sample, whose time comes after the last one's.
@@ -223,12 +221,15 @@ class LiveStream:
             None, or NaN under semantics without continuations to wait for.
         """
         samples = self._leaves.look_at(sample)
-        if self._live is None:
+        if not self._is_online:
             return self._extend_apart(sample, samples)
         if sample.time_ns < self._start_ns:
             return [None] * len(self._evaluators)
-        numbers = self._live.extend(*self._leaves.planned(samples), sample.time_ns)
-        return [numbers[own] for own in self._own_nodes] if len(self._own_nodes) > 1 else [numbers]
+        leaves = self._leaves.values(samples)
+        return [
+            cast(OnlineRun, run).add_sample(leaves, own.start, sample.time_ns)
+            for run, own in zip(self._runs, self._own_leaves, strict=True)
+        ]
 
     def _extend_apart(self, sample: Sample, samples: Sequence[Sample | None]) -> list[Floats | None]:
         self._position += 1
@@ -239,7 +240,7 @@ class LiveStream:
         values = self._leaves.values(samples)
         position, time_ns = np.array([self._position]), np.array([sample.time_ns])
         results: list[Floats | None] = []
-        for evaluator, run, own in zip(self._evaluators, self._apart, self._own_leaves, strict=True):
+        for evaluator, run, own in zip(self._evaluators, self._runs, self._own_leaves, strict=True):
             leaves = evaluator.leaves_within_log(values[:, own], position, time_ns, self._first_ns)
             numbers = run.extend(leaves, time_ns)[:, :, 0]
             numbers.flags.writeable = False

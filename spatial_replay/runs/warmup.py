@@ -22,7 +22,7 @@ from spatial_replay.geometry.footprint import Footprint, TrackedObject
 from spatial_replay.logs.source import MemorySource
 from spatial_replay.monitor.evaluate import evaluate
 from spatial_replay.monitor.monitor import Monitor
-from spatial_replay.monitor.online.live_runs import ROOM
+from spatial_replay.monitor.online.step import ROOM
 from spatial_replay.recording.recorder import Recorder
 from spatial_replay.replay import run_replay
 from spatial_replay.runs.planned import warm_up_planner

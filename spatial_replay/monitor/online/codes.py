@@ -1,4 +1,4 @@
-"""Operation codes and table columns shared by `program` and `step`, and the channels of numbers.
+"""Operation codes and table columns shared by programs and kernels, and the channels of numbers.
 
 Every number has up to four channels: the ends of the interval with every uncertainty at 0 (nominal low and
 high), and the ends with uncertainty (wide low and high). While everything is known they are equal and only
@@ -36,14 +36,15 @@ AHEAD = 16  # added to a code from ONCE on: its mirror image in time (see `finis
 # a = -1 for the left operand of an until that is `true`, of a release that is `false`
 NODE_CODE, NODE_A, NODE_B, NODE_WEAK, NODE_UNIT, NODE_LOW, NODE_HIGH = range(7)
 NODE_VARIABLE, NODE_TABLE, NODE_DEPENDS = 7, 8, 9  # the first two -1 for none
-NODE_TIMED = 10  # the number of a window or shift ahead in seconds, -1 for none
+NODE_TIMED = 10  # the number, in its part, of a window or shift in seconds, -1 for none
 NODE_CUTS = 11  # whether its windows cut a part's bound short (see `PART_IS_CUT`)
-NODE_WIDTH = 12
+# of a window ahead, a bit for each of `OPEN_END`, …: whether what it holds can only become better
+NODE_GROWS = 12
+NODE_WIDTH = 13
 # codes of parts' nodes
-LITERAL = 0  # signal a, negated if b
+LITERAL = 0  # signal a
 PART_AND, PART_OR = 2, 3
-# max(b, min(a, next)); min(b, max(a, next)). With a high end, as the root of a part, over the window
-# [low, high] from the first sample on
+# max(b, min(a, next)); min(b, max(a, next))
 UNTIL, RELEASE = 4, 5
 PART_WINDOW_MAX, PART_WINDOW_MIN = 6, 7  # of a, over [low, high] ahead
 SHIFT = 8  # a, low ahead; a is wanted up to high ahead
@@ -58,36 +59,19 @@ BINARY_NODES = (
     PART_AND, PART_OR, UNTIL, RELEASE, PAST_SINCE, PAST_TRIGGER, ANCHORED_UNTIL, ANCHORED_RELEASE,
 )  # fmt: skip
 
-# columns of parts: nodes, numbers of variables and tables, where its tables and its cells start
-PART_FIRST, PART_END, PART_VARIABLES, PART_TABLES, PART_TABLE_START, PART_CELL_START = range(6)
-# the kind; whether it says what it, or another part, is at the last sample; the corner that ends a run
-PART_KIND, PART_IS_REMEMBERING, PART_END_CORNER = 6, 7, 8
-PART_IS_NESTED = 9  # whether a node below the root depends on a variable, or any on a table
-# whether the bound that is not known at once is the value but for positions where a window of those nodes
-# is open that cut it
-PART_IS_CUT = 10
-# the part, itself or another, and its node that is what this one is at the last sample; -1 if not asked for
-PART_LAST_IN, PART_LAST_NODE = 11, 12
-# a bit for each bound: which follow from its table alone until its root has ended, since what may still come
-# outdoes all that is open; eight bits higher up, which do even once it has; again eight bits higher up, which
-# are the value once it has
-PART_KNOWN = 13
-EVEN_IF_OVER, SAME_IF_OVER = 1 << 8, 1 << 16
-# the signal that what a root joins by the minimum is at least, by the maximum at most; -1 for none
-PART_LIMIT = 14
-# 1 if the value of what a root joins by the minimum falls no more, by the maximum rises no more, while
-# windows are open
-PART_IS_MONOTONE = 15
+# columns of parts: their nodes' rows, the kind, numbers of variables and tables, the corner that ends a run, and
+# where the table begins in each channel (of parts without windows)
+PART_FIRST, PART_END, PART_KIND, PART_VARIABLES, PART_TABLES, PART_END_CORNER, PART_TABLE_START = range(7)
+# a bit for each of `OPEN_LOW`, `OPEN_HIGH`: which bounds follow from the table alone until the root has ended,
+# since what may still come outdoes all that is open; eight bits higher up, which do even once it has
+PART_KNOWN = 7
+EVEN_IF_OVER = 1 << 8
+# whether the bound that is not known at once is the value but for positions where a window is open that cuts it
+PART_IS_CUT = 8
 # the unit, and how far from the first sample on the root joins what its operand is; -1 if it never ends
-PART_END_UNIT, PART_ENDS_AT = 16, 17
-# which of its numbers a run computes, a bit for each: all but what a past operator is at first, where that is
-# its operand
-PART_NUMBERS = 18
-PART_WIDTH = 19
-ALL_NUMBERS = (1 << 8) - 1
-LAST_NUMBERS = 1 << 2 | 1 << 3  # what a part is at the last sample
-FIRST_NUMBERS = ALL_NUMBERS ^ LAST_NUMBERS  # what it is at the first one
-LOWER, UPPER = 4, 5  # its bounds, with uncertainty
+PART_END_UNIT, PART_ENDS_AT = 9, 10
+PART_HAS_NOW = 11  # whether it says what it is at the newest sample, too
+PART_IS_MONOTONE = 12  # whether what the root joins by the minimum never falls, or the other way round
 # kinds of parts
 TABLE, WINDOWED = 0, 1  # see `tables`, `windows`
 
@@ -97,8 +81,7 @@ REPORT_WIDTH = 5
 # codes of reports: a row is a node as written, so that here, alone, `xor`, `->` and `<->` have codes;
 # rows for their expansions would cost eight numbers a sample each
 REPORT_SIGNAL, REPORT_PART = 0, 1
-# a past operator that is, at the first sample, its operand; now it is a signal, or what a part is at first or
-# at last
+# a past operator that is, at the first sample, its operand; now it is a signal, or what a part is at first
 REPORT_PAST = 9
 # an until whose left operand never falls, by what it waits for, which is a part (see `after_lasting`); where
 # its rule is `NOW_LAST_OPERAND`, its right operand is an alternative
@@ -116,11 +99,14 @@ REPORT_OF_BOOLEAN = MappingProxyType(
     }
 )
 NOW_LAST_OPERAND, NOW_EITHER, NOW_TRUE, NOW_FALSE, NOW_OF_PART = 0, 1, 2, 3, 4
-NOW_OF_SIGNAL, NOW_OF_VALUE = 5, 6  # of `REPORT_PAST`, and `NOW_OF_PART`
+NOW_OF_SIGNAL, NOW_OF_VALUE = 5, 6  # of `REPORT_PAST`
+
+# columns of the first row of a program: where its rows stand, and how many there are
+HEAD_SIGNALS_AT, HEAD_SIGNALS, HEAD_PARTS_AT, HEAD_PARTS, HEAD_REPORTS_AT, HEAD_REPORTS = range(6)
+HEAD_OPERANDS_AT = 6
 
 # how a run over the recent samples treats what lies beyond the last one
-OPEN_END, OPEN_LOW, OPEN_HIGH, OPEN_CORNER = 0, 1, 2, 3
-
+OPEN_END, OPEN_LOW, OPEN_HIGH = 0, 1, 2
 
 CHANNELS = 4
 """Nominal low and high, wide low and high."""

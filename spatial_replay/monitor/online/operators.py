@@ -1,6 +1,6 @@
 """Compile operators: those without future operands to signals, those that look ahead to parts.
 
-Signals are run by `step.step_signals`, parts by `tables.step_tables` and `windows.step_windows`. A part is in
+Signals are run by `signals.run_signals`, parts by `tables.run_table` and `windows.run_windows`. A part is in
 negation normal form over signals, so that its value is monotone in all its operands.
 """
 
@@ -237,11 +237,6 @@ class PartRows:
         self._is_past = False
         self._has_window_signals = False
 
-    @property
-    def fields(self) -> tuple[Row, ...]:
-        """Rows up to the column for the window's end, and whether they are a variable."""
-        return tuple(self._rows)
-
     def rows(self) -> tuple[Row, ...]:
         """Return rows with the numbers of their variable and table, and whether they depend on either."""
         variable = 0
@@ -271,22 +266,12 @@ class PartRows:
         return is_flat and not self._is_past
 
     @property
-    def is_nested(self) -> bool:
-        """Whether more than the root alone depends on what is to come, or anything on a table."""
-        return self.tables > 1 or any(row[-1] for row in self.fields[:-1])
-
-    @property
     def looks_back(self) -> bool:
         """Whether a past operator over a future one is left, so that not the first sample alone matters."""
         # a root with a window of its own stands at the first sample alone
-        stands_alone = self.ends or self._has_window_signals
-        return self._is_past or (not stands_alone and any(row[0] in codes.PAST for row in self._rows))
-
-    @property
-    def ends(self) -> bool:
-        """Whether the root joins a window that is counted from the first sample."""
-        code, *_, high, is_variable = self.fields[-1]
-        return code in _RUNNING and bool(is_variable) and high > 0
+        return self._is_past or (
+            not self._has_window_signals and any(row[0] in codes.PAST for row in self._rows)
+        )
 
     @property
     def end_corner(self) -> int:
@@ -325,7 +310,7 @@ class WindowedPart(PartRows):
             anchored: whether the root is a bounded operator that is only ever asked for at the first
                 sample, so that its window is a fixed stretch of the run and needs no history.
             ends: whether such a root, over what looks ahead itself, is an unbounded operator that joins no
-                more than its window, so that what has closed in there is kept as one number, or one table.
+                more than its window, so that what has closed in there is kept as one table.
         """
         super().__init__()
         self._signals = signals
@@ -422,8 +407,6 @@ class WindowedPart(PartRows):
         left, body, _ = _as_until(formula.operator, operands, formula.bound)
         is_until = (formula.operator != "G") == positive
         code, weak = codes.UNTIL if is_until else codes.RELEASE, int(not is_until)
-        if left == NOTHING and not self.variables and self.tables == 1:
-            return self.row(code, left, body, weak, unit, low, high, variable=True)
         # in an until, say, positions outside the window are -inf, and so is the operand that has to hold so
         # far where the window ends: whatever comes later is out of reach
         self._has_window_signals, sign = True, -1 if is_until else 1

@@ -1,4 +1,4 @@
-"""One program on one stream of samples: the compiled step that monitors and replays share.
+"""One program on one stream of samples: what monitors and replays share.
 
 Samples are run in tiles: first the signals of a tile (subformulas without future operators, final at each
 sample), then each part, then the tree as the user wrote it. A tile of one sample and a tile of many give the
@@ -7,108 +7,147 @@ same bits, because the only arithmetic is minima, maxima and negation.
 
 from __future__ import annotations
 
-from typing import Any, cast
-
 import numpy as np
 
-from spatial_replay.compiled import apart, floats_at, inlined, integers_at
+from spatial_replay.compiled import kernel
 from spatial_replay.geometry.arrays import Empty, Floats, Integers
-from spatial_replay.monitor.online.codes import in_channels
-from spatial_replay.monitor.online.node_numbers import Results, report
+from spatial_replay.monitor.online import codes, tables, windows
+from spatial_replay.monitor.online.codes import CHANNELS, in_channels
+from spatial_replay.monitor.online.node_numbers import NUMBERS, SERIES, report, said_in
 from spatial_replay.monitor.online.program import Program
-from spatial_replay.monitor.online.run_arrays import RunArrays, Tables, arrays_at, table_of
-from spatial_replay.monitor.online.signals import step_signals
-from spatial_replay.monitor.online.state import (
-    KEEPS,
-    OFFSET,
-    POSITION,
-    START_NS,
-    TILE,
-    Memory,
-    first_memory,
-    has_windows,
-    scratch_for,
-    widen,
-    with_room,
-)
-from spatial_replay.monitor.online.tables import step_tables
-from spatial_replay.monitor.online.windows import forget, run_windows
+from spatial_replay.monitor.online.signals import ENTERING, HEAD, RING, TAIL, run_signals
+from spatial_replay.monitor.online.tables import run_table
+from spatial_replay.monitor.online.windows import run_windows
+
+TILE = 1024
+"""How many samples are taken in together: enough to amortise the calls of kernels, few enough to stay in the
+processor's cache."""
+
+ROOM = 256
+"""Recent samples a live run has room for at first: few, so that they stay in the processor's cache."""
+
+BEGIN, FINISH = 1, 2
+"""What `run_samples` does: up to the parts without windows; the numbers of all nodes."""
+_UNKNOWN = -2
+"""Stands for the newest sample that a set of columns knows, before it knows any."""
 
 
-@inlined
-def _begin(memory: Memory, times_ns: Integers, t: int, count: int) -> int:
-    """Enter the times of the next samples; return where they stand in the history."""
-    clock = memory.clock
-    if clock[POSITION] == 0:
-        clock[START_NS] = times_ns[t]
-    if not clock[KEEPS]:
-        clock[OFFSET] = clock[POSITION]
-    begin = clock[POSITION] - clock[OFFSET]
-    stamps, times_ns = memory.stamps[begin : begin + count], times_ns[t : t + count]
-    for k in range(count):
-        stamps[k] = times_ns[k]
-    return int(begin)
-
-
-@inlined
-def begin_step(
-    table_at: int, leaves_at: int, channels: int, width: int, times_at: int, length: int, t: int, count: int
-) -> None:
-    """Run the samples t … t + count - 1 through the signals, and through the parts without windows.
+@kernel
+def run_samples(
+    rows: Integers, leaves: Floats, history: Floats, times: Integers, memory: Floats, work: Floats,
+    first_leaf: int, t: int, count: int, position: int, begin: int, start_ns: int, phases: int,
+) -> None:  # fmt: skip
+    """Run samples through a program, but for its windows under parts.
 
     Args:
-        table_at: that of the run's arrays (see `run_arrays`).
-        leaves_at: (channels, width, length), the leaves of all samples, the run's own first; for as many
-            channels as the run has.
-        times_at: (length,), the times of all samples.
+        rows: the program's.
+        leaves: (C, A, T), of which the run's own begin at `first_leaf`, and these samples at `t`.
+        history: (4, S, room), the signals at the recent samples, by channel.
+        times: (1 + 4 W, room + RING), the times of these, and the rings of sliding windows, by channel.
+        memory: (4, …), each signal at the last and at the first sample, and then the parts' tables.
+        work: the numbers of parts and nodes, the series, and room to work in, row by row.
+        position: of the first of these `count` samples; they stand at `begin` in the history.
     """
-    tables, memory, scratch, _ = arrays_at(table_at)
-    position, begin = memory.clock[POSITION], _begin(memory, integers_at(times_at, length), t, count)
-    leaves = floats_at(leaves_at, (channels, width, length))
-    step_signals(tables.signals, leaves, t, count, position, begin, memory)
-    step_tables(tables.nodes, tables.parts, memory, scratch, channels, position, begin, count)
+    channels, signals, parts = leaves.shape[0], rows[0, codes.HEAD_SIGNALS], rows[0, codes.HEAD_PARTS]
+    if phases & BEGIN:
+        run_signals(rows, leaves, first_leaf, t, count, position, begin, start_ns, history, times, memory)
+        top = NUMBERS * parts + (NUMBERS + SERIES) * rows[0, codes.HEAD_REPORTS]
+        for p in range(parts):
+            part = rows[0, codes.HEAD_PARTS_AT] + p
+            table = 2 * signals + rows[part, codes.PART_TABLE_START]
+            for channel in range(channels if rows[part, codes.PART_KIND] == codes.TABLE else 0):
+                says = run_table(
+                    rows,
+                    part,
+                    history,
+                    channel,
+                    times,
+                    memory,
+                    table,
+                    work,
+                    top,
+                    position,
+                    begin,
+                    count,
+                    start_ns,
+                )
+                for mode in range(3):
+                    row = said_in(mode, channel, channels)
+                    if row >= 0:
+                        for k in range(count):
+                            work[NUMBERS * p + row, k] = work[says + mode, k]
+                if channels > 1 and channel >= channels - 2:
+                    for k in range(count):
+                        work[NUMBERS * p + 6 + (channel & 1), k] = work[says, k]
+    if phases & FINISH:
+        report(rows, history, memory, work, channels, begin, count)
 
 
-@inlined
-def end_step(table_at: int, channels: int, series_at: int, length: int, t: int, count: int) -> None:
-    """Enter the numbers of every node into the series, (N, 4, length)."""
-    tables, memory, scratch, final = arrays_at(table_at)
-    begin = memory.clock[POSITION] - memory.clock[OFFSET]
-    results = Results(floats_at(series_at, (len(final), 4, length)), final)
-    report(tables.reports, tables.operands, memory, scratch, channels, begin, count, t, results)
-    memory.clock[POSITION] += count
+class _OpenPart:
+    """What `run_windows` carries from sample to sample, of one part in one channel."""
 
+    def __init__(self, rows: Integers, room: int) -> None:
+        nodes, part = len(rows) - 1, rows[-1]
+        variables, count = int(part[codes.PART_VARIABLES]), int(part[codes.PART_TABLES])
+        self.rows = rows
+        self.tables = np.zeros((2 * count + 2, max(1 << variables, count)))
+        self._timed = int(rows[:-1, codes.NODE_TIMED].max()) + 1
+        self._nodes = nodes
+        self.state = self._state(room)
+        self.state[windows.STATE, :nodes] = -1
+        self.columns = self._columns(room)
 
-@apart
-def step(
-    table_at: int, leaves_at: int, channels: int, width: int, times_at: int, series_at: int, length: int,
-    t: int, count: int,
-) -> int:  # fmt: skip
-    """Run samples through a program without windows under its parts (see `begin_step`, `end_step`)."""
-    begin_step(table_at, leaves_at, channels, width, times_at, length, t, count)
-    end_step(table_at, channels, series_at, length, t, count)
-    return 0
+    def _state(self, room: int) -> Integers:
+        width = max(room, self._nodes, windows.NEXT + 2 * self._timed)
+        state = np.zeros((windows.STARTS + 2 * self._timed, width), np.int64)
+        state[windows.HEAD, windows.KNOWN : windows.KNOWN + windows.SETS] = _UNKNOWN
+        return state
 
+    def _columns(self, room: int) -> Floats:
+        return np.empty(((windows.SETS + 1) * self._nodes + windows.EXTRA_ROWS, room))
 
-@apart
-def step_with_windows(
-    table_at: int, leaves_at: int, channels: int, width: int, times_at: int, series_at: int, length: int,
-    t: int, count: int,
-) -> int:  # fmt: skip
-    """`step` for any program; apart from it because windows are much more to compile and to load."""
-    begin_step(table_at, leaves_at, channels, width, times_at, length, t, count)
-    run_windows(table_at, channels, count)
-    end_step(table_at, channels, series_at, length, t, count)
-    return 0
+    def copy(self, room: int) -> _OpenPart:
+        """Return a part of the same state, with columns that are not known yet."""
+        copied = _OpenPart(self.rows, room)
+        copied.tables[:] = self.tables
+        copied.state[windows.HEAD, : windows.ENTERED] = self.state[windows.HEAD, : windows.ENTERED]
+        copied.state[windows.LOWS : windows.STARTS, : self._nodes] = self.state[
+            windows.LOWS : windows.STARTS, : self._nodes
+        ]
+        return copied
+
+    def forget(self, moved: int) -> None:
+        """Have positions count from a later sample."""
+        head = self.state[windows.HEAD]
+        head[windows.OFFSET] += moved
+        head[windows.BASE] -= moved
+        head[windows.ENTERED :] = 0
+        head[windows.KNOWN : windows.KNOWN + windows.SETS] = _UNKNOWN
+        self.state[[windows.LOWS, windows.BOUNDARY], : self._nodes] -= moved
+        self.state[windows.STATE, : self._nodes] -= np.where(
+            self.state[windows.STATE, : self._nodes] < 0, 0, moved
+        )
+
+    @property
+    def kept_from(self) -> int | None:
+        """The first position that it may still look at; None if there is none."""
+        is_begun, corners = (
+            self.state[windows.HEAD, windows.IS_BEGUN],
+            1 << self.rows[-1, codes.PART_VARIABLES],
+        )
+        if (
+            is_begun
+            and self.tables[0, 0] == self.tables[0, corners - 1]
+            and not self.rows[-1, codes.PART_HAS_NOW]
+        ):
+            return None
+        return int(self.state[windows.LOWS, : self._nodes].min())
 
 
 class OnlineRun:
     """The state that a compiled formula carries from sample to sample.
 
     Its size depends on the formula and on how many samples its windows span, not on the length of the stream.
-
-    Attributes:
-        step: the kernel that runs its samples.
     """
 
     def __init__(self, program: Program, *, room: int = 2 * TILE, tile: int = TILE) -> None:
@@ -116,31 +155,41 @@ class OnlineRun:
 
         Args:
             room: the number of recent samples there is room for at first (it doubles when needed).
-            tile: how many samples are run together, at most. Samples that come one by one are faster with 1,
-                since the numbers worked with then lie closer together.
+            tile: how many samples are run together, at most.
         """
-        self._program = program
-        self.step = step_with_windows if has_windows(program) else step
-        self._tile = tile
-        if not program.keeps_history:
-            room = tile
-        self._tables = Tables.of(program)
-        self._channels = 1
-        self._take(first_memory(program, room), np.zeros((len(program.reports), 2)))
+        self._program, self._tile = program, tile
+        self._room = room = max(room, tile) if program.keeps_history else tile
+        self._channels, self._position, self._offset, self._start_ns = 1, 0, 0, 0
+        signals, parts, reports = len(program.signals), len(program.parts), len(program.reports)
+        self._history = np.zeros((CHANNELS, signals, room))
+        self._times = np.zeros((1 + CHANNELS * program.windows, room + RING), np.int64)
+        self._memory = np.zeros((CHANNELS, 2 * signals + program.table_size))
+        nodes = max((len(rows) for rows in program.part_rows), default=0)
+        corners = 1 << max((int(part[codes.PART_VARIABLES]) for part in program.parts), default=0)
+        shape = (
+            NUMBERS * parts + (NUMBERS + SERIES) * reports + nodes + tables.EXTRA_ROWS,
+            max(tile, nodes, corners),
+        )
+        self._work = np.zeros(shape)
+        series_at = NUMBERS * (parts + reports)
+        self._numbers = self._work[NUMBERS * parts : series_at].reshape(reports, NUMBERS, shape[1])
+        self._series = self._work[series_at : series_at + SERIES * reports].reshape(reports, SERIES, shape[1])
+        self._ended = np.zeros((reports, 2))
+        self._open = [
+            (number, [_OpenPart(rows, room)])
+            for number, rows in enumerate(program.part_rows)
+            if rows[-1, codes.PART_KIND] == codes.WINDOWED
+        ]
+        self._see_history()
 
     def __len__(self) -> int:
         """Return how many samples were added."""
-        return int(self._memory.clock[POSITION])
-
-    @property
-    def table_at(self) -> int:
-        """The address of the table of its arrays, until samples are added or room is made for them."""
-        return self._table_at
+        return self._position
 
     @property
     def final(self) -> Floats:
         """(N, 2): lower and upper end of each node's value if the run ends here."""
-        return self._final.copy()
+        return self._ended.copy()
 
     def extend(self, leaves: Floats, times_ns: Integers, empty: Empty = np.empty) -> Floats:
         """Add samples.
@@ -161,47 +210,160 @@ class OnlineRun:
         if leaves.shape[1:] != wanted or len(leaves) not in (1, 2, 4):
             raise ValueError(f"leaves of shape {leaves.shape}; a run of these needs (1, 2 or 4, *{wanted})")
         self.widen(len(leaves))
-        leaves = np.ascontiguousarray(in_channels(leaves, self._channels), np.float64)
-        times_ns = np.array(times_ns, np.int64)  # writable, since kernels are compiled for that
-        length, done = len(times_ns), 0
-        series = empty((len(self._program.reports), 4, length))
-        while done < length:
-            count = self.make_room(min(self._tile, length - done))
-            shape = leaves.shape[:2]
-            self.step(self._table_at, leaves, *shape, times_ns, series, length, done, count)
+        leaves = np.array(in_channels(leaves, self._channels), np.float64, order="C")
+        series, done = empty((len(self._program.reports), SERIES, len(times_ns))), 0
+        while done < len(times_ns):
+            count = self._make_room(min(self._tile, len(times_ns) - done))
+            series[:, :, done : done + count] = self._add(leaves, 0, times_ns[done : done + count], done)
             done += count
         return series
 
     def widen(self, channels: int) -> None:
-        """Have at least so many channels."""
-        if channels > self._channels:
-            widen(self._memory, self._channels)
-            self._channels = channels
+        """Have at least so many channels: each begins as the one that it was equal to."""
+        if channels <= self._channels:
+            return
+        before, self._channels = self._channels, channels
+        for state in (self._history, self._memory, self._rings().swapaxes(0, 1)):
+            if before == 1:
+                state[1] = state[0]
+            state[2:] = state[:2]
+        for _, parts in self._open:
+            parts += [parts[channel % before].copy(self._room) for channel in range(before, channels)]
+        self._see_history()
 
-    def _take(self, memory: Memory, final: Floats) -> None:
-        """Go on with another memory, and the room to work in that it needs."""
-        scratch = scratch_for(self._program, len(memory.stamps), self._tile)
-        arrays = RunArrays(self._tables, memory, scratch, final)
-        table = table_of(arrays)
-        at = table.ctypes.data
-        # together, so that an interruption comes before all of these or after
-        self._memory, self._final = memory, final
-        self._arrays, self._table, self._table_at = arrays, table, at
+    def add_sample(self, leaves: Floats, first_leaf: int, time_ns: int) -> Floats:
+        """Add one sample; return value, now, lower and upper of each node, (N, 4), read-only.
 
-    def make_room(self, wanted: int) -> int:
-        """Make room for at least one of the wanted samples; return for how many."""
-        room, clock = len(self._memory.stamps), self._memory.clock
+        Args:
+            leaves: (C, A, 1), of which those of the program begin at `first_leaf`.
+        """
+        if len(leaves) > self._channels:
+            self.widen(len(leaves))
+        elif len(leaves) < self._channels:
+            leaves = np.ascontiguousarray(in_channels(leaves, self._channels))
+        self._make_room(1)
+        numbers = self._add(leaves, first_leaf, np.array([time_ns]), 0)[:, :, 0].copy()
+        numbers.flags.writeable = False
+        return numbers
+
+    def _add(self, leaves: Floats, first_leaf: int, times_ns: Integers, t: int) -> Floats:
+        """Add samples for which there is room, of leaves in as many channels as the run has.
+
+        Args:
+            first_leaf: where the leaves of the program begin.
+            times_ns: of the samples; their leaves stand from `t` on.
+
+        Returns:
+            (N, 4, T): value, now, lower and upper of each node, until more samples are added.
+        """
+        count = len(times_ns)
+        if self._position == 0:
+            self._start_ns = int(times_ns[0])
+            for _, parts in self._open:
+                for part in parts:
+                    part.state[windows.HEAD, windows.START_NS] = self._start_ns
         if not self._program.keeps_history:
-            return min(wanted, room)
-        position, offset = int(clock[POSITION]), int(clock[OFFSET])
-        used = position - offset
-        if used + wanted > room:
-            # given addresses, a kernel does not see how much there is to move, and is interpreted long
-            is_compiled = getattr(self.step, "is_compiled", False)
-            drop = cast(Any, forget).compiled() if is_compiled else forget
-            if drop(self._table_at, self._channels):
-                offset = int(clock[OFFSET])
-            elif used == room:
-                memory = with_room(self._memory, 2 * room, self._channels, self._program.signals)
-                self._take(memory, self._final)
-        return min(wanted, len(self._memory.stamps) - (position - offset))
+            self._offset = self._position
+        begin = self._position - self._offset
+        self._stamps[begin : begin + count] = times_ns
+        arrays = self._program.rows, leaves, self._history, self._times, self._memory, self._work
+        numbers = first_leaf, t, count, self._position, begin, self._start_ns
+        if not self._open:
+            run_samples(*arrays, *numbers, BEGIN | FINISH)
+        else:
+            run_samples(*arrays, *numbers, BEGIN)
+            for number, parts in self._open:
+                for channel, part in enumerate(parts):
+                    self._run_open(number, channel, part, begin, count)
+            run_samples(*arrays, *numbers, FINISH)
+        self._position += count
+        ends = self._numbers[:, [0, 0] if self._channels == 1 else [6, 7], count - 1]
+        np.add(ends, 0.0, out=self._ended)
+        return self._series[:, :, :count]
+
+    def _run_open(self, number: int, channel: int, part: _OpenPart, begin: int, count: int) -> None:
+        """Run a part in one channel, and enter what it says."""
+        channels, is_high = self._channels, channel & 1
+        bounds = 3 if channels == 1 else 1 << is_high if channel >= channels - 2 else 0
+        run_windows(
+            part.rows, self._channel_history[channel], self._stamps, part.columns, part.state, part.tables,
+            begin, count, bounds,
+        )  # fmt: skip
+        says, rows = part.columns[-4:, :count], self._work[NUMBERS * number : NUMBERS * (number + 1), :count]
+        if channels == 1:
+            rows[[0, 2, 3, 1]] = says
+            return
+        if channel < 2:
+            rows[is_high], rows[2 + is_high] = says[0], says[3]
+        if bounds:
+            rows[4 + is_high], rows[6 + is_high] = says[1 + is_high], says[0]
+
+    def _see_history(self) -> None:
+        """Take views of what the recent samples are."""
+        self._stamps = self._times[0, : self._room]
+        self._channel_history = [self._history[channel] for channel in range(CHANNELS)]
+
+    def _rings(self) -> Integers:
+        """Return the rings of sliding windows, (W, CHANNELS, …)."""
+        return self._times[1:].reshape(-1, CHANNELS, self._times.shape[1])
+
+    def _make_room(self, wanted: int) -> int:
+        """Make room for at least one of the wanted samples; return for how many."""
+        if not self._program.keeps_history:
+            return min(wanted, self._room)
+        used = self._position - self._offset
+        if used + wanted > self._room:
+            moved = self._kept_from() if used else 0
+            if 2 * moved >= self._room:
+                self._forget(moved, used - moved)
+                used -= moved
+            elif used == self._room:
+                self._grow()
+        return min(wanted, self._room - used)
+
+    def _kept_from(self) -> int:
+        """Return the first of the recent samples that anything may still look at after the newest one."""
+        last = self._position - self._offset - 1
+        keep, stamps = last, self._stamps[: last + 1]
+        for code, _, _, unit, low, high, *_ in self._program.signals.tolist():
+            if code not in (codes.DELAY, *codes.RINGS):
+                continue
+            far = low if code == codes.DELAY else high
+            if unit == codes.SAMPLES:
+                keep = min(keep, last - far)
+            else:
+                behind = stamps[last] - stamps
+                keep = min(keep, int(np.count_nonzero(behind > far)) - (code == codes.DELAY))
+        for _, parts in self._open:
+            for part in parts:
+                kept = part.kept_from
+                keep = keep if kept is None else min(keep, kept)
+        return max(keep, 0)
+
+    def _forget(self, moved: int, kept: int) -> None:
+        """Drop the oldest samples, which nothing looks at again."""
+        self._stamps[:kept] = self._stamps[moved : moved + kept].copy()
+        signals = np.flatnonzero(self._program.signals[:, codes.SIGNAL_IS_KEPT])
+        for signal in signals.tolist():
+            recent = self._history[: self._channels, signal]
+            recent[:, :kept] = recent[:, moved : moved + kept].copy()
+        for _, parts in self._open:
+            for part in parts:
+                part.forget(moved)
+        self._offset += moved
+
+    def _grow(self) -> None:
+        """Have room for twice as many recent samples."""
+        old, self._room = self._room, 2 * self._room
+        history = np.zeros((*self._history.shape[:2], self._room))
+        history[: self._channels, :, :old] = self._history[: self._channels]
+        times = np.zeros((len(self._times), self._room + RING), np.int64)
+        times[0, :old] = self._stamps
+        for ring, grown in zip(self._times[1:], times[1:], strict=True):
+            entries = np.arange(ring[HEAD], ring[TAIL])
+            grown[[HEAD, TAIL, ENTERING]] = ring[[HEAD, TAIL, ENTERING]]
+            grown[RING + entries % self._room] = ring[RING + entries % old]
+        self._history, self._times = history, times
+        for _, parts in self._open:
+            parts[:] = [part.copy(self._room) for part in parts]
+        self._see_history()

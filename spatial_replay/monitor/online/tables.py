@@ -12,242 +12,185 @@ from __future__ import annotations
 
 import numpy as np
 
-from spatial_replay.compiled import inlined, uncounted
+from spatial_replay.compiled import inlined, kernel
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
-from spatial_replay.monitor.online.state import START_NS, Memory, Scratch
+
+# rows that a part works with, after one for each of its nodes; what it says comes after them
+VALUES, FRESH, POINT, SAYS = range(4)
+EXTRA_ROWS = 6
 
 
-@uncounted
-def read_table(table: Floats, variables: int, point: Floats, order: Integers) -> float:
-    """Read a table at a point: walk its corners in descending order of the coordinates."""
+@kernel
+def read_table(tables: Floats, row: int, first: int, variables: int, points: Floats, point: int) -> float:
+    """Read a table at a point: walk its corners in descending order of the coordinates.
+
+    Args:
+        tables, row, first: where the table begins.
+        points, point: the row of the point.
+    """
     if variables == 1:
-        return float(max(table[0], min(point[0], table[1])))
-    # insertion sort into `order`: there are only a few variables
-    for j in range(variables):
-        k = j
-        while k > 0 and point[order[k - 1]] < point[j]:
-            order[k] = order[k - 1]
-            k -= 1
-        order[k] = j
+        return float(max(tables[row, first], min(points[point, 0], tables[row, first + 1])))
     # a monotone lattice polynomial is the maximum over the chain of corners of min(coordinate, entry)
-    result = table[0]
-    corner = 0
-    for k in range(variables):
-        corner |= 1 << order[k]
-        result = max(result, min(point[order[k]], table[corner]))
+    result, corner = tables[row, first], 0
+    for _ in range(variables):
+        greatest = -1
+        for j in range(variables):
+            if not corner >> j & 1 and (greatest < 0 or points[point, j] > points[point, greatest]):
+                greatest = j
+        corner |= 1 << greatest
+        result = max(result, min(points[point, greatest], tables[row, first + corner]))
     return float(result)
 
 
-@uncounted
-def corner_value(corner: int, variable: int) -> float:
-    return np.inf if (corner >> variable) & 1 else -np.inf
-
-
-@uncounted
-def _start(nodes: Integers, part: Integers, table: Floats, values: Floats) -> None:
+@inlined
+def _start(
+    rows: Integers, first: int, end: int, corners: int, memory: Floats, channel: int, table: int,
+    work: Floats, values: int,
+) -> None:  # fmt: skip
     """Fill the table before the first sample: each operator as it is there."""
-    first, end = part[codes.PART_FIRST], part[codes.PART_END]
-    for corner in range(1 << part[codes.PART_VARIABLES]):
-        for d in range(first, end):
-            if nodes[d, codes.NODE_VARIABLE] >= 0:
-                values[d - first] = corner_value(corner, nodes[d, codes.NODE_VARIABLE])
-            elif nodes[d, codes.NODE_CODE] == codes.PART_OR:
-                values[d - first] = max(values[nodes[d, codes.NODE_A]], values[nodes[d, codes.NODE_B]])
-        table[corner] = values[end - 1 - first]
+    for corner in range(corners):
+        for d in range(end - first):
+            variable, a, b = rows[first + d, codes.NODE_VARIABLE], rows[first + d, codes.NODE_A], 0
+            if variable >= 0:
+                work[values, d] = np.inf if corner >> variable & 1 else -np.inf
+            elif rows[first + d, codes.NODE_CODE] == codes.PART_OR:
+                b = rows[first + d, codes.NODE_B]
+                work[values, d] = max(work[values, a], work[values, b])
+        memory[channel, table + corner] = work[values, end - 1 - first]
 
 
-@uncounted
+@inlined
 def _fill_columns(
-    nodes: Integers,
-    part: Integers,
-    channel: int,
-    mirror: int,
-    history: Floats,
-    begin: int,
-    count: int,
-    columns: Floats,
-) -> None:
+    rows: Integers, first: int, end: int, history: Floats, channel: int, begin: int, count: int,
+    work: Floats, top: int,
+) -> None:  # fmt: skip
     """Compute the nodes that depend on no variable, over some samples."""
-    for d in range(part[codes.PART_FIRST], part[codes.PART_END]):
-        code, a, b = nodes[d, codes.NODE_CODE], nodes[d, codes.NODE_A], nodes[d, codes.NODE_B]
-        column = columns[d - part[codes.PART_FIRST]]
+    for d in range(end - first):
+        row, own = first + d, top + d
+        code, a, b = rows[row, codes.NODE_CODE], rows[row, codes.NODE_A], top + rows[row, codes.NODE_B]
         if code == codes.LITERAL:
-            signal = history[mirror if b else channel, a, begin : begin + count]
             for k in range(count):
-                column[k] = -signal[k] if b else signal[k]
-        elif nodes[d, codes.NODE_DEPENDS]:
-            continue
-        elif code == codes.PART_AND:
-            for k in range(count):
-                column[k] = min(columns[a, k], columns[b, k])
-        elif code == codes.PART_OR:
-            for k in range(count):
-                column[k] = max(columns[a, k], columns[b, k])
+                work[own, k] = history[channel, a, begin + k]
+        elif not rows[row, codes.NODE_DEPENDS]:
+            if code == codes.PART_AND:
+                for k in range(count):
+                    work[own, k] = min(work[top + a, k], work[b, k])
+            elif code == codes.PART_OR:
+                for k in range(count):
+                    work[own, k] = max(work[top + a, k], work[b, k])
 
 
-@uncounted
+@inlined
+def _run_simple(
+    rows: Integers, root: int, end_corner: int, memory: Floats, channel: int, table: int, work: Floats,
+    top: int, says: int, count: int,
+) -> None:  # fmt: skip
+    """Run a part that is a single until or release: a table of two numbers."""
+    low, high = memory[channel, table], memory[channel, table + 1]
+    has_left, a, b = rows[root, codes.NODE_A] >= 0, rows[root, codes.NODE_A], rows[root, codes.NODE_B]
+    is_until = rows[root, codes.NODE_CODE] == codes.UNTIL
+    for k in range(count):
+        right = work[top + b, k]
+        if is_until:
+            least, most = right, max(right, work[top + a, k]) if has_left else np.inf
+        else:
+            least, most = min(right, work[top + a, k]) if has_left else -np.inf, right
+        low, high = max(low, min(least, high)), max(low, min(most, high))
+        work[says + 1, k], work[says + 2, k] = low, high
+        work[says, k] = high if end_corner else low
+    memory[channel, table], memory[channel, table + 1] = low, high
+
+
+@inlined
 def _is_anchored(code: int) -> bool:
     return code in (codes.ANCHORED_UNTIL, codes.ANCHORED_RELEASE)
 
 
-@uncounted
-def _expand_anchored(node: Integers, values: Floats, later: float, position: int, elapsed_ns: int) -> float:
-    """Expand an anchored until or release at a sample, from `values` there and its value at the next sample.
-
-    Its right operand counts inside its window only.
-    """
-    a, right = node[codes.NODE_A], values[node[codes.NODE_B]]
-    now = position if node[codes.NODE_UNIT] == codes.SAMPLES else elapsed_ns
-    counts = node[codes.NODE_LOW] <= now and (node[codes.NODE_HIGH] < 0 or now <= node[codes.NODE_HIGH])
-    if node[codes.NODE_CODE] == codes.ANCHORED_UNTIL:
-        value = min(values[a], later) if a >= 0 else later
-        return float(max(right, value)) if counts else float(value)
-    value = max(values[a], later) if a >= 0 else later
-    return float(min(right, value)) if counts else float(value)
-
-
-@uncounted
-def _close_windows(nodes: Integers, part: Integers, table: Floats, position: int, elapsed_ns: int) -> None:
-    """Settle the anchored operators whose window no later sample can fall into."""
-    for d in range(part[codes.PART_FIRST], part[codes.PART_END]):
-        now = position if nodes[d, codes.NODE_UNIT] == codes.SAMPLES else elapsed_ns
-        if (
-            _is_anchored(nodes[d, codes.NODE_CODE])
-            and nodes[d, codes.NODE_HIGH] >= 0
-            and now >= nodes[d, codes.NODE_HIGH]
-        ):
-            bit = 1 << nodes[d, codes.NODE_VARIABLE]
-            for corner in range(1 << part[codes.PART_VARIABLES]):
-                table[corner] = table[corner | bit] if nodes[d, codes.NODE_WEAK] else table[corner & ~bit]
-
-
 @inlined
-def _step_channel(
-    nodes: Integers, part: Integers, table: Floats, channel: int, mirror: int, memory: Memory,
-    scratch: Scratch, position: int, begin: int, count: int,
-) -> None:  # fmt: skip
-    """Run `step_tables` in one channel; put the values of an ending run and the bounds into the scratch."""
-    first, end, variables, end_corner = (
-        part[codes.PART_FIRST],
-        part[codes.PART_END],
-        part[codes.PART_VARIABLES],
-        part[codes.PART_END_CORNER],
-    )
-    corners = 1 << variables
-    columns, values, fresh, point = scratch.columns, scratch.values, scratch.fresh, scratch.point
-    ends, lows, highs = scratch.series[0], scratch.series[1], scratch.series[2]
-    if position == 0:
-        _start(nodes, part, table, values)
-    elif table[0] == table[corners - 1]:
-        # it says the same whatever comes
-        for k in range(count):
-            ends[k] = lows[k] = highs[k] = table[0]
-        return
-    _fill_columns(nodes, part, channel, mirror, memory.history, begin, count, columns)
-    anchored = (
-        _is_anchored(nodes[end - 1, codes.NODE_CODE]) or nodes[end - 1, codes.NODE_CODE] == codes.PART_OR
-    )
-    if variables == 1 and not anchored:
-        _step_simple(nodes[end - 1], table, columns, count, end_corner, ends, lows, highs)
-        return
-    for k in range(count):
-        elapsed_ns = memory.stamps[begin + k] - memory.clock[START_NS]
-        for d in range(first, end):
-            # what depends on no variable is the same at every corner
-            if not nodes[d, codes.NODE_DEPENDS]:
-                values[d - first] = columns[d - first, k]
-        for corner in range(corners):
-            for d in range(first, end):
-                if not nodes[d, codes.NODE_DEPENDS]:
-                    continue
-                code, a, b = nodes[d, codes.NODE_CODE], nodes[d, codes.NODE_A], nodes[d, codes.NODE_B]
-                if code == codes.PART_AND:
-                    value = min(values[a], values[b])
-                elif code == codes.PART_OR:
-                    value = max(values[a], values[b])
-                else:
-                    variable = nodes[d, codes.NODE_VARIABLE]
-                    later = np.inf if (corner >> variable) & 1 else -np.inf
-                    # the two that most formulas are made of come without a call
-                    if code == codes.UNTIL:
-                        value = max(values[b], min(values[a], later) if a >= 0 else later)
-                    elif code == codes.RELEASE:
-                        value = min(values[b], max(values[a], later) if a >= 0 else later)
-                    else:
-                        value = _expand_anchored(nodes[d], values, later, position + k, elapsed_ns)
-                    point[variable] = value
-                values[d - first] = value
-            fresh[corner] = read_table(table, variables, point, scratch.order)
-        for corner in range(corners):
-            table[corner] = fresh[corner]
-        if anchored:
-            _close_windows(nodes, part, table, position + k, elapsed_ns)
-        ends[k], lows[k], highs[k] = table[end_corner], table[0], table[corners - 1]
+def _now(rows: Integers, row: int, position: int, elapsed_ns: int) -> int:
+    return position if rows[row, codes.NODE_UNIT] == codes.SAMPLES else elapsed_ns
 
 
-@uncounted
-def _step_simple(
-    node: Integers,
-    table: Floats,
-    columns: Floats,
-    count: int,
-    end_corner: int,
-    ends: Floats,
-    lows: Floats,
-    highs: Floats,
-) -> None:
-    """Run `step_tables` for a single until or release: a table of two numbers."""
-    low, high = table[0], table[1]
-    a, b = node[codes.NODE_A], node[codes.NODE_B]
-    until = node[codes.NODE_CODE] == codes.UNTIL
-    for k in range(count):
-        right = columns[b, k]
-        if until:
-            later_low = right
-            later_high = max(right, columns[a, k]) if a >= 0 else np.inf
-        else:
-            later_low = min(right, columns[a, k]) if a >= 0 else -np.inf
-            later_high = right
-        low, high = max(low, min(later_low, high)), max(low, min(later_high, high))
-        lows[k], highs[k] = low, high
-        ends[k] = high if end_corner else low
-    table[0], table[1] = low, high
-
-
-@uncounted
-def step_tables(
-    nodes: Integers, parts: Integers, memory: Memory, scratch: Scratch, channels: int, position: int,
-    begin: int, count: int,
-) -> None:  # fmt: skip
-    """Substitute samples into the tables of the parts without windows.
+@kernel
+def run_table(
+    rows: Integers, part: int, history: Floats, channel: int, times: Integers, memory: Floats, table: int,
+    work: Floats, top: int, position: int, begin: int, count: int, start_ns: int,
+) -> int:  # fmt: skip
+    """Substitute samples into the table of a part without windows, in one channel.
 
     Args:
+        part: its row.
+        times: the first row has those of the recent samples.
+        table: where it begins in the `memory` of the channel.
+        top: the first row of `work` that there is room in.
         position: of the first of the `count` samples; they stand at `begin` in the history.
+
+    Returns:
+        The first of the rows of `work` that say what it is, and its lower and upper bound.
     """
-    nominal_high = 1 if channels > 1 else 0
-    wide_low = 2 if channels > 2 else 0
-    ends, lows, highs = scratch.series[0], scratch.series[1], scratch.series[2]
-    for p in range(parts.shape[0]):
-        part, numbers = parts[p], scratch.parts[p]
-        if not part[codes.PART_NUMBERS]:
-            continue
-        if part[codes.PART_KIND] != codes.TABLE:
-            continue
-        for channel in range(channels):
-            table = memory.tables[
-                channel,
-                part[codes.PART_TABLE_START] : part[codes.PART_TABLE_START]
-                + (1 << part[codes.PART_VARIABLES]),
-            ]
-            mirror = channel ^ nominal_high
-            _step_channel(nodes, part, table, channel, mirror, memory, scratch, position, begin, count)
-            for k in range(count):
-                if channel == 0:
-                    numbers[0, k] = ends[k]
-                if channel == nominal_high:
-                    numbers[1, k] = ends[k]
-                if channel == wide_low:
-                    numbers[4, k], numbers[6, k] = lows[k], ends[k]
-                if channel == wide_low + nominal_high:
-                    numbers[5, k], numbers[7, k] = highs[k], ends[k]
+    first, end = rows[part, codes.PART_FIRST], rows[part, codes.PART_END]
+    variables, end_corner = rows[part, codes.PART_VARIABLES], rows[part, codes.PART_END_CORNER]
+    nodes, corners, root = end - first, 1 << variables, rows[end - 1, codes.NODE_CODE]
+    values, fresh, point, says = (
+        top + nodes + VALUES,
+        top + nodes + FRESH,
+        top + nodes + POINT,
+        top + nodes + SAYS,
+    )
+    if position == 0:
+        _start(rows, first, end, corners, memory, channel, table, work, values)
+    elif memory[channel, table] == memory[channel, table + corners - 1]:
+        # it says the same whatever comes
+        for k in range(count):
+            work[says, k] = work[says + 1, k] = work[says + 2, k] = memory[channel, table]
+        return says
+    _fill_columns(rows, first, end, history, channel, begin, count, work, top)
+    if variables == 1 and root in (codes.UNTIL, codes.RELEASE):
+        _run_simple(rows, end - 1, end_corner, memory, channel, table, work, top, says, count)
+        return says
+    for k in range(count):
+        elapsed_ns = times[0, begin + k] - start_ns
+        for d in range(nodes):
+            # what depends on no variable is the same at every corner
+            if not rows[first + d, codes.NODE_DEPENDS]:
+                work[values, d] = work[top + d, k]
+        for corner in range(corners):
+            for row in range(first, end):
+                if not rows[row, codes.NODE_DEPENDS]:
+                    continue
+                code, a, b = rows[row, codes.NODE_CODE], rows[row, codes.NODE_A], rows[row, codes.NODE_B]
+                if code == codes.PART_AND:
+                    value = min(work[values, a], work[values, b])
+                elif code == codes.PART_OR:
+                    value = max(work[values, a], work[values, b])
+                else:
+                    variable, counts = rows[row, codes.NODE_VARIABLE], True
+                    is_until = code in (codes.UNTIL, codes.ANCHORED_UNTIL)
+                    if _is_anchored(code):
+                        # its right operand counts inside its window only
+                        now, high = _now(rows, row, position + k, elapsed_ns), rows[row, codes.NODE_HIGH]
+                        counts = rows[row, codes.NODE_LOW] <= now and (high < 0 or now <= high)
+                    value = np.inf if corner >> variable & 1 else -np.inf
+                    if a >= 0:
+                        value = min(work[values, a], value) if is_until else max(work[values, a], value)
+                    if counts:
+                        value = max(work[values, b], value) if is_until else min(work[values, b], value)
+                    work[point, variable] = value
+                work[values, row - first] = value
+            work[fresh, corner] = read_table(memory, channel, table, variables, work, point)
+        for corner in range(corners):
+            memory[channel, table + corner] = work[fresh, corner]
+        for row in range(first, end):
+            # settle the anchored operators whose window no later sample can fall into
+            high = rows[row, codes.NODE_HIGH]
+            if _is_anchored(rows[row, codes.NODE_CODE]) and 0 <= high <= _now(
+                rows, row, position + k, elapsed_ns
+            ):
+                bit = 1 << rows[row, codes.NODE_VARIABLE]
+                for corner in range(corners):
+                    settled = corner | bit if rows[row, codes.NODE_WEAK] else corner & ~bit
+                    memory[channel, table + corner] = memory[channel, table + settled]
+        work[says, k] = memory[channel, table + end_corner]
+        work[says + 1, k], work[says + 2, k] = memory[channel, table], memory[channel, table + corners - 1]
+    return says

@@ -1,295 +1,804 @@
-"""Bounded operators below unbounded ones, and past operators above future ones.
+"""Windows below unbounded operators: the nodes of a part at every position that is still open.
 
-Such a part's value at its oldest open positions changes with every sample, so the samples since then are
-stored. Its table (see `tables`) belongs to a *base*: the last position of the root up to which all windows
-have closed, or do not matter any more (see `closing`), or that of some samples ago. Later positions are
-columns of numbers (see `open_windows`), which are read into the table. A past operator with a future
-operator below it carries a table of its own from base to base.
+A part runs in one channel at a time. Each of its nodes is a row of numbers, its *column*, one number for each
+recent sample. A sample changes a column only where a window has begun to hold it or has closed with it, or
+where an operand has changed, so columns are brought up to it, operands first, and each says from where on
+it has changed.
 
-A part's cells hold: the base, as the next position to absorb; for each variable, its position in the table;
-for each table of a past operator, the position it belongs to (-1: before the first).
+Positions of the root whose windows have all closed are absorbed into a table (see `tables`). It belongs to the
+*base*, the first position of the root that is not absorbed: it says what the root is at the first sample, by
+what each variable will be where the table ends for it, its *boundary*. A past operator over one that looks
+ahead has a table of its own, which says what it is at one position, its *state*.
+
+Columns exist in up to three sets: as if the run ended with the newest sample, and as low and as high as what is
+still to come may make them. Positions are places among the recent samples; `last` is the newest of them.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from spatial_replay.compiled import apart, inlined, uncounted
+from spatial_replay.compiled import inlined, kernel
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
-from spatial_replay.monitor.online.closing import (
-    CLOSING,
-    absorb,
-    is_outdone,
-    is_settled,
-    looks_for_outdone,
-)
-from spatial_replay.monitor.online.node_columns import (
-    columns_number,
-    look_of,
-    set_point,
-    signal_of,
-    tables_end,
-)
-from spatial_replay.monitor.online.open_windows import (
-    bring_columns_up,
-    has_ended,
-    is_cut_short,
-    is_known,
-    is_plain,
-    is_same,
-    known_number,
-    looks_of,
-    reach,
-    root_window,
-    runs_root,
-)
-from spatial_replay.monitor.online.run_arrays import arrays_at
-from spatial_replay.monitor.online.sliding import (
-    beyond,
-    copy,
-    either,
-    enter_samples,
-    extremum,
-    first_unclosed,
-    recent_of,
-)
-from spatial_replay.monitor.online.state import (
-    JOINED,
-    NUMBERS,
-    OFFSET,
-    POSITION,
-    Memory,
-    Scratch,
-    behind,
-    first_behind,
-)
 from spatial_replay.monitor.online.tables import read_table
 
-_MANY = 4
-"""From so many stretches of open positions on, each is joined by itself, and only if it has changed."""
+CLOSING = 16
+"""So many samples together are looked at for positions that have closed."""
+BLOCK = 64
+"""So many numbers of what the root joins are joined together, and again only if one has changed."""
+STRIDE = 16
+"""So many numbers are filled with one at a time."""
+_NEVER = 1 << 62
 
+SETS = 3
+"""`OPEN_END`, `OPEN_LOW` and `OPEN_HIGH`; the columns of a corner of the table come after those."""
+# rows of columns after those of the nodes: what blocks are joined to, room for `_slide`, and what a part says
+JOINED, BEFORE, SAYS = 0, SETS, SETS + 1
+SAID_NOW = 3
+"""The row of what a part is at the newest sample; those before it are what it is at the first one, by set."""
+EXTRA_ROWS = SETS + 5
 
-@uncounted
-def _joined(
-    number: int, at: int, is_until: bool, body: Floats, value: float, begin: int, end: int, memory: Memory,
-    count: int,
-) -> float:  # fmt: skip
-    """Join a number with those at begin … end - 1, of `count` recent ones, of which few ever change."""
-    if end - begin < _MANY * JOINED:
-        return extremum(is_until, body[begin : max(end, begin)], value)
-    joined, nothing = memory.joined[at, number], -np.inf if is_until else np.inf
-    first = max(memory.unjoined[number, at] - memory.clock[OFFSET], 0) // JOINED
-    for k in range(first, (count - 1) // JOINED + 1):
-        joined[k] = extremum(is_until, body[k * JOINED : min(k * JOINED + JOINED, count)], nothing)
-    memory.unjoined[number, at] = memory.clock[OFFSET] + count
-    whole, after = begin // JOINED + 1, end // JOINED
-    value = extremum(is_until, body[begin : whole * JOINED], value)
-    value = extremum(is_until, joined[whole:after], value)
-    return extremum(is_until, body[after * JOINED : end], value)
+# rows of the state: the first holds single numbers, the others a number for each node
+HEAD, LOWS, LOW, HIGH, PLAIN, CHANGED, BOUNDARY, STATE = range(8)
+STARTS = 8  # and then, of each window in seconds: where it starts at each position, and what comes after it
+# columns of the first row: how many samples are forgotten, the time of the first one, the base, whether anything
+# is absorbed, how many samples windows in seconds know
+OFFSET, START_NS, BASE, IS_BEGUN, ENTERED = range(5)
+KNOWN = 5  # for each set, up to where its columns are known
+UNJOINED = KNOWN + SETS  # for each set, the first position that its blocks do not know
+NEXT = UNJOINED + SETS  # of each window in seconds, the next positions to begin and to close
+PERSISTENT = ENTERED
 
 
 @inlined
-def _cut_at(nodes: Integers, part: Integers, memory: Memory, scratch: Scratch, offset: int, last: int) -> int:
-    """Return the first position where a window is open that cuts a part's bound short."""
-    first, recent = last + 1, recent_of(memory, scratch)
-    for d in range(part[codes.PART_FIRST], part[codes.PART_END]):
-        if nodes[d, codes.NODE_CUTS]:
-            first = min(first, first_unclosed(nodes[d], recent, offset, last))
+def better(is_greatest: bool, first: float, second: float) -> float:
+    """Return the greater or the lesser of two numbers."""
+    if is_greatest:
+        return first if first > second else second
+    return first if first < second else second
+
+
+@inlined
+def _outdoes(is_greatest: bool, value: float, other: float) -> bool:
+    return value > other if is_greatest else value < other
+
+
+@inlined
+def beyond(mode: int, weak: int) -> float:
+    """Return the value an operator that is still open takes from beyond the last sample."""
+    if mode == codes.OPEN_END:
+        return np.inf if weak else -np.inf
+    return np.inf if mode == codes.OPEN_HIGH else -np.inf
+
+
+@kernel
+def extremum(is_greatest: bool, columns: Floats, row: int, begin: int, end: int, start: float) -> float:
+    """Return the greatest or least of some numbers of a row and `start`.
+
+    Eight are joined side by side: one after the other, each would wait for the one before.
+    """
+    v0 = v1 = v2 = v3 = v4 = v5 = v6 = v7 = start
+    k = begin
+    if is_greatest:
+        while k + 8 <= end:
+            v0, v1 = max(v0, columns[row, k]), max(v1, columns[row, k + 1])
+            v2, v3 = max(v2, columns[row, k + 2]), max(v3, columns[row, k + 3])
+            v4, v5 = max(v4, columns[row, k + 4]), max(v5, columns[row, k + 5])
+            v6, v7 = max(v6, columns[row, k + 6]), max(v7, columns[row, k + 7])
+            k += 8
+        value = max(max(max(v0, v1), max(v2, v3)), max(max(v4, v5), max(v6, v7)))
+    else:
+        while k + 8 <= end:
+            v0, v1 = min(v0, columns[row, k]), min(v1, columns[row, k + 1])
+            v2, v3 = min(v2, columns[row, k + 2]), min(v3, columns[row, k + 3])
+            v4, v5 = min(v4, columns[row, k + 4]), min(v5, columns[row, k + 5])
+            v6, v7 = min(v6, columns[row, k + 6]), min(v7, columns[row, k + 7])
+            k += 8
+        value = min(min(min(v0, v1), min(v2, v3)), min(min(v4, v5), min(v6, v7)))
+    for i in range(k, end):
+        value = better(is_greatest, value, columns[row, i])
+    return value
+
+
+# ------------------------------------------------------------------------------- where windows begin and end
+
+
+@inlined
+def window_of(rows: Integers, d: int) -> tuple[bool, int, int, int, int]:
+    """Return whether a node looks ahead, its unit and its ends, and the row of its times."""
+    is_ahead = codes.PART_WINDOW_MAX <= rows[d, codes.NODE_CODE] <= codes.SHIFT
+    times = STARTS + 2 * rows[d, codes.NODE_TIMED]
+    return is_ahead, rows[d, codes.NODE_UNIT], rows[d, codes.NODE_LOW], rows[d, codes.NODE_HIGH], times
+
+
+@inlined
+def _start(state: Integers, window: tuple[bool, int, int, int, int], position: int, last: int) -> int:
+    """Return the first position that a window holds, that after the last sample if it is still to come."""
+    is_ahead, unit, near, far, times = window
+    if unit != codes.SAMPLES:
+        return min(state[times, position], last + 1)
+    return min(position + near, last + 1) if is_ahead else max(position - far, 0)
+
+
+@inlined
+def _after(state: Integers, window: tuple[bool, int, int, int, int], position: int, last: int) -> int:
+    """Return the position that comes after a window, at most that after the last sample."""
+    is_ahead, unit, near, far, times = window
+    if unit != codes.SAMPLES:
+        return min(state[times + 1, position], last + 1)
+    return min(position + far, last) + 1 if is_ahead else position - near + 1
+
+
+@inlined
+def _first_holding(state: Integers, window: tuple[bool, int, int, int, int], position: int, last: int) -> int:
+    """Return the first position whose window does not end before another one."""
+    is_ahead, unit, near, far, times = window
+    if unit == codes.SAMPLES:
+        return max(position - far, 0) if is_ahead else position + near
+    low, high = 0, last + 1
+    while low < high:
+        middle = (low + high) >> 1
+        if state[times + 1, middle] <= position:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@inlined
+def _first_starting(
+    state: Integers, window: tuple[bool, int, int, int, int], position: int, last: int
+) -> int:
+    """Return the first position whose window ahead starts at another one, or after it."""
+    _, unit, near, _, times = window
+    if unit == codes.SAMPLES:
+        return max(position - near, 0)
+    low, high = 0, last + 1
+    while low < high:
+        middle = (low + high) >> 1
+        if state[times, middle] < position:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@inlined
+def _first_unclosed(
+    state: Integers, stamps: Integers, window: tuple[bool, int, int, int, int], last: int
+) -> int:
+    """Return the first position whose window ahead a later sample may fall into."""
+    _, unit, _, far, times = window
+    if unit == codes.SAMPLES:
+        return max(last - far + 1, 0)
+    first = state[HEAD, NEXT + times + 1 - STARTS]
+    return first + 1 if stamps[last] - stamps[first] == far else first
+
+
+@inlined
+def _enter(rows: Integers, stamps: Integers, state: Integers, last: int) -> None:
+    """Note which windows in seconds begin with the newest samples, and which have ended before them."""
+    for d in range(len(rows) - 1):
+        if rows[d, codes.NODE_TIMED] < 0:
+            continue
+        is_ahead, _, near, far, times = window_of(rows, d)
+        begun, closed = state[HEAD, NEXT + times - STARTS], state[HEAD, NEXT + times + 1 - STARTS]
+        for position in range(state[HEAD, ENTERED], last + 1):
+            time_ns = stamps[position]
+            if is_ahead:
+                state[times, position] = state[times + 1, position] = _NEVER
+                while begun <= position and time_ns - stamps[begun] >= near:
+                    state[times, begun] = position
+                    begun += 1
+                while 0 <= far and closed < position and time_ns - stamps[closed] > far:
+                    state[times + 1, closed] = position
+                    closed += 1
+            else:
+                while begun < position and time_ns - stamps[begun] > far:
+                    begun += 1
+                while closed <= position and time_ns - stamps[closed] >= near:
+                    closed += 1
+                state[times, position], state[times + 1, position] = begun, closed
+        state[HEAD, NEXT + times - STARTS], state[HEAD, NEXT + times + 1 - STARTS] = begun, closed
+    state[HEAD, ENTERED] = last + 1
+
+
+# -------------------------------------------------------------------------------------- columns of the nodes
+
+
+@kernel
+def _slide(
+    is_greatest: bool, window: tuple[bool, int, int, int, int], state: Integers, columns: Floats,
+    child: int, own: int, before: int, begin: int, end: int, last: int,
+) -> int:  # fmt: skip
+    """Compute extrema over windows at begin … end - 1; return the first that changes, last + 1 for none.
+
+    What all of these hold is looked through once, and then what the first ones hold before it, and the last
+    ones after it.
+    """
+    nothing, changed = -np.inf if is_greatest else np.inf, last + 1
+    while begin < end:
+        middle, stop = _after(state, window, begin, last), end
+        at = _start(state, window, end - 1, last)
+        if at >= middle:
+            stop, at = begin + 1, _start(state, window, begin, last)
+            while stop < end and _start(state, window, stop, last) < middle:
+                at = _start(state, window, stop, last)
+                stop += 1
+        value = extremum(is_greatest, columns, child, at, middle, nothing)
+        for position in range(stop - 1, begin - 1, -1):
+            start = _start(state, window, position, last)
+            while at > start:
+                at -= 1
+                value = better(is_greatest, value, columns[child, at])
+            columns[before, position - begin] = value
+        value = nothing
+        for position in range(begin, stop):
+            after = _after(state, window, position, last)
+            while middle < after:
+                value = better(is_greatest, value, columns[child, middle])
+                middle += 1
+            number = better(is_greatest, columns[before, position - begin], value)
+            if changed > last and columns[own, position] != number:
+                changed = position
+            columns[own, position] = number
+        begin = stop
+    return changed
+
+
+@inlined
+def _join_changes(
+    is_greatest: bool, window: tuple[bool, int, int, int, int], state: Integers, columns: Floats,
+    child: int, own: int, begin: int, end: int, changed: int, last: int,
+) -> int:  # fmt: skip
+    """Join what has changed, and can only have become better, with windows that hold all of it up to their
+    end; return the first that changes, last + 1 for none."""
+    value, first, at = -np.inf if is_greatest else np.inf, last + 1, changed
+    for position in range(begin, end):
+        after = _after(state, window, position, last)
+        while at < after:
+            value = better(is_greatest, value, columns[child, at])
+            at += 1
+        number = better(is_greatest, columns[own, position], value)
+        if number != columns[own, position]:
+            columns[own, position], first = number, min(first, position)
     return first
 
 
 @inlined
-def _value_at_first(
-    nodes: Integers, part: Integers, number: int, which: int, channels: int, memory: Memory, scratch: Scratch,
-    offset: int, last: int,
-) -> float:  # fmt: skip
-    """Return one of a part's numbers at the first sample, once its columns are brought up."""
-    look, at, root = look_of(which, channels), columns_number(which), nodes[part[codes.PART_END] - 1]
-    base, variables = memory.cells[part[codes.PART_CELL_START]], part[codes.PART_VARIABLES]
-    tables = memory.tables[look.channel, part[codes.PART_TABLE_START] : tables_end(part)]
-    if is_known(which, part, memory, last):
-        return known_number(which, part, memory, look.channel)
-    has_more = not has_ended(part, root, memory, last)
-    value = beyond(look.mode if has_more else codes.OPEN_END, root[codes.NODE_WEAK])
-    if runs_root(part, root):
-        value = memory.columns[at, part[codes.PART_END] - 1, base - offset] if base <= last else value
-    else:
-        begin, end = root_window(root, memory, last)
-        if is_cut_short(which, part, root, channels):
-            at = look.channel
-            end = min(end, _cut_at(nodes, part, memory, scratch, offset, last))
-        d = part[codes.PART_FIRST] + root[codes.NODE_B]
-        signal, is_until = signal_of(nodes, d), root[codes.NODE_CODE] == codes.UNTIL
-        body = memory.columns[at, d] if signal < 0 else memory.history[look.channel, signal]
-        begin, count = max(begin, base) - offset, last + 1 - offset
-        value = _joined(number, at, is_until, body, value, begin, end - offset, memory, count)
-    if base == 0:
-        return float(value)
-    if is_plain(part):
-        return float(max(tables[0], min(value, tables[1])))
-    for d in range(part[codes.PART_FIRST], part[codes.PART_END] - 1):
-        set_point(nodes[d], part, memory.columns[at, d], memory.cells, look.mode, offset, last, scratch.point)
-    if root[codes.NODE_VARIABLE] >= 0:
-        scratch.point[root[codes.NODE_VARIABLE]] = value
-    return read_table(tables[: 1 << variables], variables, scratch.point, scratch.order)
+def _run_open(
+    is_greatest: bool, window: tuple[bool, int, int, int, int], state: Integers, columns: Floats,
+    child: int, own: int, begin: int, changed: int, last: int, is_fresh: bool,
+) -> int:  # fmt: skip
+    """Bring windows up that reach to the last sample, backwards as far as they change; return the first.
+
+    The later one of these begins, the less it holds.
+    """
+    value = -np.inf if is_greatest else np.inf
+    for position in range(begin if is_fresh else last, last + 1):
+        columns[own, position] = value
+    # after those that have begun
+    position = min(_first_starting(state, window, last + 1, last), last + 1)
+    if changed == last and not is_fresh:
+        value = columns[child, last]
+        for stride in (STRIDE, 1):
+            while position - stride >= begin and _outdoes(
+                is_greatest, value, columns[own, position - stride]
+            ):
+                for k in range(position - stride, position):
+                    columns[own, k] = value
+                position -= stride
+        return position
+    at = last + 1
+    while position > begin:
+        start = _start(state, window, position - 1, last)
+        while at > start:
+            at -= 1
+            value = better(is_greatest, value, columns[child, at])
+        if not is_fresh and start <= changed and columns[own, position - 1] == value:
+            break
+        position -= 1
+        columns[own, position] = value
+    return position
 
 
 @inlined
-def _value_at_last(
-    nodes: Integers, part: Integers, d: int, which: int, channel: int, memory: Memory, offset: int, last: int
-) -> float:
-    """Return what a node of a part is at the last sample, once the part's columns are brought up."""
-    root = nodes[part[codes.PART_END] - 1]
-    if d < part[codes.PART_END] - 1 or runs_root(part, root):
-        return float(memory.columns[which, d, last - offset])
-    d = part[codes.PART_FIRST] + root[codes.NODE_B]
-    signal = signal_of(nodes, d)
-    body = (memory.columns[which, d] if signal < 0 else memory.history[channel, signal])[last - offset]
-    value = beyond(codes.OPEN_END, root[codes.NODE_WEAK])
-    return either(root[codes.NODE_CODE] == codes.UNTIL, float(body), value)
+def _run_window(
+    rows: Integers, d: int, stamps: Integers, state: Integers, columns: Floats, child: int, own: int,
+    before: int,
+    mode: int, changed: int, last: int, is_fresh: bool,
+) -> int:  # fmt: skip
+    """Bring the column of a bounded operator up; return the first position that changes."""
+    code, window, lowest = rows[d, codes.NODE_CODE], window_of(rows, d), state[LOWS, d]
+    is_greatest = code in (codes.PART_WINDOW_MAX, codes.PAST_WINDOW_MAX)
+    begin = lowest if is_fresh else max(min(_first_holding(state, window, changed, last), last), lowest)
+    if not window[0]:
+        first = _slide(is_greatest, window, state, columns, child, own, before, begin, last + 1, last)
+        return lowest if is_fresh else min(first, last)
+    # whether what may come outdoes all that an open window holds
+    is_decided = mode != codes.OPEN_END and (mode == codes.OPEN_HIGH) == is_greatest
+    if is_decided:
+        tail = max(_first_unclosed(state, stamps, window, last), lowest)
+        if not is_fresh and last > 0:  # those that have closed with the last sample have changed, too
+            begin = min(begin, max(_first_holding(state, window, last - 1, last), lowest))
+    else:
+        tail = max(_first_holding(state, window, last, last), lowest)
+    tail, first = min(tail, last + 1), last
+    grown = begin
+    if not is_fresh and not is_decided and rows[d, codes.NODE_GROWS] >> mode & 1:
+        grown = min(max(_first_starting(state, window, changed + 1, last), begin), tail)
+        first = min(
+            first, _join_changes(is_greatest, window, state, columns, child, own, begin, grown, changed, last)
+        )
+    if grown < tail:
+        first = min(first, _slide(is_greatest, window, state, columns, child, own, before, grown, tail, last))
+    if is_decided:
+        for position in range(tail if is_fresh else max(tail, last), last + 1):
+            columns[own, position] = beyond(mode, 0)
+    elif tail <= last:
+        first = min(
+            first, _run_open(is_greatest, window, state, columns, child, own, tail, changed, last, is_fresh)
+        )
+    return lowest if is_fresh else first
 
 
-@uncounted
-def _enter_last(
-    nodes: Integers, parts: Integers, number: int, which: int, channels: int, memory: Memory,
-    scratch: Scratch, offset: int, last: int, k: int,
+@kernel
+def _run_since(
+    strong: bool, has_left: bool, columns: Floats, left: int, right: int, own: int, value: float, begin: int,
+    last: int,
+) -> int:  # fmt: skip
+    """Run a since or trigger forwards from a value before `begin`; return the first position that changes."""
+    changes, is_same = begin, True
+    for k in range(begin, last + 1):
+        if has_left:
+            value = better(not strong, columns[left, k], value)
+        value = better(strong, columns[right, k], value)
+        is_same = is_same and k < last and columns[own, k] == value
+        changes += is_same
+        columns[own, k] = value
+    return changes
+
+
+@inlined
+def _start_of_past(rows: Integers, d: int, state: Integers, tables: Floats) -> float:
+    """Return the value that a since or trigger starts from, by its table, which ends at its state."""
+    if state[STATE, d] < 0:
+        return np.inf if rows[d, codes.NODE_WEAK] else -np.inf
+    part = len(rows) - 1
+    variables, point = rows[part, codes.PART_VARIABLES], 2 * rows[part, codes.PART_TABLES]
+    return read_table(tables, rows[d, codes.NODE_TABLE], 0, variables, tables, point)
+
+
+@inlined
+def _set_point(
+    rows: Integers, d: int, state: Integers, columns: Floats, row: int, mode: int, last: int, tables: Floats
+) -> None:
+    """Enter into the point what the variable of a node is where the part's table ends."""
+    boundary = state[BOUNDARY, d]
+    value = columns[row, boundary] if boundary <= last else beyond(mode, rows[d, codes.NODE_WEAK])
+    tables[2 * rows[len(rows) - 1, codes.PART_TABLES], rows[d, codes.NODE_VARIABLE]] = value
+
+
+@inlined
+def has_column(rows: Integers) -> bool:
+    """Return whether the root has a column. One that joins all its operand from the base on needs none."""
+    root = len(rows) - 2
+    return bool(rows[root, codes.NODE_A] >= 0 or rows[root, codes.NODE_VARIABLE] < 0)
+
+
+@kernel
+def _bring_up(
+    rows: Integers, history: Floats, stamps: Integers, columns: Floats, state: Integers, tables: Floats,
+    mode: int, last: int,
 ) -> None:  # fmt: skip
-    """Enter what a part says of itself, and of others, at the last sample."""
-    channel = look_of(which, channels).channel
-    for other in range(len(parts)):
-        if parts[other, codes.PART_LAST_IN] == number:
-            d = parts[number, codes.PART_FIRST] + parts[other, codes.PART_LAST_NODE]
-            value = _value_at_last(nodes, parts[number], d, which, channel, memory, offset, last)
-            scratch.parts[other, which + 2, k] = value
-            if channels == 1:
-                scratch.parts[other, 3, k] = value
-
-
-@uncounted
-def _outdone_up_to(
-    nodes: Integers, part: Integers, channels: int, memory: Memory, offset: int, last: int
-) -> int:
-    """Return what comes after the positions where what the root joins is outdone (see `closing`)."""
-    root, position = nodes[part[codes.PART_END] - 1], memory.cells[part[codes.PART_CELL_START]]
-    d, stop = part[codes.PART_FIRST] + root[codes.NODE_B], last + 1
-    signal = signal_of(nodes, d)
-    for which in range(channels):
-        body, k = memory.columns[which, d] if signal < 0 else memory.history[which, signal], position
-        while k < stop and is_outdone(part, root, memory, which, body[k - offset]):
-            k += 1
-        stop = k
-    return int(stop)
-
-
-@apart
-def run_windows(table_at: int, channels: int, count: int) -> int:
-    """Run all parts with windows over the next `count` samples, one by one.
-
-    `scratch.parts` receives their numbers; those of an ending run are for the last sample.
-    """
-    tables, _, _, _ = arrays_at(table_at)
-    for number in range(len(tables.parts)):
-        part = tables.parts[number]
-        if part[codes.PART_KIND] == codes.WINDOWED and part[codes.PART_NUMBERS] & codes.FIRST_NUMBERS:
-            run_part(table_at, number, channels, 0, count, count)
-    return 0
-
-
-@apart
-def run_part(table_at: int, number: int, channels: int, begin: int, end: int, count: int) -> int:
-    """Run a part over the samples number begin … end - 1 of the next `count`, one by one."""
-    tables, memory, scratch, _ = arrays_at(table_at)
-    position, offset = memory.clock[POSITION], memory.clock[OFFSET]
-    part, numbers = tables.parts[number], scratch.parts[number]
-    own = part[codes.PART_NUMBERS]
-    for k in range(begin, end):
-        last = position + k
-        if is_settled(part, memory):
-            for which in range(NUMBERS):
-                # what is now goes on, and is said by another part
-                if (own & codes.FIRST_NUMBERS) >> which & 1:
-                    channel = look_of(which, channels).channel
-                    numbers[which, k] = memory.tables[channel, part[codes.PART_TABLE_START]]
-            continue
-        if len(memory.window_next):
-            enter_samples(
-                tables.nodes, part, memory.stamps, memory.window_ends, memory.window_next, offset, last
-            )
-        root = tables.nodes[part[codes.PART_END] - 1]
-        looks = looks_of(part, root, memory, channels, k == count - 1, last)
-        bring_columns_up(table_at, number, looks, channels, last)
-        for which in range(NUMBERS):
-            if which in (2, 3) or (which >= 6 and k < count - 1) or not (own >> which) & 1:
-                continue
-            if which == 1 and channels == 1:
-                numbers[1, k] = numbers[0, k]
-            elif which >= 6 and channels < 4:
-                numbers[which, k] = numbers[which - 6, k]
-            elif is_same(which, part, memory, channels, last):
-                numbers[which, k] = numbers[look_of(which, channels).channel, k]
+    """Bring the columns of one set up to the last sample: by that one alone, or all of them."""
+    nodes = len(rows) - 1
+    is_fresh, first = state[HEAD, KNOWN + mode] != last - 1 or last == 0, mode * nodes
+    if state[HEAD, KNOWN + mode] == last:
+        return
+    state[HEAD, KNOWN + mode] = last
+    if is_fresh:
+        find_lows(rows, state, stamps, last)
+        state[HEAD, UNJOINED + mode] = 0
+    before = (SETS + 1) * nodes + BEFORE
+    for d in range(nodes if has_column(rows) else nodes - 1):
+        code, a, b = rows[d, codes.NODE_CODE], rows[d, codes.NODE_A], rows[d, codes.NODE_B]
+        own, begin, lowest = first + d, last, state[LOWS, d]
+        if code == codes.LITERAL:
+            begin = lowest if is_fresh else last
+            for k in range(begin, last + 1):
+                columns[own, k] = history[a, k]
+        elif code in (codes.PART_AND, codes.PART_OR):
+            left, right = first + a, first + b
+            begin = max(min(state[CHANGED, a], state[CHANGED, b]), lowest)
+            if code == codes.PART_OR:
+                while (
+                    begin < last
+                    and not is_fresh
+                    and max(columns[left, begin], columns[right, begin]) == columns[own, begin]
+                ):
+                    begin += 1
+                for k in range(begin, last + 1):
+                    columns[own, k] = max(columns[left, k], columns[right, k])
             else:
-                numbers[which, k] = _value_at_first(
-                    tables.nodes, part, number, which, channels, memory, scratch, offset, last
-                )
-                if which < 2 and part[codes.PART_IS_REMEMBERING]:
-                    _enter_last(
-                        tables.nodes, tables.parts, number, which, channels, memory, scratch, offset, last, k
-                    )
-        if last % CLOSING == CLOSING - 1:
-            outdone = 0
-            if looks_for_outdone(part, memory, channels, last):
-                outdone = _outdone_up_to(tables.nodes, part, channels, memory, offset, last)
-            absorb(table_at, number, channels, last, outdone)
-    return 0
+                while (
+                    begin < last
+                    and not is_fresh
+                    and min(columns[left, begin], columns[right, begin]) == columns[own, begin]
+                ):
+                    begin += 1
+                for k in range(begin, last + 1):
+                    columns[own, k] = min(columns[left, k], columns[right, k])
+        elif code in (codes.UNTIL, codes.RELEASE):
+            left, right, strong = first + max(a, 0), first + b, code == codes.UNTIL
+            changed, begin = state[CHANGED, b], last + 1
+            if a >= 0:
+                changed = min(changed, state[CHANGED, a])
+            value = beyond(mode, rows[d, codes.NODE_WEAK])
+            while begin > lowest:
+                if a >= 0:
+                    value = better(not strong, columns[left, begin - 1], value)
+                value = better(strong, columns[right, begin - 1], value)
+                if not is_fresh and begin <= min(changed, last) and columns[own, begin - 1] == value:
+                    break
+                begin -= 1
+                columns[own, begin] = value
+            if rows[d, codes.NODE_VARIABLE] >= 0:
+                _set_point(rows, d, state, columns, own, mode, last, tables)
+        elif code in (codes.PAST_SINCE, codes.PAST_TRIGGER):
+            left, right, start = first + max(a, 0), first + b, state[STATE, d]
+            value, begin = _start_of_past(rows, d, state, tables), min(state[CHANGED, b], last)
+            if a >= 0:
+                begin = min(begin, state[CHANGED, a])
+            # what its table says follows what is to come, if that matters to its operands
+            if start >= 0 and (is_fresh or columns[own, start] != value):
+                columns[own, start], begin = value, start
+            begin = start + 1 if is_fresh else max(begin, start + 1)
+            if begin > start + 1:
+                value = columns[own, begin - 1]
+            changed = _run_since(
+                code == codes.PAST_SINCE, a >= 0, columns, left, right, own, value, begin, last
+            )
+            begin = lowest if is_fresh else changed
+        elif code in (codes.SHIFT, codes.PAST_DELAY):
+            window, child = window_of(rows, d), first + a
+            missing = beyond(mode if window[0] else codes.OPEN_END, rows[d, codes.NODE_WEAK])
+            if is_fresh:
+                begin = lowest
+            elif window[0]:
+                begin = max(min(_first_starting(state, window, state[CHANGED, a], last), last), lowest)
+            else:
+                begin = max(min(_first_holding(state, window, state[CHANGED, a], last), last), lowest)
+            for k in range(begin, last + 1):
+                at = _start(state, window, k, last) if window[0] else _after(state, window, k, last) - 1
+                columns[own, k] = columns[child, at] if 0 <= at <= last else missing
+        else:
+            begin = _run_window(
+                rows,
+                d,
+                stamps,
+                state,
+                columns,
+                first + a,
+                own,
+                before,
+                mode,
+                state[CHANGED, a],
+                last,
+                is_fresh,
+            )
+        state[CHANGED, d] = begin
+    if not has_column(rows):
+        changed = state[CHANGED, rows[nodes - 1, codes.NODE_B]]
+        state[HEAD, UNJOINED + mode] = min(state[HEAD, UNJOINED + mode], changed)
 
 
-@uncounted
-def _kept_from(table_at: int, last: int) -> int:
-    """Return the first position that anything may still look at after the sample at `last`."""
-    tables, memory, scratch, _ = arrays_at(table_at)
-    signals, parts, offset, keep = tables.signals, tables.parts, memory.clock[OFFSET], last
-    for s in range(signals.shape[0]):
-        code, unit = signals[s, codes.SIGNAL_CODE], signals[s, codes.SIGNAL_UNIT]
-        if code == codes.DELAY:
-            keep = min(keep, behind(memory.stamps, offset, last, unit, signals[s, codes.SIGNAL_LOW]))
-        elif code in codes.RINGS:
-            keep = min(keep, first_behind(memory.stamps, offset, last, unit, signals[s, codes.SIGNAL_HIGH]))
-    for p in range(parts.shape[0]):
-        part = parts[p]
-        is_open = part[codes.PART_KIND] == codes.WINDOWED and not is_settled(part, memory)
-        if is_open and part[codes.PART_NUMBERS] & codes.FIRST_NUMBERS:
-            base = min(memory.cells[part[codes.PART_CELL_START]], last)
-            reach(table_at, p, base, last, last)
-            for d in range(part[codes.PART_END] - part[codes.PART_FIRST]):
-                keep = min(keep, scratch.low[d])
-    return int(max(keep, offset))
+# --------------------------------------------------------------------------------------- what a part says
 
 
-@apart
-def forget(table_at: int, channels: int) -> int:
-    """Drop the oldest samples, which nothing looks at again, if these are half of those there is room for.
+@inlined
+def _joined(
+    is_until: bool, columns: Floats, body: int, joined: int, unjoined: int, value: float, begin: int, end: int
+) -> float:
+    """Join a number with those at begin … end - 1, block by block; blocks are known before `unjoined`."""
+    whole, after = begin // BLOCK + 1, end // BLOCK
+    nothing = -np.inf if is_until else np.inf
+    for k in range(max(unjoined // BLOCK, whole), after):
+        columns[joined, k] = extremum(is_until, columns, body, k * BLOCK, (k + 1) * BLOCK, nothing)
+    value = extremum(is_until, columns, body, begin, whole * BLOCK, value)
+    value = extremum(is_until, columns, joined, whole, after, value)
+    return extremum(is_until, columns, body, after * BLOCK, end, value)
 
-    Returns:
-        1 if any were dropped, else 0.
+
+@kernel
+def _at_first(
+    rows: Integers, stamps: Integers, columns: Floats, state: Integers, tables: Floats, mode: int, end: int,
+    last: int, own_set: int,
+) -> float:  # fmt: skip
+    """Return what the root is at the first sample, by the columns of a set.
+
+    Args:
+        mode: what lies beyond the last sample.
+        end: what comes after the positions that the root joins.
     """
-    tables, memory, _, _ = arrays_at(table_at)
-    signals, position, offset = tables.signals, memory.clock[POSITION], memory.clock[OFFSET]
-    if position == 0:
-        return 0
-    keep = _kept_from(table_at, position - 1)
-    moved, kept = keep - offset, position - keep
-    if 2 * moved < len(memory.stamps):
-        return 0
-    stamps = memory.stamps[moved : moved + kept]
-    for k in range(kept):
-        memory.stamps[k] = stamps[k]
-    for channel in range(channels):
-        for s in range(len(signals)):
-            if signals[s, codes.SIGNAL_IS_KEPT]:
-                copy(memory.history[channel, s, moved : moved + kept], memory.history[channel, s, :kept])
-    # positions have moved
-    memory.known[:] = -1
-    memory.window_next[:] = -1
-    memory.clock[OFFSET] = keep
-    return 1
+    nodes, base = len(rows) - 1, state[HEAD, BASE]
+    first, root = own_set * nodes, nodes - 1
+    value = beyond(mode, rows[root, codes.NODE_WEAK])
+    if has_column(rows):
+        if base <= last:
+            value = columns[first + root, base]
+    else:
+        is_until, body = rows[root, codes.NODE_CODE] == codes.UNTIL, first + rows[root, codes.NODE_B]
+        if end - base < 4 * BLOCK:
+            value = extremum(is_until, columns, body, base, end, value)
+        else:
+            unjoined, joined = state[HEAD, UNJOINED + own_set], (SETS + 1) * nodes + JOINED + own_set
+            value = _joined(is_until, columns, body, joined, unjoined, value, base, end)
+            state[HEAD, UNJOINED + own_set] = max(unjoined, end // BLOCK * BLOCK)
+    if not state[HEAD, IS_BEGUN]:
+        return value
+    variables, point = rows[nodes, codes.PART_VARIABLES], 2 * rows[nodes, codes.PART_TABLES]
+    for d in range(root):
+        if rows[d, codes.NODE_VARIABLE] >= 0:
+            _set_point(rows, d, state, columns, first + d, mode, last, tables)
+    if rows[root, codes.NODE_VARIABLE] >= 0:
+        tables[point, rows[root, codes.NODE_VARIABLE]] = value
+    return read_table(tables, 0, 0, variables, tables, point)
+
+
+@inlined
+def _bound(
+    rows: Integers, history: Floats, stamps: Integers, columns: Floats, state: Integers, tables: Floats,
+    mode: int, last: int,
+) -> float:  # fmt: skip
+    """Return the lower or the upper bound of the root at the first sample (see `root_bounds`)."""
+    nodes = len(rows) - 1
+    variables, known = rows[nodes, codes.PART_VARIABLES], rows[nodes, codes.PART_KNOWN] >> mode
+    corner = 0 if mode == codes.OPEN_LOW else (1 << variables) - 1
+    is_until = rows[nodes - 1, codes.NODE_CODE] == codes.UNTIL
+    is_begun = state[HEAD, IS_BEGUN] > 0
+    if (known & 1 and (known & codes.EVEN_IF_OVER or not _is_over(rows, stamps, state, last))) or (
+        is_begun and variables == 0
+    ):
+        return tables[0, corner] if is_begun else beyond(mode, 0)
+    if rows[nodes, codes.PART_IS_CUT] and (mode == codes.OPEN_LOW) == is_until:
+        end = last + 1
+        for d in range(nodes):
+            if rows[d, codes.NODE_CUTS]:
+                end = min(end, _first_unclosed(state, stamps, window_of(rows, d), last))
+        end = max(end, state[HEAD, BASE])
+        return _at_first(rows, stamps, columns, state, tables, mode, end, last, codes.OPEN_END)
+    _bring_up(rows, history, stamps, columns, state, tables, mode, last)
+    return _at_first(rows, stamps, columns, state, tables, mode, last + 1, last, mode)
+
+
+@inlined
+def _is_over(rows: Integers, stamps: Integers, state: Integers, last: int) -> bool:
+    """Return whether no later sample can fall into the window of a root that counts from the first one."""
+    part = len(rows) - 1
+    far = rows[part, codes.PART_ENDS_AT]
+    if far < 0:
+        return False
+    if rows[part, codes.PART_END_UNIT] == codes.SAMPLES:
+        return bool(state[HEAD, OFFSET] + last >= far)
+    return bool(stamps[last] - state[HEAD, START_NS] >= far)
+
+
+@kernel
+def run_windows(
+    rows: Integers, history: Floats, stamps: Integers, columns: Floats, state: Integers, tables: Floats,
+    begin: int, count: int, bounds: int,
+) -> None:  # fmt: skip
+    """Run a part over the recent samples begin … begin + count - 1, in one channel.
+
+    Args:
+        rows: (D + 1, NODE_WIDTH), the part's nodes, and the part itself.
+        history: (S, room), the signals in the channel.
+        stamps: (room,), the times of the recent samples.
+        columns: (4 D + EXTRA_ROWS, room); the last four rows receive what the part says.
+        state: see `HEAD`.
+        tables: (2 T + 2, …): the part's table and those of its past operators, room for the next ones, a point
+            at which tables are read, and what past operators start from.
+        bounds: 1 to compute the lower bound, 2 for the upper one, 3 for both.
+    """
+    nodes = len(rows) - 1
+    root, says = nodes - 1, (SETS + 1) * nodes + SAYS
+    corners, has_now = 1 << rows[nodes, codes.PART_VARIABLES], rows[nodes, codes.PART_HAS_NOW] > 0
+    for k in range(count):
+        last = begin + k
+        if state[HEAD, IS_BEGUN] and not has_now and tables[0, 0] == tables[0, corners - 1]:
+            # it is the same whatever is still to come
+            for each in range(SETS):
+                columns[says + each, k] = tables[0, 0]
+            continue
+        if state.shape[0] > STARTS:
+            _enter(rows, stamps, state, last)
+        _bring_up(rows, history, stamps, columns, state, tables, codes.OPEN_END, last)
+        columns[says, k] = _at_first(
+            rows, stamps, columns, state, tables, codes.OPEN_END, last + 1, last, codes.OPEN_END
+        )
+        if has_now and has_column(rows):
+            columns[says + SAID_NOW, k] = columns[root, last]
+        elif has_now:
+            columns[says + SAID_NOW, k] = better(
+                rows[root, codes.NODE_CODE] == codes.UNTIL,
+                columns[rows[root, codes.NODE_B], last],
+                beyond(codes.OPEN_END, rows[root, codes.NODE_WEAK]),
+            )
+        for mode in range(codes.OPEN_LOW, codes.OPEN_HIGH + 1):
+            if bounds >> (mode - 1) & 1:
+                columns[says + mode, k] = _bound(rows, history, stamps, columns, state, tables, mode, last)
+        if (state[HEAD, OFFSET] + last) % CLOSING == CLOSING - 1:
+            _absorb(rows, stamps, columns, state, tables, last)
+
+
+# ------------------------------------------------------------------------------- closed positions go to tables
+
+
+@kernel
+def _reach(
+    rows: Integers, state: Integers, stamps: Integers, root_low: int, root_high: int, last: int
+) -> bool:
+    """Find which positions of the nodes matter for the root at root_low … root_high.
+
+    Returns whether every window that they look through has closed. `PLAIN` holds the lower ends before they are
+    widened to where the tables end.
+    """
+    nodes, is_closed = len(rows) - 1, True
+    for d in range(nodes):
+        state[LOW, d], state[HIGH, d] = _NEVER, -1
+    state[LOW, nodes - 1], state[HIGH, nodes - 1] = root_low, root_high
+    for d in range(nodes - 1, -1, -1):
+        code, a, b = rows[d, codes.NODE_CODE], rows[d, codes.NODE_A], rows[d, codes.NODE_B]
+        state[PLAIN, d] = state[LOW, d]
+        if rows[d, codes.NODE_VARIABLE] >= 0 and state[HEAD, IS_BEGUN]:
+            state[LOW, d] = min(state[LOW, d], state[BOUNDARY, d])
+        if rows[d, codes.NODE_TABLE] >= 0:
+            # what it starts from stands in its column, too
+            state[LOW, d] = min(state[LOW, d], max(state[STATE, d], 0))
+        low, high = state[LOW, d], state[HIGH, d]
+        if code == codes.LITERAL:
+            continue
+        window = window_of(rows, d)
+        if code in (codes.PART_WINDOW_MAX, codes.PART_WINDOW_MIN):
+            is_closed = is_closed and high < _first_unclosed(state, stamps, window, last)
+            high = _after(state, window, high, last) - 1
+        elif code == codes.SHIFT:
+            shifted = _start(state, window, high, last)
+            is_closed = is_closed and shifted <= last
+            wanted = _after(state, window, high, last) - 1 if window[3] >= 0 else shifted
+            high = min(max(shifted, wanted), last)
+        elif code in (codes.PAST_WINDOW_MAX, codes.PAST_WINDOW_MIN):
+            low = _start(state, window, min(low, last), last)
+        elif code == codes.PAST_DELAY:
+            low = max(_after(state, window, min(low, last), last) - 1, 0)
+        if a >= 0:
+            state[LOW, a] = min(state[LOW, a], low)
+            state[HIGH, a] = max(state[HIGH, a], high, state[HIGH, d])
+        if not (
+            codes.PART_WINDOW_MAX <= code <= codes.SHIFT or codes.PAST_WINDOW_MAX <= code <= codes.PAST_DELAY
+        ):
+            state[LOW, b], state[HIGH, b] = min(state[LOW, b], low), max(state[HIGH, b], high)
+    return is_closed
+
+
+@kernel
+def find_lows(rows: Integers, state: Integers, stamps: Integers, last: int) -> None:
+    """Enter the first position of each node that still matters."""
+    _reach(rows, state, stamps, min(state[HEAD, BASE], last), last, last)
+    for d in range(len(rows) - 1):
+        state[LOWS, d] = state[LOW, d]
+
+
+@kernel
+def _run_corner(
+    rows: Integers, stamps: Integers, columns: Floats, state: Integers, tables: Floats, corner: int, last: int
+) -> None:
+    """Run what depends on a variable or a table at the positions `LOW` … `HIGH`, at one corner of the table."""
+    nodes = len(rows) - 1
+    point, corners = 2 * rows[nodes, codes.PART_TABLES], SETS * nodes
+    for d in range(nodes):
+        if not rows[d, codes.NODE_DEPENDS]:
+            continue
+        code, a, b = rows[d, codes.NODE_CODE], max(rows[d, codes.NODE_A], 0), rows[d, codes.NODE_B]
+        has_left, low, high = rows[d, codes.NODE_A] >= 0, state[LOW, d], state[HIGH, d]
+        left = corners + a if rows[a, codes.NODE_DEPENDS] else a
+        right = corners + b if rows[b, codes.NODE_DEPENDS] else b
+        own = corners + d
+        if code in (codes.PART_AND, codes.PART_OR):
+            for k in range(low, high + 1):
+                columns[own, k] = better(code == codes.PART_OR, columns[left, k], columns[right, k])
+        elif code in (codes.UNTIL, codes.RELEASE):
+            variable, strong, start = rows[d, codes.NODE_VARIABLE], code == codes.UNTIL, -np.inf
+            if variable >= 0 and corner >> variable & 1:
+                start = np.inf
+            value = start
+            for k in range(high, low - 1, -1):
+                if has_left:
+                    value = better(not strong, columns[left, k], value)
+                value = better(strong, columns[right, k], value)
+                columns[own, k] = value
+            if variable >= 0:
+                boundary = state[BOUNDARY, d]
+                tables[point, variable] = columns[own, boundary] if boundary <= high else start
+        elif code in (codes.PAST_SINCE, codes.PAST_TRIGGER):
+            value = _start_of_past(rows, d, state, tables)
+            tables[point + 1, rows[d, codes.NODE_TABLE]] = value
+            begin = state[STATE, d] + 1
+            _run_since(code == codes.PAST_SINCE, has_left, columns, left, right, own, value, begin, high)
+        elif code in (codes.SHIFT, codes.PAST_DELAY):
+            window, missing = window_of(rows, d), beyond(codes.OPEN_END, rows[d, codes.NODE_WEAK])
+            for k in range(low, high + 1):
+                at = _start(state, window, k, last) if window[0] else _after(state, window, k, last) - 1
+                columns[own, k] = columns[left, at] if 0 <= at <= last else missing
+        else:
+            is_greatest = code in (codes.PART_WINDOW_MAX, codes.PAST_WINDOW_MAX)
+            before = (SETS + 1) * nodes + BEFORE
+            _slide(is_greatest, window_of(rows, d), state, columns, left, own, before, low, high + 1, last)
+
+
+@kernel
+def _renew_tables(
+    rows: Integers, stamps: Integers, columns: Floats, state: Integers, tables: Floats, last: int
+) -> None:
+    """Renew the tables of a part after adding positions from its base on."""
+    nodes = len(rows) - 1
+    count, variables = rows[nodes, codes.PART_TABLES], rows[nodes, codes.PART_VARIABLES]
+    for corner in range(1 << variables):
+        _run_corner(rows, stamps, columns, state, tables, corner, last)
+        if state[HEAD, IS_BEGUN]:
+            tables[count, corner] = read_table(tables, 0, 0, variables, tables, 2 * count)
+        else:
+            root = nodes - 1
+            tables[count, corner] = columns[
+                SETS * nodes + root if rows[root, codes.NODE_DEPENDS] else root, 0
+            ]
+        for d in range(nodes):
+            table, at = rows[d, codes.NODE_TABLE], state[PLAIN, d] - 1
+            if table >= 0:
+                is_new = at > state[STATE, d]
+                value = columns[SETS * nodes + d, at] if is_new else tables[2 * count + 1, table]
+                tables[count + table, corner] = value
+    for table in range(count):
+        for corner in range(1 << variables):
+            tables[table, corner] = tables[count + table, corner]
+
+
+@inlined
+def _pass_outdone(rows: Integers, columns: Floats, state: Integers, tables: Floats, last: int) -> None:
+    """Move the base over positions whose windows are open, but which cannot change the table any more.
+
+    `G x` is never more than its table says, so that x matters no more where it is at least that, if it cannot
+    fall.
+    """
+    root, base = len(rows) - 2, state[HEAD, BASE]
+    is_until, body = rows[root, codes.NODE_CODE] == codes.UNTIL, rows[root, codes.NODE_B]
+    limit = tables[0, 0] if is_until else tables[0, 1]
+    while base <= last and not _outdoes(is_until, columns[body, base], limit):
+        base += 1
+    state[HEAD, BASE] = state[BOUNDARY, root] = base
+
+
+@kernel
+def _absorb(
+    rows: Integers, stamps: Integers, columns: Floats, state: Integers, tables: Floats, last: int
+) -> None:
+    """Move the base over every position whose windows have all closed, many at a time."""
+    size, before = CLOSING, state[HEAD, BASE]
+    while size > 0:
+        base = state[HEAD, BASE]
+        if base + size > last + 1 or not _reach(rows, state, stamps, base, base + size - 1, last):
+            size //= 2
+            continue
+        _renew_tables(rows, stamps, columns, state, tables, last)
+        for d in range(len(rows) - 1):
+            if rows[d, codes.NODE_VARIABLE] >= 0:
+                state[BOUNDARY, d] = state[HIGH, d] + 1
+            if rows[d, codes.NODE_TABLE] >= 0:
+                state[STATE, d] = max(state[STATE, d], state[PLAIN, d] - 1)
+        state[HEAD, BASE], state[HEAD, IS_BEGUN] = base + size, 1
+    if rows[len(rows) - 1, codes.PART_IS_MONOTONE] and state[HEAD, IS_BEGUN]:
+        _pass_outdone(rows, columns, state, tables, last)
+    if state[HEAD, BASE] > before:
+        find_lows(rows, state, stamps, last)
