@@ -22,12 +22,12 @@ from typing import Any, TypeAlias, cast
 import numpy as np
 
 from spatial_replay.errors import UsageError
-from spatial_replay.geometry.arrays import Floats, Integers, places_of, starts_from_counts
+from spatial_replay.geometry.arrays import Floats, Integers, starts_from_counts
 from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.geometry.measure import QUANTITY_CODES
 from spatial_replay.monitor.atoms.delays import NO_DELAY, RecentSamples, iter_delays
 from spatial_replay.monitor.atoms.instructions import LeafCode
-from spatial_replay.monitor.atoms.live_kernel import ABSENT, leaves_of_sample
+from spatial_replay.monitor.atoms.live_kernel import ABSENT, PackedPlan, PlanArrays, leaves_of_sample
 from spatial_replay.monitor.atoms.live_rows import (
     Leaves,
     Member,
@@ -35,7 +35,6 @@ from spatial_replay.monitor.atoms.live_rows import (
     PlanRows,
 )
 from spatial_replay.monitor.atoms.measurements import quantity_of
-from spatial_replay.monitor.atoms.plan_arrays import PlacedPlan, PlanArrays
 from spatial_replay.monitor.atoms.terms import footprint_from_outline
 from spatial_replay.spec.formula import (
     ANY_CLASS,
@@ -69,7 +68,7 @@ class LeafPlan:
         code = LeafCode(rows)
         outputs = [number for leaves in frame.leaves for number in code.add_leaves(leaves, {})]
         arrays = _arrays(frame, rows, code, outputs)
-        self.placed = PlacedPlan(arrays, places_of(arrays))
+        self.packed = PackedPlan.of(arrays)
         self.placeholders = placeholders
         self._places = tuple(rows.places)
         self._signals = tuple(code.signals)
@@ -80,7 +79,7 @@ class LeafPlan:
     @property
     def nbytes(self) -> int:
         """The memory of its arrays."""
-        return sum(array.nbytes for array in self.placed.arrays)
+        return self.packed.whole.nbytes + self.packed.real.nbytes
 
     def numbers(
         self, samples: Sequence[Sample | None], stands_for: Mapping[str, str], codes: ClassCodes
@@ -274,18 +273,10 @@ class SampleLeaves:
         Raises:
             UsageError: more bindings than `MAX_BINDINGS`.
         """
-        return leaves_of_sample(*self.planned(samples))
-
-    def planned(self, samples: Sequence[Sample | None]) -> tuple[PlacedPlan, bytes]:
-        """Return what `measure_sample` takes, as bytes.
-
-        Raises:
-            UsageError: more bindings than `MAX_BINDINGS`.
-        """
         plan, stands_for = self._only_plan, _NOTHING
         if plan is None:
             plan, stands_for = self._fitting_plan(samples)
-        return plan.placed, plan.numbers(samples, stands_for, self._codes)
+        return leaves_of_sample(plan.packed, plan.numbers(samples, stands_for, self._codes))
 
     def _fitting_plan(self, samples: Sequence[Sample | None]) -> tuple[LeafPlan, Mapping[str, str]]:
         """Return a plan for the members of open groups in some samples, and their names in it."""

@@ -5,23 +5,21 @@ each sample looked at, the regions, then the places, each an object in one of th
 or object has the class code `ABSENT`; an object that is there, but not known where, has its class, and no
 parts.
 
-What is worked with lies in one piece of memory: to allocate an array, and to count who refers to it, takes as
-long as to measure a pair of boxes.
+What is worked with lies in few arrays: to allocate one takes as long as to measure a pair of boxes.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from spatial_replay.compiled import allocating_apart, flags_at, floats_at, inlined, integers_at, merged
+from spatial_replay.compiled import inlined, kernel
 from spatial_replay.geometry.arrays import Flags, Floats, Integers
 from spatial_replay.geometry.footprint import BOTTOM, PARTS, TOP, UNCERTAINTY, YAW
 from spatial_replay.geometry.kernels import measure_rows
 from spatial_replay.geometry.measure import closest_rows, misalignment_of
 from spatial_replay.monitor.atoms.instructions import run_instructions
-from spatial_replay.monitor.atoms.plan_arrays import PlacedPlan, PlanArrays, plan_at
 from spatial_replay.text import TEXTS
 
 ABSENT = -1
@@ -33,6 +31,122 @@ MOST_CHANNELS = 4
 
 _OF_OBJECT, _OF_PART = 5, 2
 """How many numbers come before those of an object's parts, and before those of a part's vertices."""
+
+
+class PlanArrays(NamedTuple):
+    """What a plan does with every sample; ragged lists come with the offsets of their rows.
+
+    Attributes:
+        extent: (5,), how many samples, regions, places, signals and classes of places there are.
+        region_parts, region_sizes, region_radius, region_vertices, region_heights: the regions' footprints:
+            parts of each, vertices of each part, radius of each part, x and y of all vertices,
+            (bottom, top) of each.
+        operand_start, operand_rows, operand_classes: rows of each operand, and the class that each must have.
+        enlargement: of each operand.
+        geometric: numbers of the measurements between footprints, with their `quantity` and operands
+            `first` and `second` (-1: none).
+        yaws: (Y, 3), the number of each measurement between orientations, and its two rows.
+        required_start, required: the rows without which each measurement is unknown.
+        closest_start, closest_rows, closest_classes, closest_enlargement: the rows of each closest pair's
+            group, the class that each must have, and the enlargement of both.
+        member_start, member_rows, member_classes: the rows that must be there for each binding, and classes.
+        is_group: for each binding, 1 where it stands for a group itself: not known without its row.
+        code, constants, outputs: what `run_instructions` takes.
+    """
+
+    extent: Integers
+    region_parts: Integers
+    region_sizes: Integers
+    region_radius: Floats
+    region_vertices: Floats
+    region_heights: Floats
+    operand_start: Integers
+    operand_rows: Integers
+    operand_classes: Integers
+    enlargement: Floats
+    geometric: Integers
+    quantity: Integers
+    first: Integers
+    second: Integers
+    yaws: Integers
+    required_start: Integers
+    required: Integers
+    closest_start: Integers
+    closest_rows: Integers
+    closest_classes: Integers
+    closest_enlargement: Floats
+    member_start: Integers
+    member_rows: Integers
+    member_classes: Integers
+    is_group: Integers
+    code: Integers
+    constants: Floats
+    outputs: Integers
+
+
+class PackedPlan(NamedTuple):
+    """A plan's arrays one after the other, so that a kernel gets two.
+
+    Attributes:
+        whole: where each array begins and ends, and then those of whole numbers.
+        real: the others.
+        leaves: how many leaves it computes.
+    """
+
+    whole: Integers
+    real: Floats
+    leaves: int
+
+    @classmethod
+    def of(cls, arrays: PlanArrays) -> PackedPlan:
+        whole, real = [np.zeros(2 * len(arrays), np.int64)], [np.zeros(0)]
+        for number, array in enumerate(arrays):
+            among: list[Any] = whole if array.dtype == np.int64 else real
+            begin = sum(map(len, among))
+            whole[0][2 * number : 2 * number + 2] = begin, begin + array.size
+            among.append(array.ravel())
+        return cls(np.concatenate(whole), np.concatenate(real), len(arrays.outputs))
+
+
+@inlined
+def _own(whole, numbers, number):  # type: ignore[no-untyped-def]
+    """Return an array of a plan."""
+    return numbers[whole[2 * number] : whole[2 * number + 1]]
+
+
+@inlined
+def plan_at(whole: Integers, real: Floats) -> PlanArrays:
+    """Return the arrays of a plan."""
+    return PlanArrays(
+        extent=_own(whole, whole, 0),
+        region_parts=_own(whole, whole, 1),
+        region_sizes=_own(whole, whole, 2),
+        region_radius=_own(whole, real, 3),
+        region_vertices=_own(whole, real, 4),
+        region_heights=_own(whole, real, 5).reshape((-1, 2)),
+        operand_start=_own(whole, whole, 6),
+        operand_rows=_own(whole, whole, 7),
+        operand_classes=_own(whole, whole, 8),
+        enlargement=_own(whole, real, 9),
+        geometric=_own(whole, whole, 10),
+        quantity=_own(whole, whole, 11),
+        first=_own(whole, whole, 12),
+        second=_own(whole, whole, 13),
+        yaws=_own(whole, whole, 14).reshape((-1, 3)),
+        required_start=_own(whole, whole, 15),
+        required=_own(whole, whole, 16),
+        closest_start=_own(whole, whole, 17),
+        closest_rows=_own(whole, whole, 18),
+        closest_classes=_own(whole, whole, 19),
+        closest_enlargement=_own(whole, real, 20),
+        member_start=_own(whole, whole, 21),
+        member_rows=_own(whole, whole, 22),
+        member_classes=_own(whole, whole, 23),
+        is_group=_own(whole, whole, 24),
+        code=_own(whole, whole, 25).reshape((-1, 4)),
+        constants=_own(whole, real, 26),
+        outputs=_own(whole, whole, 27),
+    )
 
 
 class SampleRows(NamedTuple):
@@ -56,57 +170,42 @@ class SampleRows(NamedTuple):
 
 
 @inlined
-def _places_at(plan: PlanArrays, sample_at: int) -> int:
-    """Return where the numbers of the objects begin."""
-    return sample_at + 8 * int(plan.extent[0] + plan.extent[3] + plan.extent[4])
+def _places_at(plan: PlanArrays) -> int:
+    """Return where the numbers of the objects begin in those of a sample."""
+    return int(plan.extent[0] + plan.extent[3] + plan.extent[4])
 
 
 @inlined
-def _parts_and_corners(plan: PlanArrays, sample_at: int) -> tuple[int, int]:
-    """Count the parts of regions and objects, and their vertices."""
-    parts, corners = len(plan.region_radius), len(plan.region_vertices) // 2
-    at = _places_at(plan, sample_at)
-    for _ in range(plan.extent[2]):
-        own = max(int(floats_at(at, _OF_OBJECT)[PARTS]), 0)
-        at += 8 * _OF_OBJECT
-        parts += own
-        for _ in range(own):
-            count = int(floats_at(at, _OF_PART)[0])
-            at += 8 * (_OF_PART + 2 * count)
-            corners += count
-    return parts, corners
-
-
-@inlined
-def _room_for_rows(plan: PlanArrays, parts: int, corners: int) -> int:
-    rows = plan.extent[0] + plan.extent[1] + plan.extent[2]
-    return int(6 * rows + 2 * parts + 6 * corners + 2)
-
-
-@inlined
-def _rows_of_sample(plan: PlanArrays, sample_at: int, parts: int, corners: int, room_at: int) -> SampleRows:
+def _rows_of_sample(plan: PlanArrays, sample: Floats) -> SampleRows:
     """Lay the regions and the objects of a sample out in rows; its numbers are those of `measure_sample`."""
     samples, regions, places = plan.extent[0], plan.extent[1], plan.extent[2]
     here, rows = samples + regions, samples + regions + places
-    starts_at = room_at + 8 * rows
-    heights_at = starts_at + 8 * (rows + 1 + parts + 1)
-    vertices_at = heights_at + 8 * (4 * rows + parts)
+    parts, corners, at = len(plan.region_radius), len(plan.region_vertices) // 2, _places_at(plan)
+    for _ in range(places):
+        own = max(int(sample[at + PARTS]), 0)
+        at += _OF_OBJECT
+        parts += own
+        for _ in range(own):
+            count = int(sample[at])
+            at += _OF_PART + 2 * count
+            corners += count
+    whole, real = np.empty(2 * rows + parts + 2, np.int64), np.empty(4 * rows + parts + 6 * corners)
+    starts, heights = rows, 4 * rows + parts
     made = SampleRows(
-        classes=integers_at(room_at, rows),
-        part_start=integers_at(starts_at, rows + 1),
-        vertex_start=integers_at(starts_at + 8 * (rows + 1), parts + 1),
-        vertices=floats_at(vertices_at, (corners, 2)),
-        radius=floats_at(heights_at + 32 * rows, parts),
-        bottom=floats_at(heights_at, rows),
-        top=floats_at(heights_at + 8 * rows, rows),
-        yaw=floats_at(heights_at + 16 * rows, rows),
-        uncertainty=floats_at(heights_at + 24 * rows, rows),
-        edges=floats_at(vertices_at + 16 * corners, (corners, 4)),
+        classes=whole[:rows],
+        part_start=whole[starts : starts + rows + 1],
+        vertex_start=whole[starts + rows + 1 :],
+        vertices=real[heights : heights + 2 * corners].reshape((corners, 2)),
+        radius=real[4 * rows : heights],
+        bottom=real[:rows],
+        top=real[rows : 2 * rows],
+        yaw=real[2 * rows : 3 * rows],
+        uncertainty=real[3 * rows : 4 * rows],
+        edges=real[heights + 2 * corners :].reshape((corners, 4)),
     )
-    given = floats_at(sample_at, samples)
     made.part_start[0] = made.vertex_start[0] = 0
     for k in range(here):
-        made.classes[k] = int(given[k]) if k < samples else 0
+        made.classes[k] = int(sample[k]) if k < samples else 0
         made.part_start[k + 1] = made.part_start[k]
         made.bottom[k] = made.top[k] = made.yaw[k] = np.nan
         made.uncertainty[k] = 0.0
@@ -122,26 +221,24 @@ def _rows_of_sample(plan: PlanArrays, sample_at: int, parts: int, corners: int, 
             plan.region_vertices[2 * v],
             plan.region_vertices[2 * v + 1],
         )
-    codes = floats_at(sample_at + 8 * (samples + plan.extent[3]), plan.extent[4])
-    at = _places_at(plan, sample_at)
+    at, codes_at = _places_at(plan), samples + plan.extent[3]
     for row in range(here, rows):
-        tracked = floats_at(at, _OF_OBJECT)
-        own = max(int(tracked[PARTS]), 0)
-        at += 8 * _OF_OBJECT
-        made.classes[row] = int(codes[row - here]) if len(codes) else 0
-        if tracked[PARTS] == 0.0:
+        own = max(int(sample[at + PARTS]), 0)
+        made.classes[row] = int(sample[codes_at + row - here]) if plan.extent[4] > 0 else 0
+        if sample[at + PARTS] == 0.0:
             made.classes[row] = ABSENT
         made.part_start[row + 1] = part + own
-        made.bottom[row], made.top[row] = tracked[BOTTOM], tracked[TOP]
-        made.yaw[row], made.uncertainty[row] = tracked[YAW], tracked[UNCERTAINTY]
+        made.bottom[row], made.top[row] = sample[at + BOTTOM], sample[at + TOP]
+        made.yaw[row], made.uncertainty[row] = sample[at + YAW], sample[at + UNCERTAINTY]
+        at += _OF_OBJECT
         for p in range(part, part + own):
-            start, count = made.vertex_start[p], int(floats_at(at, _OF_PART)[0])
-            made.radius[p] = floats_at(at, _OF_PART)[1]
-            outline = floats_at(at + 8 * _OF_PART, (count, 2))
-            for v in range(count):
-                made.vertices[start + v, 0], made.vertices[start + v, 1] = outline[v, 0], outline[v, 1]
+            start, count = made.vertex_start[p], int(sample[at])
+            made.radius[p] = sample[at + 1]
+            at += _OF_PART
+            for v in range(start, start + count):
+                made.vertices[v, 0], made.vertices[v, 1] = sample[at], sample[at + 1]
+                at += 2
             made.vertex_start[p + 1] = start + count
-            at += 8 * (_OF_PART + 2 * count)
         part += own
     return made
 
@@ -158,18 +255,15 @@ def _is_hidden(plan: PlanArrays, rows: SampleRows, row: int) -> bool:
     return bool(is_place and rows.part_start[row] == rows.part_start[row + 1])
 
 
-@merged
-def _measure(plan: PlanArrays, rows: SampleRows, room_at: int, values: Floats, spreads: Floats) -> None:
+@inlined
+def _measure(plan: PlanArrays, rows: SampleRows, values: Floats, spreads: Floats) -> None:
     """Fill `values` and `spreads` (K, 1), as `measurements.measured` gives them."""
     if len(values) == 0:  # signals alone
         return
     operands = len(plan.operand_start) - 1
-    of_operands = floats_at(room_at, operands + 1)
-    widths = integers_at(room_at + 8 * (operands + 1), operands)
-    hidden = integers_at(room_at + 16 * (operands + 1), operands + 1)
-    measured_at = room_at + 24 * (operands + 1)
-    measured = floats_at(measured_at, (len(plan.geometric), 1))
-    members = integers_at(measured_at + 8 * len(plan.geometric), len(plan.operand_rows))
+    of_operands, measured = np.empty(operands + 1), np.empty((len(plan.geometric), 1))
+    room = np.empty(2 * operands + 1 + len(plan.operand_rows), np.int64)
+    widths, hidden, members = room[:operands], room[operands : 2 * operands + 1], room[2 * operands + 1 :]
     of_operands[operands], hidden[operands] = 0.0, 0  # for no operand, -1
     for operand in range(operands):
         begin, end = plan.operand_start[operand], plan.operand_start[operand + 1]
@@ -216,13 +310,15 @@ def _measure(plan: PlanArrays, rows: SampleRows, room_at: int, values: Floats, s
                 values[k, 0] = np.nan
 
 
-@merged
-def _closest(plan: PlanArrays, rows: SampleRows, room_at: int, closest: Floats) -> None:
+@inlined
+def _closest(plan: PlanArrays, rows: SampleRows, closest: Floats) -> None:
     """Fill `closest` (K, 4, 1), as `measurements.leaf_values` computes it."""
-    found = floats_at(room_at, (1, 3))
+    if len(closest) == 0:
+        return
+    found = np.empty((1, 3))
     for k in range(len(closest)):
         begin, end = plan.closest_start[k], plan.closest_start[k + 1]
-        members = integers_at(room_at + 24, (1, end - begin))
+        members = np.empty((1, end - begin), np.int64)
         there = hidden = 0
         for m in range(begin, end):
             row, members[0, m - begin] = plan.closest_rows[m], ABSENT
@@ -290,65 +386,40 @@ def _channels_of(
     return channels
 
 
-@inlined
-def _room_for_numbers(plan: PlanArrays) -> int:
-    flags, results = (len(plan.is_group) + 7) // 8, 2 * (len(plan.required_start) - 1)
-    while_measuring = 3 * len(plan.operand_start) + len(plan.geometric) + len(plan.operand_rows)
-    # one after the other
-    work = max(while_measuring, 3 + len(plan.closest_rows))
-    return int(flags + results + 4 * len(plan.closest_enlargement) + work)
-
-
-@merged
-def _measured(table_at: int, sample_at: int, parts: int, corners: int, room_at: int, leaves_at: int) -> int:
-    """Do what `measure_sample` does, with room for rows and for numbers."""
-    plan = plan_at(table_at)
-    rows = _rows_of_sample(plan, sample_at, parts, corners, room_at)
-    members_at = room_at + 8 * _room_for_rows(plan, parts, corners)
-    members = flags_at(members_at, (len(plan.is_group), 1))
-    _members(plan, rows.classes, members)
-    values_at = members_at + 8 * ((len(members) + 7) // 8)
-    count = len(plan.required_start) - 1
-    values, spreads = floats_at(values_at, (count, 1)), floats_at(values_at + 8 * count, (count, 1))
-    closest_at = values_at + 16 * count
-    closest = floats_at(closest_at, (len(plan.closest_enlargement), 4, 1))
-    work_at = closest_at + 32 * len(closest)
-    _closest(plan, rows, work_at, closest)
-    _measure(plan, rows, work_at, values, spreads)
-    signals = floats_at(sample_at + 8 * plan.extent[0], (plan.extent[3], 1))
-    channels = _channels_of(values, spreads, signals, closest, members, plan.constants)
-    leaves = floats_at(leaves_at, (channels, len(plan.outputs), 1))
-    run_instructions(
-        plan.code, plan.constants, values, spreads, signals, closest, members, plan.outputs, leaves, 0, 1
-    )
-    return channels
-
-
-@allocating_apart
-def measure_sample(table_at: int, sample_at: int, leaves_at: int) -> int:
+@kernel
+def measure_sample(whole: Integers, real: Floats, sample: Floats, leaves: Floats) -> int:
     """Compute the leaves of one sample, (C, A, 1), as `leaf_values` does.
 
     Args:
-        table_at: address of the table of a plan's arrays.
-        sample_at: address of these numbers: for each sample looked at 0, or `ABSENT`; the value of each
-            signal; if the plan distinguishes classes, the code of that at each place; of each place, as its
-            object is `packed`: as one of no parts if it is not there, of -1 if it is not known where.
-        leaves_at: address of room for all channels of the leaves.
+        whole, real: of a `PackedPlan`.
+        sample: for each sample looked at 0, or `ABSENT`; the value of each signal; if the plan distinguishes
+            classes, the code of that at each place; of each place, as its object is `packed`: as one of no
+            parts if it is not there, of -1 if it is not known where.
+        leaves: (MOST_CHANNELS, A, 1), receives them.
 
     Returns:
         C, in how many channels they are.
     """
-    plan = plan_at(table_at)
-    parts, corners = _parts_and_corners(plan, sample_at)
-    room = np.empty(_room_for_rows(plan, parts, corners) + _room_for_numbers(plan))
-    channels = _measured(table_at, sample_at, parts, corners, room.ctypes.data, leaves_at)
-    room[0] = 0.0  # until here it has to live
+    plan = plan_at(whole, real)
+    rows, count = _rows_of_sample(plan, sample), len(plan.required_start) - 1
+    members = np.empty((len(plan.is_group), 1), np.int8)
+    _members(plan, rows.classes, members)
+    results, closest = np.empty((2, count, 1)), np.empty((len(plan.closest_enlargement), 4, 1))
+    values, spreads = results[0], results[1]
+    _closest(plan, rows, closest)
+    _measure(plan, rows, values, spreads)
+    signals = sample[plan.extent[0] : plan.extent[0] + plan.extent[3]].reshape((-1, 1))
+    channels = _channels_of(values, spreads, signals, closest, members, plan.constants)
+    run_instructions(
+        plan.code, plan.constants, values, spreads, signals, closest, members, plan.outputs,
+        leaves[:channels], 0, 1,
+    )  # fmt: skip
     return channels
 
 
-def leaves_of_sample(plan: PlacedPlan, sample: bytes) -> Floats:
+def leaves_of_sample(plan: PackedPlan, sample: bytes) -> Floats:
     """Return the leaves of one sample, (C, A, 1), from the bytes of what `measure_sample` takes."""
-    count = len(plan.arrays.outputs)
-    leaves = np.empty(MOST_CHANNELS * count)
-    channels = measure_sample(plan.table, np.frombuffer(sample), leaves)
-    return leaves[: channels * count].reshape(channels, count, 1)
+    leaves = np.empty((MOST_CHANNELS, plan.leaves, 1))
+    # writable, since kernels are compiled for that
+    channels = measure_sample(plan.whole, plan.real, np.frombuffer(bytearray(sample)), leaves)
+    return leaves[:channels]
