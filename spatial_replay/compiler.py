@@ -83,8 +83,7 @@ class Compiler:
 
         What only kernels call is optimised with these, and not before, which takes a third of the time.
         """
-        made = self._compile(lambda numba: numba.njit, function, options)
-        return made
+        return self._compile(lambda numba: numba.njit, function, options)
 
     def compile_entry(self, function: FunctionType, options: dict[str, Any]) -> Any:
         """Compile a function of integers; return it as what takes bytes, too, for the address of these."""

@@ -16,7 +16,7 @@ from laws.strategies_monitor import LEAVES, LeafRun, combinations_of, responses,
 from laws.test_monitor_laws import fewest
 from spatial_replay import UsageError
 from spatial_replay.compiled import only
-from spatial_replay.monitor.online import codes, operators, state
+from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.program import compile_formula
 from spatial_replay.monitor.online.step import OnlineRun
 from spatial_replay.spec.formula import Boolean, Bound, Temporal
@@ -250,15 +250,21 @@ def program_of(formula):
         program = compile_formula(formula)
     except UsageError:  # too many operators without end
         assume(False)
-    assume(state.has_windows(program))
+    assume(has_windows(program))
     return program
+
+
+def has_windows(program):
+    return (program.parts[:, codes.PART_KIND] == codes.WINDOWED).any()
 
 
 def leaving_out_nothing(program):
     """The same program, of which positions count until their windows close."""
-    parts = program.parts.copy()
-    parts[:, [codes.PART_LIMIT, codes.PART_IS_MONOTONE]] = operators.NOTHING, 0
-    return replace(program, parts=parts)
+    part_rows = tuple(rows.copy() for rows in program.part_rows)
+    for rows in part_rows:
+        rows[-1, codes.PART_IS_MONOTONE] = 0
+    parts = np.array([rows[-1] for rows in part_rows]).reshape(program.parts.shape)
+    return replace(program, parts=parts, part_rows=part_rows)
 
 
 def both_ways(program, run, ends, **options):
@@ -329,7 +335,7 @@ def test_leaving_out_what_matters_no_more_changes_nothing(data, case, tile):
     formula, run = case
     program = compile_formula(formula)
     whole = leaving_out_nothing(program)
-    if not state.has_windows(program) or (whole.parts == program.parts).all():
+    if not has_windows(program) or (whole.parts == program.parts).all():
         return
     ends, leaves, times = data.draw(stretches(len(run))), run.values(program.leaves), np.array(run.times_ns)
     runs = [OnlineRun(each, tile=tile) for each in (program, whole)]
@@ -365,7 +371,7 @@ def test_memory_does_not_grow_with_a_window_from_the_first_sample():
         run = OnlineRun(program, room=64, tile=32)
         run.extend(rng.normal(size=(1, len(program.leaves), size)), times)
         # room for more is less than all there is
-        assert run.make_room(size) <= 512
+        assert run.room <= 512
 
 
 @examples(40)
@@ -443,7 +449,7 @@ _both_open = Boolean("or", (ahead("G", 0, 0, Q), ahead("G", 0, 1, ahead("G", 0, 
 )
 def test_windows_equal_the_definitions_where(formula, numbers, ends, spread, tile):
     run, program = run_of_numbers(numbers, ends[-1], spread), compile_formula(formula)
-    assert state.has_windows(program)
+    assert has_windows(program)
     assert_as_defined(formula, program, run, ends, tile=tile)
 
 

@@ -59,14 +59,15 @@ BINARY_NODES = (
     PART_AND, PART_OR, UNTIL, RELEASE, PAST_SINCE, PAST_TRIGGER, ANCHORED_UNTIL, ANCHORED_RELEASE,
 )  # fmt: skip
 
-# columns of parts: their nodes' rows, the kind, numbers of variables and tables, the corner that ends a run, and
-# where the table begins in each channel (of parts without windows)
+# columns of parts: their nodes' rows, the kind, numbers of variables and tables, the corner that ends a run,
+# and where the table begins in each channel (of parts without windows)
 PART_FIRST, PART_END, PART_KIND, PART_VARIABLES, PART_TABLES, PART_END_CORNER, PART_TABLE_START = range(7)
-# a bit for each of `OPEN_LOW`, `OPEN_HIGH`: which bounds follow from the table alone until the root has ended,
-# since what may still come outdoes all that is open; eight bits higher up, which do even once it has
+# a bit for each of `OPEN_LOW`, `OPEN_HIGH`: which bounds follow from the table alone until the root has
+# ended, since what may still come outdoes all that is open; eight bits higher up, which do even once it has
 PART_KNOWN = 7
 EVEN_IF_OVER = 1 << 8
-# whether the bound that is not known at once is the value but for positions where a window is open that cuts it
+# whether the bound that is not known at once is the value but for positions where a window is open that
+# cuts it
 PART_IS_CUT = 8
 # the unit, and how far from the first sample on the root joins what its operand is; -1 if it never ends
 PART_END_UNIT, PART_ENDS_AT = 9, 10

@@ -39,10 +39,12 @@ class _Direction(NamedTuple):
 
 
 _BY_MINIMUM = _Direction(
-    codes.PART_OR, codes.PART_AND, codes.PART_WINDOW_MAX, codes.UNTIL, codes.RELEASE, codes.OPEN_LOW, codes.OPEN_HIGH, 0,
+    codes.PART_OR, codes.PART_AND, codes.PART_WINDOW_MAX, codes.UNTIL, codes.RELEASE, codes.OPEN_LOW,
+    codes.OPEN_HIGH, 0,
 )  # fmt: skip
 _BY_MAXIMUM = _Direction(
-    codes.PART_AND, codes.PART_OR, codes.PART_WINDOW_MIN, codes.RELEASE, codes.UNTIL, codes.OPEN_HIGH, codes.OPEN_LOW, 1,
+    codes.PART_AND, codes.PART_OR, codes.PART_WINDOW_MIN, codes.RELEASE, codes.UNTIL, codes.OPEN_HIGH,
+    codes.OPEN_LOW, 1,
 )  # fmt: skip
 _DIRECTIONS: Mapping[int, _Direction] = MappingProxyType(
     {codes.RELEASE: _BY_MINIMUM, codes.UNTIL: _BY_MAXIMUM}
@@ -131,7 +133,7 @@ def cutting_windows(rows: tuple[Row, ...]) -> set[int] | None:
 def directions(rows: tuple[Row, ...]) -> list[tuple[bool, bool]]:
     """Return for each node whether what it is never falls, and whether it never rises, as samples come.
 
-    That is as if the run ended with the newest sample, where an operator that looks ahead finds nothing after it.
+    That is as if the run ended with the newest sample: an operator that looks ahead finds nothing after it.
     """
     found = list[tuple[bool, bool]]()
     for code, a, b, weak, *_ in rows:
@@ -146,8 +148,8 @@ def directions(rows: tuple[Row, ...]) -> list[tuple[bool, bool]]:
 def growing_windows(rows: tuple[Row, ...]) -> list[int]:
     """Return for each node, a bit for each of `OPEN_END`, …, whether it is a window of what can only improve.
 
-    With all that is still to come at its least, each sample can only raise a number, or lower it with all at its
-    greatest.
+    With all that is still to come at its least, each sample can only raise a number, or lower it with all at
+    its greatest.
     """
     grows = list[int]()
     for (code, *_), (rises, falls) in zip(rows, directions(rows), strict=True):

@@ -53,8 +53,8 @@ def _distance(times: Integers, unit: int, place: int, later: int) -> int:
 
 @kernel
 def _slide(
-    rows: Integers, row: int, history: Floats, channel: int, own: int, times: Integers, offset: int, begin: int,
-    count: int,
+    rows: Integers, row: int, history: Floats, channel: int, own: int, times: Integers, offset: int,
+    begin: int, count: int,
 ) -> None:  # fmt: skip
     """Compute an extremum over a sliding window, with a wedge of the positions that can still attain it."""
     a, unit = rows[row, codes.SIGNAL_A], rows[row, codes.SIGNAL_UNIT]

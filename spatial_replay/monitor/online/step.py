@@ -148,6 +148,9 @@ class OnlineRun:
     """The state that a compiled formula carries from sample to sample.
 
     Its size depends on the formula and on how many samples its windows span, not on the length of the stream.
+
+    Attributes:
+        room: for how many recent samples there is room.
     """
 
     def __init__(self, program: Program, *, room: int = 2 * TILE, tile: int = TILE) -> None:
@@ -158,7 +161,7 @@ class OnlineRun:
             tile: how many samples are run together, at most.
         """
         self._program, self._tile = program, tile
-        self._room = room = max(room, tile) if program.keeps_history else tile
+        self.room = room = max(room, tile) if program.keeps_history else tile
         self._channels, self._position, self._offset, self._start_ns = 1, 0, 0, 0
         signals, parts, reports = len(program.signals), len(program.parts), len(program.reports)
         self._history = np.zeros((CHANNELS, signals, room))
@@ -228,7 +231,7 @@ class OnlineRun:
                 state[1] = state[0]
             state[2:] = state[:2]
         for _, parts in self._open:
-            parts += [parts[channel % before].copy(self._room) for channel in range(before, channels)]
+            parts += [parts[channel % before].copy(self.room) for channel in range(before, channels)]
         self._see_history()
 
     def add_sample(self, leaves: Floats, first_leaf: int, time_ns: int) -> Floats:
@@ -300,7 +303,7 @@ class OnlineRun:
 
     def _see_history(self) -> None:
         """Take views of what the recent samples are."""
-        self._stamps = self._times[0, : self._room]
+        self._stamps = self._times[0, : self.room]
         self._channel_history = [self._history[channel] for channel in range(CHANNELS)]
 
     def _rings(self) -> Integers:
@@ -310,16 +313,16 @@ class OnlineRun:
     def _make_room(self, wanted: int) -> int:
         """Make room for at least one of the wanted samples; return for how many."""
         if not self._program.keeps_history:
-            return min(wanted, self._room)
+            return min(wanted, self.room)
         used = self._position - self._offset
-        if used + wanted > self._room:
+        if used + wanted > self.room:
             moved = self._kept_from() if used else 0
-            if 2 * moved >= self._room:
+            if 2 * moved >= self.room:
                 self._forget(moved, used - moved)
                 used -= moved
-            elif used == self._room:
+            elif used == self.room:
                 self._grow()
-        return min(wanted, self._room - used)
+        return min(wanted, self.room - used)
 
     def _kept_from(self) -> int:
         """Return the first of the recent samples that anything may still look at after the newest one."""
@@ -354,16 +357,16 @@ class OnlineRun:
 
     def _grow(self) -> None:
         """Have room for twice as many recent samples."""
-        old, self._room = self._room, 2 * self._room
-        history = np.zeros((*self._history.shape[:2], self._room))
+        old, self.room = self.room, 2 * self.room
+        history = np.zeros((*self._history.shape[:2], self.room))
         history[: self._channels, :, :old] = self._history[: self._channels]
-        times = np.zeros((len(self._times), self._room + RING), np.int64)
+        times = np.zeros((len(self._times), self.room + RING), np.int64)
         times[0, :old] = self._stamps
         for ring, grown in zip(self._times[1:], times[1:], strict=True):
             entries = np.arange(ring[HEAD], ring[TAIL])
             grown[[HEAD, TAIL, ENTERING]] = ring[[HEAD, TAIL, ENTERING]]
-            grown[RING + entries % self._room] = ring[RING + entries % old]
+            grown[RING + entries % self.room] = ring[RING + entries % old]
         self._history, self._times = history, times
         for _, parts in self._open:
-            parts[:] = [part.copy(self._room) for part in parts]
+            parts[:] = [part.copy(self.room) for part in parts]
         self._see_history()

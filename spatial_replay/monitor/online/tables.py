@@ -144,11 +144,11 @@ def run_table(
         # it says the same whatever comes
         for k in range(count):
             work[says, k] = work[says + 1, k] = work[says + 2, k] = memory[channel, table]
-        return says
+        return int(says)
     _fill_columns(rows, first, end, history, channel, begin, count, work, top)
     if variables == 1 and root in (codes.UNTIL, codes.RELEASE):
         _run_simple(rows, end - 1, end_corner, memory, channel, table, work, top, says, count)
-        return says
+        return int(says)
     for k in range(count):
         elapsed_ns = times[0, begin + k] - start_ns
         for d in range(nodes):
@@ -193,4 +193,4 @@ def run_table(
                     memory[channel, table + corner] = memory[channel, table + settled]
         work[says, k] = memory[channel, table + end_corner]
         work[says + 1, k], work[says + 2, k] = memory[channel, table], memory[channel, table + corners - 1]
-    return says
+    return int(says)

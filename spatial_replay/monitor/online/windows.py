@@ -5,13 +5,13 @@ recent sample. A sample changes a column only where a window has begun to hold i
 where an operand has changed, so columns are brought up to it, operands first, and each says from where on
 it has changed.
 
-Positions of the root whose windows have all closed are absorbed into a table (see `tables`). It belongs to the
-*base*, the first position of the root that is not absorbed: it says what the root is at the first sample, by
-what each variable will be where the table ends for it, its *boundary*. A past operator over one that looks
+Positions of the root whose windows have all closed are absorbed into a table (see `tables`). It belongs to
+the *base*, the first position of the root that is not absorbed: it says what the root is at the first sample,
+by what each variable will be where the table ends for it, its *boundary*. A past operator over one that looks
 ahead has a table of its own, which says what it is at one position, its *state*.
 
-Columns exist in up to three sets: as if the run ended with the newest sample, and as low and as high as what is
-still to come may make them. Positions are places among the recent samples; `last` is the newest of them.
+Columns exist in up to three sets: as if the run ended with the newest sample, and as low and as high as what
+is still to come may make them. Positions are places among the recent samples; `last` is the newest of them.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ EXTRA_ROWS = SETS + 5
 # rows of the state: the first holds single numbers, the others a number for each node
 HEAD, LOWS, LOW, HIGH, PLAIN, CHANGED, BOUNDARY, STATE = range(8)
 STARTS = 8  # and then, of each window in seconds: where it starts at each position, and what comes after it
-# columns of the first row: how many samples are forgotten, the time of the first one, the base, whether anything
-# is absorbed, how many samples windows in seconds know
+# columns of the first row: how many samples are forgotten, the time of the first one, the base, whether
+# anything is absorbed, how many samples windows in seconds know
 OFFSET, START_NS, BASE, IS_BEGUN, ENTERED = range(5)
 KNOWN = 5  # for each set, up to where its columns are known
 UNJOINED = KNOWN + SETS  # for each set, the first position that its blocks do not know
@@ -117,7 +117,7 @@ def _start(state: Integers, window: tuple[bool, int, int, int, int], position: i
     """Return the first position that a window holds, that after the last sample if it is still to come."""
     is_ahead, unit, near, far, times = window
     if unit != codes.SAMPLES:
-        return min(state[times, position], last + 1)
+        return int(min(state[times, position], last + 1))
     return min(position + near, last + 1) if is_ahead else max(position - far, 0)
 
 
@@ -126,7 +126,7 @@ def _after(state: Integers, window: tuple[bool, int, int, int, int], position: i
     """Return the position that comes after a window, at most that after the last sample."""
     is_ahead, unit, near, far, times = window
     if unit != codes.SAMPLES:
-        return min(state[times + 1, position], last + 1)
+        return int(min(state[times + 1, position], last + 1))
     return min(position + far, last) + 1 if is_ahead else position - near + 1
 
 
@@ -173,7 +173,7 @@ def _first_unclosed(
     if unit == codes.SAMPLES:
         return max(last - far + 1, 0)
     first = state[HEAD, NEXT + times + 1 - STARTS]
-    return first + 1 if stamps[last] - stamps[first] == far else first
+    return int(first + 1 if stamps[last] - stamps[first] == far else first)
 
 
 @inlined
@@ -191,7 +191,7 @@ def _enter(rows: Integers, stamps: Integers, state: Integers, last: int) -> None
                 while begun <= position and time_ns - stamps[begun] >= near:
                     state[times, begun] = position
                     begun += 1
-                while 0 <= far and closed < position and time_ns - stamps[closed] > far:
+                while far >= 0 and closed < position and time_ns - stamps[closed] > far:
                     state[times + 1, closed] = position
                     closed += 1
             else:
@@ -598,8 +598,8 @@ def run_windows(
         stamps: (room,), the times of the recent samples.
         columns: (4 D + EXTRA_ROWS, room); the last four rows receive what the part says.
         state: see `HEAD`.
-        tables: (2 T + 2, …): the part's table and those of its past operators, room for the next ones, a point
-            at which tables are read, and what past operators start from.
+        tables: (2 T + 2, …): the part's table and those of its past operators, room for the next ones, a
+            point at which tables are read, and what past operators start from.
         bounds: 1 to compute the lower bound, 2 for the upper one, 3 for both.
     """
     nodes = len(rows) - 1
@@ -633,7 +633,7 @@ def run_windows(
             _absorb(rows, stamps, columns, state, tables, last)
 
 
-# ------------------------------------------------------------------------------- closed positions go to tables
+# ------------------------------------------------------------------------------ closed positions go to tables
 
 
 @kernel
@@ -642,8 +642,8 @@ def _reach(
 ) -> bool:
     """Find which positions of the nodes matter for the root at root_low … root_high.
 
-    Returns whether every window that they look through has closed. `PLAIN` holds the lower ends before they are
-    widened to where the tables end.
+    Returns whether every window that they look through has closed. `PLAIN` holds the lower ends before they
+    are widened to where the tables end.
     """
     nodes, is_closed = len(rows) - 1, True
     for d in range(nodes):
@@ -695,7 +695,7 @@ def find_lows(rows: Integers, state: Integers, stamps: Integers, last: int) -> N
 def _run_corner(
     rows: Integers, stamps: Integers, columns: Floats, state: Integers, tables: Floats, corner: int, last: int
 ) -> None:
-    """Run what depends on a variable or a table at the positions `LOW` … `HIGH`, at one corner of the table."""
+    """Run what depends on a variable or a table, at `LOW` … `HIGH`, at one corner of the table."""
     nodes = len(rows) - 1
     point, corners = 2 * rows[nodes, codes.PART_TABLES], SETS * nodes
     for d in range(nodes):
