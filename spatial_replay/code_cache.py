@@ -1,6 +1,7 @@
 """Where machine code is kept on disk: in a folder named after a digest of all sources of the package.
 
-So a changed kernel is never mistaken for the one before. `SPATIAL_REPLAY_CACHE` names another place for it.
+So a changed kernel is never mistaken for the one before. A digest lies beside each file: damaged code would
+end the process by a signal, and is compiled again. `SPATIAL_REPLAY_CACHE` names another place.
 """
 
 from __future__ import annotations
@@ -45,6 +46,32 @@ def cache_folder() -> Path | None:
                     shutil.copytree(shipped, folder, dirs_exist_ok=True)
         return folder
     return None
+
+
+def remove_damaged(folder: Path) -> None:
+    """Remove machine code that is not what was written."""
+    for path in folder.rglob("*.nb[ic]"):
+        with suppress(OSError):
+            sealed = _seal_of(path)
+            if not sealed.exists() or sealed.read_text() != _digest_of(path):
+                path.unlink()
+
+
+def seal(folder: Path) -> None:
+    """Note what was written since the last time."""
+    for path in folder.rglob("*.nb[ic]"):
+        with suppress(OSError):
+            sealed = _seal_of(path)
+            if not sealed.exists() or sealed.stat().st_mtime_ns < path.stat().st_mtime_ns:
+                sealed.write_text(_digest_of(path))
+
+
+def _seal_of(path: Path) -> Path:
+    return path.with_name(f"{path.name}.sha256")
+
+
+def _digest_of(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _cache_parents() -> Iterator[Path]:

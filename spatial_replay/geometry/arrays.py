@@ -11,8 +11,6 @@ from typing import Any, Final, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from spatial_replay.compiled import inlined
-
 Floats: TypeAlias = NDArray[np.float64]
 Integers: TypeAlias = NDArray[np.int64]
 Flags: TypeAlias = NDArray[np.int8]
@@ -63,40 +61,6 @@ def count_in_rows(flags: Booleans, start: Integers) -> Integers:
         return np.zeros(len(start) - 1, np.int64)
     total = starts_from_counts(flags.astype(np.int64))
     return np.asarray(total[start[1:]] - total[start[:-1]])
-
-
-PLACE: Final = 5
-"""What a table says of an array: its address, and its lengths, 0 for dimensions that it does not have."""
-
-
-def places_of(arrays: Sequence[NDArray[Any]]) -> Integers:
-    """Return the table (n, PLACE) of where arrays lie, which have to be kept as long as it is used.
-
-    Passing an array to a kernel costs a call more than many a kernel takes, and kernels that are compiled
-    apart take integers only: they get the address of such a table.
-    """
-    places = np.zeros((len(arrays), PLACE), np.int64)
-    for place, array in zip(places, arrays, strict=True):
-        place[0], place[1 : 1 + array.ndim] = array.ctypes.data, array.shape
-    return places
-
-
-@inlined
-def shape_2(places, number):  # type: ignore[no-untyped-def]
-    """Return the lengths of a matrix."""
-    return places[number, 1], places[number, 2]
-
-
-@inlined
-def shape_3(places, number):  # type: ignore[no-untyped-def]
-    """Return the lengths of an array of three dimensions."""
-    return places[number, 1], places[number, 2], places[number, 3]
-
-
-@inlined
-def shape_4(places, number):  # type: ignore[no-untyped-def]
-    """Return the lengths of an array of four dimensions."""
-    return places[number, 1], places[number, 2], places[number, 3], places[number, 4]
 
 
 _MOST: Final = 2**62

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from spatial_replay.compiled import elementwise, inlined_as, long_kernel
+from spatial_replay.compiled import elementwise, inlined, long_kernel
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Flags, Floats, Integers
 from spatial_replay.monitor.atoms.closest_pair import ClosestPair, number_of_closest
@@ -59,30 +59,16 @@ TILE = 128
 """Samples processed together: few, so that their columns stay in the processor's cache."""
 
 
-def _copy_each_to(source: Floats, row: int, begin: int, count: int, target: Floats) -> None:
+@inlined
+def _copy_to(source: Floats, row: int, begin: int, count: int, target: Floats) -> None:
     for k in range(count):
         target[k] = source[row, begin + k]
 
 
-@inlined_as(_copy_each_to)
-def _copy_to(source: Floats, row: int, begin: int, count: int, target: Floats) -> None:
-    """Copy some numbers of a row; as a slice, of which the compiler sees that they stand side by side."""
-    numbers = source[row, begin : begin + count]
-    for k in range(count):
-        target[k] = numbers[k]
-
-
-def _copy_each_from(source: Floats, target: Floats, channel: int, row: int, begin: int, count: int) -> None:
+@inlined
+def _copy_from(source: Floats, target: Floats, channel: int, row: int, begin: int, count: int) -> None:
     for k in range(count):
         target[channel, row, begin + k] = source[k]
-
-
-@inlined_as(_copy_each_from)
-def _copy_from(source: Floats, target: Floats, channel: int, row: int, begin: int, count: int) -> None:
-    """Copy numbers to some of a row (see `_copy_to`)."""
-    numbers = target[channel, row, begin : begin + count]
-    for k in range(count):
-        numbers[k] = source[k]
 
 
 @elementwise

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from spatial_replay.compiled import inlined, kernel
+from spatial_replay.compiled import inlined, piece
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
 
@@ -77,7 +77,7 @@ def _fill(work: Floats, into: int, value: float, count: int) -> None:
         work[into, k] = value
 
 
-@kernel
+@piece
 def report(
     rows: Integers, history: Floats, memory: Floats, work: Floats, channels: int, begin: int, count: int
 ) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from spatial_replay.compiled import inlined, kernel
+from spatial_replay.compiled import inlined, piece
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
 
@@ -51,7 +51,7 @@ def _distance(times: Integers, unit: int, place: int, later: int) -> int:
     return later - place if unit == codes.SAMPLES else times[0, later] - times[0, place]
 
 
-@kernel
+@piece
 def _slide(
     rows: Integers, row: int, history: Floats, channel: int, own: int, times: Integers, offset: int,
     begin: int, count: int,
@@ -84,7 +84,7 @@ def _slide(
     times[ring, HEAD], times[ring, TAIL], times[ring, ENTERING] = head, tail, entering
 
 
-@kernel
+@piece
 def run_signals(
     rows: Integers, leaves: Floats, first_leaf: int, t: int, count: int, position: int, begin: int,
     start_ns: int, history: Floats, times: Integers, memory: Floats,

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from spatial_replay.compiled import inlined, kernel
+from spatial_replay.compiled import inlined, piece
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
 
@@ -21,7 +21,7 @@ VALUES, FRESH, POINT, SAYS = range(4)
 EXTRA_ROWS = 6
 
 
-@kernel
+@piece
 def read_table(tables: Floats, row: int, first: int, variables: int, points: Floats, point: int) -> float:
     """Read a table at a point: walk its corners in descending order of the coordinates.
 
@@ -112,7 +112,7 @@ def _now(rows: Integers, row: int, position: int, elapsed_ns: int) -> int:
     return position if rows[row, codes.NODE_UNIT] == codes.SAMPLES else elapsed_ns
 
 
-@kernel
+@piece
 def run_table(
     rows: Integers, part: int, history: Floats, channel: int, times: Integers, memory: Floats, table: int,
     work: Floats, top: int, position: int, begin: int, count: int, start_ns: int,

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from spatial_replay.compiled import inlined, kernel
+from spatial_replay.compiled import inlined, kernel, piece
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.tables import read_table
@@ -72,7 +72,7 @@ def beyond(mode: int, weak: int) -> float:
     return np.inf if mode == codes.OPEN_HIGH else -np.inf
 
 
-@kernel
+@piece
 def extremum(is_greatest: bool, columns: Floats, row: int, begin: int, end: int, start: float) -> float:
     """Return the greatest or least of some numbers of a row and `start`.
 
@@ -207,7 +207,7 @@ def _enter(rows: Integers, stamps: Integers, state: Integers, last: int) -> None
 # -------------------------------------------------------------------------------------- columns of the nodes
 
 
-@kernel
+@piece
 def _slide(
     is_greatest: bool, window: tuple[bool, int, int, int, int], state: Integers, columns: Floats,
     child: int, own: int, before: int, begin: int, end: int, last: int,
@@ -343,7 +343,7 @@ def _run_window(
     return lowest if is_fresh else first
 
 
-@kernel
+@piece
 def _run_since(
     strong: bool, has_left: bool, columns: Floats, left: int, right: int, own: int, value: float, begin: int,
     last: int,
@@ -387,7 +387,7 @@ def has_column(rows: Integers) -> bool:
     return bool(rows[root, codes.NODE_A] >= 0 or rows[root, codes.NODE_VARIABLE] < 0)
 
 
-@kernel
+@piece
 def _bring_up(
     rows: Integers, history: Floats, stamps: Integers, columns: Floats, state: Integers, tables: Floats,
     mode: int, last: int,
@@ -511,7 +511,7 @@ def _joined(
     return extremum(is_until, columns, body, after * BLOCK, end, value)
 
 
-@kernel
+@piece
 def _at_first(
     rows: Integers, stamps: Integers, columns: Floats, state: Integers, tables: Floats, mode: int, end: int,
     last: int, own_set: int,
@@ -636,7 +636,7 @@ def run_windows(
 # ------------------------------------------------------------------------------ closed positions go to tables
 
 
-@kernel
+@piece
 def _reach(
     rows: Integers, state: Integers, stamps: Integers, root_low: int, root_high: int, last: int
 ) -> bool:
@@ -683,7 +683,7 @@ def _reach(
     return is_closed
 
 
-@kernel
+@piece
 def find_lows(rows: Integers, state: Integers, stamps: Integers, last: int) -> None:
     """Enter the first position of each node that still matters."""
     _reach(rows, state, stamps, min(state[HEAD, BASE], last), last, last)
@@ -691,7 +691,7 @@ def find_lows(rows: Integers, state: Integers, stamps: Integers, last: int) -> N
         state[LOWS, d] = state[LOW, d]
 
 
-@kernel
+@piece
 def _run_corner(
     rows: Integers, stamps: Integers, columns: Floats, state: Integers, tables: Floats, corner: int, last: int
 ) -> None:
@@ -738,7 +738,7 @@ def _run_corner(
             _slide(is_greatest, window_of(rows, d), state, columns, left, own, before, low, high + 1, last)
 
 
-@kernel
+@piece
 def _renew_tables(
     rows: Integers, stamps: Integers, columns: Floats, state: Integers, tables: Floats, last: int
 ) -> None:
@@ -780,7 +780,7 @@ def _pass_outdone(rows: Integers, columns: Floats, state: Integers, tables: Floa
     state[HEAD, BASE] = state[BOUNDARY, root] = base
 
 
-@kernel
+@piece
 def _absorb(
     rows: Integers, stamps: Integers, columns: Floats, state: Integers, tables: Floats, last: int
 ) -> None:
