@@ -16,6 +16,7 @@ import pytest
 import spatial_replay as sr
 from planning.plans import record_plan_of
 from planning.test_map_layers import OBJECTS, SPEC, TIDYING
+from report.report_pages import page_of
 from spatial_replay import Settings, UsageError, cli
 from spatial_replay.planning import (
     Grid,
@@ -123,7 +124,7 @@ def test_the_log_and_the_page_of_it_have_both_decisions(tidied, tmp_path):
     (layout,) = (each.data for each in source.attachments() if each.name == "layout.json")
     assert {"3D!scene", "3D!redone"} <= json.loads(layout)["configById"].keys()
     write_report(source, [], page)
-    assert "Replanned" in page.read_text()
+    assert '"redone":' in page_of(page).script("facts")
 
 
 def test_a_copy_with_both_decisions_keeps_the_units_of_lengths_and_signals(tmp_path):
