@@ -44,9 +44,9 @@ if TYPE_CHECKING:
     from spatial_replay.planning.decisions import Outcome
     from spatial_replay.planning.planner import Planner
     from spatial_replay.planning.settings import Settings
+    from spatial_replay.recording.clips import Trigger
     from spatial_replay.recording.plan_loop import plan
     from spatial_replay.recording.recorder import Recorder
-    from spatial_replay.recording.trigger import Trigger
     from spatial_replay.sanity.examine import doctor
     from spatial_replay.sources.open_log import read_trace
     from spatial_replay.spec.formula import Specification
@@ -135,7 +135,7 @@ __getattr__, __dir__ = loaded_when_used(
         "planning.decisions": ("Outcome",),
         "planning.planner": ("Planner",),
         "planning.settings": ("Settings",),
-        "recording.trigger": ("Trigger",),
+        "recording.clips": ("Trigger",),
         "recording.plan_loop": ("plan",),
         "recording.recorder": ("Recorder",),
         "sanity.examine": ("doctor",),

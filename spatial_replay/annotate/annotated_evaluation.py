@@ -10,11 +10,9 @@ from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
-import numpy as np
-
 from spatial_replay.annotate.specification import reported_trees
 from spatial_replay.errors import UsageError
-from spatial_replay.geometry.arrays import Empty, Floats
+from spatial_replay.geometry.arrays import Floats
 from spatial_replay.logs.messages import Attachment, Channel, Messages, merge
 from spatial_replay.logs.topics import AUTOMATON, DERIVED, SCENE
 from spatial_replay.monitor.instances import Instance
@@ -23,8 +21,8 @@ from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.stream import EvaluationStream, SeriesBlock
 from spatial_replay.spec.formula import Specification
 from spatial_replay.text import nearest_hint
-from spatial_replay.trace.axes import OUR_AXES, Axes
 from spatial_replay.trace.trace import Trace
+from spatial_replay.trace.units import OUR_AXES, Axes
 
 if TYPE_CHECKING:
     from spatial_replay.annotate.annotator import Annotator
@@ -91,9 +89,9 @@ class AnnotatedEvaluation:
         self._extent: SceneBounds | None = None
         self._has_samples = False
 
-    def extend(self, trace: Trace, empty: Empty = np.empty) -> list[SeriesBlock]:
-        """Take in the next samples; return one block for each of `trees`, in memory that `empty` gives."""
-        return [block for evaluation in self._evaluations for block in evaluation.extend(trace, empty)]
+    def extend(self, trace: Trace) -> list[SeriesBlock]:
+        """Evaluate the next samples; return one block for each of `trees`."""
+        return [block for evaluation in self._evaluations for block in evaluation.extend(trace)]
 
     def messages(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> list[Messages]:
         """Return what to write beside samples, from the blocks that `extend` returned for them."""

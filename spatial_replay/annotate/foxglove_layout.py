@@ -30,7 +30,7 @@ from spatial_replay.annotate.viewer_panels import (
 from spatial_replay.logs.messages import Attachment
 from spatial_replay.logs.schemas.Robustness_pb2 import VIOLATED
 from spatial_replay.logs.topics import EVENT_LOG, LAYOUT, PLAN_DECISION, REDONE_MAP
-from spatial_replay.trace.axes import OUR_AXES, Axes
+from spatial_replay.trace.units import OUR_AXES, Axes
 
 _PER_ROW: Final = 6
 

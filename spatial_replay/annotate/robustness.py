@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from spatial_replay.errors import LogError
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.logs.objects.wire import LayoutError, WireTemplate, rows_of, words_of
 from spatial_replay.logs.schemas.Robustness_pb2 import (
     FAILS_SO_FAR,
     HOLDS_SO_FAR,
@@ -22,6 +21,7 @@ from spatial_replay.logs.schemas.Robustness_pb2 import (
     Robustness,
     Standing,
 )
+from spatial_replay.logs.wire import LayoutError, WireTemplate, rows_of, words_of
 
 Codes = NDArray[np.uint8]
 

@@ -16,7 +16,6 @@ from spatial_replay.annotate.robustness import Codes, standing_codes
 from spatial_replay.annotate.scene.scene_update import spaced
 from spatial_replay.annotate.specification import ReportedTree, unit_of
 from spatial_replay.geometry.arrays import Floats, Integers, combined, equal_places
-from spatial_replay.logs.objects.wire import WireTemplate, placed, rounded, words_of
 from spatial_replay.logs.schemas.Robustness_pb2 import (
     FAILS_NOW,
     FAILS_SO_FAR,
@@ -28,6 +27,7 @@ from spatial_replay.logs.schemas.Robustness_pb2 import (
     VIOLATED,
     StandingUpdate,
 )
+from spatial_replay.logs.wire import WireTemplate, placed, rounded, words_of
 from spatial_replay.monitor.online.rewriting import looks_ahead
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.spec.formula import Formula, iter_nodes

@@ -43,7 +43,7 @@ from spatial_replay.monitor.online.rewriting import looks_ahead
 from spatial_replay.palette import CURVES, FAILING, HOLDING, NEGATIVE, NEUTRAL, POSITIVE, hexadecimal, lighter
 from spatial_replay.spec.formula import Formula
 from spatial_replay.text import number_text, shortened_formula
-from spatial_replay.trace.axes import OUR_AXES, Axes
+from spatial_replay.trace.units import OUR_AXES, Axes
 
 _MOST_CURVES: Final = 12
 _MOST_STRIPS: Final = 8

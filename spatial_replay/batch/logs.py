@@ -16,9 +16,14 @@ from spatial_replay.batch.rows import spec_lines
 from spatial_replay.batch.suite import Case, LogPattern
 from spatial_replay.batch.workers import Progress, ThisProcess, WorkerLost, Workers
 from spatial_replay.errors import SpatialReplayError, UsageError
-from spatial_replay.logs.downloads import local_copy
-from spatial_replay.logs.remote import BAG_METADATA, RemoteFile, is_address, log_file
-from spatial_replay.logs.remote_folder import matching_addresses
+from spatial_replay.logs.remote import (
+    BAG_METADATA,
+    RemoteFile,
+    is_address,
+    local_copy,
+    log_file,
+    matching_addresses,
+)
 from spatial_replay.monitor.instances import Choice
 from spatial_replay.sources.open_log import bag_files_at
 from spatial_replay.spec.diagnostics import Diagnostic

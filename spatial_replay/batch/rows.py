@@ -34,7 +34,7 @@ from spatial_replay.spec.diagnostics import SourceText
 from spatial_replay.spec.formula import NamedSpec, Specification
 from spatial_replay.spec.overrides import SpecificationText, load_specifications
 from spatial_replay.text import counted_from, encodable, printable
-from spatial_replay.trace.time_points import time_point_from_text
+from spatial_replay.trace.trace import time_point_from_text
 
 ErrorKind: TypeAlias = Literal["usage", "log", "machine"]
 """Whose an error is: of the options or files given, of the log, or of the machine and this program."""

@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias
 from spatial_replay.batch.rows import ResultRow
 from spatial_replay.errors import LogError, MissingFileError, OutputError, UsageError, importing
 from spatial_replay.logs.output_file import output_error, refuse_addresses, replacing
-from spatial_replay.logs.remote import is_address
-from spatial_replay.logs.remote_folder import RemoteFolder
+from spatial_replay.logs.remote import RemoteFolder, is_address
 
 if TYPE_CHECKING:
     import pyarrow as pa

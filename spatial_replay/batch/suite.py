@@ -28,7 +28,7 @@ from spatial_replay.mapping.yaml_document import (
 )
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.verdict import Verdict
-from spatial_replay.trace.time_points import time_point_from_text
+from spatial_replay.trace.trace import time_point_from_text
 
 LARGEST_SUITE: Final = 8 * 2**20
 """Bytes of a suite file."""

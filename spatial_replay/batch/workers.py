@@ -29,7 +29,7 @@ from multiprocessing.connection import Connection
 from typing import Any, Final, Protocol, TypeAlias, TypeVar, cast
 
 from spatial_replay.errors import ClusterError, UsageError, importing
-from spatial_replay.recording.interruption import uninterrupted
+from spatial_replay.recording.recorder import uninterrupted
 
 _Task = TypeVar("_Task")
 _Result = TypeVar("_Result")

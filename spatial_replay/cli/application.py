@@ -85,7 +85,7 @@ class LazyCommands(click.Group):
     def invoke(self, ctx: click.Context) -> Any:
         # imported here so that --help stays fast
         from spatial_replay.cli.terminal import progress
-        from spatial_replay.logs.downloads import showing_downloads
+        from spatial_replay.logs.remote import showing_downloads
 
         with showing_downloads(progress):
             return super().invoke(ctx)

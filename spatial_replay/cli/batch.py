@@ -359,7 +359,7 @@ _READING_DEFAULTS: Mapping[str, Any] = {
 
 
 def _check_time(option: str, text: str) -> None:
-    from spatial_replay.trace.time_points import time_point_from_text
+    from spatial_replay.trace.trace import time_point_from_text
 
     with naming_option(option):
         time_point_from_text(text)

@@ -19,7 +19,7 @@ from spatial_replay.cli.options import (
 from spatial_replay.cli.output import print_verdicts
 from spatial_replay.cli.terminal import progress, show, warn
 from spatial_replay.text import counted, time_text
-from spatial_replay.trace.time_points import duration_ns_from_text
+from spatial_replay.trace.trace import duration_ns_from_text
 
 if TYPE_CHECKING:
     from spatial_replay.compare.clips import Clip

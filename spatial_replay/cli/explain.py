@@ -25,7 +25,7 @@ from spatial_replay.cli.output import MANY, VERDICT_COLOURS, counts_text, others
 from spatial_replay.cli.terminal import Coloured, Line, fitted, progress, show, show_json, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.text import requirement_text, time_text
-from spatial_replay.trace.time_points import time_point_from_text
+from spatial_replay.trace.trace import time_point_from_text
 
 if TYPE_CHECKING:
     from spatial_replay.monitor.result import SpecResult

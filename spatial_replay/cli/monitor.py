@@ -29,15 +29,15 @@ from spatial_replay.cli.output import change_line, ending_lines
 from spatial_replay.cli.terminal import Line, StatusLine, show, show_diagnostics, show_file, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.text import counted, time_text
-from spatial_replay.trace.time_points import duration_ns_from_text
+from spatial_replay.trace.trace import duration_ns_from_text
 
 if TYPE_CHECKING:
     from spatial_replay.live import LiveSession, LiveUpdate
     from spatial_replay.live.viewing import Viewing
     from spatial_replay.mapping import LogMapping
     from spatial_replay.recording import Recorder
+    from spatial_replay.recording.clips import Trigger
     from spatial_replay.recording.recorder import SampleWriter
-    from spatial_replay.recording.trigger import Trigger
     from spatial_replay.spec.formula import Specification
 
 _STATUS_S: Final = 0.5
@@ -293,7 +293,7 @@ class _SignalTrigger:
 
 
 def _trigger(when: tuple[str, ...], before_s: float, after_s: float, ring: int) -> Trigger:
-    from spatial_replay.recording.trigger import Trigger
+    from spatial_replay.recording.clips import Trigger
 
     if ring < 2**20:
         raise UsageError(f"--ring is {ring} bytes; a ring takes 1MB or more")

@@ -15,18 +15,17 @@ import click
 
 from spatial_replay.cli.terminal import show_diagnostics, warn
 from spatial_replay.errors import UsageError
-from spatial_replay.logs.downloads import local_copy
-from spatial_replay.logs.remote import LogFile, is_address, local_files, log_file
+from spatial_replay.logs.remote import LogFile, is_address, local_copy, local_files, log_file
 from spatial_replay.monitor.verdict import ALLOWED_KINDS, FAILING_KINDS, checked_kinds
 from spatial_replay.text import counted
-from spatial_replay.trace.time_points import time_point_from_text
+from spatial_replay.trace.trace import time_point_from_text
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from spatial_replay.logs.source import Source
     from spatial_replay.monitor.semantics import Semantics
-    from spatial_replay.recording.record_source import Recorded
+    from spatial_replay.recording.recorder import Recorded
     from spatial_replay.replay import Replayed, ReplayOptions, Window
     from spatial_replay.spec.formula import Specification
 
@@ -453,7 +452,7 @@ def open_inputs(
     """
     # imported here so that --help stays fast
     from spatial_replay.replay import load_files
-    from spatial_replay.replay.annotated import recorded_texts
+    from spatial_replay.replay.engine import recorded_texts
     from spatial_replay.sources.open_log import open_source
 
     source = open_source(request.log, **request.reading)

@@ -23,7 +23,7 @@ from spatial_replay.text import (
 if TYPE_CHECKING:
     from spatial_replay.monitor.monitor import Ending
     from spatial_replay.monitor.result import SpecResult
-    from spatial_replay.recording.changes import VerdictChange
+    from spatial_replay.recording.log import VerdictChange
     from spatial_replay.replay import Replayed
 
 WORST_FIRST: Final = ("violated", "unknown", "satisfied")

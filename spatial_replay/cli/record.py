@@ -32,11 +32,11 @@ from spatial_replay.cli.terminal import progress, show, show_diagnostics, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import LogFile, local_files
 from spatial_replay.text import counted
-from spatial_replay.trace.time_points import duration_ns_from_text
+from spatial_replay.trace.trace import duration_ns_from_text
 
 if TYPE_CHECKING:
     from spatial_replay.logs.output_file import Durability
-    from spatial_replay.recording.changes import VerdictChange
+    from spatial_replay.recording.log import VerdictChange
     from spatial_replay.runs.record_video import FrameSource, KeepVideo
     from spatial_replay.simulation.world import Injection, Start
 

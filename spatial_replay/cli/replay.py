@@ -27,7 +27,7 @@ from spatial_replay.cli.output import print_verdicts, write_document
 from spatial_replay.cli.terminal import progress, show_message
 from spatial_replay.cli.watching import watch_log, watch_option
 from spatial_replay.errors import UsageError
-from spatial_replay.trace.time_points import duration_ns_from_text
+from spatial_replay.trace.trace import duration_ns_from_text
 
 if TYPE_CHECKING:
     from spatial_replay.monitor.semantics import Semantics

@@ -24,8 +24,7 @@ from spatial_replay.cli.options import (
 )
 from spatial_replay.cli.terminal import progress, show, show_diagnostics, show_json
 from spatial_replay.errors import UsageError
-from spatial_replay.logs.downloads import local_copy
-from spatial_replay.logs.remote import LogFile, is_address
+from spatial_replay.logs.remote import LogFile, is_address, local_copy
 from spatial_replay.text import counted
 
 if TYPE_CHECKING:

@@ -73,8 +73,12 @@ def verify(
     from spatial_replay.logs.read_options import ReadOptions
     from spatial_replay.planning.read import recompute_decisions
     from spatial_replay.replay import known_start_ns
-    from spatial_replay.replay.signatures import sign_certificate, signer_of
-    from spatial_replay.replay.verification import recorded_reading, verify_certificate
+    from spatial_replay.replay.verification import (
+        recorded_reading,
+        sign_certificate,
+        signer_of,
+        verify_certificate,
+    )
     from spatial_replay.sources.open_log import open_source
 
     if signature is not None and sign is None and signer is None:

@@ -17,7 +17,7 @@ from spatial_replay.cli.options import EvaluationArguments, EvaluationInputs, op
 from spatial_replay.cli.output import print_verdicts
 from spatial_replay.cli.terminal import progress, show, show_diagnostics
 from spatial_replay.errors import MissingFileError, SpatialReplayError, SpecificationError
-from spatial_replay.logs.downloads import local_copy
+from spatial_replay.logs.remote import local_copy
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

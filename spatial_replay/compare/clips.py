@@ -28,11 +28,9 @@ from spatial_replay.monitor.stream import NEVER
 from spatial_replay.monitor.verdict import Verdict, final_verdict, online_verdict
 from spatial_replay.monitor.witness.path import End, MissedResponse, deciding_path, missed_response
 from spatial_replay.monitor.witness.unfinished import UnfinishedNodes, evaluate_unfinished
-from spatial_replay.replay.annotated import run_replay
 from spatial_replay.replay.clipped_source import clipped_source
-from spatial_replay.replay.engine import Replay, Replayed
-from spatial_replay.replay.kept_messages import KEEP_ALL
-from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions, Selection, Window
+from spatial_replay.replay.engine import Replay, Replayed, run_replay
+from spatial_replay.replay.selection import DEFAULT_OPTIONS, KEEP_ALL, ReplayOptions, Selection, Window
 from spatial_replay.spec.diagnostics import nearest_hint
 from spatial_replay.spec.formula import Outline, Specification, iter_nodes
 from spatial_replay.trace.trace import ABSENT, Trace, window_of

@@ -29,9 +29,9 @@ from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.formula import Atom, Specification, iter_nodes
 from spatial_replay.spec.walks import other_names
 from spatial_replay.text import Instant, Sentence, counted, counted_from, json_number, number_text, with_unit
-from spatial_replay.trace.other_units import OTHER_UNITS, require_same_units
 from spatial_replay.trace.sample import FOREVER
 from spatial_replay.trace.trace import Trace
+from spatial_replay.trace.units import OTHER_UNITS, require_same_units
 
 _PAIRS_AT_ONCE: Final = 16_384
 """Observations that are compared at once: few enough for the processor's cache."""

@@ -36,8 +36,8 @@ from spatial_replay.falsification.simulations import (
     own_simulation,
     scenario_simulation,
 )
-from spatial_replay.logs.downloads import local_copy
 from spatial_replay.logs.output_file import output_error, refuse_addresses
+from spatial_replay.logs.remote import local_copy
 from spatial_replay.monitor.evaluate import evaluate
 from spatial_replay.monitor.verdict import worst_verdict
 from spatial_replay.replay.selection import DEFAULT_OPTIONS

@@ -19,7 +19,7 @@ import numpy as np
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.footprint import Footprint
 from spatial_replay.logs.output_file import replacing
-from spatial_replay.recording.recording import refuse_templates
+from spatial_replay.recording.log import refuse_templates
 from spatial_replay.runs.planned import record_plan
 from spatial_replay.runs.run_log import run_log
 from spatial_replay.runs.scripted import about_run, refuse_unknown_names, simulate_script
@@ -31,8 +31,7 @@ from spatial_replay.sources.open_log import read_trace
 from spatial_replay.spec.formula import Specification
 from spatial_replay.text import nearest_hint
 from spatial_replay.trace.sample import Sample
-from spatial_replay.trace.time_points import duration_ns_from_text
-from spatial_replay.trace.trace import Trace
+from spatial_replay.trace.trace import Trace, duration_ns_from_text
 
 # ------------------------------------------------------------------------------------------------- parameters
 

@@ -30,7 +30,7 @@ from spatial_replay.spec.formula import NamedSpec, Specification
 from spatial_replay.spec.relations import DEFAULT_PROFILE, PROFILES
 from spatial_replay.spec.tokens import quoted
 from spatial_replay.text import counted, json_number, number_text, printable
-from spatial_replay.trace.other_units import require_same_units
+from spatial_replay.trace.units import require_same_units
 from spatial_replay.tuning.margins import LabelledRun
 from spatial_replay.tuning.tuned import MOST_RUNS, MOST_SAMPLES
 

@@ -30,7 +30,7 @@ from spatial_replay.live.client import (
     Warned,
 )
 from spatial_replay.logs.messages import Channel
-from spatial_replay.logs.objects.decode import decode_objects
+from spatial_replay.logs.objects import decode_objects
 from spatial_replay.logs.read_options import FaultKinds
 from spatial_replay.logs.topics import OBJECTS, is_kept
 from spatial_replay.mapping import LiveAssembler, LogMapping, ReadingPlan, load_mapping
@@ -40,10 +40,9 @@ from spatial_replay.monitor.monitor import Ending, Monitor, NodeUpdate, SpecUpda
 from spatial_replay.monitor.result import no_such_node
 from spatial_replay.monitor.verdict import Verdict, worst_verdict
 from spatial_replay.monitor.violation import Violation
-from spatial_replay.recording.changes import VerdictChange, VerdictChanges
+from spatial_replay.recording.clips import Trigger
+from spatial_replay.recording.log import RunEvent, VerdictChange, VerdictChanges
 from spatial_replay.recording.recorder import Recorder, SampleWriter
-from spatial_replay.recording.recording import RunEvent
-from spatial_replay.recording.trigger import Trigger
 from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import listed_specifications

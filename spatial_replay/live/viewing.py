@@ -13,9 +13,8 @@ from spatial_replay.logs.messages import MemorySink, Messages
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.topics import OBJECTS, SPECIFICATION, protobuf_channel
 from spatial_replay.mapping import LogMapping
+from spatial_replay.recording.log import Missed, Recording, RunEnd, RunEvent, refuse_templates, warm_up
 from spatial_replay.recording.recorder import SampleWriter
-from spatial_replay.recording.recorder_log import Missed, RunEnd, warm_up
-from spatial_replay.recording.recording import Recording, RunEvent, refuse_templates
 from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace

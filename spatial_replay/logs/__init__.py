@@ -14,8 +14,7 @@ if TYPE_CHECKING:
     from spatial_replay.logs.mcap.summary import summarise_mcap
     from spatial_replay.logs.mcap.write import LogWriter
     from spatial_replay.logs.messages import Attachment, Block, Channel, MemorySink, Messages, Schema
-    from spatial_replay.logs.objects.decode import decode_objects
-    from spatial_replay.logs.objects.encode import encode_objects
+    from spatial_replay.logs.objects import decode_objects, encode_objects
     from spatial_replay.logs.source import MemorySource, Source
 
 __all__ = [
@@ -41,8 +40,7 @@ __getattr__, __dir__ = loaded_when_used(
         "mcap.summary": ("summarise_mcap",),
         "mcap.write": ("LogWriter",),
         "messages": ("Attachment", "Block", "Channel", "MemorySink", "Messages", "Schema"),
-        "objects.decode": ("decode_objects",),
-        "objects.encode": ("encode_objects",),
+        "objects": ("decode_objects", "encode_objects"),
         "source": ("MemorySource", "Source"),
     },
 )

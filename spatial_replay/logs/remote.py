@@ -1,27 +1,205 @@
-"""Files at addresses: s3://, gs://, az://, https://. Only the ranges of bytes that are needed are moved.
-
-The only importer of obstore, which knows the services, and takes credentials from the environment as their
-own tools do (AWS_ACCESS_KEY_ID, GOOGLE_SERVICE_ACCOUNT, AZURE_STORAGE_ACCOUNT_NAME and so on).
-"""
+"""Logs at addresses: ranges of their bytes, whole copies on this machine, and folders in buckets."""
 
 from __future__ import annotations
 
+import hashlib
+import io
+import logging
 import os
+import shutil
+import tempfile
+from bisect import bisect_right
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextvars import ContextVar
 from dataclasses import dataclass
 from datetime import timedelta
+from fnmatch import fnmatchcase
 from functools import lru_cache
+from itertools import pairwise
 from os import PathLike, fspath
 from pathlib import Path
 from threading import Lock
 from types import MappingProxyType
-from typing import Any, BinaryIO, Final, TypeAlias, cast
+from typing import Any, BinaryIO, Final, Protocol, TypeAlias, cast
 from urllib.parse import unquote, urlsplit
 
-from spatial_replay.errors import MissingFileError, RemoteError, SpatialReplayError, UsageError, importing
-from spatial_replay.logs.byte_ranges import MOST_HELD_BYTES, HeldBytes, Range, RangeStream, joined_ranges
+from spatial_replay.errors import (
+    LogError,
+    MissingFileError,
+    OutputError,
+    RemoteError,
+    SpatialReplayError,
+    UsageError,
+    importing,
+)
+from spatial_replay.logs.output_file import output_error
+
+Range: TypeAlias = tuple[int, int]
+"""Bytes from the first up to, not including, the second."""
+
+_BATCH_BYTES: Final = 2**26
+"""What is read at once if that is all; of more, the first batches are smaller, and one is read ahead."""
+MOST_HELD_BYTES: Final = 2**28
+_WASTE: Final = 0.08
+"""The share of bytes that may be read between ranges, unused, to save requests."""
+
+
+class FileInParts(Protocol):
+    """A file that gives ranges of its bytes."""
+
+    @property
+    def size(self) -> int:
+        """In bytes."""
+
+    def read(self, begin: int, end: int) -> bytes:
+        """Return a range, less where the file ends before that."""
+
+    def fetch(self, ranges: Iterable[Range]) -> None:
+        """Read ranges, to be held until they are asked for."""
+
+
+class RangeStream(io.RawIOBase):
+    """A position in a file, and the ranges that are going to be read from it, in batches."""
+
+    def __init__(self, file: FileInParts) -> None:
+        super().__init__()
+        self._file = file
+        self._position = 0
+        self._batches: list[list[Range]] = []
+        self._batch_of: dict[int, int] = {}
+        self._fetching: dict[int, Future[None]] = {}
+        self._thread: ThreadPoolExecutor | None = None
+
+    def plan(self, ranges: Iterable[Range]) -> None:
+        """Announce which ranges are going to be read, in this order.
+
+        They are fetched in batches when the first of them is read, and one batch ahead.
+        """
+        batch, size, most = list[Range](), 0, _BATCH_BYTES
+        wanted = list(ranges)
+        if sum(end - begin for begin, end in wanted) > _BATCH_BYTES:
+            # the reader may stop after the first messages
+            most = _BATCH_BYTES // 32
+        for begin, end in wanted:
+            batch.append((begin, end))
+            self._batch_of.setdefault(begin, len(self._batches))
+            size += end - begin
+            if size >= most:
+                self._batches.append(batch)
+                batch, size, most = [], 0, min(4 * most, _BATCH_BYTES // 2)
+        if batch:
+            self._batches.append(batch)
+
+    def seekable(self) -> bool:
+        return True
+
+    def readable(self) -> bool:
+        return True
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        base = {os.SEEK_SET: 0, os.SEEK_CUR: self._position}.get(whence)
+        self._position = (self._file.size if base is None else base) + offset
+        return self._position
+
+    def read(self, size: int = -1) -> bytes:
+        end = self._file.size if size < 0 else self._position + size
+        if (batch := self._batch_of.get(self._position)) is not None:
+            self._fetch(batch)
+        data = self._file.read(self._position, end)
+        self._position += len(data)
+        return data
+
+    def close(self) -> None:
+        if self._thread is not None:
+            self._thread.shutdown(wait=False, cancel_futures=True)
+        super().close()
+
+    def _fetch(self, batch: int) -> None:
+        if self._thread is None:
+            self._thread = ThreadPoolExecutor(1, "remote-batches")
+        # not ahead of the first one: a search for the first sample needs no other
+        for each in range(batch, min(batch + 1 + bool(batch), len(self._batches))):
+            if each not in self._fetching:
+                self._fetching[each] = self._thread.submit(self._file.fetch, self._batches[each])
+        self._fetching[batch].result()
+
+
+def plan_reads(stream: BinaryIO, ranges: Iterable[Range]) -> None:
+    """Announce the ranges that are going to be read from a stream, if it is of a remote file."""
+    if isinstance(stream, RangeStream):
+        stream.plan(ranges)
+
+
+def is_planned(stream: BinaryIO) -> bool:
+    """Return whether a stream reads announced ranges ahead, and joined: that of a remote file."""
+    return isinstance(stream, RangeStream)
+
+
+def joined_ranges(ranges: Sequence[Range]) -> list[Range]:
+    """Return ranges in order, joined over the smallest gaps as long as these add up to little."""
+    ordered = sorted(each for each in ranges if each[1] > each[0])
+    wanted = sum(end - begin for begin, end in ordered)
+    gaps = sorted((after[0] - before[1], i) for i, (before, after) in enumerate(pairwise(ordered)))
+    bridged, wasted = set[int](), 0
+    for gap, index in gaps:
+        wasted += max(gap, 0)
+        if wasted > _WASTE * wanted:
+            break
+        bridged.add(index)
+    result: list[Range] = []
+    for index, (begin, end) in enumerate(ordered):
+        if index - 1 in bridged:
+            result[-1] = (result[-1][0], max(result[-1][1], end))
+        else:
+            result.append((begin, end))
+    return result
+
+
+class HeldBytes:
+    """Parts of a file that do not overlap; the oldest are dropped when there are too many."""
+
+    def __init__(self) -> None:
+        self._begins: list[int] = []
+        self._parts: dict[int, bytes] = {}
+        self._size = 0
+
+    def missing(self, begin: int, end: int) -> list[Range]:
+        """Return the parts of a range that are not held."""
+        gaps = []
+        for start, data in self._overlapping(begin, end):
+            if start > begin:
+                gaps.append((begin, start))
+            begin = max(begin, start + len(data))
+        return [*gaps, (begin, end)] if begin < end else gaps
+
+    def read(self, begin: int, end: int) -> bytes:
+        """Return a range that is held."""
+        return b"".join(
+            data[max(begin - start, 0) : end - start] for start, data in self._overlapping(begin, end)
+        )
+
+    def add(self, begin: int, data: bytes) -> None:
+        """Take in what is not held of a part."""
+        for start, end in self.missing(begin, begin + len(data)):
+            self._begins.insert(bisect_right(self._begins, start), start)
+            self._parts[start] = data if end - start == len(data) else data[start - begin : end - begin]
+            self._size += end - start
+        while self._size > MOST_HELD_BYTES and len(self._parts) > 1:
+            oldest = next(iter(self._parts))
+            self._size -= len(self._parts.pop(oldest))
+            self._begins.remove(oldest)
+
+    def _overlapping(self, begin: int, end: int) -> Iterator[tuple[int, bytes]]:
+        index = max(bisect_right(self._begins, begin) - 1, 0)
+        while index < len(self._begins) and self._begins[index] < end:
+            start = self._begins[index]
+            if start + len(self._parts[start]) > begin:
+                yield start, self._parts[start]
+            index += 1
+
 
 _CREDENTIALS: Final = {
     "s3": "set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_SKIP_SIGNATURE=true for a public bucket",
@@ -392,3 +570,288 @@ def store_failure(shown: str, scheme: str, error: Exception, done: str = "read")
     reason = _REASONS.get(reason.rpartition("HTTP error: ")[2], reason)
     remedy = "the address" if scheme in WEB_SCHEMES else f"the credentials: {_CREDENTIALS[scheme]}"
     return RemoteError(f"{shown} cannot be {done}: {reason}; check the network and {remedy}")
+
+
+_LOG: Final = logging.getLogger("spatial_replay")
+_LIMIT: Final = "SPATIAL_REPLAY_DOWNLOADS"
+_GIGABYTE: Final = 10**9
+_DEFAULT_GIGABYTES: Final = 20.0
+
+
+Show: TypeAlias = Callable[[str, int], AbstractContextManager[Callable[[int], None]]]
+"""Shows some work, given what it is called and how many steps it has; what comes out counts them."""
+_shows: Final[ContextVar[Show | None]] = ContextVar("shows", default=None)
+
+
+@contextmanager
+def showing_downloads(show: Show) -> Iterator[None]:
+    """Show the bytes of downloads, while this lasts, in the thread that asks for it."""
+    before = _shows.set(show)
+    try:
+        yield
+    finally:
+        _shows.reset(before)
+
+
+def local_copy(path: str | PathLike[str]) -> Path:
+    """Return a path as it is, and of a small file at an address, such as a specification, a copy.
+
+    Raises:
+        UsageError: an address that names no file, or obstore is not installed.
+        LogError: it is larger than all copies may be.
+        MissingFileError, RemoteError: it cannot be read.
+        OutputError: the disk cannot take it.
+    """
+    file = log_file(path)
+    return downloaded(file) if isinstance(file, RemoteFile) else file
+
+
+def downloaded(file: RemoteFile, reason: str = "") -> Path:
+    """Return a copy of a remote file on this machine, which is made once for each version of it.
+
+    The oldest copies are removed when all together exceed 20 GB, or SPATIAL_REPLAY_DOWNLOADS gigabytes.
+
+    Args:
+        reason: why it is not read in parts, for the message that says that it is downloaded; without one,
+            there is none.
+
+    Raises:
+        LogError: it is larger than all copies may be.
+        MissingFileError, RemoteError: it cannot be read.
+        OutputError: the disk cannot take it.
+    """
+    return _copied([file], str(file), reason) / _name(file)
+
+
+def downloaded_folder(files: Sequence[RemoteFile], name: str, shown: str, reason: str) -> Path:
+    """Return a folder of this name with copies of remote files; see `downloaded`.
+
+    Args:
+        shown: the address of the folder, for messages.
+    """
+    return _copied(files, shown, reason, name)
+
+
+def _copied(files: Sequence[RemoteFile], shown: str, reason: str, below: str = "") -> Path:
+    """Return the folder that holds copies of files."""
+    versions, limit = [file.version for file in files], gigabytes(_LIMIT, _DEFAULT_GIGABYTES)
+    size = sum(version.size for version in versions)
+    parent = user_cache_folder("downloads")
+    known = [f"{os.fspath(file)}\n{file.version.tag}\n{file.version.size}" for file in files]
+    folder = parent / hashlib.sha256("\n".join(known).encode()).hexdigest()[:32]
+    # what has no tag may have changed
+    if all(version.tag is not None for version in versions) and all(
+        _has(folder / below / _name(file), file.version.size) for file in files
+    ):
+        with suppress(OSError):
+            os.utime(folder)
+        return folder / below
+    if size > limit:
+        raise LogError(
+            f"{shown} has {size / _GIGABYTE:.2f} GB, and downloads may have {limit / _GIGABYTE:g} GB;"
+            f" set {_LIMIT} to more gigabytes, or copy the log to this machine"
+        )
+    if reason:
+        _LOG.warning("%s: downloading %.1f MB once, to %s: %s", shown, size / 1e6, parent, reason)
+    show = _shows.get()
+    try:
+        parent.mkdir(parents=True, exist_ok=True)
+        _make_room(parent, limit - size)
+        partial = Path(tempfile.mkdtemp(".partial", "", parent))
+        try:
+            (partial / below).mkdir(exist_ok=True)
+            with nullcontext(lambda size: None) if show is None else show("downloading", size) as advance:
+                for file in files:
+                    _write(file, partial / below / _name(file), advance)
+            shutil.rmtree(folder, ignore_errors=True)
+            with suppress(FileExistsError):
+                partial.rename(folder)
+        finally:
+            shutil.rmtree(partial, ignore_errors=True)
+    except OSError as error:
+        raise output_error(folder, error) from error
+    return folder / below
+
+
+def _name(file: RemoteFile) -> str:
+    return file.name.replace("/", "_") or "log"
+
+
+def _has(copy: Path, size: int) -> bool:
+    return copy.is_file() and copy.stat().st_size == size
+
+
+def _write(file: RemoteFile, copy: Path, advance: Callable[[int], None]) -> None:
+    size = 0
+    with copy.open("wb") as stream:
+        for part in file.iter_whole():
+            size += len(part)
+            if size > file.version.size:
+                break
+            stream.write(part)
+            advance(len(part))
+    if size != file.version.size:
+        raise LogError(f"{file}: {size} bytes came instead of {file.version.size}; run the command again")
+
+
+def _make_room(parent: Path, room: int) -> None:
+    """Remove the copies that were not used for longest, until the others fit."""
+    copies = []
+    for folder in parent.iterdir():
+        with suppress(OSError):
+            size = sum(each.stat().st_size for each in folder.rglob("*"))
+            copies.append((folder.stat().st_mtime, folder.name, size))
+    total = sum(size for *_, size in copies)
+    for _, name, size in sorted(copies):
+        if total <= room:
+            return
+        shutil.rmtree(parent / name, ignore_errors=True)
+        total -= size
+
+
+def user_cache_folder(name: str) -> Path:
+    """Return the folder of this name among what the user's programs may keep.
+
+    Raises:
+        RuntimeError: the user has no home folder.
+    """
+    if chosen := os.environ.get("SPATIAL_REPLAY_CACHE"):
+        return Path(chosen) / name
+    # the XDG specification has a relative path ignored
+    parent = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    return (parent if parent.is_absolute() else Path.home() / ".cache") / "spatial-replay" / name
+
+
+def gigabytes(variable: str, otherwise: float) -> int:
+    """Return the bytes that a variable of the environment names in gigabytes.
+
+    Raises:
+        UsageError: it is not a number from 0 on.
+    """
+    text = os.environ.get(variable, str(otherwise))
+    try:
+        size = int(float(text) * _GIGABYTE)
+    except (ValueError, OverflowError):
+        size = -1
+    if size < 0:
+        raise UsageError(f"{variable} is {text!r}; give a number of gigabytes")
+    return size
+
+
+_FILES_AT_ONCE: Final = 32
+
+
+class RemoteFolder:
+    """A folder in a bucket. A file is written by one put, so it is whole or not there.
+
+    Names of files are relative to the folder. Several threads may use it.
+    """
+
+    def __init__(self, address: str) -> None:
+        """Take an address such as "s3://bucket/folder/"; nothing is read yet.
+
+        Raises:
+            UsageError: a web server, no bucket, or obstore is not installed.
+        """
+        self._scheme, _, rest = address.partition("://")
+        if self._scheme in WEB_SCHEMES:
+            raise UsageError(
+                "a web server neither lists nor takes files; give a folder of a bucket, such as "
+                "s3://bucket/results, or one on this machine"
+            )
+        bucket, _, key = rest.partition("/")
+        if not bucket:
+            raise UsageError(f"{address} names no bucket; give one, such as s3://bucket/results")
+        folder = key.strip("/")
+        self.location: Final = f"{self._scheme}://{bucket}/{folder}".rstrip("/")
+        self._prefix = f"{folder}/" if folder else ""
+        self._library = obstore_library()
+        self._store = open_store(self._scheme, bucket)
+        self._failures = (OSError, ValueError, self._library.exceptions.BaseError)
+
+    def __str__(self) -> str:
+        return self.location
+
+    def exists(self) -> bool:
+        """Return whether there is a file in it."""
+        return next(self._keys(""), None) is not None
+
+    def names(self, below: str = "") -> list[str]:
+        """Return the names of all files in it, or in a folder below, in order.
+
+        Raises:
+            MissingFileError, RemoteError: it cannot be listed.
+        """
+        return sorted(key.removeprefix(self._prefix) for key in self._keys(below))
+
+    def read(self, names: Sequence[str]) -> Iterator[bytes]:
+        """Read files, several at the same time, and yield the content of each in their order.
+
+        Raises:
+            MissingFileError: one is not there; it may have been joined with others by another batch.
+            UsageError, RemoteError: one cannot be read.
+        """
+        with ThreadPoolExecutor(_FILES_AT_ONCE, "remote-reading") as threads:
+            yield from threads.map(self._read, names)
+
+    def write(self, name: str, data: bytes) -> None:
+        """Write a file, which is whole or, where that fails, as before.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        try:
+            self._library.put(self._store, self._prefix + name, data)
+        except self._failures as error:
+            shown = f"{self.location}/{name}"
+            raise OutputError(str(store_failure(shown, self._scheme, error, "written"))) from None
+
+    def remove(self, names: Iterable[str]) -> None:
+        """Remove files; one that is gone already is no error.
+
+        Raises:
+            OutputError: one cannot be removed.
+        """
+        keys = [self._prefix + name for name in names]
+        try:
+            if keys:
+                self._library.delete(self._store, keys)
+        except FileNotFoundError:
+            return
+        except self._failures as error:
+            raise OutputError(str(store_failure(self.location, self._scheme, error, "written"))) from None
+
+    def _keys(self, below: str) -> Iterator[str]:
+        try:
+            for some in self._library.list(self._store, self._prefix + below or None):
+                yield from (each["path"] for each in some)
+        except self._failures as error:
+            raise store_failure(self.location, self._scheme, error) from None
+
+    def _read(self, name: str) -> bytes:
+        try:
+            return bytes(self._library.get(self._store, self._prefix + name).bytes())
+        except self._failures as error:
+            failure = store_failure(f"{self.location}/{name}", self._scheme, error)
+            is_denied = isinstance(failure, MissingFileError) and not isinstance(error, FileNotFoundError)
+            raise UsageError(str(failure)) if is_denied else failure from None
+
+
+def matching_addresses(pattern: str) -> list[str]:
+    """Return the addresses of a bucket or container that fit a pattern, in order.
+
+    Args:
+        pattern: such as "s3://fleet/2026-11/*.mcap"; an end in "/" stands for everything below.
+
+    Raises:
+        UsageError: a web server cannot list its files.
+        MissingFileError, RemoteError: the bucket cannot be read.
+    """
+    scheme, _, rest = pattern.partition("://")
+    if scheme in WEB_SCHEMES:
+        raise UsageError(f"{pattern}: web servers do not list their files; give each address")
+    bucket, _, key = rest.partition("/")
+    begin = min((key.find(sign) for sign in "*?[" if sign in key), default=len(key))
+    fixed, wanted = key[:begin].rpartition("/")[0], key + "*" if key.endswith("/") or not key else key
+    keys = RemoteFolder(f"{scheme}://{bucket}").names(fixed)
+    return [f"{scheme}://{bucket}/{each}" for each in keys if fnmatchcase(each, wanted)]

@@ -16,8 +16,7 @@ from os import PathLike
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from spatial_replay.errors import MissingFileError, UsageError
-from spatial_replay.logs.downloads import local_copy
-from spatial_replay.logs.remote import log_file
+from spatial_replay.logs.remote import local_copy, log_file
 from spatial_replay.text import nearest_hint
 
 if TYPE_CHECKING:

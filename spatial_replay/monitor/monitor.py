@@ -25,9 +25,9 @@ from spatial_replay.spec.formula import NamedSpec, Specification, iter_nodes
 from spatial_replay.spec.load import require_specification
 from spatial_replay.spec.units import declared_unit
 from spatial_replay.text import counted, time_text, times_apart
-from spatial_replay.trace.declared_units import checked_units
 from spatial_replay.trace.sample import Sample, require_time
-from spatial_replay.trace.time_points import duration_ns_from_text
+from spatial_replay.trace.trace import duration_ns_from_text
+from spatial_replay.trace.units import checked_units
 
 _MOST_KNOWN: Final = 1000
 """Names that a missing one is compared with, of each kind."""

@@ -21,7 +21,7 @@ from spatial_replay.geometry.footprint import Footprint
 from spatial_replay.logs.remote import log_file
 from spatial_replay.mapping.yaml_document import Document, Place, checked_document, read_yaml_text
 from spatial_replay.perception.opencv import FAMILY_SIZES, Camera, pose_looking_at
-from spatial_replay.trace.time_points import duration_ns_from_text
+from spatial_replay.trace.trace import duration_ns_from_text
 
 SCHEMA_FILE: Final = "tags.schema.json"
 LEAST_REFERENCES: Final = 4

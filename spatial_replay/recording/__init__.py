@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from spatial_replay.logs.topics import ENDING
-from spatial_replay.recording.record_source import Recorded, record_source
-from spatial_replay.recording.recorder import Recorder
-from spatial_replay.recording.recording import Recording
+from spatial_replay.recording.log import Recording
+from spatial_replay.recording.recorder import Recorded, Recorder, record_source
 
 __all__ = ["ENDING", "Recorded", "Recorder", "Recording", "record_source"]

@@ -1,8 +1,7 @@
 """Replay: a log and specifications in, verdicts and an annotated log out.
 
-`selection` picks the samples, `engine` evaluates them, `annotated` writes the log, `document` the JSON.
-`loaded_log` evaluates a log in memory again, with what `specification_files` reads when it is saved;
-`playback` plays what that gives.
+`selection` picks the samples, `engine` evaluates them and writes the log, `document` the JSON. `loaded_log`
+evaluates a log in memory again, with what `specification_files` reads when it is saved, and plays it.
 
 Names are loaded when they are first used.
 """
@@ -14,7 +13,6 @@ from typing import TYPE_CHECKING
 from spatial_replay.lazy import loaded_when_used
 
 if TYPE_CHECKING:
-    from spatial_replay.replay.annotated import load_files, recorded_texts, run_replay
     from spatial_replay.replay.document import (
         Explanation,
         document_from_replay,
@@ -22,9 +20,14 @@ if TYPE_CHECKING:
         idle_document,
         verdict_of,
     )
-    from spatial_replay.replay.engine import Replay, Replayed
-    from spatial_replay.replay.loaded_log import Evaluated, LoadedLog, constant_text, constant_values
-    from spatial_replay.replay.playback import Playback
+    from spatial_replay.replay.engine import Replay, Replayed, load_files, recorded_texts, run_replay
+    from spatial_replay.replay.loaded_log import (
+        Evaluated,
+        LoadedLog,
+        Playback,
+        constant_text,
+        constant_values,
+    )
     from spatial_replay.replay.selection import (
         LogNames,
         ReplayOptions,
@@ -69,7 +72,6 @@ __all__ = [
 __getattr__, __dir__ = loaded_when_used(
     globals(),
     {
-        "annotated": ("load_files", "recorded_texts", "run_replay"),
         "document": (
             "Explanation",
             "document_from_replay",
@@ -77,8 +79,7 @@ __getattr__, __dir__ = loaded_when_used(
             "idle_document",
             "verdict_of",
         ),
-        "engine": ("Replay", "Replayed"),
-        "playback": ("Playback",),
+        "engine": ("Replay", "Replayed", "load_files", "recorded_texts", "run_replay"),
         "selection": (
             "LogNames",
             "ReplayOptions",
@@ -89,7 +90,7 @@ __getattr__, __dir__ = loaded_when_used(
         ),
         "specification_files": ("SpecificationFiles", "write_constants"),
         "table": ("QUANTITIES", "export_table"),
-        "loaded_log": ("Evaluated", "LoadedLog", "constant_text", "constant_values"),
+        "loaded_log": ("Evaluated", "LoadedLog", "Playback", "constant_text", "constant_values"),
         "verification": ("verify_certificate",),
     },
 )

@@ -10,7 +10,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from spatial_replay.bags.decoders import Topic, decoder_of, full_type_name
+from spatial_replay.bags.decoders import decoder_of
+from spatial_replay.bags.ros_definitions import full_type_name
+from spatial_replay.bags.topic import Topic
 from spatial_replay.errors import LogError
 from spatial_replay.logs.mcap.read import McapSource
 from spatial_replay.logs.messages import Block, Channel, Messages, merge, select
@@ -18,7 +20,7 @@ from spatial_replay.logs.source import Source, SourceOf, read_blocks
 from spatial_replay.logs.topics import OBJECTS
 from spatial_replay.mapping.field_paths import get_field
 from spatial_replay.mapping.message_types import TRANSFORM_TYPES, short_type
-from spatial_replay.replay.kept_messages import KEEP_ALL, source_keeping
+from spatial_replay.replay.selection import KEEP_ALL, source_keeping
 from spatial_replay.trace.sample import FOREVER
 from spatial_replay.trace.trace import Trace, window_of
 

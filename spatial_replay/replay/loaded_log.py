@@ -1,12 +1,13 @@
 """A log in memory, evaluated again and again with other values for the constants of its specifications.
 
-`LoadedLog` holds the log, `EditedFiles` the specifications with some values, `Evaluated` what they give.
+`LoadedLog` holds the log, `EditedFiles` the specifications with some values, `Evaluated` their results,
+`OwnMessages` the messages of the log itself; `Playback` plays them.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, replace
@@ -15,25 +16,26 @@ from pathlib import PurePath
 from types import MappingProxyType
 from typing import Final
 
+import numpy as np
+
 from spatial_replay.annotate.annotated_evaluation import AnnotatedEvaluation
-from spatial_replay.annotate.annotator import Annotator
+from spatial_replay.annotate.annotator import Annotator, shown_regions
 from spatial_replay.annotate.curves import encode_curves
 from spatial_replay.annotate.foxglove_layout import live_layout_attachment
 from spatial_replay.annotate.rings import SceneBounds
-from spatial_replay.annotate.scene.scene_update import SceneState
+from spatial_replay.annotate.scene.scene_update import SceneState, scene_start
 from spatial_replay.annotate.specification import logged_specifications
 from spatial_replay.errors import SpecificationError, UsageError
-from spatial_replay.logs.messages import Attachment
-from spatial_replay.logs.source import MemorySource, Source, units_of
+from spatial_replay.geometry.arrays import Integers
+from spatial_replay.logs.messages import Attachment, Block, Channel, Messages, join, merge, select
+from spatial_replay.logs.source import MemorySource, Source, read_blocks, units_of
 from spatial_replay.monitor.result import SpecResult, worst_first
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.monitor.verdict import Verdict, worst_verdict
 from spatial_replay.replay.engine import Replayed, dropped_samples, idle_templates, replayed_specs
-from spatial_replay.replay.kept_messages import KEEP_ALL
-from spatial_replay.replay.own_messages import OwnMessages
-from spatial_replay.replay.reused_memory import ReusedMemory
 from spatial_replay.replay.selection import (
     DEFAULT_OPTIONS,
+    KEEP_ALL,
     LogNames,
     ReplayOptions,
     Selection,
@@ -46,7 +48,152 @@ from spatial_replay.spec.diagnostics import Diagnostic, nearest_hint
 from spatial_replay.spec.format import format_duration, format_specification
 from spatial_replay.spec.formula import Constant, Specification, iter_nodes
 from spatial_replay.text import counted_from
-from spatial_replay.trace.trace import Trace
+from spatial_replay.trace.trace import Trace, window_of
+
+_FEW: Final = 2_000
+_FEW_BYTES: Final = 1 << 26
+"""The most messages of one topic, and bytes of all such topics, that are kept in memory."""
+
+_PIECE: Final = 256
+"""Samples that are encoded at once."""
+
+
+class OwnMessages:
+    """The messages that a copy of a log has: those of the log, and samples that are not among them.
+
+    Topics with few messages (a map, a transform) stay in memory, since viewers show a message until the next
+    one of its topic, however old it is. The other topics are read again when they are played.
+
+    Attributes:
+        channels: in the order of their first messages.
+        start_ns, end_ns: times of the first and the last message or sample; 0 and -1 if there are none.
+    """
+
+    def __init__(self, selection: Selection) -> None:
+        self._selection = selection
+        self._samples: list[Trace] = []
+        self._few: dict[Channel, list[Messages]] = {}
+        self._counts: dict[Channel, int] = {}
+        self._bytes = 0
+        self.start_ns, self.end_ns = 0, -1
+
+    @property
+    def channels(self) -> tuple[Channel, ...]:
+        return tuple(self._counts)
+
+    def add(self, block: Block) -> None:
+        """Add the next block of the log."""
+        window = self._selection.window
+        begin, end = window_of(block.messages.log_time_ns, window.start_ns, window.end_ns)
+        messages = select(block.messages, np.arange(begin, end))
+        self._span(messages.log_time_ns)
+        self._span(self._selection.inside(block.trace).times_ns)
+        self._count(messages)
+        # a log without messages is played from memory; others are read again
+        if self._counts:
+            self._samples = []
+        else:
+            self._samples.append(block.trace)
+
+    def iter_from(self, start_ns: int) -> Iterator[Messages]:
+        """Read the messages at or after a time, in order, in pieces of bounded size.
+
+        Raises:
+            LogError: the log can no longer be read.
+        """
+        selection = self._selection
+        first = 0
+        for block in self._iter_blocks(max(start_ns, selection.window.start_ns)):
+            yield selection.own_messages(block, first)
+            first += len(selection.inside(block.trace))
+
+    def few_before(self, time_ns: int) -> Messages:
+        """Return the last message before a time of each topic with few messages."""
+        before = [
+            select(messages, np.arange(np.searchsorted(messages.log_time_ns, time_ns)))
+            for pieces in self._few.values()
+            for messages in pieces
+        ]
+        return latest_messages(merge(before), time_ns)
+
+    def _iter_blocks(self, start_ns: int) -> Iterator[Block]:
+        """Read the log from a time on; from memory, in small pieces, if samples are all that it has."""
+        if self._counts:
+            yield from read_blocks(self._selection.source, start_ns, self._selection.window.end_ns)
+            return
+        if len(self._samples) > 1:
+            self._samples = [Trace.concatenate(self._samples)]
+        for trace in self._samples:
+            begin = int(np.searchsorted(trace.times_ns, start_ns))
+            for at in range(begin, len(trace), _PIECE):
+                yield Block(trace.slice(at, at + _PIECE))
+
+    def _span(self, times_ns: Integers) -> None:
+        if len(times_ns):
+            first_ns, last_ns = times_ns[[0, -1]].tolist()
+            self.start_ns = first_ns if self.end_ns < 0 else min(self.start_ns, first_ns)
+            self.end_ns = max(self.end_ns, last_ns)
+
+    def _count(self, messages: Messages) -> None:
+        """Count messages in the window; topics that turn out to have many leave the memory."""
+        for number, channel in messages.channels.items():
+            chosen = np.flatnonzero(messages.channel == number)
+            if not len(chosen):
+                continue
+            if channel not in self._counts:
+                self._few[channel] = []
+            self._counts[channel] = self._counts.get(channel, 0) + len(chosen)
+            if channel in self._few:
+                own = select(messages, chosen)
+                self._few[channel].append(own)
+                self._bytes += _size(own)
+                if self._counts[channel] > _FEW or self._bytes > _FEW_BYTES:
+                    self._bytes -= sum(map(_size, self._few.pop(channel)))
+
+
+class MessageCursor:
+    """A position in a log's own messages, which moves forward."""
+
+    def __init__(self, own: OwnMessages, start_ns: int) -> None:
+        self._pieces = own.iter_from(start_ns)
+        self._waiting = Messages()
+        self._taken = 0
+        self._is_over = False
+
+    def take_before(self, end_ns: int) -> Messages:
+        """Return the messages before a time that were not taken yet.
+
+        Raises:
+            LogError: the log can no longer be read.
+        """
+        while not self._is_over and not _reaches(self._waiting, end_ns):
+            piece = next(self._pieces, None)
+            if piece is None:
+                self._is_over = True
+            else:
+                rest = select(self._waiting, np.arange(self._taken, len(self._waiting)))
+                self._waiting, self._taken = merge([rest, piece]), 0
+        begin = self._taken
+        self._taken = max(begin, int(np.searchsorted(self._waiting.log_time_ns, end_ns)))
+        return select(self._waiting, np.arange(begin, self._taken))
+
+
+def latest_messages(messages: Messages, time_ns: int) -> Messages:
+    """Return of each channel the messages from a time on or, if it has none, the last one before."""
+    _, last = np.unique(messages.channel[::-1], return_index=True)
+    chosen = messages.log_time_ns >= time_ns
+    chosen[len(messages) - 1 - last] = True
+    return select(messages, np.flatnonzero(chosen))
+
+
+def _reaches(messages: Messages, end_ns: int) -> bool:
+    return len(messages) > 0 and int(messages.log_time_ns[-1]) >= end_ns
+
+
+def _size(messages: Messages) -> int:
+    payloads: Sequence[bytes] = messages.payloads
+    return sum(map(len, payloads))
+
 
 MOST_NUMBERS: Final = 1 << 27
 """Numbers of nodes at samples, four for each, that an evaluation may have: 1 GiB of them."""
@@ -112,7 +259,6 @@ class LoadedLog:
         self.name, self.options, self._keep = source.name, replace(options, keep=None), options.keep
         self._source, self._saved = source, saved
         self._looks_back = look_before(files)
-        self._memory = ReusedMemory(MOST_NUMBERS)
         self._attachments = source.attachments
         self._files, self._kept = tuple(files), logged_specifications(files)
         self.own = OwnMessages(selection)
@@ -222,7 +368,7 @@ class LoadedLog:
             edited.files, instances, options.semantics, self._attachments, units=units_of(self._source)
         )
         self._check_size(evaluation)
-        blocks = evaluation.extend(self.trace, self._memory.empty)
+        blocks = evaluation.extend(self.trace)
         return Evaluated(self, edited, selection, evaluation, tuple(blocks))
 
     def _constants(self, files: Sequence[Specification]) -> Mapping[str, Constant]:
@@ -408,3 +554,108 @@ def _stored(edited: Specification, written: Specification, kept: Specification) 
         if read_back == edited:
             return replace(read_back, filename=kept.filename)
     return replace(edited, filename=kept.filename)
+
+
+_LOOK_BACK_NS: Final = 2_000_000_000
+"""How far before a seek the latest message of each topic is looked for."""
+
+_MOST_EVENTS: Final = 500
+"""The most earlier events that a seek sends."""
+
+
+class Playback:
+    """The messages that an annotated log would have, in the order of time.
+
+    From a seek on they are those that a replay writes, however they are split into stretches, except for the
+    scene: it is drawn again at once, and what a viewer may still show of another time is deleted.
+
+    Attributes:
+        evaluated: the evaluation; another one of the same log may replace it before a `seek`.
+        start_ns, end_ns: from the first sample to the last sample or message of the log.
+        arrow: the title of the result whose violation the scene points at, from the next `seek` on; "" for
+            the first one.
+        time_ns: the time up to which messages were taken, inclusive.
+    """
+
+    def __init__(self, evaluated: Evaluated) -> None:
+        """Begin before the first message; `seek` first."""
+        own = evaluated.loaded.own
+        self._times_ns = evaluated.loaded.inside.times_ns
+        self.start_ns, self.end_ns = int(self._times_ns[0]), own.end_ns
+        self.time_ns = self.start_ns
+        self.evaluated = evaluated
+        self.arrow = ""
+        self._regions = shown_regions(evaluated.edited.files)
+        self._start = scene_start(evaluated.loaded.inside, self._regions)
+        self._annotator = evaluated.annotator(self._start)
+        self._own = MessageCursor(own, self.start_ns)
+        self._next = 0
+        self._has_ended = False
+
+    @property
+    def channels(self) -> tuple[Channel, ...]:
+        """All channels that may have messages."""
+        own = self.evaluated.loaded.own
+        first = MessageCursor(own, self.start_ns).take_before(self.start_ns + 1)
+        derived = Messages(channels=dict(enumerate(self.evaluated.evaluation.channels)))
+        return tuple(dict.fromkeys((*join([derived, first]).channels.values(), *own.channels)))
+
+    def seek(self, time_ns: int) -> Messages:
+        """Go to a time, and return what a viewer shows there.
+
+        That is the sample at or before it with all its messages, the specification, the events so far (the
+        latest, if they are many), and the last message of each of the log's own topics.
+
+        Raises:
+            LogError: the log can no longer be read.
+        """
+        self.time_ns = min(max(time_ns, self.start_ns), self.end_ns)
+        self._next = int(np.searchsorted(self._times_ns, self.time_ns, side="right"))
+        shown = max(self._next - 1, 0)
+        regions = shown_regions(self.evaluated.edited.files)
+        if regions != self._regions:
+            self._start, self._regions = scene_start(self.evaluated.loaded.inside, regions), regions
+        scene = replace(self._annotator.scene, written_ns=None, place=self._start.place)
+        self._annotator = self.evaluated.annotator(scene, self.arrow)
+        self._has_ended = False
+        events = _last(merge(self._annotator.pass_over(*self.evaluated.part(0, shown))))
+        derived = self._annotator.messages(*self.evaluated.part(shown, self._next))
+        shown_there = merge([events, *derived, self._seek_own(int(self._times_ns[shown]))])
+        return join([shown_there, _last(self._end())])
+
+    def advance_to(self, time_ns: int) -> Messages:
+        """Return the messages after those taken so far, up to and including a time.
+
+        Raises:
+            LogError: the log can no longer be read.
+        """
+        self.time_ns = min(max(time_ns, self.time_ns), self.end_ns)
+        begin = self._next
+        self._next = int(np.searchsorted(self._times_ns, self.time_ns, side="right"))
+        derived = self._annotator.messages(*self.evaluated.part(begin, self._next))
+        coming = merge([*derived, self._own.take_before(self.time_ns + 1)])
+        return join([coming, self._end()])
+
+    def reach_ns(self, samples: int) -> int:
+        """Return the time of the sample that comes so many after the last one taken, or the end."""
+        index = self._next + samples - 1
+        return int(self._times_ns[index]) if index < len(self._times_ns) else self.end_ns
+
+    def _end(self) -> Messages:
+        """Return the messages at the end of the log, once it is reached."""
+        if self._has_ended or self.time_ns < self.end_ns:
+            return Messages()
+        self._has_ended = True
+        return merge(self._annotator.end(self.end_ns, self.evaluated.evaluation.finals))
+
+    def _seek_own(self, sample_ns: int) -> Messages:
+        """Return the latest of the log's own messages of each topic, and all those at the present time."""
+        own = self.evaluated.loaded.own
+        since_ns = max(min(self.time_ns - _LOOK_BACK_NS, sample_ns), own.start_ns)
+        self._own = MessageCursor(own, since_ns)
+        messages = merge([own.few_before(since_ns), self._own.take_before(self.time_ns + 1)])
+        return latest_messages(messages, self.time_ns)
+
+
+def _last(events: Messages) -> Messages:
+    return select(events, np.arange(max(0, len(events) - _MOST_EVENTS), len(events)))

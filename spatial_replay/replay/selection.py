@@ -1,4 +1,4 @@
-"""What of a log is evaluated: the options of a replay, and the samples and messages that they select."""
+"""Which messages of a log its copies keep: all, those that make the samples, or those of some topics."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from types import MappingProxyType
+from typing import Final
 
 import numpy as np
 
 from spatial_replay.errors import LogError, SpecificationError, UsageError
 from spatial_replay.logs.messages import Block, Channel, Messages, merge, messages_of, select
-from spatial_replay.logs.objects.encode import encode_objects
+from spatial_replay.logs.objects import encode_objects
+from spatial_replay.logs.remote import LogFile
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.source import (
     MemorySource,
@@ -20,17 +22,66 @@ from spatial_replay.logs.source import (
     read_blocks,
     reading_only,
 )
-from spatial_replay.logs.topics import OBJECTS, protobuf_channel
+from spatial_replay.logs.topics import ALL, MAPPED, OBJECTS, is_kept, protobuf_channel
 from spatial_replay.monitor.atoms.delays import look_back
 from spatial_replay.monitor.instances import Instance, find_instances
 from spatial_replay.monitor.semantics import Semantics, checked_semantics
-from spatial_replay.replay.kept_messages import source_keeping
 from spatial_replay.spec import check_names
 from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.formula import Specification
 from spatial_replay.text import time_text
 from spatial_replay.trace.sample import FOREVER
 from spatial_replay.trace.trace import Trace, window_of, within
+
+KEEP_ALL: Final = (ALL,)
+"""What a copy keeps unless it is given something else."""
+
+
+def source_keeping(source: Source, keep: Sequence[str] | None) -> Source:
+    """Return a source whose blocks hold the messages that a copy keeps, besides the samples.
+
+    Args:
+        keep: "all", "mapped" for the topics that the samples are made of, or patterns of topics such as
+            "/camera/*"; several add up. None leaves the source as it is.
+
+    Raises:
+        UsageError: a pattern that no topic of the log fits.
+    """
+    if keep is None:
+        return source
+    patterns = [each for each in keep if each not in (ALL, MAPPED)]
+    if patterns:
+        _check_patterns(source, patterns)
+    return reading_only(source, tuple(keep))
+
+
+def _check_patterns(source: Source, patterns: Sequence[str]) -> None:
+    """Check that every pattern fits a topic: with a misspelt one, what was meant would be lost."""
+    topics = _topics(source)
+    if not topics:
+        raise UsageError(f"{source.name} has no messages to keep; it holds samples only")
+    for pattern in patterns:
+        if not any(is_kept(topic, (pattern,), ()) for topic in topics):
+            listed = ", ".join(topics[:8]) + (", …" if len(topics) > 8 else "")
+            raise UsageError(
+                f"no topic of {source.name} fits {pattern!r}; it has {listed}; "
+                "'all' keeps everything, 'mapped' the topics that make the samples"
+            )
+
+
+def _topics(source: Source) -> list[str]:
+    from spatial_replay.logs.mcap.read import McapSource
+
+    if isinstance(source, McapSource):
+        with source.open_walk() as walk:
+            return sorted({channel.topic for channel in walk.channels.values()})
+    path = getattr(source, "path", None)
+    if hasattr(source, "keep") and isinstance(path, LogFile):
+        # readers of external logs are loaded when there is one
+        from spatial_replay.bags.open import open_messages
+
+        return [topic.name for topic in open_messages(path).topics()]
+    return []
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,27 +1,309 @@
-"""Certificates of logs, compared with those that a new evaluation gives."""
+"""Certificates: a log against what it is certified to be, first differences, and signatures.
+
+Signatures are detached, made and checked by ssh-keygen with keys that people have. The signed text is the
+recorded certificate, in the namespace "spatial-replay", so that no signature for another purpose fits.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+import re
+import subprocess
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import zip_longest
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
+
+from spatial_replay import __version__
 from spatial_replay.annotate.certificate import PLAN_SHA256, plan_sha256
-from spatial_replay.errors import LogError, UsageError
+from spatial_replay.bags.columns import Message
+from spatial_replay.bags.mcap_log import McapLog
+from spatial_replay.errors import LogError, MissingFileError, UsageError
 from spatial_replay.logs.mcap.read import McapSource
+from spatial_replay.logs.messages import Messages
+from spatial_replay.logs.remote import LogFile
+from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
+from spatial_replay.logs.schemas.Robustness_pb2 import Robustness
+from spatial_replay.logs.schemas.Specification_pb2 import Specification as SpecificationMessage
 from spatial_replay.logs.source import Source
-from spatial_replay.logs.topics import CERTIFICATE, METADATA, PLAN_METADATA
+from spatial_replay.logs.topics import (
+    CERTIFICATE,
+    DERIVED,
+    METADATA,
+    OBJECTS,
+    PLAN_METADATA,
+    ROBUSTNESS,
+    SPECIFICATION,
+)
 from spatial_replay.monitor.semantics import Semantics
-from spatial_replay.replay.annotated import load_files, run_replay
 from spatial_replay.replay.clipped_source import CLIP_METADATA, clipped_source
-from spatial_replay.replay.engine import Replay
-from spatial_replay.replay.first_differences import FirstDifferences, explain_differences
-from spatial_replay.replay.kept_messages import KEEP_ALL
-from spatial_replay.replay.selection import ReplayOptions, Window
+from spatial_replay.replay.engine import Replay, load_files, run_replay
+from spatial_replay.replay.selection import KEEP_ALL, ReplayOptions, Window
 from spatial_replay.spec.formula import Specification
-from spatial_replay.text import Sentence, counted_from
+from spatial_replay.text import Instant, Sentence, counted_from, printable
+
+NAMESPACE = "spatial-replay"
+LARGEST_SIGNATURE = 2**16
+_HEADING = "spatial-replay certificate 1"
+_PUBLIC_KEY = re.compile(r"(?:ssh|ecdsa|sk)-[\w@.-]+ [A-Za-z0-9+/]+=*(?: (?P<comment>.*))?$")
+_LONGEST_S = 120.0
+"""How long a passphrase or a touch of a hardware key is waited for."""
+
+
+def statement(certificate: Mapping[str, str]) -> bytes:
+    """Return the text that is signed: a certificate, one entry a line, in the order of names."""
+    return "\n".join(
+        [_HEADING, *(f"{key} {value}" for key, value in sorted(certificate.items())), ""]
+    ).encode()
+
+
+def sign_certificate(certificate: Mapping[str, str], key: Path) -> bytes:
+    """Return a signature over a certificate.
+
+    Args:
+        key: a private key of OpenSSH, or the public one of a key that ssh-agent or a token holds.
+
+    Raises:
+        MissingFileError: there is no such key.
+        UsageError: ssh-keygen is missing, or cannot sign with it.
+    """
+    _require(key)
+    signed = _ssh_keygen(["sign", "-f", str(key.resolve()), "-n", NAMESPACE], statement(certificate))
+    if signed.returncode != 0 or not signed.stdout:
+        raise UsageError(
+            f"{key} cannot sign: {_reason(signed)}; give an OpenSSH key, such as ~/.ssh/id_ed25519"
+        )
+    return signed.stdout
+
+
+def signer_of(certificate: Mapping[str, str], signature: Path, signers: Path) -> str | None:
+    """Return who of some signers signed a certificate; None if none of them did.
+
+    Args:
+        signers: public keys, one a line, as in id_ed25519.pub or authorized_keys, or an allowed_signers file
+            of OpenSSH, with names before the keys.
+
+    Raises:
+        MissingFileError: one of the files is missing.
+        UsageError: the signers are none, or ssh-keygen is missing.
+    """
+    for each in (signature, signers):
+        _require(each)
+    if signature.stat().st_size > LARGEST_SIGNATURE:
+        return None
+    allowed, names = _allowed(signers)
+    with TemporaryDirectory(prefix="spatial-replay-") as folder:
+        (listed := Path(folder) / "allowed_signers").write_text(allowed)
+        files = ["-f", str(listed), "-s", str(signature.resolve())]
+        found = _ssh_keygen(["find-principals", *files], b"")
+        for principal in found.stdout.decode("utf-8", "replace").splitlines():
+            arguments = ["verify", *files, "-n", NAMESPACE, "-I", principal]
+            if _ssh_keygen(arguments, statement(certificate)).returncode == 0:
+                return names.get(principal, principal)
+    return None
+
+
+def _allowed(signers: Path) -> tuple[str, dict[str, str]]:
+    """Return an allowed_signers file, and names for the principals that bare keys get in it."""
+    try:
+        lines = [line.strip() for line in signers.read_text().splitlines()]
+    except UnicodeDecodeError:
+        raise UsageError(f"{signers} is not text; give public keys or an allowed_signers file") from None
+    listed, names = [], {}
+    for number, line in enumerate((line for line in lines if line and not line.startswith("#")), 1):
+        if bare := _PUBLIC_KEY.match(line):
+            names[f"key{number}"] = bare["comment"] or f"key {number} of {signers.name}"
+            listed.append(f"key{number} {line}")
+        else:
+            listed.append(line)
+    if not listed:
+        raise UsageError(f"{signers} has no public key; give an id_ed25519.pub or an allowed_signers file")
+    return "\n".join([*listed, ""]), names
+
+
+def _require(path: Path) -> None:
+    try:
+        path.open("rb").close()
+    except (OSError, ValueError) as error:
+        raise MissingFileError.of(path, error) from None
+
+
+def _ssh_keygen(arguments: Sequence[str], content: bytes) -> subprocess.CompletedProcess[bytes]:
+    try:
+        return subprocess.run(
+            ["ssh-keygen", "-Y", *arguments],
+            input=content,
+            capture_output=True,
+            check=False,
+            timeout=_LONGEST_S,
+        )
+    except FileNotFoundError:
+        raise UsageError(
+            "signatures take ssh-keygen; install OpenSSH 8.1 or later (openssh-client)"
+        ) from None
+    except subprocess.TimeoutExpired:
+        raise UsageError(f"ssh-keygen has not answered in {_LONGEST_S:.0f} s; is the key there?") from None
+
+
+def _reason(ended: subprocess.CompletedProcess[bytes]) -> str:
+    lines = ended.stderr.decode("utf-8", "replace").strip().splitlines()
+    return printable(lines[-1]) if lines else f"ssh-keygen ended with {ended.returncode}"
+
+
+_QUANTITIES = ("value", "now", "lower", "upper")
+_LONGEST_LINE = 80
+
+
+class FirstDifferences:
+    """Compares the messages of a log with those of a new evaluation, topic by topic, as they come."""
+
+    def __init__(self, log: LogFile) -> None:
+        self._reader = McapLog(log)
+        self._recorded: dict[str, Iterator[Message]] = {}
+        self._counts: dict[str, int] = {}
+        self._found: dict[str, Sentence] = {}
+
+    def add(self, messages: Messages) -> None:
+        """Compare the next messages of the evaluation."""
+        topics = {number: channel.topic for number, channel in messages.channels.items()}
+        rows = zip(messages.channel.tolist(), messages.log_time_ns.tolist(), messages.payloads, strict=True)
+        for number, time_ns, payload in rows:
+            topic = topics[number]
+            if topic not in self._found:
+                self._compare(topic, time_ns, payload)
+
+    def finish(self) -> dict[str, Sentence]:
+        """Compare what the log has beyond the evaluation; return the first difference of each topic."""
+        for topic in (each.name for each in self._reader.topics()):
+            is_compared = topic in self._recorded or topic not in DERIVED
+            if topic not in self._found and is_compared:
+                extra = next(self._messages(topic), None)
+                if extra is not None:
+                    when = Instant(extra.log_time_ns, 0)
+                    self._found[topic] = Sentence("the one at ", when, " is only in the log")
+        return self._found
+
+    def _compare(self, topic: str, time_ns: int, payload: bytes) -> None:
+        recorded = next(self._messages(topic), None)
+        if recorded is None:
+            self._found[topic] = Sentence("the one at ", Instant(time_ns, 0), " is not in the log")
+        elif recorded.log_time_ns != time_ns:
+            now, then = Instant(time_ns, 0), Instant(recorded.log_time_ns, 0)
+            self._found[topic] = Sentence("one is at ", now, " now, and was at ", then)
+        elif recorded.payload != payload:
+            what = _difference(topic, payload, recorded.payload)
+            if what is not None:
+                self._found[topic] = Sentence("at ", Instant(time_ns, 0), f": {what}")
+
+    def _messages(self, topic: str) -> Iterator[Message]:
+        if topic not in self._recorded:
+            self._recorded[topic] = self._reader.iter_messages({topic})
+        return self._recorded[topic]
+
+
+def explain_differences(
+    recorded: Mapping[str, str], computed: Mapping[str, str], found: Mapping[str, Sentence]
+) -> list[Sentence]:
+    """Return for each part of a certificate whether it is the same, and where it differs first.
+
+    Args:
+        found: the first difference of each topic, in a clause; see `FirstDifferences`.
+    """
+    beside = {topic: what for topic, what in found.items() if topic not in DERIVED and topic != OBJECTS}
+    first = next((Sentence(f"on {topic}, ", what) for topic, what in sorted(beside.items())), None)
+    parts = (
+        ("samples", found.get(OBJECTS)),
+        ("messages", first or found.get(OBJECTS)),
+        ("specification", found.get(SPECIFICATION)),
+        ("results", found.get(ROBUSTNESS)),
+    )
+    lines = []
+    for name, where in parts:
+        key = f"{name}_sha256"
+        if recorded.get(key) == computed.get(key):
+            lines.append(Sentence(f"{name:<14} the same"))
+        elif where is None:
+            lines.append(Sentence(f"{name:<14} differ from those certified; the log does not show where"))
+        else:
+            lines.append(Sentence(f"{name:<14} differ first ", where))
+    if PLAN_SHA256 in recorded:
+        is_same = recorded[PLAN_SHA256] == computed.get(PLAN_SHA256)
+        lines.append(
+            Sentence(f"{'plan settings':<14} {'the same' if is_same else 'differ from those certified'}")
+        )
+    version = recorded.get("spatial_replay_version", "unknown")
+    is_same = version == __version__
+    lines.append(
+        Sentence(f"{'program':<14} " + ("the same" if is_same else f"{__version__} now, {version} recorded"))
+    )
+    return lines
+
+
+def _difference(topic: str, now: bytes, then: bytes) -> str | None:
+    """Return how a message differs from the recorded one; None if it only is encoded in another way."""
+    try:
+        match topic:
+            case "/spatial/objects":
+                return _of_samples(ObjectStates.FromString(now), ObjectStates.FromString(then))
+            case "/spatial/robustness":
+                return _of_results(Robustness.FromString(now), Robustness.FromString(then))
+            case "/spatial/specification":
+                return _of_specifications(
+                    SpecificationMessage.FromString(now), SpecificationMessage.FromString(then)
+                )
+    # what is recorded need not be a message of ours
+    except ValueError:
+        return "what is recorded cannot be decoded"
+    return f"{len(now)} bytes now, {len(then)} recorded, of other content"
+
+
+def _of_samples(now: ObjectStates, then: ObjectStates) -> str | None:
+    objects, before = ({each.name: each for each in sample.objects} for sample in (now, then))
+    for name in sorted(objects.keys() | before.keys()):
+        if name not in objects or name not in before:
+            return f"`{name}` is {'only in the log' if name in before else 'not in the log'}"
+        for field in ("class_name", "parts", "yaw", "height", "uncertainty"):
+            if getattr(objects[name], field) != getattr(before[name], field):
+                what = {"class_name": "class", "parts": "footprint"}.get(field, field)
+                return f"`{name}` has another {what}"
+    signals, old = ({each.name: each.value for each in sample.signals} for sample in (now, then))
+    for name in sorted(signals.keys() | old.keys()):
+        if signals.get(name) != old.get(name):
+            values = [side.get(name, "missing") for side in (signals, old)]
+            return f"the signal `{name}` is {values[0]} now, {values[1]} recorded"
+    return None
+
+
+def _of_results(now: Robustness, then: Robustness) -> str | None:
+    if (now.specification, now.object) != (then.specification, then.object):
+        return f"`{now.specification}` now, `{then.specification}` recorded"
+    for one, other in zip_longest(now.nodes, then.nodes):
+        if one is None or other is None:
+            return f"`{now.specification}` has {len(now.nodes)} nodes now, {len(then.nodes)} recorded"
+        for name in _QUANTITIES:
+            values = getattr(one, name), getattr(other, name)
+            if not np.array_equal(*values, equal_nan=True):
+                node = f"`{one.name or f'node {one.id}'}` in `{now.specification}`"
+                return f"{name} of {node} is {values[0]!r} now, {values[1]!r} recorded"
+    return None
+
+
+def _of_specifications(now: SpecificationMessage, then: SpecificationMessage) -> str | None:
+    for one, other in zip_longest(now.files, then.files):
+        if one is None or other is None:
+            return f"{len(now.files)} files now, {len(then.files)} recorded"
+        lines = zip_longest(one.canonical.splitlines(), other.canonical.splitlines(), fillvalue="")
+        for number, (line, before) in enumerate(lines, 1):
+            if line != before:
+                shown = [printable(each, _LONGEST_LINE) for each in (line, before)]
+                return f"{one.name}, line {number} as formatted: `{shown[0]}` now, `{shown[1]}` recorded"
+    return None
+
 
 _HASHES: Mapping[str, str] = MappingProxyType(
     {

@@ -42,7 +42,7 @@ from spatial_replay.report.panels import (
 from spatial_replay.spec.formula import Formula, NamedSpec, Specification
 from spatial_replay.spec.units import Unit
 from spatial_replay.text import Sentence, json_number
-from spatial_replay.trace.axes import Axes
+from spatial_replay.trace.units import Axes
 
 MANY: Final = 6
 """More results are counted, sorted and can be filtered; only the explanation of the first is unfolded."""

@@ -12,8 +12,8 @@ from spatial_replay.logs.messages import Messages, merge
 from spatial_replay.logs.output_file import Durability, open_output, refuse_inputs
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.recording import Recording
-from spatial_replay.recording.interruption import leaving, terminable, uninterrupted
-from spatial_replay.recording.recording import refuse_templates
+from spatial_replay.recording.log import refuse_templates
+from spatial_replay.recording.recorder import leaving, terminable, uninterrupted
 from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace

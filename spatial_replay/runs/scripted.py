@@ -17,8 +17,8 @@ from spatial_replay.simulation.world import Execution, Injection, Start
 from spatial_replay.simulation.worlds import default_specification, make_world
 from spatial_replay.spec import check_names
 from spatial_replay.spec.formula import Specification
-from spatial_replay.trace.axes import Axes
 from spatial_replay.trace.sample import Sample
+from spatial_replay.trace.units import Axes
 
 
 def refuse_unknown_names(files: Iterable[Specification], sample: Sample) -> None:

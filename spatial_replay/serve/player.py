@@ -12,8 +12,7 @@ from spatial_replay.annotate.curves import CURVES_CHANNEL
 from spatial_replay.errors import SpatialReplayError
 from spatial_replay.logs.messages import Messages, messages_of, select
 from spatial_replay.logs.topics import CURVES_TOPIC
-from spatial_replay.replay.loaded_log import EditedFiles, constant_values
-from spatial_replay.replay.playback import Playback
+from spatial_replay.replay.loaded_log import EditedFiles, Playback, constant_values
 from spatial_replay.serve.pace import PlaybackState, Status
 from spatial_replay.serve.requests import PendingRequests, Values
 from spatial_replay.serve.session import ARROW, Session

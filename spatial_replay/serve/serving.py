@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 
 from spatial_replay.annotate.curves import CURVES_CHANNEL
 from spatial_replay.errors import SpatialReplayError, importing
-from spatial_replay.replay.loaded_log import EditedFiles, Evaluated
-from spatial_replay.replay.playback import Playback
+from spatial_replay.replay.loaded_log import EditedFiles, Evaluated, Playback
 from spatial_replay.serve.player import SPECIFICATION, Level, Note, Player
 from spatial_replay.serve.requests import Questions
 from spatial_replay.serve.session import Session

@@ -22,17 +22,24 @@ from urllib.parse import quote
 
 from spatial_replay.errors import LogError, MissingFileError, RemoteError, UsageError
 from spatial_replay.geometry.footprint import Concave
-from spatial_replay.logs.downloads import downloaded, downloaded_folder
 from spatial_replay.logs.formats.csv_tracks import COLUMNS, iter_csv
 from spatial_replay.logs.formats.drone import FRAMES_A_SECOND, is_annotations, iter_annotations
 from spatial_replay.logs.formats.tracks import iter_jsonl, open_text
 from spatial_replay.logs.read_options import Lost, OnTimeJump, ReadOptions, count_of
-from spatial_replay.logs.remote import BAG_METADATA, LogFile, RemoteFile, is_web, log_file
+from spatial_replay.logs.remote import (
+    BAG_METADATA,
+    LogFile,
+    RemoteFile,
+    downloaded,
+    downloaded_folder,
+    is_web,
+    log_file,
+)
 from spatial_replay.logs.source import IterTraces, Source, TrackSource, reading_only, units_of
 from spatial_replay.logs.topics import MAGIC
 from spatial_replay.text import counted_from
-from spatial_replay.trace.axes import Axes
 from spatial_replay.trace.trace import Trace
+from spatial_replay.trace.units import Axes
 
 _BAG_FILE = re.compile(r"^metadata\.yaml$|\.(db3|mcap)(\.zstd)?$")
 
@@ -210,7 +217,7 @@ def bag_files_at(metadata: RemoteFile) -> list[RemoteFile]:
         LogError: the metadata cannot be used.
         MissingFileError, RemoteError: it cannot be read.
     """
-    from spatial_replay.bags.sqlite import LARGEST_METADATA, bag_metadata_from_text
+    from spatial_replay.bags.metadata import LARGEST_METADATA, bag_metadata_from_text
 
     folder = os.fspath(metadata).removesuffix(BAG_METADATA)
     try:

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from spatial_replay.bags.columns import Message
-from spatial_replay.bags.decoders import Decoder, Topic
 from spatial_replay.bags.mcap_log import McapLog
 from spatial_replay.bags.open import open_messages
 from spatial_replay.bags.reader import MessageReader
+from spatial_replay.bags.topic import Decoder, Topic
 from spatial_replay.errors import LogError, MissingFileError, UsageError
 from spatial_replay.logs.mcap.read import McapSource
 from spatial_replay.logs.mcap.summary import LogSummary, summarise_mcap
@@ -25,8 +25,8 @@ from spatial_replay.logs.topics import OBJECTS
 from spatial_replay.mapping.suggest import EXAMPLES, suggest_mapping, suggest_topics
 from spatial_replay.sources.open_log import is_bag_folder, readable_file
 from spatial_replay.text import Instant, Sentence
-from spatial_replay.trace.axes import OUR_AXES, Axes
 from spatial_replay.trace.trace import Trace
+from spatial_replay.trace.units import OUR_AXES, Axes
 
 _STEP = 10_000
 """Messages between two reports of progress."""

@@ -21,7 +21,7 @@ from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.mcap.read import is_samples
 from spatial_replay.logs.mcap.write import WHOLE_CHUNK_NS, LogWriter
 from spatial_replay.logs.messages import Channel, Messages, select
-from spatial_replay.logs.objects.decode import decode_objects
+from spatial_replay.logs.objects import decode_objects
 from spatial_replay.logs.output_file import refuse_inputs, replacing
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.logs.remote import LogFile, local_files

@@ -1,22 +1,148 @@
-"""A trace: the samples of a run, as columns."""
+"""Samples as columns, with a cache of their measurements, and the time points of callers."""
 
 from __future__ import annotations
 
+import re
 from bisect import bisect_left
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections import OrderedDict
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime, timedelta
+from decimal import Decimal
+from threading import Lock
 from types import MappingProxyType
+from typing import Literal
 
 import numpy as np
 
-from spatial_replay.errors import TraceError
+from spatial_replay.errors import TraceError, UsageError
 from spatial_replay.geometry.arrays import Floats, Integers, read_only_floats, read_only_integers
 from spatial_replay.geometry.footprint import Footprint, FootprintBatch, TrackedObject
 from spatial_replay.lazy import Displayed
 from spatial_replay.text import times_apart
-from spatial_replay.trace.declared_units import checked_units
-from spatial_replay.trace.measurement_cache import MeasurementCache
-from spatial_replay.trace.sample import FOREVER, Sample
+from spatial_replay.trace.sample import FOREVER, LATEST_NS, Sample
+from spatial_replay.trace.units import checked_units
+
+_BYTES = 1 << 30
+
+
+class MeasurementCache:
+    """Arrays computed from one frozen trace; above 1 GiB the least recently used are dropped.
+
+    Each trace owns one, so a result for one trace is never taken for another's. Keys are compared by
+    equality, never by hash alone. Several threads may evaluate the same trace.
+    """
+
+    def __init__(self) -> None:
+        self._arrays: OrderedDict[Hashable, Floats] = OrderedDict()
+        self._bytes = 0
+        self._lock = Lock()
+
+    def get(self, key: Hashable) -> Floats | None:
+        """Return the array stored under a key, or None."""
+        with self._lock:
+            array = self._arrays.get(key)
+            if array is not None:
+                self._arrays.move_to_end(key)
+            return array
+
+    def put(self, key: Hashable, array: Floats) -> None:
+        """Store an array, which must not be written to afterwards."""
+        with self._lock:
+            replaced = self._arrays.pop(key, None)
+            self._bytes += array.nbytes - (0 if replaced is None else replaced.nbytes)
+            self._arrays[key] = array
+            while self._bytes > _BYTES and len(self._arrays) > 1:
+                _, dropped = self._arrays.popitem(last=False)
+                self._bytes -= dropped.nbytes
+
+
+_DURATION = re.compile(
+    r"(?P<number>\d{1,19}(?:\.\d{1,30})?(?:e[+-]?\d{1,2})?)(?P<unit>s|ms)", re.ASCII | re.I
+)
+_ABSOLUTE = re.compile(r"(?P<number>\d{1,19})(?P<unit>ns)?", re.ASCII | re.I)
+_LEAST_WITHOUT_UNIT_NS = 10**12
+"""Smaller integers without a unit could be seconds or milliseconds as well."""
+_CALENDAR = re.compile(
+    r"(?P<date>\d{4}-\d\d-\d\d)[T ](?P<time>\d\d:\d\d:\d\d)(?:\.(?P<fraction>\d{1,9}))?"
+    r"(?P<offset>Z|[+-]\d\d:\d\d)",
+    re.ASCII | re.IGNORECASE,
+)
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+@dataclass(frozen=True, slots=True)
+class TimePoint:
+    """A time in a log, as people write it.
+
+    Attributes:
+        nanoseconds: since the first sample, or since the log's own zero.
+        origin: which of the two.
+    """
+
+    nanoseconds: int
+    origin: Literal["first sample", "zero"]
+
+    def absolute_ns(self, first_ns: int) -> int:
+        """Return this time on the clock of a log whose first sample has time `first_ns`."""
+        return first_ns + self.nanoseconds if self.origin == "first sample" else self.nanoseconds
+
+
+def time_point_from_text(text: str) -> TimePoint:
+    """Read `12.5s` or `1500ms` after the first sample, `5250000000ns` on the log's clock, or RFC 3339.
+
+    The unit of nanoseconds can be left out from 10^12 on.
+
+    Raises:
+        UsageError: for anything else, for a small integer without a unit, and for a time beyond the range of
+            logs.
+    """
+    if _DURATION.fullmatch(text):
+        return TimePoint(duration_ns_from_text(text), "first sample")
+    if absolute := _ABSOLUTE.fullmatch(text):
+        if absolute["unit"] is None and int(text) < _LEAST_WITHOUT_UNIT_NS:
+            raise UsageError(
+                f"{text!r} has no unit: {text}s after the log's first sample, or {text} ns on the log's own "
+                f"clock? Write {text}s or {text}ns"
+            )
+        return TimePoint(_checked_ns(int(absolute["number"]), text), "zero")
+    if calendar := _CALENDAR.fullmatch(text):
+        return TimePoint(_checked_ns(_ns_from_calendar(calendar, text), text), "zero")
+    raise UsageError(
+        f"{text!r} is not a time; write 12.5s or 1500ms after the log's first sample, "
+        "5250000000ns on its own clock, or 2026-01-31T12:00:00Z"
+    )
+
+
+def duration_ns_from_text(text: str) -> int:
+    """Read a duration such as `2s`, `0.5s` or `1500ms` as nanoseconds, rounded to the nearest.
+
+    Raises:
+        UsageError: for anything else.
+    """
+    match = _DURATION.fullmatch(text)
+    if match is None:
+        raise UsageError(f"{text!r} is not a duration; write it as 2s, 0.5s or 1500ms")
+    nanoseconds = Decimal(match["number"]) * (10**9 if match["unit"].lower() == "s" else 10**6)
+    # compared before it becomes an integer, which might have a hundred digits
+    return _checked_ns(int(min(nanoseconds, Decimal(LATEST_NS + 1)).to_integral_value()), text)
+
+
+def _ns_from_calendar(match: re.Match[str], text: str) -> int:
+    offset = "+00:00" if match["offset"] in "Zz" else match["offset"]
+    try:
+        whole_seconds = datetime.fromisoformat(f"{match['date']}T{match['time']}{offset}")
+    except ValueError as error:
+        raise UsageError(f"{text!r} is not a calendar time: {error}") from error
+    fraction_ns = int((match["fraction"] or "").ljust(9, "0"))
+    return (whole_seconds - _EPOCH) // timedelta(seconds=1) * 10**9 + fraction_ns
+
+
+def _checked_ns(nanoseconds: int, text: str) -> int:
+    if not 0 <= nanoseconds <= LATEST_NS:
+        raise UsageError(f"{text!r} is outside the times of a log, 0 to 2**63 - 1 ns")
+    return nanoseconds
+
 
 ABSENT = -1
 """The row number of an object that is not in the sample."""

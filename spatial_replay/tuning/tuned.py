@@ -18,7 +18,7 @@ from spatial_replay.spec.diagnostics import nearest_hint
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import constant_writer
 from spatial_replay.text import counted, json_number
-from spatial_replay.trace.other_units import require_same_units
+from spatial_replay.trace.units import require_same_units
 from spatial_replay.tuning.margins import (
     Direction,
     LabelledRun,

@@ -16,7 +16,6 @@ from mcap.reader import make_reader
 
 import spatial_replay as sr
 from spatial_replay.logs import MemorySource
-from spatial_replay.logs.objects.wire import rounded
 from spatial_replay.logs.schemas.Robustness_pb2 import (
     FAILS_NOW,
     FAILS_SO_FAR,
@@ -29,6 +28,7 @@ from spatial_replay.logs.schemas.Robustness_pb2 import (
     Standing,
     StandingUpdate,
 )
+from spatial_replay.logs.wire import rounded
 from spatial_replay.replay import run_replay
 
 STEP_NS = 10**8

@@ -19,7 +19,7 @@ from spatial_replay.cli.application import application
 from spatial_replay.logs import LogWriter
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.topics import CERTIFICATE, OBJECTS
-from spatial_replay.replay.signatures import statement
+from spatial_replay.replay.verification import statement
 
 
 def call(*arguments: object) -> tuple[int, str]:

@@ -26,8 +26,7 @@ from spatial_replay import LogError, MissingFileError, UsageError
 from spatial_replay.cli import run
 from spatial_replay.errors import RemoteError
 from spatial_replay.logs import Channel, LogWriter, Messages, Schema
-from spatial_replay.logs.byte_ranges import joined_ranges
-from spatial_replay.logs.remote_folder import matching_addresses
+from spatial_replay.logs.remote import joined_ranges, matching_addresses
 
 RECORDINGS = Path(__file__).parents[2] / "recordings"
 SPEC = sr.parse_specification("G (cup dist plate >= 0.1)")

@@ -7,7 +7,7 @@ import subprocess
 import sys
 
 from spatial_replay.code_cache import cache_folder
-from spatial_replay.logs.downloads import user_cache_folder
+from spatial_replay.logs.remote import user_cache_folder
 
 _EVERY_KERNEL = """
 import importlib, pkgutil

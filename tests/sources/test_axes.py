@@ -17,7 +17,7 @@ from spatial_replay import read_trace
 from spatial_replay.cli import run
 from spatial_replay.logs.source import axes_of
 from spatial_replay.sources import open_source
-from spatial_replay.trace.axes import Axes
+from spatial_replay.trace.units import Axes
 
 CSV = """\
 time_ns,name,class,x,y,yaw,length,width

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from spatial_replay import UsageError
 from spatial_replay.trace.sample import LATEST_NS
-from spatial_replay.trace.time_points import (
+from spatial_replay.trace.trace import (
     TimePoint,
     duration_ns_from_text,
     time_point_from_text,

@@ -14,7 +14,7 @@ from spatial_replay.annotate.scene.scene_template import (
     numbers_of_witness,
 )
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.logs.objects.wire import Words, words_of
+from spatial_replay.logs.wire import Words, words_of
 
 LIFT: Final = 0.01
 """Height of flat objects above the plane, by the scale of the scene."""

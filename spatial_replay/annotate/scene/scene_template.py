@@ -30,7 +30,7 @@ from spatial_replay.annotate.scene.scene_entities import (
     point_at,
 )
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.logs.objects.wire import WireTemplate, Words
+from spatial_replay.logs.wire import WireTemplate, Words
 from spatial_replay.spec.formula import Outline
 
 OBJECT_OPACITY: Final = 0.55

@@ -48,7 +48,7 @@ from spatial_replay.annotate.violations import (
     worst_robustness,
 )
 from spatial_replay.geometry.arrays import Floats, Integers, combined, equal_places
-from spatial_replay.logs.objects.wire import placed
+from spatial_replay.logs.wire import placed
 from spatial_replay.monitor.atoms.terms import footprint_from_outline
 from spatial_replay.spec.formula import Outline
 from spatial_replay.trace.trace import Trace

@@ -31,7 +31,6 @@ from spatial_replay.cores import cores
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.geometry.footprint import Concave
-from spatial_replay.logs.byte_ranges import plan_reads
 from spatial_replay.logs.mcap.index import (
     CHUNK_HEAD,
     RECORD_HEAD,
@@ -55,15 +54,14 @@ from spatial_replay.logs.messages import (
     noting_pauses,
     select,
 )
-from spatial_replay.logs.objects.decode import decode_objects
+from spatial_replay.logs.objects import decode_objects
 from spatial_replay.logs.read_options import FaultList, gap_ns
-from spatial_replay.logs.remote import LogFile, RemoteFile, open_file
+from spatial_replay.logs.remote import LogFile, RemoteFile, open_file, plan_reads
 from spatial_replay.logs.topics import ALL, DERIVED, METADATA, OBJECTS, RECOVERY, is_kept
 from spatial_replay.text import Instant, Sentence, counted, encodable
-from spatial_replay.trace.axes import Axes
-from spatial_replay.trace.declared_units import signal_units_from_metadata
 from spatial_replay.trace.sample import LATEST_NS
 from spatial_replay.trace.trace import Trace
+from spatial_replay.trace.units import Axes, signal_units_from_metadata
 
 ALWAYS_ALLOWED, MOST_TIMES_LARGER = 2**26, 1_000
 """Bytes, and times its own size, that a chunk or a message may decompress to: no recorder's needs more."""

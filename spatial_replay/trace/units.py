@@ -1,4 +1,4 @@
-"""The axes of a source: which way its y points and how long its unit is.
+"""The axes and units of a source: where its y points, how long its unit is, and the units of its signals.
 
 Samples always have y upwards, so that `above` means above and drawings are the right way up. Images count
 their rows downwards; what is measured in them is turned over when it is read, and by nothing else.
@@ -9,18 +9,18 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
+from reprlib import repr as shortened
+from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
+from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.geometry.footprint import FootprintBatch
-from spatial_replay.trace.declared_units import (
-    checked_units,
-    signal_units_from_metadata,
-    signal_units_metadata,
-)
-from spatial_replay.trace.trace import Trace
+from spatial_replay.text import is_encodable
+
+if TYPE_CHECKING:
+    from spatial_replay.trace.trace import Trace
 
 AXES_KEY = "source_axes"
 """The entry of a log's metadata that says what the axes of its source were."""
@@ -121,3 +121,84 @@ def units_metadata(units: Mapping[str, str] | None) -> dict[str, str]:
 def units_from_metadata(about: Mapping[str, str]) -> dict[str, str]:
     """Return the units that a log's metadata declare: of signals by their names, of lengths by ""."""
     return Axes.from_metadata(about).units_with(signal_units_from_metadata(about))
+
+
+SIGNAL_UNITS_KEY = "signal_units"
+"""The entry of a log's metadata with the units of its signals; that of lengths is among the axes."""
+
+_LONGEST_UNIT = 64
+
+
+def checked_units(units: Mapping[str, str] | None) -> dict[str, str]:
+    """Return units that a caller declares, in the order of their names; none for None.
+
+    Raises:
+        UsageError: something else than short texts by names.
+    """
+    if units is None:
+        return {}
+    if not isinstance(units, Mapping) or not all(isinstance(name, str) for name in units):
+        remedy = 'give them by the names of signals, and that of lengths by "": {"": "m"}'
+        raise UsageError(f"units are {shortened(units)}; {remedy}")
+    for name, unit in units.items():
+        if not isinstance(unit, str) or not 0 < len(unit) <= _LONGEST_UNIT or not is_encodable(unit):
+            what = f"of signal {name!r}" if name else "of lengths"
+            raise UsageError(f"the unit {what} is {shortened(unit)}; give a short text, such as 'm'")
+    return dict(sorted(units.items()))
+
+
+def signal_units_metadata(units: Mapping[str, str]) -> dict[str, str]:
+    """Return the entry for the metadata of a log; none where no signal has a unit."""
+    of_signals = {name: unit for name, unit in sorted(units.items()) if name}
+    return {SIGNAL_UNITS_KEY: json.dumps(of_signals)} if of_signals else {}
+
+
+def signal_units_from_metadata(about: Mapping[str, str]) -> dict[str, str]:
+    """Return the units of signals that a log's metadata declare, by their names."""
+    try:
+        found = json.loads(about.get(SIGNAL_UNITS_KEY, "{}"))
+        return {name: unit for name, unit in found.items() if name and isinstance(unit, str)}
+    except (ValueError, AttributeError, RecursionError):
+        return {}
+
+
+OTHER_UNITS: Final = 8.0
+"""What is so many times as large in one of two runs is in another unit there."""
+
+_MOST_SIZES: Final = 256
+"""Samples of an object that its size is the median of."""
+
+
+def require_same_units(a: Trace, b: Trace, called: tuple[str, str] = ("A", "B")) -> None:
+    """Refuse runs whose common objects are all many times as large in one as in the other.
+
+    Args:
+        called: what the runs are called in the message.
+
+    Raises:
+        UsageError: the runs are in other units.
+    """
+    ratios, example = [], ""
+    for name in sorted(set(a.names) & set(b.names)):
+        one, other = _size(a, name), _size(b, name)
+        if min(one, other) > 0.0:
+            ratios.append(one / other)
+            times, which = (ratios[0], called[0]) if ratios[0] > 1.0 else (1.0 / ratios[0], called[1])
+            example = example or f"{name} is {times:,.0f} times as large in {which}"
+    if ratios and (min(ratios) >= OTHER_UNITS or max(ratios) <= 1.0 / OTHER_UNITS):
+        runs = "the runs" if called == ("A", "B") else " and ".join(called)
+        raise UsageError(
+            f"{runs} seem to be in other units: {example}. Read both in one unit, by a mapping with `scale`"
+        )
+
+
+def _size(trace: Trace, name: str) -> float:
+    """Return the median extent of an object, radii included; 0 where it is a point or never observed."""
+    rows = trace.rows[:, trace.names.index(name)]
+    rows = rows[rows >= 0]
+    if not len(rows):
+        return 0.0
+    batch = trace.footprints.select(rows[:: -(-len(rows) // _MOST_SIZES)])
+    start = batch.vertex_start[batch.part_start[:-1]]
+    spans = [np.maximum.reduceat(x, start) - np.minimum.reduceat(x, start) for x in batch.vertices.T]
+    return float(np.median(np.hypot(*spans) + 2.0 * np.maximum.reduceat(batch.radius, batch.part_start[:-1])))

@@ -1,0 +1,559 @@
+"""A log as it is recorded: samples and the messages of an evaluation out, and changes of its verdicts."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Protocol, TypeAlias
+
+import numpy as np
+
+from spatial_replay import __version__
+from spatial_replay.annotate.annotated_evaluation import AnnotatedEvaluation
+from spatial_replay.annotate.automaton_state import SpecAutomaton
+from spatial_replay.annotate.certificate import EvaluationHashes, specifications_json
+from spatial_replay.annotate.event_sentences import change_sentence
+from spatial_replay.annotate.specification import logged_specifications, specification_attachments
+from spatial_replay.annotate.verdict_changes import FAILING, HOLDING, SATISFIED, VIOLATED, NodeStates, track
+from spatial_replay.compiled import compile_ahead
+from spatial_replay.errors import OutputError, UsageError
+from spatial_replay.geometry.contact import contacts
+from spatial_replay.geometry.footprint import Footprint, FootprintBatch, TrackedObject
+from spatial_replay.geometry.measure import Operand
+from spatial_replay.logs.mcap.write import LogWriter
+from spatial_replay.logs.messages import Attachment, Channel, Messages, Sink, merge, messages_of, select
+from spatial_replay.logs.objects import encode_objects
+from spatial_replay.logs.output_file import Durability, open_output
+from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
+from spatial_replay.logs.topics import (
+    AUTOMATA,
+    CERTIFICATE,
+    DERIVED,
+    ENDING,
+    METADATA,
+    OBJECTS,
+    PLAN_METADATA,
+    RECORDED_PREFIX,
+    VERDICTS,
+    image_topics,
+    protobuf_channel,
+)
+from spatial_replay.monitor.instances import find_instances
+from spatial_replay.monitor.monitor import SpecUpdate, Update
+from spatial_replay.monitor.sentences import verdict_text
+from spatial_replay.monitor.verdict import Verdict
+from spatial_replay.spec import object_names, signal_names
+from spatial_replay.spec.formula import Specification
+from spatial_replay.spec.units import declared_unit
+from spatial_replay.text import requirement_text
+from spatial_replay.trace.sample import FOREVER, Sample
+from spatial_replay.trace.trace import Trace
+from spatial_replay.trace.units import Axes, units_from_metadata
+
+if TYPE_CHECKING:
+    from spatial_replay.planning.planner import Planner
+
+
+class RunEvent(NamedTuple):
+    """What happens to a run beside its samples.
+
+    Attributes:
+        time_ns: on the clock of the samples.
+        what: in a few words: "connection lost".
+        sentence: with its consequence.
+    """
+
+    time_ns: int
+    what: str
+    sentence: str
+
+
+class Recording:
+    """Write samples to a sink as they arrive, in blocks of any length."""
+
+    def __init__(
+        self,
+        sink: Sink,
+        files: Sequence[Specification] = (),
+        about: Mapping[str, str] | None = None,
+        known: Sequence[SpecAutomaton] = (),
+    ) -> None:
+        """Write what comes before the first sample: metadata and specifications.
+
+        Args:
+            files: specifications to evaluate and write beside the samples.
+            about: further metadata: where the samples come from, a seed.
+            known: automata of specs of these files, which are not compiled again.
+
+        Raises:
+            UsageError: a template, since its objects are not known yet.
+        """
+        refuse_templates(files)
+        self._files = files = logged_specifications(files)
+        self._sink = sink
+        self._axes = Axes.from_metadata(about or {})
+        self._evaluation = AnnotatedEvaluation(
+            files,
+            [find_instances(file, {}, (), 0, FOREVER) for file in files],
+            known=known,
+            units=units_from_metadata(about or {}),
+        )
+        self._samples = self._messages = self._end_ns = 0
+        self._topics: set[str] = set()
+        self._plan: Mapping[str, str] | None = None
+        self._images: set[str] = set()
+        self._hashes = EvaluationHashes([(tree.name, tree.object) for tree in self._evaluation.trees])
+        sink.add_metadata(METADATA, _metadata(files, about or {}))
+        if self._evaluation.trees:
+            sink.add_metadata(AUTOMATA, self._evaluation.automata_metadata())
+        automata = self._evaluation.automata_attachments(RECORDED_PREFIX)
+        for attachment in [*specification_attachments(files, RECORDED_PREFIX), *automata]:
+            sink.add_attachment(attachment.name, attachment.media_type, attachment.data)
+
+    def __len__(self) -> int:
+        """Return the number of samples so far."""
+        return self._samples
+
+    @property
+    def files(self) -> Sequence[Specification]:
+        """The specifications, as the log stores them."""
+        return self._files
+
+    @property
+    def automata(self) -> Sequence[SpecAutomaton]:
+        """The automaton of each result, or the reason why it has none."""
+        return self._evaluation.automata
+
+    @property
+    def verdicts(self) -> Mapping[str, Verdict]:
+        """The verdict of each result, by its name, if the log ends here."""
+        reported = zip(self._evaluation.trees, self._evaluation.streams, strict=True)
+        return {tree.name: stream.verdict for tree, stream in reported}
+
+    @property
+    def channels(self) -> tuple[Channel, ...]:
+        """The channels of the messages that annotate a sample."""
+        return self._evaluation.channels
+
+    def layout_ahead(self) -> Attachment:
+        """Return the layout for viewers before there are samples: all that may come has its place."""
+        # imported here since a log that is written has its layout at its end
+        from spatial_replay.annotate.foxglove_layout import layout_attachment
+
+        return layout_attachment(self._evaluation.contents(None, (), self._axes))
+
+    def redraw(self) -> None:
+        """Draw the whole scene with the next sample, for a viewer that shows nothing yet."""
+        self._evaluation.redraw()
+
+    def add(self, trace: Trace, beside: Messages | None = None) -> None:
+        """Write the next samples, with the messages of their evaluation.
+
+        Args:
+            beside: messages of other topics that are not derived from samples, those of each topic in the
+                order of time; a replay keeps them.
+
+        Raises:
+            TraceError: samples that are not after those before.
+        """
+        stretches = self._evaluation.extend(trace)
+        own = self._own(trace, beside)
+        self._sink.write_messages(merge([own, *self._evaluation.messages(trace, stretches)]))
+        self._hashes.add_results(stretches)
+
+    def add_samples(self, trace: Trace, beside: Messages | None = None) -> None:
+        """Write the next samples alone; `evaluate` them later, in any pieces, before more than these."""
+        self._sink.write_messages(self._own(trace, beside))
+
+    def evaluate(self, trace: Trace) -> None:
+        """Write the messages of the evaluation of samples that were added before."""
+        stretches = self._evaluation.extend(trace)
+        self._sink.write_messages(merge(self._evaluation.messages(trace, stretches)))
+        self._hashes.add_results(stretches)
+
+    def report(self, event: RunEvent) -> None:
+        """Write what happens to the run beside its samples.
+
+        A replay, which knows nothing of it, has only what it makes unknown.
+        """
+        self._sink.write_messages(self._evaluation.occurrence(*event))
+
+    def _own(self, trace: Trace, beside: Messages | None) -> Messages:
+        """Return samples and messages beside them as they are written; count and hash them."""
+        own = messages_of(_OBJECTS, trace.times_ns, encode_objects(trace), self._samples)
+        written = own
+        if beside is not None and len(beside):
+            kept = _kept(beside)
+            own, written = merge([own, kept]), merge([own, beside])
+            self._topics.update(channel.topic for channel in beside.channels.values())
+            self._images |= image_topics(beside.channels.values())
+            self._messages += len(kept)
+        if len(written):
+            self._end_ns = max(self._end_ns, int(written.log_time_ns[-1]))
+        self._samples += len(trace)
+        self._hashes.add_samples(trace, own)
+        return written
+
+    def add_metadata(self, name: str, data: Mapping[str, str]) -> None:
+        """Write a metadata record; the certificate covers that of a plan."""
+        self._sink.add_metadata(name, data)
+        if name == PLAN_METADATA:
+            self._plan = dict(data)
+
+    def end(self, *, interrupted: bool = False, dropped: int = 0, messages_dropped: int = 0) -> None:
+        """Write what follows the last sample; the certificate is that of a replay of the log.
+
+        Args:
+            interrupted: whether the recording ended early.
+            dropped, messages_dropped: how many samples, and messages beside them, found no place.
+        """
+        ending = self._ending(interrupted, dropped, messages_dropped)
+        if self._samples:
+            self._sink.write_messages(self._evaluation.end(self._end_ns))
+        layout = self._evaluation.layout(self._topics, self._axes, self._images)
+        self._sink.add_attachment(layout.name, layout.media_type, layout.data)
+        streams = self._evaluation.streams
+        if self._samples and streams:
+            results = [
+                (self._evaluation.trees[place], streams[place]) for place in self._evaluation.worst_first
+            ]
+            texts = {
+                tree.title: verdict_text(
+                    each.verdict,
+                    float(each.robustness[0]),
+                    declared_unit(tree.formula, self._evaluation.units),
+                )
+                for tree, each in results
+            }
+            self._sink.add_metadata(VERDICTS, texts)
+        self._sink.add_metadata(ENDING, ending)
+        self._sink.add_metadata(CERTIFICATE, self._hashes.certificate(self._files, self._plan))
+
+    def break_off(self, *, dropped: int = 0, messages_dropped: int = 0) -> None:
+        """Write the end of a log whose last samples could not be written: it has no certificate."""
+        ending = self._ending(True, dropped, messages_dropped) | {"failed": "true"}
+        self._sink.add_metadata(ENDING, ending)
+
+    def _ending(self, interrupted: bool, dropped: int, messages_dropped: int) -> dict[str, str]:
+        ending = {
+            "samples": str(self._samples),
+            "dropped": str(dropped),
+            "interrupted": json.dumps(interrupted),
+        }
+        if self._messages or messages_dropped:
+            ending |= {"messages": str(self._messages), "messages_dropped": str(messages_dropped)}
+        return ending
+
+
+def _metadata(files: Sequence[Specification], about: Mapping[str, str]) -> dict[str, str]:
+    return {
+        "version": __version__,
+        "written_by": "record",
+        "specifications": specifications_json(files),
+        "options": "{}",
+        **about,
+    }
+
+
+def refuse_templates(files: Sequence[Specification]) -> None:
+    """Check that specifications can be evaluated as samples arrive.
+
+    Raises:
+        UsageError: a template, since its objects are not known yet.
+    """
+    for file in files:
+        for spec in file.results:
+            if spec.parameter is not None:
+                raise UsageError(
+                    f"{spec.name}({spec.parameter}) in {file.filename} is a template: it stands for objects "
+                    "that are not known before the end; record without it and replay it over the log"
+                )
+
+
+_OBJECTS = protobuf_channel(OBJECTS, ObjectStates)
+
+
+def _kept(messages: Messages) -> Messages:
+    """Return messages without those on topics that a replay does not keep, such as planning times."""
+    derived = [number for number, channel in messages.channels.items() if channel.topic in DERIVED]
+    if not derived:
+        return messages
+    return select(messages, np.flatnonzero(~np.isin(messages.channel, derived)))
+
+
+GATHER_S: Final = 0.2
+"""How long samples are gathered before they are encoded. A few together cost hardly more than one, and while
+none are encoded, the caller's thread need not wait for the interpreter lock."""
+
+
+_EVALUATING_S: Final = 0.05
+"""About how long samples are evaluated before those that have come are written."""
+_AT_FIRST, _MOST_AT_ONCE = 16, 1024
+"""How many samples are evaluated at first before that time is known, and at most."""
+
+
+Missed: TypeAlias = Literal["sample", "message"]
+
+
+class RunEnd(NamedTuple):
+    """How a recording ended: whether early, and how many samples and messages found no place."""
+
+    interrupted: bool
+    dropped: int
+    messages_dropped: int
+
+
+class RecorderLog(Protocol):
+    """What the thread of a recorder writes to; only that thread calls it, but for `miss` and `close`."""
+
+    @property
+    def gather_s(self) -> float:
+        """How long to gather samples before the next call of `add`."""
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether to call `add` again at once, whatever has come."""
+
+    @property
+    def backlog(self) -> int:
+        """How many of the samples given so far wait for their evaluation."""
+
+    def add(self, samples: Sequence[Sample], trace: Trace, messages: Messages) -> None:
+        """Write the next samples, given in both forms, and messages."""
+
+    def miss(self, time_ns: int, kind: Missed) -> None:
+        """Take note of what found no place; the threads that write call it."""
+
+    def report(self, event: RunEvent) -> None:
+        """Write what happens to the run beside its samples."""
+
+    def flush(self) -> None:
+        """Hand everything written so far to the operating system."""
+
+    def end(self, end: RunEnd) -> None:
+        """Write what follows the last sample."""
+
+    def break_off(self, end: RunEnd) -> None:
+        """Write the end after a failure, as far as that is possible."""
+
+    def close(self) -> None:
+        """Let go of files, whatever happened before."""
+
+
+class FileLog:
+    """One log in one file, written in place.
+
+    Samples are written before they are evaluated, a few at a time: an evaluation can be repeated from the
+    log, samples cannot.
+    """
+
+    gather_s = GATHER_S
+
+    def __init__(
+        self,
+        path: Path,
+        files: Sequence[Specification],
+        about: Mapping[str, str] | None,
+        durability: Durability = "process",
+        *,
+        overwrite: bool = True,
+    ) -> None:
+        """Begin the file, with everything compiled that writing to it takes."""
+        self.backlog = 0
+        self._unevaluated: deque[Trace] = deque()
+        self._plans: deque[Mapping[str, str]] = deque()
+        self._at_once = _AT_FIRST
+        self._stream = open_output(path, durability, overwrite=overwrite)
+        try:
+            self._writer = LogWriter(self._stream, clock=time.monotonic)
+            self._recording = Recording(self._writer, files, about)
+            self.flush()
+            warm_up(self._recording.files, self._recording.automata)
+        except BaseException:
+            with suppress(OutputError):
+                self._stream.close()
+            raise
+
+    def add(self, samples: Sequence[Sample], trace: Trace, messages: Messages) -> None:
+        """See `RecorderLog`."""
+        while self._plans:
+            self._recording.add_metadata(PLAN_METADATA, self._plans.popleft())
+        if len(trace) or len(messages):
+            self._recording.add_samples(trace, messages)
+        if len(trace):
+            self.backlog += len(trace)
+            self._unevaluated.append(trace)
+        if self._unevaluated:
+            self._evaluate_some()
+
+    def miss(self, time_ns: int, kind: Missed) -> None:
+        """The end of the log has the counts."""
+
+    def report(self, event: RunEvent) -> None:
+        """See `RecorderLog`."""
+        self._recording.report(event)
+
+    def add_plan(self, planner: Planner, number: int) -> None:
+        """Write the settings of a planner of a specification with what is added next; from any thread."""
+        from spatial_replay.planning.decision_log import plan_metadata
+
+        self._plans.append(plan_metadata(planner, self._recording.files[number].filename))
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether samples wait for their evaluation."""
+        return bool(self._unevaluated)
+
+    def _evaluate_some(self) -> None:
+        """Evaluate the next samples, as many as take the time that there is."""
+        trace = self._unevaluated.popleft()
+        count = min(self._at_once, len(trace))
+        if count < len(trace):
+            self._unevaluated.appendleft(trace.slice(count, len(trace)))
+        begun = time.monotonic()
+        self._recording.evaluate(trace.slice(0, count))
+        self.backlog -= count
+        took_s = max(time.monotonic() - begun, 1e-6)
+        self._at_once = max(1, min(int(count * _EVALUATING_S / took_s), _MOST_AT_ONCE))
+
+    def flush(self) -> None:
+        """See `RecorderLog`."""
+        self._writer.flush()
+        self._stream.flush()
+
+    def end(self, end: RunEnd) -> None:
+        """See `RecorderLog`."""
+        while self._unevaluated:
+            self._evaluate_some()
+        self._recording.end(
+            interrupted=end.interrupted, dropped=end.dropped, messages_dropped=end.messages_dropped
+        )
+        self._writer.close()
+
+    def break_off(self, end: RunEnd) -> None:
+        """See `RecorderLog`."""
+        self._recording.break_off(dropped=end.dropped, messages_dropped=end.messages_dropped)
+        self._writer.close()
+
+    def close(self) -> None:
+        """See `RecorderLog`."""
+        self._stream.close()
+
+
+def encodable(samples: Sequence[Sample]) -> list[Sample]:
+    """Return the samples before the first that cannot be encoded."""
+    sound: list[Sample] = []
+    with suppress(Exception):
+        for sample in samples:
+            Trace.from_samples([sample])
+            sound.append(sample)
+    return sound
+
+
+def warm_up(files: Sequence[Specification], automata: Sequence[SpecAutomaton]) -> None:
+    """Record some samples into memory, so that the code for the specifications is compiled and loaded.
+
+    With an empty compiler cache this takes many seconds, otherwise a fraction of one.
+
+    Args:
+        automata: those of the specifications, which are not compiled again.
+    """
+    compile_ahead()
+    writer = LogWriter(BytesIO())
+    recording = Recording(writer, files, known=automata)
+    objects = ["object", *(name for file in files for name in object_names(file))]
+    signals = {name: 0.0 for file in files for name in signal_names(file)}
+    samples = [
+        Sample(
+            time_s * 10**9,
+            {
+                name: _tracked(index + time_s, 0.1 * index + time_s)
+                for index, name in enumerate(dict.fromkeys(objects))
+            },
+            signals,
+        )
+        for time_s in range(4)
+    ]
+    recording.add(Trace.from_samples(samples[:1]))
+    recording.add(Trace.from_samples(samples[1:]))
+    # without objects: intervals of unknown atoms run code of their own
+    recording.add(Trace.from_samples([Sample(10**10, {})]))
+    recording.end()
+    writer.close()
+    # the arrow at a violation, of which these samples may have none
+    shapes = FootprintBatch.from_footprints([Footprint.box(x, 0, x + 1, 1) for x in range(2)])
+    contacts(shapes, *(Operand(np.array([[row]])) for row in range(2)), is_protrusion=False)
+
+
+def _tracked(kind: int, x: float) -> TrackedObject:
+    box, disc = Footprint.box(x, 0, x + 1, 1), Footprint.disc(x + 0.5, 0.5, 0.5)
+    footprint = (box, disc, Footprint((*box.parts, *disc.parts)))[kind % 3]
+    return TrackedObject(footprint, class_name="thing", yaw=x, height=(0.0, 1.0), uncertainty=0.01)
+
+
+_WORDS: Final = {HOLDING: "holds", FAILING: "pending", SATISFIED: "satisfied", VIOLATED: "violated"}
+
+
+class VerdictChange(NamedTuple):
+    """The verdict of a spec, or the sign of its value while it is pending, is another than before.
+
+    A verdict counts at once; a sign once it lasts three samples, as in the events of a log.
+
+    Attributes:
+        time_ns: of the sample that confirms it.
+        spec: its name.
+        state: "satisfied" and "violated" whatever comes; "holds" and "pending" so far.
+        sentence: what changed and why.
+        is_first: whether nothing was known before.
+    """
+
+    time_ns: int
+    spec: str
+    state: str
+    sentence: str
+    is_first: bool
+
+
+class VerdictChanges:
+    """The states of the results of some specifications, from sample to sample."""
+
+    def __init__(self, files: Sequence[Specification]) -> None:
+        """Start before the first sample."""
+        self._states = [[NodeStates.begin(1) for _ in file.results] for file in files]
+        self._root = np.zeros(1, np.int64)
+
+    def after(self, updates: Sequence[Update]) -> Iterator[VerdictChange]:
+        """Yield what changed with a sample, from the update of each file."""
+        for states, update in zip(self._states, updates, strict=True):
+            for place, spec in enumerate(update.specs):
+                if spec.numbers is None or states[place].are_final:
+                    continue
+                times_ns = np.array([update.time_ns], np.int64)
+                before = states[place]
+                tracked = track(before, times_ns, spec.numbers[:1, :, None].copy(), self._root)
+                states[place] = tracked.states
+                is_first = not before.integers[0, 0] and tracked.states.integers[0, 0]
+                if tracked.changes or is_first:
+                    yield self._change(tracked.states, spec, update, is_first=bool(is_first))
+
+    def _change(
+        self, states: NodeStates, spec: SpecUpdate, update: Update, *, is_first: bool
+    ) -> VerdictChange:
+        period = states.period(0)
+        name = spec.spec.name
+        about = requirement_text(spec.spec.id, spec.spec.title)
+        title = f"`{name}` ({about})" if about else f"`{name}`"
+        reasons = [each.reason for each in update.satisfied if each.spec is spec.spec]
+        sentence = change_sentence(
+            title, period, reasons[0] if period.code == SATISFIED and reasons else "", spec.unit
+        )
+        if period.code == VIOLATED:
+            own = {node for node in spec.names if node is not None} | {name}
+            reasons = [str(each) for each in update.violations if each.spec in own]
+            sentence = f"{title} is violated, whatever comes: {'; '.join(reasons)}." if reasons else sentence
+        return VerdictChange(update.time_ns, name, _WORDS[period.code], sentence, is_first)
