@@ -40,6 +40,17 @@ def test_every_limit_is_the_one_of_the_code() -> None:
     assert len(rows()) > 30
 
 
+def test_a_crowd_beyond_a_limit_is_refused(tmp_path: Path) -> None:
+    crowd = {f"o{number}": sr.Footprint.disc(number, 0, 0.1) for number in range(20_001)}
+    trace = sr.Trace.from_samples([sr.Sample(0, crowd)])
+    closest = sr.parse_specification("G (forall x, y in all: x dist y >= 0.5)")
+    with pytest.raises(sr.UsageError, match="closest two of 20001 objects; 20000 is the limit"):
+        sr.evaluate(closest, trace)
+    with pytest.raises(sr.UsageError, match="has 20001 objects; a page draws at most 20000: map fewer"):
+        sr.write_report(trace, sr.parse_specification("o1 dist o2 >= 0"), output=tmp_path / "run.html")
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize(
     "text",
     [

@@ -169,6 +169,8 @@ def run_instructions(
 
 MAX_BINDINGS = 20_000
 """The most bindings of variables that the open quantifiers of one formula may have in total."""
+MAX_CLOSEST = 20_000
+"""The most objects of an open group of which the closest two are found."""
 
 
 class OpenGroups(Protocol):
@@ -289,6 +291,11 @@ class LeafCode:
         is_forall = formula.quantifier == "forall"
         group: Any = substitute_term(formula.group, bindings)
         if (found := number_of_closest(replace(formula, group=group))) is not None:
+            if (count := len(self._groups.candidates(group))) > MAX_CLOSEST:
+                what = f"{formula.quantifier} {', '.join(formula.variables)} looks for the closest two"
+                raise UsageError(
+                    f"{what} of {count} objects; {MAX_CLOSEST} is the limit: use a smaller group"
+                )
             return self._row(HOLDS, self._expression(found[1], bindings))
         names = self._groups.candidates(group)
         self._check_bindings(formula, len(names))
