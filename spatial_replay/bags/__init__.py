@@ -11,9 +11,9 @@ from spatial_replay.lazy import loaded_when_used
 
 if TYPE_CHECKING:
     from spatial_replay.bags.columns import Message
+    from spatial_replay.bags.decoders import Decoder, Topic
     from spatial_replay.bags.open import open_messages
     from spatial_replay.bags.reader import MessageReader
-    from spatial_replay.bags.topic import Decoder, Topic
 
 __all__ = ["Decoder", "Message", "MessageReader", "Topic", "open_messages"]
 
@@ -21,8 +21,8 @@ __getattr__, __dir__ = loaded_when_used(
     globals(),
     {
         "columns": ("Message",),
+        "decoders": ("Decoder", "Topic"),
         "open": ("open_messages",),
         "reader": ("MessageReader",),
-        "topic": ("Decoder", "Topic"),
     },
 )

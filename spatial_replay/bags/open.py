@@ -2,17 +2,293 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import replace
+from functools import cached_property, partial
+from itertools import accumulate
 from pathlib import Path
+from typing import TypeAlias
 
-from spatial_replay.bags.folder import BagFolder
+import numpy as np
+
+from spatial_replay.bags.columns import Columns, MessageColumns, TimedColumns, merged
+from spatial_replay.bags.decoders import Topic, full_type_name, topics_by_name
 from spatial_replay.bags.mcap_log import McapLog
 from spatial_replay.bags.reader import MessageReader
-from spatial_replay.bags.ros1 import Ros1Bag
-from spatial_replay.bags.ros1_index import BAG_MAGIC
-from spatial_replay.bags.sqlite import SQLITE_MAGIC, SqliteBag
+from spatial_replay.bags.ros1 import BAG_MAGIC, Ros1Bag
+from spatial_replay.bags.sqlite import (
+    LARGEST_METADATA,
+    SQLITE_MAGIC,
+    ZSTD_MAGIC,
+    BagMetadata,
+    SqliteBag,
+    bag_metadata_from_text,
+    temporary_folder,
+    unpack_file,
+    unpacked,
+    unpacked_size,
+)
 from spatial_replay.errors import LogError, MissingFileError
+from spatial_replay.logs.messages import Attachment, Channel
+from spatial_replay.logs.read_options import FaultList
 from spatial_replay.logs.remote import LogFile, open_file
 from spatial_replay.logs.topics import MAGIC
+from spatial_replay.text import Instant, Sentence
+
+METADATA_FILE = "metadata.yaml"
+_ENDINGS = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
+
+_CDR_BEGIN = b"\x00"
+"""How every message of ROS 2 begins, and none that is compressed."""
+
+_MOST_UNPACKED = 2**26
+"""Bytes of messages that are decompressed at a time, and one message more."""
+
+_File: TypeAlias = McapLog | SqliteBag
+
+
+def files_of_bag_around(path: Path) -> tuple[str, ...]:
+    """Return the names of all files of the bag that a file is in; none where no metadata lists it."""
+    try:
+        with path.with_name(METADATA_FILE).open("rb") as stream:
+            listed = bag_metadata_from_text(stream.read(LARGEST_METADATA + 1).decode()).files
+    except (OSError, UnicodeDecodeError, LogError):
+        return ()
+    return listed if path.name in listed else ()
+
+
+class BagFolder(MessageReader):
+    """A folder with the files of one ROS 2 bag."""
+
+    kind = "ROS 2 bag"
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self._remarks = FaultList()
+
+    @cached_property
+    def _metadata(self) -> BagMetadata | None:
+        path = self._path / METADATA_FILE
+        try:
+            with path.open("rb") as stream:
+                text = stream.read(LARGEST_METADATA + 1).decode()
+            return bag_metadata_from_text(text)
+        except FileNotFoundError:
+            what = "is missing: its recorder was interrupted"
+        except OSError as error:
+            raise MissingFileError.of(path, error) from None
+        except UnicodeDecodeError:
+            what = "is not UTF-8"
+        except LogError as error:
+            what = f"cannot be used: {error}"
+        self._faults.add(f"{self.name}: {METADATA_FILE} {what}; the files in the folder were read without it")
+        return None
+
+    @cached_property
+    def _files(self) -> tuple[_File, ...]:
+        present = sorted(
+            (each.name for each in self._path.iterdir() if each.name.endswith(_ENDINGS)), key=_rank
+        )
+        listed = self._metadata.files if self._metadata else tuple(present)
+        for name in listed:
+            if not (self._path / name).is_file():
+                self._faults.add(f"{self.name}: its file {name!r} is missing; what it holds is lost")
+        for name in sorted(set(present) - set(listed)):
+            self._remarks.add(
+                f"{self.name}: the file {name!r} is not listed in {METADATA_FILE}; it was not read"
+            )
+        opened = [self._opened(self._path / name) for name in listed if (self._path / name).is_file()]
+        files = tuple(each for each in opened if each is not None)
+        if not files:
+            reason = next(iter(self._faults.take()), "it has no .db3 and no .mcap file")
+            raise LogError(f"{self.name} is not a ROS 2 bag that can be read: {reason}")
+        return files
+
+    @cached_property
+    def _unpacked_files(self) -> Path:
+        """A folder for decompressed files."""
+        return temporary_folder(self)
+
+    @cached_property
+    def _topics(self) -> tuple[Topic, ...]:
+        present = [topic for file in self._files for topic in self._described(file)]
+        declared = self._metadata
+        named = topics_by_name(present, self._distribution)
+        if declared is None:
+            return named
+        missing = declared.counts.keys() - {topic.name for topic in present}
+        absent = [
+            Topic(
+                name,
+                declared.types[name],
+                "cdr",
+                declared.counts[name],
+                unreadable=f"topic {name!r} is in none of the bag's files",
+            )
+            for name in missing
+        ]
+        known = [replace(topic, count=declared.counts.get(topic.name, 0)) for topic in named]
+        return tuple(sorted([*known, *absent], key=lambda topic: topic.name))
+
+    @property
+    def start_ns(self) -> int | None:
+        """Log time of the first message."""
+        return min((file.start_ns for file in self._files if file.start_ns is not None), default=None)
+
+    @property
+    def _distribution(self) -> str | None:
+        return self._metadata.distribution if self._metadata else None
+
+    def topics(self) -> tuple[Topic, ...]:
+        return self._topics
+
+    def take_faults(self) -> tuple[str, ...]:
+        return (
+            tuple(fault for each in self._opened_files() for fault in each.take_faults())
+            + self._faults.take()
+        )
+
+    def move_faults(self, other: FaultList) -> None:
+        for each in self._opened_files():
+            each.move_faults(other)
+        self._faults.move_to(other)
+
+    def take_remarks(self) -> tuple[str, ...]:
+        return (
+            tuple(remark for each in self._opened_files() for remark in each.take_remarks())
+            + self._remarks.take()
+        )
+
+    def _read(self, topics: Collection[str], first: int, last: int, *, as_recorded: bool) -> Columns:
+        def read(number: int, file: _File) -> Columns:
+            for each in file.iter_columns(topics, first, last, as_recorded=as_recorded):
+                place, first_channel = np.int64(number) << 48, self._first_channels[number]
+                yield replace(each, place=place + each.place, channel=first_channel + each.channel)
+
+        reads = [partial(read, number, file) for number, file in enumerate(self._files)]
+        if as_recorded or len(reads) == 1:
+            columns: Columns = (each for open_file in reads for each in open_file())
+        else:
+            pairs = zip(self._files, reads, strict=True)
+            columns = merged(TimedColumns(file.start_ns or 0, open_file) for file, open_file in pairs)
+        if self._metadata and self._metadata.compression == "message":
+            return self._all_unpacked(columns)
+        return columns
+
+    def _all_unpacked(self, columns: Columns) -> Columns:
+        """Decompress messages; a topic with messages that are plain is remarked once."""
+        plain = set[str]()
+        for packed in columns:
+            # some at a time, however much they decompress to
+            begin = size = 0
+            for number, payload in enumerate(packed.payloads, 1):
+                size += unpacked_size(payload)
+                if size >= _MOST_UNPACKED or number == len(packed):
+                    yield self._unpacked(packed.slice(begin, number), plain)
+                    begin, size = number, 0
+
+    def channels(self, topics: Collection[str]) -> Mapping[int, Channel]:
+        return {
+            first + number: channel
+            for first, file in zip(self._first_channels, self._files, strict=True)
+            for number, channel in file.channels(topics).items()
+        }
+
+    def attachments(self) -> tuple[Attachment, ...]:
+        return tuple(each for file in self._files for each in file.attachments())
+
+    def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
+        return tuple(each for file in self._files for each in file.metadata())
+
+    @cached_property
+    def _first_channels(self) -> tuple[int, ...]:
+        """The number of the first channel of each file."""
+        return tuple(accumulate((file.channel_count for file in self._files[:-1]), initial=0))
+
+    def _counted(self, columns: Columns, topics: Collection[str], name: str | None = None) -> Columns:
+        if self._metadata is None:
+            # each file compares its own counts
+            return columns
+        name = name or f"{self.name}/{METADATA_FILE}"
+        for topic in self._topics:
+            type_name = self._metadata.types.get(topic.name, topic.type)
+            # recorders write pkg/Type and pkg/msg/Type for one type
+            if topic.name in topics and full_type_name(type_name) != full_type_name(topic.type):
+                self._faults.add(
+                    f"{name}: it declares messages of {type_name!r:.100} on {topic.name!r}; they are of"
+                    f" {topic.type!r}"
+                )
+        return super()._counted(columns, topics, name)
+
+    def _opened_files(self) -> Iterable[_File]:
+        """Return the files that were opened so far."""
+        return self._files if "_files" in self.__dict__ else ()
+
+    def _opened(self, path: Path) -> _File | None:
+        """Open a file by its content; None, and a fault, where nothing in it can be read."""
+        try:
+            with path.open("rb") as stream:
+                head = stream.read(len(SQLITE_MAGIC))
+            if head.startswith(ZSTD_MAGIC):
+                damage = FaultList()
+                file = self._opened(unpack_file(path, self._unpacked_files, damage))
+                for fault in damage.take(last=True):
+                    self._faults.add(f"{self.name}: {fault}")
+                return file
+        except OSError as error:
+            raise MissingFileError.of(path, error) from None
+        except LogError as error:
+            self._faults.add(f"{self.name}: {error}; what it holds is lost")
+            return None
+        if head == SQLITE_MAGIC:
+            return SqliteBag(path)
+        if head.startswith(MAGIC):
+            return McapLog(path)
+        self._faults.add(f"{self.name}: {path.name!r} is neither SQLite nor MCAP; what it holds is lost")
+        return None
+
+    def _described(self, file: _File) -> tuple[Topic, ...]:
+        try:
+            return file.topics()
+        except LogError as error:
+            self._faults.add(f"{self.name}: {error}")
+            return ()
+
+    def _unpacked(self, packed: MessageColumns, plain: set[str]) -> MessageColumns:
+        payloads: list[bytes] = []
+        places: list[int] = []
+        lost: dict[str, list[Sentence]] = {}
+        for place, payload in enumerate(packed.payloads):
+            topic, when = packed.topics[place], Instant(int(packed.log_time_ns[place]), 0)
+            try:
+                if not payload.startswith(_CDR_BEGIN):
+                    payloads.append(unpacked(payload))
+                else:
+                    payloads.append(payload)
+                    if topic not in plain:
+                        plain.add(topic)
+                        self._remarks.add(
+                            Sentence(
+                                f"{self.name}: messages on {topic!r} are plain, the first at ",
+                                Sentence(when, f", although {METADATA_FILE} declares them as compressed"),
+                                "; they are read as they are",
+                            )
+                        )
+                places.append(place)
+            except LogError as error:
+                lost.setdefault(topic, []).append(Sentence(f"on {topic!r} at ", when, f": {error}"))
+        for first, *others in lost.values():
+            latest = Instant(int(packed.log_time_ns[-1]), 0)
+            more = Sentence(f"; so are {len(others)} more up to ", latest) if others else ""
+            self._faults.add(Sentence(f"{self.name}: ", first, ", and is lost", more))
+        return replace(packed.take(np.array(places, np.int64)), payloads=payloads)
+
+
+def _rank(name: str) -> tuple[str | int, ...]:
+    """Return a key that sorts bag_10.db3 after bag_9.db3."""
+    return tuple(int(part) if part.isdecimal() else part for part in re.split(r"([0-9]+)", name)[:80])
+
 
 READERS: dict[bytes, type[MessageReader]] = {BAG_MAGIC: Ros1Bag, SQLITE_MAGIC: SqliteBag, MAGIC: McapLog}
 """The reader of a file, by its first bytes."""

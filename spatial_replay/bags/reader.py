@@ -7,8 +7,7 @@ from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 
 from spatial_replay.bags.columns import Columns, Message, iter_counted, one_by_one
-from spatial_replay.bags.decoders import decoder_of
-from spatial_replay.bags.topic import Decoder, Topic
+from spatial_replay.bags.decoders import Decoder, Topic, decoder_of
 from spatial_replay.errors import LogError
 from spatial_replay.logs.messages import Attachment, Channel
 from spatial_replay.logs.read_options import FaultList

@@ -6,35 +6,451 @@ which interrupted recorders leave behind. Here only the damaged chunks are lost,
 
 from __future__ import annotations
 
+import bz2
+import os
 from collections import Counter
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from types import MappingProxyType
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
+import lz4.frame
 import numpy as np
+from numpy.typing import NDArray
 
 from spatial_replay.bags.columns import Columns, MessageColumns, in_order, places_in, unnumbered
-from spatial_replay.bags.decoders import channel_of, topics_by_name
+from spatial_replay.bags.decoders import Topic, channel_of, full_type_name, topics_by_name
 from spatial_replay.bags.reader import MessageReader
-from spatial_replay.bags.ros1_index import (
-    MESSAGE,
-    BagChunk,
-    BagDirectory,
-    Connection,
-    connections_in,
-    read_bag_directory,
-    read_chunk,
-    record_table,
-)
-from spatial_replay.bags.ros_definitions import full_type_name
-from spatial_replay.bags.topic import Topic
+from spatial_replay.compiled import kernel, piece
 from spatial_replay.geometry.arrays import Integers
-from spatial_replay.logs.mcap.index import DamageError
-from spatial_replay.logs.mcap.read import most_waiting
+from spatial_replay.logs.mcap.index import LARGEST_CHUNK, DamageError
+from spatial_replay.logs.mcap.read import ALWAYS_ALLOWED, MOST_TIMES_LARGER, most_waiting
 from spatial_replay.logs.messages import Channel, Schema
+from spatial_replay.logs.read_options import FaultList
 from spatial_replay.text import Instant, Sentence
+
+BAG_MAGIC = b"#ROSBAG V2.0\n"
+MESSAGE, BAG_HEADER, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
+LONGEST_HEAD = 2**20
+_SECOND_NS = 1_000_000_000
+# op=, conn=, time= begin with these
+_C, _I, _O, _P, _T = b"ciopt"
+
+
+class RecordTable(NamedTuple):
+    """N records of a chunk, in their order.
+
+    Attributes:
+        opcode, connection, time_ns: (N,) int64; -1 where the head has none.
+        head: (N,) int64, where the head's fields begin.
+        begin, end: (N,) int64, where the data are.
+    """
+
+    opcode: Integers
+    connection: Integers
+    time_ns: Integers
+    head: Integers
+    begin: Integers
+    end: Integers
+
+
+def fields_of(head: bytes) -> dict[str, bytes]:
+    """Parse the fields of a record's head, or of a connection's data, by name.
+
+    Raises:
+        DamageError: they do not fill it exactly.
+    """
+    fields: dict[str, bytes] = {}
+    for entry in _iter_fields(head):
+        name, separator, value = entry.partition(b"=")
+        if not separator:
+            raise DamageError("a field of a record's head has no name")
+        fields[name.decode("latin-1")] = value
+    return fields
+
+
+def _iter_fields(head: bytes) -> Iterator[bytes]:
+    position = 0
+    while position < len(head):
+        length = int.from_bytes(head[position : position + 4], "little")
+        position += 4 + length
+        if position > len(head):
+            raise DamageError("a record's head breaks off")
+        yield head[position - length : position]
+
+
+def number(fields: dict[str, bytes], name: str, size: int = 4) -> int:
+    """Return a field that is a little-endian number of some bytes.
+
+    Raises:
+        DamageError: it is missing, or of another size.
+    """
+    value = fields.get(name, b"")
+    if len(value) != size:
+        raise DamageError(f"a record has no field {name!r} of {size} bytes")
+    return int.from_bytes(value, "little")
+
+
+def time_from(value: int) -> int:
+    """Return nanoseconds from seconds in the lower and nanoseconds in the upper half of a word."""
+    return (value & 0xFFFFFFFF) * _SECOND_NS + (value >> 32)
+
+
+def decompressed(compression: bytes, data: bytes, size: int) -> bytes:
+    """Decompress the records of a chunk.
+
+    Raises:
+        DamageError: it does not decompress to `size` bytes.
+    """
+    most = max(ALWAYS_ALLOWED, MOST_TIMES_LARGER * len(data))
+    if size > LARGEST_CHUNK or (compression != b"none" and size > most):
+        raise DamageError(f"the chunk claims to hold {size} bytes in {len(data)}")
+    try:
+        match compression:
+            case b"none":
+                content = data
+            case b"bz2":
+                content = bz2.BZ2Decompressor().decompress(data, size + 1)
+            case b"lz4":
+                content = bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1))
+            case _:
+                raise DamageError(f"the chunk is compressed as {compression!r:.40}; known are none, bz2, lz4")
+    except (OSError, RuntimeError, EOFError, ValueError) as error:
+        raise DamageError(f"the chunk does not decompress ({error})") from None
+    if len(content) != size:
+        raise DamageError(f"the chunk holds {len(content)} bytes instead of {size}")
+    return content
+
+
+def record_table(content: bytes) -> tuple[RecordTable, bool]:
+    """Return the records in a chunk's content, and whether the last of them breaks off."""
+    view = np.frombuffer(content, np.uint8)
+    count, _ = _walk(view, np.empty((6, 0), np.int64))
+    table = np.empty((6, count), np.int64)
+    _, end = _walk(view, table)
+    return RecordTable(*table), end < len(content)
+
+
+@piece
+def _u32(content: NDArray[np.uint8], at: int) -> int:
+    """Return a little-endian word."""
+    word = 0
+    for k in range(4):
+        word += int(content[at + k]) << (8 * k)
+    return word
+
+
+@piece
+def _head(content: NDArray[np.uint8], head: int, data: int) -> tuple[int, int, int]:
+    """Return opcode, connection and time in the fields of a head, each -1 where it is missing."""
+    opcode = connection = time_ns = -1
+    at = head
+    while at + 4 <= data:
+        length = _u32(content, at)
+        at += 4
+        if at + length > data:
+            break
+        first, second = content[at], content[at + 1]
+        if length == 4 and first == _O and second == _P:
+            opcode = int(content[at + 3])
+        elif length == 9 and first == _C and second == _O:
+            connection = _u32(content, at + 5)
+        elif length == 13 and first == _T and second == _I:
+            time_ns = _u32(content, at + 5) * _SECOND_NS + _u32(content, at + 9)
+        at += length
+    return (opcode if at == data else -1), connection, time_ns
+
+
+@kernel
+def _walk(content: NDArray[np.uint8], table: NDArray[np.int64]) -> tuple[int, int]:
+    """Fill in the records that there is room for; return their number, and where the last whole one ends."""
+    size = content.shape[0]
+    position = 0
+    count = 0
+    while position + 8 <= size:
+        head = position + 4
+        data = head + _u32(content, position)
+        if data + 4 > size:
+            break
+        begin = data + 4
+        end = begin + _u32(content, data)
+        if end > size:
+            break
+        opcode, connection, time_ns = _head(content, head, data)
+        if opcode < 0:
+            break
+        if count < table.shape[1]:
+            table[0, count], table[1, count], table[2, count] = opcode, connection, time_ns
+            table[3, count], table[4, count], table[5, count] = head, begin, end
+        position = end
+        count += 1
+    return count, position
+
+
+_STRIDE = 2**20
+_CHUNK_MARK = b"\x04\x00\x00\x00op=\x05"
+_BEFORE_MARK = (4, 17, 23, 24, 36, 37)
+"""Where a chunk's head may begin before its opcode: its length, then its other fields in any order."""
+_CHUNK_HEAD_BYTES = range(20, 80)
+_MOST_GAPS, _MOST_MARKS = 1_000, 100_000
+"""Damaged stretches, and bytes that look like a chunk's, after which the rest of a file is not searched."""
+
+
+@dataclass(frozen=True, slots=True)
+class Connection:
+    """A publisher of a topic, as the bag describes it.
+
+    Attributes:
+        data: the fields that describe it: type, md5sum, message_definition and others.
+    """
+
+    number: int
+    topic: str
+    data: Mapping[str, bytes] = field(hash=False)
+
+    @property
+    def type(self) -> str:
+        return self.data.get("type", b"").decode("utf-8", "replace")
+
+    @property
+    def is_latched(self) -> bool:
+        return self.data.get("latching") == b"1"
+
+
+@dataclass(frozen=True, slots=True)
+class BagChunk:
+    """A chunk: where it is, and what it holds.
+
+    Attributes:
+        offset: of its record.
+        counts: how many messages of each connection; None where only its content says.
+    """
+
+    offset: int
+    start_ns: int
+    end_ns: int
+    counts: Mapping[int, int] | None = field(hash=False)
+
+
+@dataclass(slots=True)
+class BagDirectory:
+    """Connections by number, and chunks in the order of the file.
+
+    Attributes:
+        is_indexed: whether the bag's own index was read.
+    """
+
+    connections: dict[int, Connection] = field(default_factory=dict)
+    chunks: list[BagChunk] = field(default_factory=list)
+    is_indexed: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class _Record:
+    """A record in the file: the fields of its head, and where its data are."""
+
+    fields: dict[str, bytes]
+    data: int
+    length: int
+
+    @property
+    def opcode(self) -> int:
+        return number(self.fields, "op", 1)
+
+    @property
+    def following(self) -> int:
+        return self.data + self.length
+
+
+def read_bag_directory(stream: BinaryIO, faults: FaultList, name: str) -> BagDirectory:
+    """Read the directory of a ROS 1 bag; what is wrong with the file goes to `faults`."""
+    size = stream.seek(0, os.SEEK_END)
+    try:
+        return _from_index(stream, size)
+    except DamageError as damage:
+        faults.add(f"{name}: {damage}; the bag was read without its index")
+        return _Scan(stream, size, faults, name).directory()
+
+
+def read_chunk(stream: BinaryIO, offset: int) -> bytes:
+    """Read the content of the chunk at an offset, decompressed.
+
+    Raises:
+        DamageError: it is cut off, no chunk, or does not decompress.
+    """
+    record = _record(stream, offset, stream.seek(0, os.SEEK_END))
+    if record.opcode != CHUNK:
+        raise DamageError("there is no chunk")
+    return _content(stream, record)
+
+
+def connections_in(content: bytes, table: RecordTable) -> Iterator[Connection]:
+    """Yield the connections that a chunk declares.
+
+    Raises:
+        DamageError: one cannot be read.
+    """
+    for row in (table.opcode == CONNECTION).nonzero()[0].tolist():
+        begin, end = int(table.begin[row]), int(table.end[row])
+        yield _connection(fields_of(content[int(table.head[row]) : begin - 4]), content[begin:end])
+
+
+def _from_index(stream: BinaryIO, size: int) -> BagDirectory:
+    head = _record(stream, len(BAG_MAGIC), size)
+    if head.opcode != BAG_HEADER:
+        raise DamageError("the bag's header is damaged")
+    position = number(head.fields, "index_pos", 8)
+    if not head.following <= position <= size:
+        raise DamageError("the bag has no index; its writer was interrupted or the file is cut")
+    directory = BagDirectory(is_indexed=True)
+    while position < size:
+        record = _record(stream, position, size)
+        if record.opcode == CONNECTION:
+            connection = _connection(record.fields, _data(stream, record))
+            directory.connections[connection.number] = connection
+        elif record.opcode == CHUNK_INFO:
+            directory.chunks.append(_chunk_info(record.fields, _data(stream, record)))
+        else:
+            raise DamageError(f"the index has an unexpected record (op {record.opcode})")
+        position = record.following
+    declared = number(head.fields, "conn_count"), number(head.fields, "chunk_count")
+    if declared != (len(directory.connections), len(directory.chunks)):
+        raise DamageError("the index does not hold as many connections and chunks as the bag's header says")
+    unknown = {each for chunk in directory.chunks for each in chunk.counts or {}} - set(directory.connections)
+    if unknown:
+        raise DamageError(f"the index counts messages of a connection {min(unknown)} that it does not have")
+    directory.chunks.sort(key=lambda chunk: chunk.offset)
+    return directory
+
+
+def _chunk_info(fields: dict[str, bytes], data: bytes) -> BagChunk:
+    if number(fields, "ver") != 1 or number(fields, "count") * 8 != len(data):
+        raise DamageError("the index describes a chunk in an unknown version")
+    words = [int.from_bytes(data[at : at + 4], "little") for at in range(0, len(data), 4)]
+    return BagChunk(
+        number(fields, "chunk_pos", 8),
+        time_from(number(fields, "start_time", 8)),
+        time_from(number(fields, "end_time", 8)),
+        dict(zip(words[::2], words[1::2], strict=True)),
+    )
+
+
+def _connection(fields: dict[str, bytes], data: bytes) -> Connection:
+    topic = fields.get("topic", b"").decode("utf-8", "replace")
+    return Connection(number(fields, "conn"), topic, fields_of(data))
+
+
+def _record(stream: BinaryIO, position: int, size: int) -> _Record:
+    if position > size:
+        raise DamageError("the place lies outside the file")
+    stream.seek(position)
+    head_length = _word(stream)
+    if head_length > min(LONGEST_HEAD, size - position):
+        raise DamageError("a record's head is inconsistent")
+    fields = fields_of(stream.read(head_length))
+    length = _word(stream)
+    data = stream.tell()
+    if data + length > size:
+        raise DamageError("the file breaks off in a record")
+    return _Record(fields, data, length)
+
+
+def _word(stream: BinaryIO) -> int:
+    word = stream.read(4)
+    if len(word) < 4:
+        raise DamageError("the file breaks off")
+    return int.from_bytes(word, "little")
+
+
+def _data(stream: BinaryIO, record: _Record) -> bytes:
+    if record.length > LARGEST_CHUNK:
+        raise DamageError(f"a record claims to hold {record.length} bytes")
+    stream.seek(record.data)
+    return stream.read(record.length)
+
+
+def _content(stream: BinaryIO, record: _Record) -> bytes:
+    compression = record.fields.get("compression", b"")
+    return decompressed(compression, _data(stream, record), number(record.fields, "size"))
+
+
+class _Scan:
+    """One pass over the records of a file; chunks are read for their times and connections."""
+
+    def __init__(self, stream: BinaryIO, size: int, faults: FaultList, name: str) -> None:
+        self._stream = stream
+        self._size = size
+        self._faults = faults
+        self._name = name
+        self._directory = BagDirectory()
+        self._marks = 0
+
+    def directory(self) -> BagDirectory:
+        position = len(BAG_MAGIC)
+        gaps = 0
+        while position < self._size:
+            try:
+                position = self._take_in(position)
+            except DamageError as damage:
+                gaps += 1
+                following = self._next_chunk(position + 1) if gaps < _MOST_GAPS else None
+                lost = (following or self._size) - position
+                self._faults.add(f"{self._name}: at byte {position}: {damage}; {lost} bytes cannot be read")
+                if following is None:
+                    break
+                position = following
+        return self._directory
+
+    def _take_in(self, position: int) -> int:
+        """Take in the record at a position; return where the next one begins."""
+        record = _record(self._stream, position, self._size)
+        if record.opcode == CHUNK:
+            self._chunk(position, record)
+        elif record.opcode == CONNECTION:
+            connection = _connection(record.fields, _data(self._stream, record))
+            self._directory.connections.setdefault(connection.number, connection)
+        elif record.opcode not in (BAG_HEADER, INDEX, CHUNK_INFO):
+            raise DamageError(f"there is no known record (op {record.opcode})")
+        return record.following
+
+    def _chunk(self, position: int, record: _Record) -> None:
+        content = _content(self._stream, record)
+        table, _ = record_table(content)
+        for connection in connections_in(content, table):
+            self._directory.connections.setdefault(connection.number, connection)
+        is_message = table.opcode == MESSAGE
+        if is_message.any():
+            times = table.time_ns[is_message]
+            counts = Counter(table.connection[is_message].tolist())
+            self._directory.chunks.append(BagChunk(position, int(times.min()), int(times.max()), counts))
+
+    def _next_chunk(self, position: int) -> int | None:
+        """Return where the next chunk begins whose head is consistent, from a position on."""
+        overlap = max(_CHUNK_HEAD_BYTES) + len(_CHUNK_MARK)
+        while position < self._size:
+            self._stream.seek(position)
+            window = self._stream.read(_STRIDE + overlap)
+            found = window.find(_CHUNK_MARK)
+            while found >= 0:
+                self._marks += 1
+                if self._marks > _MOST_MARKS:
+                    return None
+                for begin in (found - before for before in reversed(_BEFORE_MARK)):
+                    length = int.from_bytes(window[max(0, begin) : max(0, begin) + 4], "little")
+                    if begin >= 0 and length in _CHUNK_HEAD_BYTES and self._is_chunk(position + begin):
+                        return position + begin
+                found = window.find(_CHUNK_MARK, found + 1)
+            position += _STRIDE
+        return None
+
+    def _is_chunk(self, position: int) -> bool:
+        try:
+            record = _record(self._stream, position, self._size)
+            return record.opcode == CHUNK and "compression" in record.fields and "size" in record.fields
+        except DamageError:
+            return False
 
 
 class Ros1Bag(MessageReader):

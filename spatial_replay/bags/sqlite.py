@@ -6,7 +6,10 @@ damaged file becomes a fault of the log.
 
 from __future__ import annotations
 
+import shutil
 import sqlite3
+import tempfile
+import weakref
 from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -14,25 +17,252 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import count
-from pathlib import Path
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from types import MappingProxyType
-from typing import Any
+from typing import Any, BinaryIO, Literal, cast
 from urllib.parse import quote
 
 import numpy as np
+import zstandard
 
 from spatial_replay.bags.columns import Columns, MessageColumns, unnumbered
-from spatial_replay.bags.decoders import channel_of, topics_by_name
-from spatial_replay.bags.metadata import BagMetadata, bag_metadata_from_text
+from spatial_replay.bags.decoders import (
+    LONGEST_TEXT,
+    Topic,
+    channel_of,
+    full_type_name,
+    is_latched,
+    topics_by_name,
+)
 from spatial_replay.bags.reader import MessageReader
-from spatial_replay.bags.ros_definitions import LONGEST_TEXT, full_type_name
-from spatial_replay.bags.topic import Topic, is_latched
-from spatial_replay.bags.unpacking import copy_beginning, temporary_folder
-from spatial_replay.errors import LogError
+from spatial_replay.errors import LogError, OutputError
 from spatial_replay.geometry.arrays import Integers
+from spatial_replay.logs.mcap.index import LARGEST_CHUNK
+from spatial_replay.logs.mcap.read import ALWAYS_ALLOWED, MOST_TIMES_LARGER
 from spatial_replay.logs.messages import Channel, Schema
+from spatial_replay.logs.output_file import open_output, output_error
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.text import Instant, Sentence
+
+Compression = Literal["", "file", "message"]
+
+LARGEST_METADATA = 2**23
+_DEEPEST = 32
+_MOST = 2**63
+
+
+@dataclass(frozen=True, slots=True)
+class BagMetadata:
+    """What a bag declares.
+
+    Attributes:
+        files: names of its files, without folders, in order.
+        types: of each topic.
+        counts: messages of each topic.
+        compression: of whole files, of each message, or none.
+        distribution: the ROS release that wrote it, if it is named.
+    """
+
+    files: tuple[str, ...]
+    types: Mapping[str, str]
+    counts: Mapping[str, int]
+    compression: Compression
+    distribution: str | None
+
+
+def bag_metadata_from_text(text: str) -> BagMetadata:
+    """Parse a metadata.yaml.
+
+    Raises:
+        LogError: it is not YAML, or does not describe a bag.
+    """
+    document = _plain(text)
+    about = document.get("rosbag2_bagfile_information", document) if isinstance(document, dict) else None
+    if not isinstance(about, dict):
+        raise LogError("it does not describe a bag; it has no 'rosbag2_bagfile_information'")
+    topics = [_metadata_topic(each) for each in _list(about, "topics_with_message_count")]
+    files = [_text(each, "relative_file_paths") for each in _list(about, "relative_file_paths")]
+    distribution = about.get("ros_distro")
+    return BagMetadata(
+        files=tuple(dict.fromkeys(_base_name(each) for each in files)),
+        types={name: type_name for name, type_name, _ in topics},
+        counts={name: count for name, _, count in topics},
+        compression=_compression(about),
+        distribution=distribution if isinstance(distribution, str) else None,
+    )
+
+
+def _plain(text: str) -> Any:
+    """Parse a YAML text without aliases, with which a short text could stand for a very long one."""
+    import yaml
+
+    if len(text) > LARGEST_METADATA:
+        raise LogError(f"it has {len(text)} characters; up to {LARGEST_METADATA} are read")
+    loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    depth = 0
+    try:
+        for event in yaml.parse(text, Loader=loader):
+            depth += isinstance(event, yaml.CollectionStartEvent)
+            depth -= isinstance(event, yaml.CollectionEndEvent)
+            if isinstance(event, yaml.AliasEvent) or depth > _DEEPEST:
+                raise LogError("it refers to parts of itself, or is nested too deep; no recorder writes that")
+        return yaml.load(text, Loader=loader)  # the loader makes plain values only
+    # malformed numbers and dates raise ValueError and its kin
+    except (yaml.YAMLError, ValueError, OverflowError, TypeError, KeyError) as error:
+        raise LogError(f"it is no YAML ({' '.join(str(error).split()):.200})") from None
+
+
+def _metadata_topic(each: object) -> tuple[str, str, int]:
+    if not isinstance(each, dict) or not isinstance(each.get("topic_metadata"), dict):
+        raise LogError("a topic in it has no 'topic_metadata'")
+    about = cast("dict[str, object]", each["topic_metadata"])
+    name, count = _text(about.get("name"), "name"), each.get("message_count")
+    if not isinstance(count, int) or not 0 <= count < _MOST:
+        raise LogError(f"the message_count of topic {name!r:.100} is {count!r:.100}; give a number")
+    return name, _text(about.get("type"), "type"), count
+
+
+def _compression(about: dict[str, object]) -> Compression:
+    mode = str(about.get("compression_mode") or "none").lower()
+    form = str(about.get("compression_format") or "")
+    if mode == "none":
+        return ""
+    if mode not in ("file", "message") or form != "zstd":
+        raise LogError(
+            f"the bag is compressed by {mode!r:.40} with {form!r:.40}; zstd by file or message is read"
+        )
+    return "file" if mode == "file" else "message"
+
+
+def _list(about: dict[str, object], name: str) -> list[object]:
+    value = about.get(name)
+    if not isinstance(value, list):
+        raise LogError(f"{name!r} in it is not a list")
+    return value
+
+
+def _text(value: object, name: str) -> str:
+    if not isinstance(value, str):
+        raise LogError(f"{name!r} in it is {value!r:.100}; give a string")
+    return value
+
+
+def _base_name(path: str) -> str:
+    """Return the last part of a path; early releases wrote the folder too, and no path may lead out of it."""
+    name = PureWindowsPath(PurePosixPath(path).name).name
+    if name in ("", "..") or "\x00" in name:
+        raise LogError(f"{path!r:.100} in it is not a file name")
+    return name
+
+
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+_PIECE = 2**20
+_PACKED_PIECE = 2**12
+"""Compressed bytes at a time: few, since each may stand for 32,000."""
+_LEFT_FREE = 2**26
+"""Bytes of a disk that are never filled; of a small one, a tenth."""
+
+
+def temporary_folder(owner: object) -> Path:
+    """Make a folder that is removed with its owner.
+
+    Raises:
+        OutputError: the machine cannot make it.
+    """
+    try:
+        folder = tempfile.mkdtemp(prefix="spatial-replay-")
+    except OSError as error:
+        raise output_error(Path("a temporary folder"), error) from error
+    weakref.finalize(owner, shutil.rmtree, folder, ignore_errors=True)
+    return Path(folder)
+
+
+def copy_beginning(path: Path, size: int, folder: Path) -> Path:
+    """Copy the first `size` bytes of a file into a folder."""
+    target = folder / path.name
+    with path.open("rb") as source, open_output(target) as sink:
+        while size > 0 and (piece := source.read(min(size, _PIECE))):
+            sink.write(piece)
+            size -= len(piece)
+    return target
+
+
+def unpack_file(packed: Path, folder: Path, faults: FaultList) -> Path:
+    """Decompress a file into a folder; return its path there, without the suffix of the compression.
+
+    Args:
+        faults: takes where it breaks off.
+
+    Raises:
+        LogError: it does not decompress, or to something absurdly large.
+        OutputError: the folder has no room for it.
+    """
+    target = folder / (packed.stem if packed.suffix in (".zstd", ".zst") else packed.name)
+    most = packed.stat().st_size * MOST_TIMES_LARGER + ALWAYS_ALLOWED
+    free = shutil.disk_usage(folder).free
+    room = free - min(_LEFT_FREE, free // 10)
+    written = 0
+    damage = "breaks off"
+    try:
+        with packed.open("rb") as source, open_output(target) as sink:
+            for piece, is_between in _decompressed(source):
+                written += len(piece)
+                if written > most:
+                    raise LogError(
+                        f"{packed.name} decompresses to more than {most} bytes; no recorder writes that"
+                    )
+                if written > room:
+                    raise OutputError(
+                        f"{packed.name} decompresses to more than fits in {folder.parent};"
+                        " set TMPDIR to a folder with more room"
+                    )
+                sink.write(piece)
+                damage = "" if is_between else "breaks off"
+    except zstandard.ZstdError as error:
+        damage = f"does not decompress to its end ({error})"
+    if not written:
+        raise LogError(f"{packed.name} {damage or 'is empty'}; nothing in it can be decompressed")
+    if damage:
+        faults.add(f"{packed.name} {damage}; {written} bytes could be decompressed")
+    return target
+
+
+def _decompressed(source: BinaryIO) -> Iterator[tuple[bytes, bool]]:
+    """Yield what the frames of a file decompress to, and whether the last frame so far is whole."""
+    frame, rest = None, b""
+    while piece := rest or source.read(_PACKED_PIECE):
+        frame = frame or zstandard.ZstdDecompressor().decompressobj()
+        content, rest = frame.decompress(piece), b""
+        if frame.eof:
+            rest = frame.unused_data
+            frame = None
+        yield content, frame is None
+
+
+def unpacked_size(payload: bytes) -> int:
+    """Return how many bytes a message that may be compressed decompresses to, at most."""
+    try:
+        size = zstandard.frame_content_size(payload)
+    except zstandard.ZstdError:
+        return len(payload)
+    return size if size >= 0 else ALWAYS_ALLOWED
+
+
+def unpacked(payload: bytes) -> bytes:
+    """Decompress a message that was compressed by itself.
+
+    Raises:
+        LogError: it does not decompress, or to more than a chunk of an MCAP log may.
+    """
+    try:
+        size = zstandard.frame_content_size(payload)
+        most = min(LARGEST_CHUNK, max(ALWAYS_ALLOWED, MOST_TIMES_LARGER * len(payload)))
+        if size > most:
+            raise LogError(f"a message claims to hold {size} bytes in {len(payload)}")
+        return zstandard.ZstdDecompressor().decompress(payload, max_output_size=most)
+    except zstandard.ZstdError as error:
+        raise LogError(f"a message does not decompress ({error})") from None
+
 
 SQLITE_MAGIC = b"SQLite format 3\x00"
 _MOST_TOPICS = 100_000

@@ -13,10 +13,9 @@ if TYPE_CHECKING:
     from spatial_replay.mapping.assemble import Assembler
     from spatial_replay.mapping.live_assembler import LiveAssembler
     from spatial_replay.mapping.mapped_source import MappedSource
-    from spatial_replay.mapping.mapping_file import load_mapping, parse_mapping
-    from spatial_replay.mapping.model import LogMapping
-    from spatial_replay.mapping.reading_plan import ReadingPlan
+    from spatial_replay.mapping.mapping_file import LogMapping, load_mapping, parse_mapping
     from spatial_replay.mapping.suggest import suggest_mapping, suggest_topics
+    from spatial_replay.mapping.topic_reader import ReadingPlan
 
 __all__ = [
     "Assembler",
@@ -36,9 +35,8 @@ __getattr__, __dir__ = loaded_when_used(
         "assemble": ("Assembler",),
         "live_assembler": ("LiveAssembler",),
         "mapped_source": ("MappedSource",),
-        "mapping_file": ("load_mapping", "parse_mapping"),
-        "model": ("LogMapping",),
-        "reading_plan": ("ReadingPlan",),
+        "mapping_file": ("LogMapping", "load_mapping", "parse_mapping"),
         "suggest": ("suggest_mapping", "suggest_topics"),
+        "topic_reader": ("ReadingPlan",),
     },
 )

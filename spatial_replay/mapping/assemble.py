@@ -3,11 +3,9 @@
 A message runs through these stages:
 
     assemble       raw messages of all topics → `PendingMessages` of each topic, transforms in a `FrameTree`
-    topic_reader   pending messages of one topic → `TopicColumns`: signals and detections
-    extract        decoded messages → `DetectionChunk`: lists of values, read by bound field paths
-    detections     chunks → `Detections`: poses and solids in columns
-    timeline       detections → observations in the fixed frame, and `Events` over time
-    tracker        events and signals of all topics → `Trace` at the times of samples
+    topic_reader   pending messages of one topic → `TopicColumns`: signals, and objects by bound field paths
+    detections     objects → `Detections`: poses and solids in columns
+    tracker        detections → observations in the fixed frame, `Events` over time, and a `Trace` of samples
 
 Messages wait in the first stage until none that is earlier can arrive.
 """
@@ -21,14 +19,13 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from spatial_replay.bags.columns import DISORDER_NS, JUMP_REMEDY, Message, MessageColumns
-from spatial_replay.bags.topic import Decoder
+from spatial_replay.bags.decoders import Decoder
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.read_options import FaultList, OnTimeJump
-from spatial_replay.mapping.names import BY_PLACE, Codes
-from spatial_replay.mapping.reading_plan import ReadingPlan
-from spatial_replay.mapping.topic_reader import MISFITS, TopicReader
+from spatial_replay.mapping.binding import BY_PLACE, Codes
+from spatial_replay.mapping.topic_reader import MISFITS, ReadingPlan, TopicReader
 from spatial_replay.mapping.tracker import Remarks, Tracker
 from spatial_replay.mapping.transforms import HISTORY_NS, FrameTree
 from spatial_replay.text import Instant, Sentence, counted, nearest_hint, times_apart

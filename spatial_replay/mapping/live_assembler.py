@@ -20,14 +20,13 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from spatial_replay.bags.columns import Message
-from spatial_replay.bags.topic import Decoder, Topic
+from spatial_replay.bags.decoders import Decoder, Topic
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.read_options import FaultKinds
 from spatial_replay.mapping.assemble import Assembler
 from spatial_replay.mapping.mapping_file import parse_mapping
-from spatial_replay.mapping.reading_plan import ReadingPlan
-from spatial_replay.mapping.topic_reader import MISFITS, TopicReader
+from spatial_replay.mapping.topic_reader import MISFITS, ReadingPlan, TopicReader
 from spatial_replay.text import Sentence
 from spatial_replay.trace.trace import Trace
 

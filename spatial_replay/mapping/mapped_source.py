@@ -16,12 +16,9 @@ from types import MappingProxyType
 import numpy as np
 
 from spatial_replay.bags.columns import Columns, MessageColumns, in_pieces, joined, without_jumps
-from spatial_replay.bags.decoders import why_unreadable
-from spatial_replay.bags.folder import files_of_bag_around
-from spatial_replay.bags.open import open_messages
+from spatial_replay.bags.decoders import Topic, full_type_name, why_unreadable
+from spatial_replay.bags.open import files_of_bag_around, open_messages
 from spatial_replay.bags.reader import MessageReader
-from spatial_replay.bags.ros_definitions import full_type_name
-from spatial_replay.bags.topic import Topic
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.messages import Attachment, Block, Channel, Messages, noting_pauses
@@ -29,8 +26,8 @@ from spatial_replay.logs.read_options import FaultList, OnTimeJump, gap_ns, late
 from spatial_replay.logs.remote import LogFile, RemoteFile
 from spatial_replay.logs.topics import DERIVED, MAPPED, OBJECTS, is_kept
 from spatial_replay.mapping.assemble import Assembler
-from spatial_replay.mapping.model import LogMapping
-from spatial_replay.mapping.reading_plan import ReadingPlan
+from spatial_replay.mapping.mapping_file import LogMapping
+from spatial_replay.mapping.topic_reader import ReadingPlan
 from spatial_replay.text import encodable
 from spatial_replay.trace.sample import FOREVER, LATEST_NS
 from spatial_replay.trace.trace import Trace

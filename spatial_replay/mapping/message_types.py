@@ -11,7 +11,14 @@ from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Literal, TypeAlias
 
-from spatial_replay.mapping.model import ClassMapping, Measure, ShapeMapping, Stamp, TopicMapping, Uncertainty
+from spatial_replay.mapping.mapping_file import (
+    ClassMapping,
+    Measure,
+    ShapeMapping,
+    Stamp,
+    TopicMapping,
+    Uncertainty,
+)
 
 Alternatives: TypeAlias = tuple[str, ...]
 """Field paths; the first that leads somewhere counts."""

@@ -1,5 +1,6 @@
-"""Read one topic: raw messages in, columns of detections and signals out.
+"""Plan what to read of a log, and read one topic: raw messages in, columns of detections and signals out.
 
+`ReadingPlan` compares a mapping with the topics of a log. `Extractor` reads the objects of decoded messages.
 A message passes three steps: it is decoded, its signals are read, its objects are read. Each step may fail
 for single messages. One boolean mask per batch says which messages are still good; a step skips the others,
 reports those that fail, and clears their flags.
@@ -7,36 +8,525 @@ reports those that fail, and clears their flags.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from itertools import compress
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain, compress
 from math import nan
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from spatial_replay.bags.topic import Decoder
+from spatial_replay.bags.columns import DISORDER_NS
+from spatial_replay.bags.decoders import Decoder, Topic
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Booleans, Floats, Integers
-from spatial_replay.mapping.binding import TimeGetter, bind_time
-from spatial_replay.mapping.detections import DetectionChunk, Detections
-from spatial_replay.mapping.extract import Extractor
+from spatial_replay.mapping.binding import Binding, Codes, Namer, TimeGetter, bind, bind_time, class_codes
+from spatial_replay.mapping.detections import (
+    DELETE_ALL_ENTITIES,
+    EVERY_OBJECT,
+    MARKER_ADD,
+    MARKER_DELETE,
+    MARKER_DELETE_ALL,
+    DetectionChunk,
+    Detections,
+    covariances,
+    detections_from_chunks,
+    lenient_getter,
+    outlines_from_lists,
+    rows_from_tuples,
+    solids_of_entity,
+    solids_of_marker,
+    solids_of_perceived_object,
+)
 from spatial_replay.mapping.field_paths import (
     ContentError,
     FieldError,
     FieldPath,
     Get,
+    NameTemplate,
+    elements_of,
     getter,
+    iter_elements,
+    keys_of,
+    leads_somewhere,
+    list_getter,
     sparse,
     style_of,
     walk,
 )
-from spatial_replay.mapping.message_types import GENERIC
-from spatial_replay.mapping.model import SignalMapping
-from spatial_replay.mapping.names import Codes
-from spatial_replay.mapping.reading_plan import PlannedTopic
-from spatial_replay.mapping.transforms import TransformReader
-from spatial_replay.text import text_number
+from spatial_replay.mapping.mapping_file import (
+    DEFAULT_MAX_AGE_NS,
+    FOREVER_NS,
+    Clock,
+    LogMapping,
+    SignalMapping,
+    TopicMapping,
+)
+from spatial_replay.mapping.message_types import (
+    BUILT_IN,
+    GENERIC,
+    GEODETIC,
+    GEODETIC_TYPES,
+    TRANSFORM_TYPES,
+    MessageLayout,
+    layout_of_topic,
+    short_type,
+)
+from spatial_replay.mapping.transforms import HISTORY_NS, TransformReader
+from spatial_replay.text import counted, nearest_hint, text_number
 from spatial_replay.trace.sample import LATEST_NS
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedTopic:
+    """How one topic is read.
+
+    Attributes:
+        mapping: its entry; None for topics that are read for transforms or times only.
+        layout: where its objects are; None for a topic without objects.
+        max_age_ns: how long an observation or a signal stays valid.
+        between_ns: its objects are unknown between transforms that are farther apart.
+        is_transforms: whether its transforms place frames; `is_static`: at all times.
+        is_lasting: whether a message counts however old it is.
+        is_latched: whether it may have been sent long before it was recorded.
+    """
+
+    name: str
+    clock: Clock
+    mapping: TopicMapping | None
+    layout: MessageLayout | None
+    max_age_ns: int
+    between_ns: int
+    is_transforms: bool
+    is_static: bool
+    is_lasting: bool
+    is_latched: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class ReadingPlan:
+    """What to read of a log for a mapping that fits it.
+
+    Attributes:
+        topics: every topic to read: those mapped, and those with transforms if frames are needed.
+        by_log_time: whether the times of samples are log times. If not, the messages of a window are known
+            only when all have been decoded.
+        late_ns: how far messages may be out of order; it is also how long samples wait for late messages.
+        margin_ns: how far beyond the end of a window messages still count.
+        planned: how each topic is read, in the order of `topics`.
+        lost: topics with transforms that cannot be decoded, with the reason.
+        absent: optional topics that the log lacks.
+        sampled_topic: the topic whose messages are sampled; None for samples at multiples of a step.
+        remarks: what is doubtful about the choice of that topic.
+    """
+
+    mapping: LogMapping
+    topics: tuple[str, ...]
+    by_log_time: bool
+    margin_ns: int
+    late_ns: int = DISORDER_NS
+    planned: tuple[PlannedTopic, ...] = ()
+    sampled_topic: str | None = None
+    lost: tuple[tuple[str, str], ...] = ()
+    absent: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, mapping: LogMapping, topics: Sequence[Topic], late_ns: int = DISORDER_NS) -> ReadingPlan:
+        """Compare a mapping with the topics of a log.
+
+        Raises:
+            UsageError: the mapping does not fit the topics; all errors are listed.
+        """
+        known = {topic.name: topic for topic in topics}
+        faults = _faults(mapping, known)
+        if faults:
+            raise UsageError("\n".join(f"{mapping.name}: {fault}" for fault in faults))
+        mapped = {entry.topic: entry for entry in mapping.topics}
+        needs_frames = mapping.fixed_frame is not None
+        names = [topic for topic in mapped if topic in known]
+        others = [topic for topic in topics if needs_frames and topic.name not in mapped]
+        transforms = [topic for topic in others if short_type(topic.type) in TRANSFORM_TYPES]
+        names += [topic.name for topic in transforms if topic.unreadable is None]
+        lost = [(each.name, each.unreadable) for each in transforms if each.unreadable and each.count != 0]
+        is_stepped = mapping.sampling.step_ns is not None
+        sampled = None if is_stepped else mapping.sampling.topic or _most_frequent(mapping, known)
+        if sampled is not None and sampled not in names:
+            names.append(sampled)
+        planned = tuple(_planned(mapping, mapped.get(name), known[name], needs_frames) for name in names)
+        waits_for_frames = any(topic.is_transforms and not topic.is_static for topic in planned)
+        return cls(
+            mapping=mapping,
+            topics=tuple(names),
+            by_log_time=all(topic.clock == "log" for topic in planned),
+            late_ns=late_ns,
+            margin_ns=late_ns + max(HISTORY_NS if waits_for_frames else 0, mapping.max_gap_ns or 0),
+            planned=planned,
+            sampled_topic=sampled,
+            lost=tuple(lost),
+            absent=tuple(topic for topic in mapped if topic not in known),
+            remarks=_slow_sampling(sampled, [known[topic] for topic in mapped if topic in known], known),
+        )
+
+    def lookback_ns(self, topic: str) -> int | None:
+        """Return how long before a window messages of a topic count; None for all, as of static
+        transforms."""
+        planned = next(each for each in self.planned if each.name == topic)
+        ages = [
+            each.max_age_ns
+            for each in self.planned
+            if each.layout is not None and not each.is_lasting and not each.is_transforms
+        ]
+        own = planned.max_age_ns if planned.mapping is not None else 0
+        if planned.is_transforms and not planned.is_static:
+            # an observation of the window may be that old, and is placed by a transform of its time
+            own = max(own, HISTORY_NS + max(ages, default=0))
+            if any(each.is_lasting and each.layout is not None for each in self.planned):
+                return None
+        return None if planned.is_lasting or own + self.late_ns >= FOREVER_NS else own + self.late_ns
+
+
+def _faults(mapping: LogMapping, known: dict[str, Topic]) -> list[str]:
+    faults: list[str] = []
+    named = [entry.topic for entry in mapping.topics]
+    sampled = mapping.sampling.topic
+    optional = {entry.topic for entry in mapping.topics if entry.optional}
+    for name in [*named, *([sampled] if sampled is not None and sampled not in named else [])]:
+        where = f"topics.{name}" if name in named else "sample.topic"
+        if name in optional and name not in known:
+            if name == sampled:
+                faults.append(
+                    f"sample.topic: the log has no topic {name!r}, so no sample can be taken; name one that"
+                    " every log has, or {every: 100ms}"
+                )
+        elif name not in known:
+            listed = ", ".join(sorted(known)[:20]) or "none"
+            hint = nearest_hint(name, known) or f"its topics are {listed}"
+            if name in named and not hint.endswith("?"):
+                hint += "; where only some logs have it, add `optional: true`"
+            faults.append(f"{where}: the log has no topic {name!r}; {hint}")
+        elif (reason := known[name].unreadable) is not None:
+            faults.append(f"{where}: its messages cannot be decoded: {reason}")
+    if optional.issuperset(named) and known.keys().isdisjoint(named):
+        listed = ", ".join(sorted(known)[:20]) or "none"
+        faults.append(f"topics: the log has none of these optional topics; its topics are {listed}")
+    for entry in mapping.topics:
+        kind = short_type(entry.type or (known[entry.topic].type if entry.topic in known else ""))
+        if (
+            kind in GEODETIC_TYPES
+            and entry.reads_objects
+            and entry.position is None
+            and mapping.origin is None
+        ):
+            faults.append(
+                f"topics.{entry.topic}: {kind} holds degrees; give the file an"
+                " `origin: [latitude, longitude]`, and positions are metres east and north of it"
+            )
+        if entry.type is not None and short_type(entry.type) not in BUILT_IN:
+            hint = nearest_hint(short_type(entry.type), BUILT_IN) or f"known are {', '.join(BUILT_IN)}"
+            faults.append(f"topics.{entry.topic}.type: {entry.type!r} is not a known type; {hint}")
+    return faults
+
+
+def _most_frequent(mapping: LogMapping, known: Mapping[str, Topic]) -> str:
+    """Return the topic that is sampled by default: of those with objects, if any, the one with most messages.
+
+    Where a log does not say how many there are, the first one counts.
+    """
+    present = [entry for entry in mapping.topics if entry.topic in known]
+    names = [entry.topic for entry in present if entry.reads_objects] or [entry.topic for entry in present]
+    counts = [known[name].count for name in names]
+    return names[0] if None in counts else max(names, key=lambda name: known[name].count or 0)
+
+
+_MANY_TIMES = 10
+
+
+def _slow_sampling(
+    sampled: str | None, mapped: Sequence[Topic], known: Mapping[str, Topic]
+) -> tuple[str, ...]:
+    """Return a remark if a mapped topic has many times the messages of the one that is sampled."""
+    most = max(mapped, key=lambda topic: topic.count or 0)
+    count = None if sampled is None else known[sampled].count
+    if count is None or most.count is None or most.count < _MANY_TIMES * max(count, 1):
+        return ()
+    messages = counted(count, "message")
+    return (
+        f"samples are taken at {sampled}, which has {messages}, where {most.name} has {most.count};"
+        f" `sample: {{topic: {most.name}}}` takes one at each of these",
+    )
+
+
+def _planned(
+    mapping: LogMapping, entry: TopicMapping | None, topic: Topic, needs_frames: bool
+) -> PlannedTopic:
+    is_transforms = needs_frames and short_type(topic.type) in TRANSFORM_TYPES
+    is_static = is_transforms and (topic.latched or topic.name.rsplit("/", 1)[-1] == "tf_static")
+    layout = layout_of_topic(topic.type, entry) if entry is not None and entry.reads_objects else None
+    if layout is not None and GEODETIC in layout.position:
+        layout = replace(layout, origin=mapping.origin)
+    stays = topic.latched or (layout is not None and layout.stays)
+    default = FOREVER_NS if stays else DEFAULT_MAX_AGE_NS
+    given = (entry.max_age_ns if entry is not None else None) or mapping.max_age_ns
+    max_age_ns = FOREVER_NS if is_static else given or default
+    return PlannedTopic(
+        name=topic.name,
+        clock=(entry.clock if entry is not None else None) or mapping.clock,
+        mapping=entry,
+        layout=layout,
+        max_age_ns=max_age_ns,
+        between_ns=min(given or DEFAULT_MAX_AGE_NS, HISTORY_NS),
+        is_transforms=is_transforms,
+        is_static=is_static,
+        is_latched=topic.latched,
+        is_lasting=is_static or (layout is not None and max_age_ns >= FOREVER_NS),
+    )
+
+
+_SOLIDS_OF = {"marker": solids_of_marker, "scene": solids_of_entity, "primitive": solids_of_perceived_object}
+
+
+class _Objects(NamedTuple):
+    """Objects in columns: their decoded values, the index of each one's message, the code of its name."""
+
+    values: list[Any]
+    message: list[int]
+    name: list[int]
+
+    def where(self, keep: list[bool]) -> _Objects:
+        return self if all(keep) else _Objects(*(list(compress(column, keep)) for column in self))
+
+
+class Extractor:
+    """Reads the objects of one topic.
+
+    The field paths of the layout are bound to the first object; all others are read with the bound paths.
+
+    Args:
+        names, classes: codes that all topics share.
+        needs_frame: whether there is a fixed frame, so that frames matter.
+    """
+
+    def __init__(
+        self, layout: MessageLayout, mapping: TopicMapping, names: Codes, classes: Codes, *, needs_frame: bool
+    ) -> None:
+        self.noted_frames: set[str] = set()
+        self.unseen: tuple[str, ...] = ()
+        """With zeros left out, the paths of the position while no object had any of them."""
+        if mapping.has_zeros_left_out and mapping.position is not None:
+            self.unseen = (mapping.position,) if isinstance(mapping.position, str) else mapping.position
+        self.cornerless = 0
+        """Outlines with too few corners, whose objects are unknown."""
+        self._layout = layout
+        self._classes = classes
+        self._namer = Namer(NameTemplate.of(layout.name), mapping.topic, names, mapping.only, mapping.without)
+        self._needs_frame = needs_frame
+        self._path = FieldPath.of(layout.objects) if layout.objects else None
+        self._list: Get | None = None
+        self._binding: Binding | None = None
+        self._time: TimeGetter | None = None
+        self._time_of_empty: TimeGetter | None = None
+        self._is_time_bound = False
+
+    @property
+    def is_bounds(self) -> bool:
+        """Whether outlines are boxes by two of their corners."""
+        return self._layout.is_bounds
+
+    @property
+    def is_by_place(self) -> bool:
+        """Whether nothing but their places in a list distinguished some objects."""
+        return self._namer.is_by_place
+
+    @property
+    def is_bound(self) -> bool:
+        """Whether an object was read, so that every path is known to lead somewhere."""
+        return self._binding is not None
+
+    @property
+    def is_timed(self) -> bool:
+        """Whether stamps were found."""
+        return self._time is not None
+
+    @property
+    def lacks_stamp(self) -> bool:
+        """Whether a message was read that has no stamp where there could be one."""
+        return self._is_time_bound and self._time is None
+
+    def stamp(self, message: object) -> int | None:
+        """Return the stamp of a message, or that of its first object; None if it has none.
+
+        A message without objects has its own stamp, if its type has one: it says that there are none.
+
+        Raises:
+            FieldError: there is no stamp where the layout says.
+        """
+        first = next(iter(self._elements(message)), None)
+        if first is None:
+            return self._stamp_of_empty(message)
+        self._bind_time(first, message)
+        if self._time is None:
+            return None
+        return self._time.nanoseconds([message if self._time.path.from_message else first])[0]
+
+    def _stamp_of_empty(self, message: object) -> int | None:
+        time = self._time
+        if time is None or not time.path.from_message:
+            if self._time_of_empty is None:
+                own = [each for each in self._layout.stamp if FieldPath.of(each.field).from_message]
+                self._time_of_empty = bind_time(own, message, message)
+            time = self._time_of_empty
+        return None if time is None else time.nanoseconds([message])[0]
+
+    def read(self, messages: Sequence[object], places: Integers) -> DetectionChunk:
+        """Extract the objects of some messages.
+
+        Args:
+            places: (N,) the place of each message in its batch.
+
+        Raises:
+            FieldError, AttributeError, LookupError, TypeError, ValueError, OverflowError: a message differs
+                from the others; FieldError says how.
+        """
+        values, index, order = self._flatten(messages)
+        style = style_of(messages[0]) if messages else "attributes"
+        deleted: list[tuple[int, int]] = []
+        if self._layout.solids == "scene":
+            deleted = self._deleted_entities(messages)
+        of_message = [messages[number] for number in index] if self._namer.needs_messages else None
+        objects = _Objects(values, index, self._namer.codes(values, order, style, of_message))
+        if self._layout.solids == "marker":
+            objects, deleted = _split_deleted_markers(objects)
+        if self._namer.is_filtering:
+            objects = objects.where(self._namer.wanted(objects.name))
+        chunk = DetectionChunk(places, deleted)
+        if objects.values:
+            if self._binding is None:
+                example, message = objects.values[0], messages[objects.message[0]]
+                self._binding = bind(self._layout, example, message, needs_frame=self._needs_frame)
+                self._bind_time(example, message)
+            self._fill(chunk, self._binding, messages, objects)
+            paths = [FieldPath.of(each) for each in self.unseen]
+            if any(leads_somewhere(path, each) for path in paths for each in objects.values):
+                self.unseen = ()
+        return chunk
+
+    def detections(self, chunks: Sequence[DetectionChunk], good: Booleans) -> Detections:
+        """Join the chunks of a batch; see `detections_from_chunks`."""
+        return detections_from_chunks(self._layout, self._binding, chunks, good)
+
+    def _fill(
+        self, chunk: DetectionChunk, binding: Binding, messages: Sequence[object], objects: _Objects
+    ) -> None:
+        cornerless = 0
+        if self._layout.solids:
+            get, solids_of = lenient_getter(binding.style), _SOLIDS_OF[self._layout.solids]
+            solids = [solids_of(each, get) for each in objects.values]
+            chunk.solids = [each for each in solids if each]
+            chunk.skipped = len(solids) - len(chunk.solids)
+            objects = objects.where([bool(each) for each in solids])
+            if self._layout.stays:
+                chunk.locked = [bool(get(each, "frame_locked")) for each in objects.values]
+        elif binding.polygon is not None:
+            corners = [binding.polygon(each) for each in objects.values]
+            outlines = outlines_from_lists(corners, is_bounds=self._layout.is_bounds)
+            chunk.corner_counts, chunk.corners, cornerless = outlines
+        values = objects.values
+        if binding.numbers is not None:
+            rows = map(binding.numbers, values)
+            chunk.numbers = rows_from_tuples(rows, len(values), binding.width, binding.style)
+        chunk.covariance = covariances(self._layout, binding, values)
+        chunk.class_code = class_codes(self._layout, binding, values, self._classes)
+        chunk.frames = self._frames(binding, messages, objects)
+        chunk.stamps = self._stamps(messages, objects)
+        if binding.lifetime is not None:
+            chunk.lifetimes = binding.lifetime.nanoseconds(values)
+        chunk.message, chunk.name = objects.message, objects.name
+        self.cornerless += cornerless
+
+    def _flatten(self, messages: Sequence[object]) -> tuple[list[Any], list[int], list[int | str]]:
+        """Return all objects, the index of each one's message, and its index, or key, in that message."""
+        if self._path is None:
+            return list(messages), list(range(len(messages))), [0] * len(messages)
+        if self._list is None and messages:
+            # step by step once, because the errors of the fast getter name no fields
+            list(iter_elements(self._path, messages[0]))
+            self._list = list_getter(self._path, style_of(messages[0])) or self._elements
+        lists = list(map(self._list, messages)) if self._list is not None else []
+        counts = [len(each) for each in lists]
+        index = np.repeat(np.arange(len(counts)), counts).tolist()
+        order: list[int | str] = list(chain.from_iterable(map(range, counts)))
+        if any(isinstance(each, Mapping) for each in lists):
+            keys = (map(str, keys_of(e)) if isinstance(e, Mapping) else range(len(e)) for e in lists)
+            order = list(chain.from_iterable(keys))
+            lists = list(map(elements_of, lists))
+            counts = [len(each) for each in lists]
+            index = np.repeat(np.arange(len(counts)), counts).tolist()
+        return list(chain.from_iterable(lists)), index, order
+
+    def _elements(self, message: object) -> list[object]:
+        return [message] if self._path is None else list(iter_elements(self._path, message))
+
+    def _deleted_entities(self, messages: Sequence[object]) -> list[tuple[int, int]]:
+        """Return (message, name) of each deletion in a foxglove.SceneUpdate."""
+        deleted: list[tuple[int, int]] = []
+        for number, message in enumerate(messages):
+            get = lenient_getter(style_of(message))
+            for deletion in get(message, "deletions") or ():
+                if get(deletion, "type") == DELETE_ALL_ENTITIES:
+                    deleted.append((number, EVERY_OBJECT))
+                else:
+                    (code,) = self._namer.codes([deletion], [0], style_of(deletion), [message])
+                    deleted.append((number, code))
+        return deleted
+
+    def _bind_time(self, example: object, message: object) -> None:
+        if not self._is_time_bound:
+            self._time = bind_time(self._layout.stamp, example, message)
+            self._is_time_bound = True
+
+    def _frames(self, binding: Binding, messages: Sequence[object], objects: _Objects) -> list[str] | None:
+        """Return the frame of each object; None if all are in the fixed frame."""
+        if self._layout.frame_name is not None:
+            self.noted_frames.add(self._layout.frame_name)
+            return [self._layout.frame_name] * len(objects.values) if self._needs_frame else None
+        if binding.frame is None or not objects.values:
+            return None
+        get, from_message = binding.frame
+        if not self._needs_frame:
+            # one of many, enough to remark that topics are in different frames
+            example = messages[objects.message[0]] if from_message else objects.values[0]
+            self.noted_frames.add(str(get(example)))
+            return None
+        frames = [str(get(each)).removeprefix("/") for each in (messages if from_message else objects.values)]
+        self.noted_frames.update(frames)
+        return [frames[index] for index in objects.message] if from_message else frames
+
+    def _stamps(self, messages: Sequence[object], objects: _Objects) -> list[int] | None:
+        if self._time is None or not self._needs_frame:
+            return None
+        if self._time.path.from_message:
+            of_message = self._time.nanoseconds(messages)
+            return [of_message[index] for index in objects.message]
+        return self._time.nanoseconds(objects.values)
+
+
+def _split_deleted_markers(objects: _Objects) -> tuple[_Objects, list[tuple[int, int]]]:
+    """Return the markers that are shown, and (message, name) of those that are deleted."""
+    deleted: list[tuple[int, int]] = []
+    if not objects.values:
+        return objects, deleted
+    get = lenient_getter(style_of(objects.values[0]))
+    actions = [get(each, "action") for each in objects.values]
+    if not any(actions):
+        return objects, deleted
+    for action, message, name in zip(actions, objects.message, objects.name, strict=True):
+        if action == MARKER_DELETE_ALL:
+            deleted.append((message, EVERY_OBJECT))
+        elif action == MARKER_DELETE:
+            deleted.append((message, name))
+    return objects.where([action == MARKER_ADD or not action for action in actions]), deleted
+
 
 MISFITS = (FieldError, AttributeError, LookupError, TypeError, ValueError, OverflowError)
 """Raised by reading fields of a message that is not as the mapping says."""

@@ -11,8 +11,8 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from spatial_replay.bags.decoders import Topic
 from spatial_replay.bags.open import is_log, open_messages
-from spatial_replay.bags.topic import Topic
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.remote import LogFile, local_copy, log_file

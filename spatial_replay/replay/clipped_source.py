@@ -10,9 +10,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from spatial_replay.bags.decoders import decoder_of
-from spatial_replay.bags.ros_definitions import full_type_name
-from spatial_replay.bags.topic import Topic
+from spatial_replay.bags.decoders import Topic, decoder_of, full_type_name
 from spatial_replay.errors import LogError
 from spatial_replay.logs.mcap.read import McapSource
 from spatial_replay.logs.messages import Block, Channel, Messages, merge, select

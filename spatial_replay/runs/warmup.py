@@ -14,7 +14,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from types import MappingProxyType
 
-from spatial_replay.bags.ros1_index import record_table
+from spatial_replay.bags.ros1 import record_table
 from spatial_replay.code_cache import cache_folder
 from spatial_replay.compare.runs import diff_sources
 from spatial_replay.compiled import compile_ahead

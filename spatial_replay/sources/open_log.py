@@ -217,7 +217,7 @@ def bag_files_at(metadata: RemoteFile) -> list[RemoteFile]:
         LogError: the metadata cannot be used.
         MissingFileError, RemoteError: it cannot be read.
     """
-    from spatial_replay.bags.metadata import LARGEST_METADATA, bag_metadata_from_text
+    from spatial_replay.bags.sqlite import LARGEST_METADATA, bag_metadata_from_text
 
     folder = os.fspath(metadata).removesuffix(BAG_METADATA)
     try:

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from spatial_replay.bags.columns import Message
+from spatial_replay.bags.decoders import Decoder, Topic
 from spatial_replay.bags.mcap_log import McapLog
 from spatial_replay.bags.open import open_messages
 from spatial_replay.bags.reader import MessageReader
-from spatial_replay.bags.topic import Decoder, Topic
 from spatial_replay.errors import LogError, MissingFileError, UsageError
 from spatial_replay.logs.mcap.read import McapSource
 from spatial_replay.logs.mcap.summary import LogSummary, summarise_mcap

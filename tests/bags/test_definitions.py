@@ -9,13 +9,15 @@ import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from spatial_replay import LogError
-from spatial_replay.bags.ros_definitions import (
+from spatial_replay.bags.decoders import (
     check_definitions,
     definitions_from_msg,
     full_type_name,
     msg_from_definitions,
+    ros_decoder,
+    ros_definitions,
+    standard_schema,
 )
-from spatial_replay.bags.ros_types import ros_decoder, ros_definitions, standard_schema
 from spatial_replay.logs import Schema
 
 SEPARATOR = "=" * 80

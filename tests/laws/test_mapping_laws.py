@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from spatial_replay import Footprint
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.geometry.outline import convex_hull
+from spatial_replay.mapping.detections import BOX, Solids, footprints_from_solids
 from spatial_replay.mapping.field_paths import FieldError, FieldPath, getter, style_of, walk
-from spatial_replay.mapping.footprints import BOX, Solids, footprints_from_solids
 from spatial_replay.mapping.transforms import FrameTree, Transforms, matrices_from_quaternions, slerp
 
 coordinates = st.floats(-100, 100, allow_subnormal=False)

@@ -14,7 +14,7 @@ from spatial_replay import MissingFileError, UsageError
 from spatial_replay.bags import Topic
 from spatial_replay.mapping import ReadingPlan, load_mapping, parse_mapping
 from spatial_replay.mapping import mapping_file as schema
-from spatial_replay.mapping.model import FOREVER_NS, Sampling, ShapeMapping, SignalMapping, Uncertainty
+from spatial_replay.mapping.mapping_file import FOREVER_NS, Sampling, ShapeMapping, SignalMapping, Uncertainty
 
 EXAMPLE = """
 fixed_frame: world

@@ -9,6 +9,7 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 from mapping.feeding import pose_stamped, tf, transform
 from spatial_replay import UsageError
+from spatial_replay.mapping.binding import Codes, Namer
 from spatial_replay.mapping.field_paths import (
     FieldError,
     FieldPath,
@@ -21,7 +22,6 @@ from spatial_replay.mapping.field_paths import (
     tuple_getter,
     walk,
 )
-from spatial_replay.mapping.names import Codes, Namer
 
 
 def scene() -> SceneUpdate:

@@ -263,13 +263,19 @@ def threshold_of(
         return None
     if not math.isfinite(deciding.lower) or not math.isfinite(deciding.upper):
         return "infinity"
+
+    def search_of(dial: Dial) -> _Search:
+        return _Search(evidence, leaves, times_ns, node, verdict, deciding, dial, goes_on=goes_on)
+
     own = Dial.of(deciding)
-    for dial in (own.with_constant(evidence.instance.formula), own):
-        if dial is not None:
-            search = _Search(evidence, leaves, times_ns, node, verdict, deciding, dial, goes_on=goes_on)
-            found = search.threshold()
-            if found is not None:
-                return found
+    constant = own.with_constant(evidence.instance.formula)
+    found = None if constant is None else search_of(constant).threshold()
+    if found is not None:
+        return found
+    search = search_of(own)
+    found = search.threshold()
+    if found is not None:
+        return found
     return "limits" if search.would_flip() else "others"
 
 
@@ -379,7 +385,8 @@ class _Search:
         step = max(stop // _AT_FIRST, 1) if len(self._directions) > 1 else stop
         for end in (0, *range(step, stop, step), stop - 1):
             if flips(listed[end]):
-                return listed[bisect_left(listed, True, begin, end, key=flips)]
+                found: float = listed[bisect_left(listed, True, begin, end, key=flips)]
+                return found
             begin = end + 1
         return None
 
@@ -450,7 +457,8 @@ class _Search:
         indices = {self._turned_atom(atom, number).expression: index for index, atom in self._moving.items()}
         found = [indices[leaf.expression] for leaf in added if isinstance(leaf, Atom)]
         shifts = [self._slopes[index] * (number - self._dial.value) for index in found]
-        return self._leaves[:, found] + np.array(shifts).reshape(1, -1, 1)
+        shifted: Floats = self._leaves[:, found] + np.array(shifts).reshape(1, -1, 1)
+        return shifted
 
     def _columns(self, formulas: Sequence[Formula]) -> Floats:
         return self._evidence.columns(formulas)[:, :, : len(self._times)]
