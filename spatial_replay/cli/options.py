@@ -44,7 +44,7 @@ class ServingArguments:
     def warn_of_access(self, what: str) -> None:
         """Say what is open to whom, when other machines can reach the server."""
         # imported here so that --help stays fast
-        from spatial_replay.serve.gate import is_loopback
+        from spatial_replay.serve.relay import is_loopback
 
         if not is_loopback(self.host):
             warn(f"who has this address, with its token, can {what}")

@@ -229,6 +229,8 @@ def _how_it_decides(
         how += uncertain_text(amount_text(abs(least), deciding.atom, witness.units))
     if without_residue(amount, deciding.atom) == 0.0:
         how = "just holds" if amount >= 0.0 else "just fails"
+    if amount >= 0.0 and witness.verdict is Verdict.VIOLATED and not is_open:
+        how = f"must not hold, and {how}"
     where = _in_time(witness)
     if witness.path[-1].operator == deciding.atom.relation:
         where = _in_time_of_all(witness, deciding, "so far " if is_open else "")

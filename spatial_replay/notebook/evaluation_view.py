@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from spatial_replay.annotate.rings import outlines_of, rings_of
+from spatial_replay.annotate.scene.scene_template import outlines_of, rings_of
 from spatial_replay.annotate.specification import unit_of, unit_words
 from spatial_replay.errors import UsageError, importing
 from spatial_replay.geometry.arrays import Floats, Integers

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from spatial_replay.annotate.rings import outlines_of
+from spatial_replay.annotate.scene.scene_template import outlines_of
 from spatial_replay.geometry.footprint import Footprint, TrackedObject, moved_object
 from spatial_replay.notebook import html, plot
 from spatial_replay.notebook.figures import (

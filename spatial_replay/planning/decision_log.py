@@ -17,9 +17,8 @@ from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletio
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.message import DecodeError, Message
 
-from spatial_replay.annotate.rings import outlines_of
-from spatial_replay.annotate.scene.scene_entities import FRAME
 from spatial_replay.annotate.scene.scene_frames import cell_colours
+from spatial_replay.annotate.scene.scene_template import FRAME, outlines_of
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.footprint import TrackedObject, centre_of, moved_object
 from spatial_replay.logs.messages import Messages, merge, messages_of

@@ -14,12 +14,19 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Protocol, TypeAlia
 import numpy as np
 
 from spatial_replay import __version__
-from spatial_replay.annotate.annotated_evaluation import AnnotatedEvaluation
+from spatial_replay.annotate.annotator import AnnotatedEvaluation
 from spatial_replay.annotate.automaton_state import SpecAutomaton
 from spatial_replay.annotate.certificate import EvaluationHashes, specifications_json
-from spatial_replay.annotate.event_sentences import change_sentence
+from spatial_replay.annotate.events import (
+    FAILING,
+    HOLDING,
+    SATISFIED,
+    VIOLATED,
+    NodeStates,
+    change_sentence,
+    track,
+)
 from spatial_replay.annotate.specification import logged_specifications, specification_attachments
-from spatial_replay.annotate.verdict_changes import FAILING, HOLDING, SATISFIED, VIOLATED, NodeStates, track
 from spatial_replay.compiled import compile_ahead
 from spatial_replay.errors import OutputError, UsageError
 from spatial_replay.geometry.contact import contacts

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from spatial_replay import __version__
-from spatial_replay.annotate.annotated_evaluation import AnnotatedEvaluation
+from spatial_replay.annotate.annotator import AnnotatedEvaluation
 from spatial_replay.annotate.certificate import EvaluationHashes, specifications_json
 from spatial_replay.annotate.specification import (
     ReportedTree,

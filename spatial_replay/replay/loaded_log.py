@@ -18,11 +18,10 @@ from typing import Final
 
 import numpy as np
 
-from spatial_replay.annotate.annotated_evaluation import AnnotatedEvaluation
-from spatial_replay.annotate.annotator import Annotator, shown_regions
-from spatial_replay.annotate.curves import encode_curves
+from spatial_replay.annotate.annotator import AnnotatedEvaluation, Annotator, shown_regions
 from spatial_replay.annotate.foxglove_layout import live_layout_attachment
-from spatial_replay.annotate.rings import SceneBounds
+from spatial_replay.annotate.robustness import encode_curves
+from spatial_replay.annotate.scene.scene_template import SceneBounds
 from spatial_replay.annotate.scene.scene_update import SceneState, scene_start
 from spatial_replay.annotate.specification import logged_specifications
 from spatial_replay.errors import SpecificationError, UsageError

@@ -18,9 +18,8 @@ from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
 from google.protobuf.timestamp_pb2 import Timestamp
 
-from spatial_replay.annotate.obligations import Standing
-from spatial_replay.annotate.requirements import Requirement, requirements_of
-from spatial_replay.annotate.scene.scene_entities import FRAME
+from spatial_replay.annotate.requirements import Requirement, Standing, requirements_of
+from spatial_replay.annotate.scene.scene_template import FRAME
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.geometry.footprint import TrackedObject

@@ -1,8 +1,7 @@
 """Serve: a log played to viewers over WebSocket, with the constants of its specifications as parameters.
 
-`serving` starts and ends it all, and `gate` says who may connect. Viewers' requests arrive in `server` on
-threads of its library and wait in `session`; `player` does them on a thread of its own, at the speed of
-`pace`; `services` answers questions.
+`serving` starts and ends it all. `player` has what viewers share, and the thread that does what they request.
+Requests arrive in `server` on threads of its library, through `relay`; `services` answers questions.
 
 Names are loaded when they are first used.
 """

@@ -1,23 +1,650 @@
-"""The thread that does what viewers request: it plays, seeks and evaluates again, and sends the messages."""
+"""Playing a log to viewers: what they share, and the thread that does what they request."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
+import math
+import time
+from collections.abc import Callable, Collection, Mapping, Sequence
+from concurrent.futures import Future, InvalidStateError
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from enum import Enum, auto
-from typing import Final, NamedTuple, Protocol
+from queue import SimpleQueue
+from threading import Condition, Lock
+from typing import Any, Final, NamedTuple, Protocol, TypeVar
 
 import numpy as np
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
-from spatial_replay.annotate.curves import CURVES_CHANNEL
-from spatial_replay.errors import SpatialReplayError
-from spatial_replay.logs.messages import Messages, messages_of, select
-from spatial_replay.logs.topics import CURVES_TOPIC
-from spatial_replay.replay.loaded_log import EditedFiles, Playback, constant_values
-from spatial_replay.serve.pace import PlaybackState, Status
-from spatial_replay.serve.requests import PendingRequests, Values
-from spatial_replay.serve.session import ARROW, Session
-from spatial_replay.serve.thinning import PlaybackThinning
+from spatial_replay.annotate.robustness import CURVES_CHANNEL
+from spatial_replay.errors import SpatialReplayError, UsageError
+from spatial_replay.geometry.arrays import Booleans, Integers
+from spatial_replay.logs.messages import Channel, Messages, messages_of, select
+from spatial_replay.logs.topics import (
+    CAMERA_ANNOTATIONS,
+    CURVES_TOPIC,
+    EVENT_LOG,
+    EVENTS,
+    GRADIENT_MAP,
+    PLAN_DECISION,
+    PLAN_PATH,
+    REDONE_MAP,
+    REDONE_PATH,
+    SCENE,
+    STANDING,
+    is_image_type,
+)
+from spatial_replay.replay.loaded_log import EditedFiles, Evaluated, LoadedLog, Playback, constant_values
 from spatial_replay.text import nearest_hint
+
+MOST_LATE_S: Final = 0.15
+"""The most time that passes between two turns; viewers can take what is played in that time at once."""
+
+
+class Pace:
+    """The seconds by which a log is played, turn by turn.
+
+    After a turn that took too long, at most `MOST_LATE_S` count: the playback falls behind the clock, so that
+    no turn has more to send than viewers can take.
+    """
+
+    def __init__(self, clock: Callable[[], float]) -> None:
+        """Begin the first turn."""
+        self._clock = clock
+        self._behind_s = 0.0
+        self._turn = clock()
+
+    def now(self) -> float:
+        """Return the seconds that have passed."""
+        return self._at(self._clock())
+
+    def next_turn(self) -> float:
+        """Begin another turn; return the seconds of the last one, at most `MOST_LATE_S`."""
+        read = self._clock()
+        now = self._at(read)
+        elapsed_s = now - self._turn
+        self._behind_s, self._turn = read - now, now
+        return elapsed_s
+
+    def _at(self, read: float) -> float:
+        return min(read - self._behind_s, self._turn + MOST_LATE_S)
+
+
+SLOWEST: Final = 0.01
+FASTEST: Final = 100.0
+
+
+class Status(Enum):
+    """The status of a playback."""
+
+    PLAYING = auto()
+    PAUSED = auto()
+    ENDED = auto()
+
+
+class PlaybackState(NamedTuple):
+    """The state of a playback, as viewers show it.
+
+    Attributes:
+        speed: seconds of the log in a second.
+        did_seek: whether it jumped to this time, so that what viewers show is out of date.
+    """
+
+    status: Status
+    time_ns: int
+    speed: float
+    did_seek: bool = False
+
+
+class Transport:
+    """Play, pause and seek; callers pass the time of their clock, `now`, in seconds.
+
+    Attributes:
+        start_ns, end_ns: first and last time.
+    """
+
+    def __init__(self, start_ns: int, end_ns: int) -> None:
+        """Pause at the start."""
+        self.start_ns, self.end_ns = start_ns, end_ns
+        self._is_playing = False
+        self._speed = 1.0
+        self._from_ns, self._since = start_ns, 0.0
+
+    def time_ns(self, now: float) -> int:
+        """Return the present time of the log."""
+        if not self._is_playing:
+            return self._from_ns
+        played_ns = round((now - self._since) * self._speed * 1e9)
+        return min(self._from_ns + max(played_ns, 0), self.end_ns)
+
+    def state(self, now: float) -> PlaybackState:
+        """Return the state to show."""
+        time_ns = self.time_ns(now)
+        status = Status.PLAYING if self._is_playing else Status.PAUSED
+        if not self._is_playing and time_ns >= self.end_ns:
+            status = Status.ENDED
+        return PlaybackState(status, time_ns, self._speed)
+
+    def play(self, now: float) -> None:
+        """Play from the present time; at the end, that is over at once."""
+        self.move_to(self.time_ns(now), now)
+        self._is_playing = True
+
+    def pause(self, now: float) -> None:
+        """Stay at the present time."""
+        self.move_to(self.time_ns(now), now)
+        self._is_playing = False
+
+    def move_to(self, time_ns: int, now: float) -> None:
+        """Go to another time, within the log."""
+        self._from_ns, self._since = min(max(time_ns, self.start_ns), self.end_ns), now
+
+    def set_speed(self, speed: float, now: float) -> None:
+        """Play at another speed, within limits; anything but a positive number changes nothing."""
+        if speed > 0.0 and not math.isinf(speed):
+            self.move_to(self.time_ns(now), now)
+            self._speed = min(max(speed, SLOWEST), FASTEST)
+
+
+Values = Mapping[str, float | str]
+"""Numbers and, as texts, durations, by the names of constants."""
+
+MOST_OPEN: Final = 8
+"""The most questions that may be open at once."""
+
+_Answer = TypeVar("_Answer")
+
+
+@dataclass
+class PendingRequests:
+    """Requests that were made and are not done yet; of several of a kind the last one counts.
+
+    Attributes:
+        edited: the specifications with other constants, if those are to change.
+        is_controlled: whether to play, pause or change the speed.
+        seek_ns: another time to go to.
+        topics: topics that were subscribed to.
+        arrow: the title of the result to point at, if that is to change.
+        stop: whether the session is to end.
+    """
+
+    edited: EditedFiles | None = None
+    is_controlled: bool = False
+    seek_ns: int | None = None
+    topics: set[str] = field(default_factory=set)
+    arrow: str | None = None
+    stop: bool = False
+
+    def __bool__(self) -> bool:
+        return self != PendingRequests()
+
+
+class Questions:
+    """Answer one question after the other, on a thread of its own, so that no playback waits for them."""
+
+    def __init__(self, wait_for_evaluation: Callable[[], Evaluated]) -> None:
+        """Begin without a question.
+
+        Args:
+            wait_for_evaluation: returns what is shown; see `Session.wait_for_evaluation`.
+        """
+        self._wait_for_evaluation = wait_for_evaluation
+        self._waiting: SimpleQueue[_Question | None] = SimpleQueue()
+        self._open: list[_Question] = []
+        self._changing = Lock()
+        self._is_over = False
+
+    def ask(self, work: Callable[[Evaluated], _Answer]) -> _Answer:
+        """Compute something from what is shown now, in turn; what `work` raises is raised here.
+
+        Raises:
+            UsageError: too many questions are open, or the session is over.
+        """
+        question = _Question(work, self._wait_for_evaluation())
+        with self._changing:
+            if self._is_over:
+                raise session_over()
+            if len(self._open) >= MOST_OPEN:
+                raise UsageError(f"{MOST_OPEN} questions are open already; ask again when they are answered")
+            self._open.append(question)
+            self._waiting.put(question)
+        answer: _Answer = question.answer.result()
+        return answer
+
+    def run(self) -> None:
+        """Answer questions until `stop`."""
+        while (question := self._waiting.get()) is not None:
+            question.settle()
+            with self._changing:
+                self._open.remove(question)
+
+    def stop(self) -> None:
+        """Refuse all open questions, and any more."""
+        with self._changing:
+            self._is_over = True
+            for question in self._open:
+                question.refuse()
+            self._waiting.put(None)
+
+
+def session_over() -> UsageError:
+    """Return the error of a request that comes too late."""
+    return UsageError("the server is stopping")
+
+
+@dataclass(frozen=True, eq=False)
+class _Question:
+    """Something to compute from an evaluation, and the place for the answer."""
+
+    work: Callable[[Evaluated], Any]
+    evaluated: Evaluated
+    answer: Future[Any] = field(default_factory=Future)
+
+    def settle(self) -> None:
+        """Compute the answer, unless it was refused."""
+        if self.answer.done():
+            return
+        # it may be refused while it is computed
+        with suppress(InvalidStateError):
+            try:
+                self.answer.set_result(self.work(self.evaluated))
+            except Exception as error:
+                self.answer.set_exception(error)
+
+    def refuse(self) -> None:
+        """Answer that it comes too late, also if it is being computed."""
+        with suppress(InvalidStateError):
+            self.answer.set_exception(session_over())
+
+
+PLAYBACK: Final = ("playback.time", "playback.play", "playback.speed", "playback.loop")
+"""The parameters that steer the playback, for viewers without controls of their own: seconds after the first
+sample, whether it plays, seconds of the log in a second, whether it begins again at the end."""
+
+ARROW: Final = "scene.arrow"
+"""The parameter with the title of the result whose violation the arrow points at; "" for the first one."""
+
+_LONGEST_S: Final = 9e9
+
+
+class PlaySpan(NamedTuple):
+    """What is to be played now: up to which time of the log, and the seconds that its last turn took."""
+
+    time_ns: int
+    elapsed_s: float
+
+
+class Session:
+    """Collect viewers' requests, on any thread, and hand them to the thread that does them.
+
+    No method but `wait_for_evaluation` waits for work. Of requests that come faster than they are done, the
+    last one counts.
+
+    Attributes:
+        failure: why the last change that could not be evaluated could not, or None.
+    """
+
+    def __init__(
+        self, loaded: LoadedLog, start_ns: int, end_ns: int, *, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        """Pause at the start, with constants as they are written.
+
+        Args:
+            start_ns, end_ns: first and last time.
+            clock: seconds by which it plays.
+        """
+        self._log = loaded
+        self._pace = Pace(clock)
+        self._transport = Transport(start_ns, end_ns)
+        self._edited = loaded.edit({})
+        self._pending = PendingRequests()
+        self._awaited: Future[Evaluated] | None = None
+        self._requested = Condition()
+        self._is_over = False
+        self._loops = False
+        self._is_behind = False
+        self._arrow = ""
+        self.failure: SpatialReplayError | None = None
+
+    @property
+    def name(self) -> str:
+        """The log's name."""
+        return self._log.name
+
+    @property
+    def span_ns(self) -> tuple[int, int]:
+        """First and last time."""
+        return self._transport.start_ns, self._transport.end_ns
+
+    @property
+    def values(self) -> Values:
+        """The constants as viewers set them."""
+        return constant_values(self._edited.constants)
+
+    @property
+    def edited(self) -> EditedFiles:
+        """The specifications with these values."""
+        return self._edited
+
+    @property
+    def state(self) -> PlaybackState:
+        """The state of the playback."""
+        with self._requested:
+            return self._transport.state(self._pace.now())
+
+    @property
+    def playback(self) -> Mapping[str, float | bool]:
+        """The values of `PLAYBACK`."""
+        state = self.state
+        seconds = round((state.time_ns - self._transport.start_ns) / 1e9, 3)
+        is_playing = state.status is Status.PLAYING
+        return dict(zip(PLAYBACK, (seconds, is_playing, state.speed, self._loops), strict=True))
+
+    @property
+    def arrow(self) -> str:
+        """The value of `ARROW`."""
+        return self._arrow
+
+    # ------------------------------------------------------------------------ called for viewers
+
+    def control(self, *, is_playing: bool, speed: float, seek_ns: int | None = None) -> PlaybackState:
+        """Play or pause at a speed, from another time on if one is given.
+
+        At the end, playing begins again.
+        """
+        with self._requested:
+            now = self._pace.now()
+            if seek_ns is None and is_playing and self._transport.state(now).status is Status.ENDED:
+                seek_ns = self._transport.start_ns
+            # what was played since the last turn is still to be sent
+            self._is_behind = seek_ns is None and not is_playing and (self._is_behind or self._plays(now))
+            self._transport.set_speed(speed, now)
+            if seek_ns is not None:
+                self._transport.move_to(seek_ns, now)
+                self._pending.seek_ns = self._transport.time_ns(now)
+            (self._transport.play if is_playing else self._transport.pause)(now)
+            self._pending.is_controlled = True
+            self._requested.notify()
+            # the player says that it jumped, right before it sends what is there
+            return self._transport.state(now)
+
+    def _plays(self, now: float) -> bool:
+        return self._transport.state(now).status is Status.PLAYING
+
+    def steer(self, values: Mapping[str, float | str | bool]) -> PlaybackState:
+        """Play, pause, seek, change the speed or begin again at the end, as some of `PLAYBACK` say.
+
+        Raises:
+            UsageError: a value of another kind, or a number that is out of the question.
+        """
+        now = self.playback
+        time, play, speed, loop = PLAYBACK
+        for name, value in values.items():
+            is_flag = isinstance(now[name], bool)
+            if isinstance(value, str) or isinstance(value, bool) != is_flag:
+                kind = "true or false" if is_flag else "a number"
+                raise UsageError(f"{name} cannot be {value!r}: give {kind}")
+            if name == speed and not (SLOWEST <= value <= FASTEST):
+                raise UsageError(f"{name} cannot be {value!r}: give a number from {SLOWEST:g} to {FASTEST:g}")
+            if not is_flag and not (0.0 <= value < float("inf")):
+                raise UsageError(f"{name} cannot be {value!r}: give a number of seconds, at least 0")
+        self._loops = bool(values.get(loop, self._loops))
+        seek_ns = None
+        if time in values:
+            seek_ns = self._transport.start_ns + round(min(float(values[time]), _LONGEST_S) * 1e9)
+        return self.control(
+            is_playing=bool(values.get(play, now[play])),
+            speed=float(values.get(speed, now[speed])),
+            seek_ns=seek_ns,
+        )
+
+    def point_at(self, arrow: float | str | bool) -> None:
+        """Let the arrow point at the violation of one result, by its title, or at the first one for "".
+
+        Raises:
+            UsageError: a value that is no text.
+        """
+        if not isinstance(arrow, str):
+            raise UsageError(f'{ARROW} cannot be {arrow!r}: give the title of a result, or "" for the first')
+        with self._requested:
+            self._pending.arrow = self._arrow = arrow
+            self._requested.notify()
+
+    def set_constants(self, values: Values) -> None:
+        """Give constants other values; all of them or, with an error, none.
+
+        Raises:
+            UsageError: no such constant, or a value of another kind.
+            SpecificationError: the specification is invalid with these values.
+        """
+        with self._requested:
+            edited = self._edited
+            self._pending.edited = self._edited = edited.loaded.edit({**edited.given, **values})
+            self._requested.notify()
+
+    def replace_log(self, loaded: LoadedLog) -> None:
+        """Evaluate other specifications over the same log.
+
+        Constants that viewers changed keep their values, unless the text changed them, too.
+        """
+        with self._requested:
+            before = self._edited
+            written = before.loaded.constants
+            kept = {
+                name: value
+                for name, value in before.given.items()
+                if name in loaded.constants
+                # what a viewer set while a former value of it was being written is newer than the file
+                and (loaded.constants[name] == written[name] or loaded.was_written(name))
+            }
+            try:
+                edited = loaded.edit(kept)
+            except SpatialReplayError:
+                edited = loaded.edit({})
+            self._pending.edited = self._edited = edited
+            self._requested.notify()
+
+    def resend(self, topic: str) -> None:
+        """Send the latest messages of a topic again, for a viewer that has just subscribed to it."""
+        with self._requested:
+            self._pending.topics.add(topic)
+            self._requested.notify()
+
+    def wait_for_evaluation(self) -> Evaluated:
+        """Return what is shown, once the requests made so far are done.
+
+        Raises:
+            UsageError: the session is over.
+        """
+        with self._requested:
+            if self._is_over:
+                raise session_over()
+            awaited = self._awaited = self._awaited or Future()
+            self._requested.notify()
+        return awaited.result()
+
+    def stop(self) -> None:
+        """End the session, and let the player's thread know."""
+        self.end()
+        with self._requested:
+            self._pending.stop = True
+            self._requested.notify()
+
+    # -------------------------------------------------------------------------- called by the player
+
+    def next_requests(self, patience_s: float, *, is_due: bool = False) -> PendingRequests:
+        """Return what was requested; wait for a request, but while it plays or work is due, only so long."""
+        with self._requested:
+            is_playing = self._transport.state(self._pace.now()).status is Status.PLAYING
+            self._requested.wait_for(
+                lambda: self._pending or self._awaited is not None,
+                patience_s if is_playing or is_due else None,
+            )
+            pending, self._pending = self._pending, PendingRequests()
+            return pending
+
+    def play_up_to(self, reach_ns: int) -> PlaySpan | None:
+        """Return what to play now, after a pause up to its time; None if nothing, or if it has to seek first.
+
+        Args:
+            reach_ns: as far as can be played at once; it falls behind the clock rather than go farther.
+        """
+        with self._requested:
+            elapsed_s = self._pace.next_turn()
+            now = self._pace.now()
+            state = self._transport.state(now)
+            is_due = self._is_behind or state.status is Status.PLAYING
+            self._is_behind = False
+            if not is_due or self._pending.seek_ns is not None:
+                return None
+            if reach_ns < state.time_ns:
+                self._transport.move_to(reach_ns, now)
+            return PlaySpan(min(state.time_ns, reach_ns), elapsed_s)
+
+    def continue_from(self, time_ns: int) -> None:
+        """Play on from what was just shown, unless a seek is pending; showing it takes no playing time."""
+        with self._requested:
+            if self._pending.seek_ns is None:
+                self._transport.move_to(time_ns, self._pace.now())
+
+    def restore(self, edited: EditedFiles, failure: SpatialReplayError) -> Values:
+        """Go back to former specifications, unless a change is pending; return the present constants.
+
+        Args:
+            failure: why the latest ones could not be evaluated.
+        """
+        with self._requested:
+            self.failure = failure
+            if self._pending.edited is None:
+                self._edited = edited
+            return constant_values(self._edited.constants)
+
+    def pause(self) -> PlaybackState:
+        """Stay at the present time, unless a seek is pending."""
+        with self._requested:
+            now = self._pace.now()
+            if self._pending.seek_ns is None:
+                self._transport.pause(now)
+            return self._transport.state(now)
+
+    def finish(self) -> PlaybackState:
+        """Pause at the end, or begin again."""
+        if self._loops:
+            return self.control(is_playing=True, speed=self.state.speed, seek_ns=self._transport.start_ns)
+        return self.pause()
+
+    def provide_evaluation(self, evaluated: Evaluated) -> None:
+        """Let `wait_for_evaluation` return."""
+        awaited = self._take_awaited()
+        if awaited is not None:
+            awaited.set_result(evaluated)
+
+    def end(self) -> None:
+        """Let `wait_for_evaluation` raise, now and from now on."""
+        with self._requested:
+            self._is_over = True
+        awaited = self._take_awaited()
+        if awaited is not None:
+            awaited.set_exception(session_over())
+
+    def _take_awaited(self) -> Future[Evaluated] | None:
+        with self._requested:
+            awaited, self._awaited = self._awaited, None
+            return awaited
+
+
+MOST_A_SECOND: Final = 600
+"""The most samples sent in a second, since viewers can take no more."""
+
+MOST_DRAWN_A_SECOND: Final = 50
+"""The most messages a second of a topic that the layout draws: as many as a second of a log has."""
+
+_MOST_AT_ONCE: Final = math.ceil(MOST_DRAWN_A_SECOND * MOST_LATE_S) + 1
+"""So many of them may come at once after a pause: at speed 1 all those of a late turn, and one by chance."""
+
+_NEVER_THINNED: Final = (EVENTS, EVENT_LOG)
+_DRAWN: Final = (
+    SCENE,
+    STANDING,
+    PLAN_DECISION,
+    GRADIENT_MAP,
+    PLAN_PATH,
+    REDONE_MAP,
+    REDONE_PATH,
+    CAMERA_ANNOTATIONS,
+)
+
+
+class PlaybackThinning:
+    """Thin the messages of a playback, turn by turn; in the thread of its player.
+
+    Of a topic that the layout draws, at most `MOST_DRAWN_A_SECOND` messages are sent for each second that
+    passes, and in any second less than 60; of any other, those of `MOST_A_SECOND` times. The last of each
+    turn is always sent, and so is every event.
+    """
+
+    def __init__(self) -> None:
+        """Begin with as many messages left as may come at once."""
+        self._passed_s = 0.0
+        self._left: dict[str, tuple[float, float]] = {}
+
+    def thin(self, messages: Messages, elapsed_s: float) -> Messages:
+        """Return what to send of the messages that came in a turn of so many seconds."""
+        self._passed_s += elapsed_s
+        most = max(1, math.ceil(MOST_A_SECOND * elapsed_s))
+        kept = np.ones(len(messages), np.bool_)
+        payloads: dict[int, bytes] = {}
+        for number, channel in messages.channels.items():
+            if channel.topic in _NEVER_THINNED:
+                continue
+            own = np.flatnonzero(messages.channel == number)
+            times_ns, which = np.unique(messages.log_time_ns[own], return_inverse=True)
+            # one time more than that comes by chance
+            count = self._take(channel.topic, len(times_ns)) if _is_drawn(channel) else most
+            if len(times_ns) <= count + (not _is_drawn(channel)):
+                continue
+            chosen = np.zeros(len(times_ns), np.bool_)
+            chosen[np.linspace(len(times_ns) - 1, 0, count, endpoint=False).astype(np.int64)] = True
+            kept[own] = chosen[which]
+            if channel.topic == SCENE:
+                payloads |= _with_deletions(messages.payloads, own, kept)
+        if kept.all():
+            return messages
+        places = np.flatnonzero(kept)
+        sent = select(messages, places)
+        if not payloads:
+            return sent
+        return replace(
+            sent, payloads=[payloads.get(place, messages.payloads[place]) for place in places.tolist()]
+        )
+
+    def _take(self, topic: str, wanted: int) -> int:
+        """Return how many messages of a topic that is drawn may be sent, at least the last one."""
+        left, at_s = self._left.get(topic, (float(_MOST_AT_ONCE), self._passed_s))
+        left = min(left + MOST_DRAWN_A_SECOND * (self._passed_s - at_s), _MOST_AT_ONCE)
+        most = max(1, math.floor(left))
+        self._left[topic] = left - min(wanted, most), self._passed_s
+        return most
+
+
+def _is_drawn(channel: Channel) -> bool:
+    # the frames of a video depend on those before
+    schema = "" if channel.schema is None else channel.schema.name
+    return channel.topic in _DRAWN or (is_image_type(schema) and not schema.endswith("Video"))
+
+
+def _with_deletions(payloads: Sequence[bytes], own: Integers, kept: Booleans) -> dict[int, bytes]:
+    """Return scenes that are kept, each with what is deleted by those left out before it."""
+    with_more = {}
+    missed = SceneUpdate()
+    for place in own.tolist():
+        if not kept[place]:
+            missed.deletions.extend(SceneUpdate.FromString(payloads[place]).deletions)
+        elif missed.deletions:
+            # a viewer deletes before it draws
+            with_more[place] = missed.SerializeToString(deterministic=True) + payloads[place]
+            missed = SceneUpdate()
+    return with_more
 
 
 class Level(Enum):

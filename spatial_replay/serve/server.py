@@ -20,13 +20,20 @@ from foxglove import websocket as protocol
 
 from spatial_replay.errors import SpatialReplayError, UsageError, system_reason
 from spatial_replay.logs.messages import Channel, Messages, Schema
-from spatial_replay.serve.gate import Gate
-from spatial_replay.serve.pace import PlaybackState, Status
-from spatial_replay.serve.player import CONSTANTS, Level, Note
-from spatial_replay.serve.relay import Relay
-from spatial_replay.serve.requests import Questions, Values
+from spatial_replay.serve.player import (
+    ARROW,
+    CONSTANTS,
+    PLAYBACK,
+    Level,
+    Note,
+    PlaybackState,
+    Questions,
+    Session,
+    Status,
+    Values,
+)
+from spatial_replay.serve.relay import Gate, Relay
 from spatial_replay.serve.services import PLAYBACK_STATE, SERVICES, STEERING, answer, asset, steered
-from spatial_replay.serve.session import ARROW, PLAYBACK, Session
 
 # viewers get their errors in replies; the SDK would print them on standard error, too
 logging.getLogger("foxglove").addHandler(logging.NullHandler())

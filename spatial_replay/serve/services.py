@@ -15,8 +15,7 @@ from spatial_replay.errors import UsageError
 from spatial_replay.logs.topics import LAYOUT
 from spatial_replay.replay.document import document_from_replay, explain_results
 from spatial_replay.replay.loaded_log import Evaluated
-from spatial_replay.serve.pace import FASTEST, SLOWEST
-from spatial_replay.serve.session import PLAYBACK
+from spatial_replay.serve.player import FASTEST, PLAYBACK, SLOWEST
 
 _MOST_BYTES: Final = 1 << 16
 

@@ -9,12 +9,10 @@ from dataclasses import dataclass
 from threading import Thread
 from typing import TYPE_CHECKING
 
-from spatial_replay.annotate.curves import CURVES_CHANNEL
+from spatial_replay.annotate.robustness import CURVES_CHANNEL
 from spatial_replay.errors import SpatialReplayError, importing
 from spatial_replay.replay.loaded_log import EditedFiles, Evaluated, Playback
-from spatial_replay.serve.player import SPECIFICATION, Level, Note, Player
-from spatial_replay.serve.requests import Questions
-from spatial_replay.serve.session import Session
+from spatial_replay.serve.player import SPECIFICATION, Level, Note, Player, Questions, Session
 from spatial_replay.spec.formula import Specification
 
 if TYPE_CHECKING:

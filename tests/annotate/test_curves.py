@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from spatial_replay import parse_specification
-from spatial_replay.annotate.curves import Thinning, curved_nodes
+from spatial_replay.annotate.robustness import Thinning, curved_nodes
 
 NUMBERS = st.one_of(st.floats(-1e6, 1e6), st.just(float("nan")))
 

@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 
 from examples import examples
 from spatial_replay import ConvexPart, Footprint, Sample, Trace, TrackedObject, parse_specification
-from spatial_replay.annotate.leaf_pairs import leaf_pairs
+from spatial_replay.annotate.deciding_leaf import leaf_pairs
 from spatial_replay.annotate.requirements import requirements_of
 from spatial_replay.annotate.scene.scene_update import PERIOD_NS, SceneEncoder
 from spatial_replay.annotate.violations import EvaluatedResult

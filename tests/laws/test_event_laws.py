@@ -15,9 +15,16 @@ from examples import examples
 from laws.strategies_monitor import Recording, cuts, recordings, specifications
 from spatial_replay import Specification, UsageError, evaluate, parse_specification
 from spatial_replay.annotate.deciding_leaf import NewestSamples
-from spatial_replay.annotate.events import EncodedEvent, EventReporter
+from spatial_replay.annotate.events import (
+    LASTING,
+    SATISFIED,
+    START,
+    EncodedEvent,
+    EventReporter,
+    NodeStates,
+    track,
+)
 from spatial_replay.annotate.specification import reported_trees
-from spatial_replay.annotate.verdict_changes import LASTING, SATISFIED, START, NodeStates, track
 from spatial_replay.monitor.instances import find_instances
 from spatial_replay.monitor.semantics import Semantics, checked_semantics
 from spatial_replay.monitor.stream import EvaluationStream

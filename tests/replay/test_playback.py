@@ -20,7 +20,7 @@ from annotate.layouts import panels, paths_of
 from annotate.message_paths import values
 from examples import examples
 from replay.runs import STEP_NS, PiecewiseSource, content_of, record, run, sample
-from spatial_replay.annotate.curves import CURVES_CHANNEL
+from spatial_replay.annotate.robustness import CURVES_CHANNEL
 from spatial_replay.logs import Channel, LogWriter, Messages, Source, encode_objects
 from spatial_replay.logs.messages import merge, messages_of
 from spatial_replay.logs.output_file import open_output

@@ -34,7 +34,7 @@ from serve.viewer import (
     viewer,
 )
 from spatial_replay import UsageError
-from spatial_replay.annotate.curves import MOST_POINTS
+from spatial_replay.annotate.robustness import MOST_POINTS
 from spatial_replay.logs import Channel, LogWriter, MemorySource, Schema, encode_objects
 from spatial_replay.logs.output_file import open_output
 from spatial_replay.logs.schemas.Curves_pb2 import Curves

@@ -22,16 +22,23 @@ import spatial_replay as sr
 from examples import examples
 from replay.runs import STEP_NS, PiecewiseSource, run
 from spatial_replay import UsageError
-from spatial_replay.annotate.curves import CURVES_CHANNEL
+from spatial_replay.annotate.robustness import CURVES_CHANNEL
 from spatial_replay.logs import Messages
 from spatial_replay.logs.schemas.Robustness_pb2 import Robustness
 from spatial_replay.logs.topics import ROBUSTNESS, SCENE, STANDING
 from spatial_replay.replay import Evaluated, LoadedLog, Playback
-from spatial_replay.serve.pace import MOST_LATE_S, PlaybackState, Status
-from spatial_replay.serve.player import Level, Note, Player
-from spatial_replay.serve.requests import MOST_OPEN, Questions
-from spatial_replay.serve.session import Session
-from spatial_replay.serve.thinning import MOST_A_SECOND
+from spatial_replay.serve.player import (
+    MOST_A_SECOND,
+    MOST_LATE_S,
+    MOST_OPEN,
+    Level,
+    Note,
+    PlaybackState,
+    Player,
+    Questions,
+    Session,
+    Status,
+)
 
 PATIENCE_S = 10.0
 MOST_SAMPLES = math.ceil(MOST_A_SECOND * MOST_LATE_S)

@@ -14,8 +14,7 @@ from hypothesis import strategies as st
 from spatial_replay.logs import Channel, Messages
 from spatial_replay.logs.messages import messages_of
 from spatial_replay.logs.topics import EVENTS, OBJECTS, ROBUSTNESS, SCENE, STANDING
-from spatial_replay.serve.pace import MOST_LATE_S
-from spatial_replay.serve.thinning import MOST_A_SECOND, MOST_DRAWN_A_SECOND, PlaybackThinning
+from spatial_replay.serve.player import MOST_A_SECOND, MOST_DRAWN_A_SECOND, MOST_LATE_S, PlaybackThinning
 
 CHANNELS = {
     number: Channel(topic, "protobuf", None) for number, topic in enumerate((EVENTS, ROBUSTNESS, OBJECTS))

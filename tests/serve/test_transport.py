@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 import spatial_replay as sr
 from spatial_replay.logs import MemorySource
 from spatial_replay.replay import LoadedLog, SpecificationFiles
-from spatial_replay.serve.pace import FASTEST, SLOWEST, Status, Transport
-from spatial_replay.serve.session import Session
+from spatial_replay.serve.player import FASTEST, SLOWEST, Session, Status, Transport
 
 START_NS, END_NS = 5_000_000_000, 65_000_000_000
 SECOND_NS = 1_000_000_000

@@ -7,31 +7,325 @@ Messages of one layout have the same entities with the same primitives. Their te
 from __future__ import annotations
 
 import re
+import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
+from foxglove_schemas_protobuf.Pose_pb2 import Pose
 from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.timestamp_pb2 import Timestamp
 
-from spatial_replay.annotate.rings import Form
-from spatial_replay.annotate.scene.scene_entities import (
-    ARROW_HEAD,
-    FRAME,
-    SLOT,
-    SLOT_BYTES,
-    Elevation,
-    draw,
-    lying_at,
-    point_at,
+from spatial_replay.geometry.arrays import (
+    Floats,
+    Integers,
+    combined,
+    equal_places,
+    flat_index,
+    starts_from_counts,
 )
-from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.geometry.footprint import Footprint, FootprintBatch
 from spatial_replay.logs.wire import WireTemplate, Words
+from spatial_replay.palette import LABEL, NEGATIVE
 from spatial_replay.spec.formula import Outline
+from spatial_replay.trace.trace import Trace
+
+ROUND: Final = 32
+"""Points on the ring of a rounded part."""
+
+
+class Rings(NamedTuple):
+    """The rings of R footprints, as ragged rows.
+
+    Attributes:
+        start: (R + 1,) int64, where each footprint's points begin.
+        points: (P, 2), counter-clockwise.
+        form: (R,) int64, index into `forms`.
+        forms: for each form, the lengths of its rings and whether it has a height.
+        has_round: whether any part is rounded, or a point.
+    """
+
+    start: Integers
+    points: Floats
+    form: Integers
+    forms: tuple[Form, ...]
+    has_round: bool
+
+    def rings_of(self, footprint: int) -> tuple[Floats, ...]:
+        """Return the rings (n, 2) of one of the footprints."""
+        end, rings = int(self.start[footprint]), []
+        for length in self.forms[self.form[footprint]].rings:
+            begin, end = end, end + length
+            rings.append(self.points[begin:end])
+        return tuple(rings)
+
+
+class Form(NamedTuple):
+    """The primitives of a footprint: the lengths of its rings, and whether it has a height."""
+
+    rings: tuple[int, ...]
+    has_height: bool
+
+
+def rings_of(footprints: FootprintBatch, point_radius: float) -> Rings:
+    """Return the rings of footprints; a bare point becomes a disc of the given radius."""
+    counts = np.diff(footprints.vertex_start)
+    is_round = (counts == 1) | (footprints.radius > 0.0)
+    lengths = np.where(is_round, ROUND, counts)
+    part_start = starts_from_counts(lengths)
+    form, forms = _forms(footprints, lengths)
+    if not is_round.any():
+        corners = footprints.vertices[footprints.vertex_start[0] : footprints.vertex_start[-1]]
+        return Rings(part_start[footprints.part_start], corners, form, forms, False)
+    points = np.empty((part_start[-1], 2))
+    straight = ~is_round
+    points[flat_index(part_start[:-1][straight], counts[straight])] = footprints.vertices[
+        flat_index(footprints.vertex_start[:-1][straight], counts[straight])
+    ]
+    for count in np.unique(counts[is_round]).tolist():
+        parts = np.flatnonzero(is_round & (counts == count))
+        corners = footprints.vertices[footprints.vertex_start[parts][:, None] + np.arange(count)]
+        radius = np.where(footprints.radius[parts] > 0.0, footprints.radius[parts], point_radius)
+        points[part_start[parts][:, None] + np.arange(ROUND)] = _rounded(corners, radius)
+    return Rings(part_start[footprints.part_start], points, form, forms, True)
+
+
+def outlines_of(footprint: Footprint) -> list[Floats]:
+    """Return the ring (n, 2) of each part of one footprint."""
+    return list(rings_of(FootprintBatch.from_footprints([footprint]), 0.0).rings_of(0))
+
+
+def extents(footprints: FootprintBatch) -> Floats:
+    """Return (R,) the longer side of each footprint's bounding box."""
+    if not len(footprints):
+        return np.empty(0)
+    start = footprints.vertex_start[footprints.part_start]
+    if footprints.radius.any():
+        radius = np.repeat(footprints.radius, np.diff(footprints.vertex_start))[:, None]
+        sides = boxes(footprints.vertices + radius, start)[1] - boxes(footprints.vertices - radius, start)[0]
+    else:
+        low, high = boxes(footprints.vertices, start)
+        sides = high - low
+    return np.asarray(np.maximum(sides[:, 0], sides[:, 1]))
+
+
+def boxes(points: Floats, start: Integers) -> tuple[Floats, Floats]:
+    """Return the least and the greatest coordinates, (R, 2) each, of rows of points.
+
+    Args:
+        points: (P, 2).
+        start: (R + 1,), where each row begins and the last one ends; none is empty.
+    """
+    if len(start) < 2:
+        return np.empty((0, 2)), np.empty((0, 2))
+    points = points[: start[-1]]
+    return np.minimum.reduceat(points, start[:-1]), np.maximum.reduceat(points, start[:-1])
+
+
+_ANGLES = np.arange(ROUND) * (2.0 * np.pi / ROUND)
+_DIRECTIONS: Final = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
+
+
+def _rounded(corners: Floats, radius: Floats) -> Floats:
+    """Return the rings (M, ROUND, 2) of M parts: the outermost point in each direction.
+
+    Args:
+        corners: (M, n, 2).
+        radius: (M,).
+    """
+    x, y = _DIRECTIONS[:, :1], _DIRECTIONS[:, 1:]
+    reach = corners[:, None, :, 0] * x + corners[:, None, :, 1] * y
+    outermost = np.take_along_axis(corners, reach.argmax(axis=2)[:, :, None], axis=1)
+    return np.asarray(outermost + radius[:, None, None] * _DIRECTIONS)
+
+
+def _forms(footprints: FootprintBatch, lengths: Integers) -> tuple[Integers, tuple[Form, ...]]:
+    """Return (R,) the form of each footprint, and the forms."""
+    part_counts = np.diff(footprints.part_start)
+    has_height = ~np.isnan(footprints.bottom)
+    columns = [part_counts, has_height]
+    for part in range(int(part_counts.max(initial=0))):
+        has_part = part_counts > part
+        at = np.where(has_part, footprints.part_start[:-1] + part, 0)
+        columns.append(np.where(has_part, lengths[at], 0))
+    form, forms = np.zeros(len(footprints), np.int64), list[Form]()
+    for places in equal_places(combined(columns, len(footprints))):
+        form[places], row = len(forms), int(places[0])
+        rings = lengths[footprints.part_start[row] : footprints.part_start[row + 1]]
+        forms.append(Form(tuple(rings.tolist()), bool(has_height[row])))
+    return form, tuple(forms)
+
+
+class SceneBounds(NamedTuple):
+    """The box that a log's footprints lie in, in footprint units."""
+
+    xmin: float
+    ymin: float
+    xmax: float
+    ymax: float
+
+    @classmethod
+    def of(cls, trace: Trace, before: SceneBounds | None = None) -> SceneBounds | None:
+        """Return the box of some samples and of those before; None without any footprint."""
+        vertices = trace.footprints.vertices
+        low, high = _corners_of_part(vertices)
+        if not np.isfinite([low, high]).all():
+            vertices = vertices[np.isfinite(vertices).all(axis=1)]
+            low, high = _corners_of_part(vertices)
+        if not len(vertices):
+            return before
+        if before is not None:
+            low = [min(low[0], before.xmin), min(low[1], before.ymin)]
+            high = [max(high[0], before.xmax), max(high[1], before.ymax)]
+        return cls(low[0], low[1], high[0], high[1])
+
+
+def _corners_of_part(vertices: Floats) -> tuple[list[float], list[float]]:
+    """Return the least and the greatest coordinates of vertices (V, 2); infinite without any."""
+    columns = [vertices[:, axis] for axis in (0, 1)]
+    low = [float(column.min(initial=np.inf)) for column in columns]
+    return low, [float(column.max(initial=-np.inf)) for column in columns]
+
+
+FRAME: Final = "world"
+
+FRAMES: Final = (FRAME, "spatial")
+"""The frame of the scene, and the child by which viewers know it."""
+
+ARROW_HEAD: Final = 0.15
+"""The length of an arrow's head by the size of the objects in a scene; of a short arrow it is half."""
+
+_LINE_PIXELS: Final = 2.0
+_LABEL_PIXELS: Final = 14.0
+SLOT_BYTES: Final = b"\xfe" + b"\xff" * 7
+SLOT: Final[float] = struct.unpack("<d", SLOT_BYTES)[0]
+"""A number that is to be filled in: a NaN whose bytes are in no text, and in no message but where it is."""
+
+
+def encode_frame(time_ns: int) -> bytes:
+    """Return the message that makes the scene's frame known to viewers: a frame in the same place."""
+    message = FrameTransform(parent_frame_id=FRAME, child_frame_id=FRAMES[1])
+    message.timestamp.seconds, message.timestamp.nanos = divmod(time_ns, 1_000_000_000)
+    message.rotation.w = 1.0
+    return message.SerializeToString(deterministic=True)
+
+
+class Elevation(NamedTuple):
+    """The heights of an entity, in footprint units; `SLOT` where it is to be filled in.
+
+    Attributes:
+        fill: of its filled face, the upper one of a prism.
+        sides: from where to where a prism's sides reach: bottom and height; None for a flat entity.
+        label: of its name.
+    """
+
+    fill: float
+    sides: tuple[float, float] | None
+    label: float
+
+
+def draw(
+    entity: SceneEntity,
+    name: str | None,
+    outlines: list[Floats],
+    faces: list[Floats],
+    anchor: tuple[float, float],
+    elevation: Elevation,
+    opacity: float,
+) -> None:
+    """Add outlines, filled faces and the label to an entity; every colour but the label's is to be filled in.
+
+    `scene_template` fills in the numbers in this order.
+
+    Args:
+        name: what the label says; None leaves it out.
+        outlines, faces: rings (n, 2); a face is convex.
+        anchor: the position of the label.
+        opacity: of the faces.
+    """
+    for ring in outlines:
+        _add_outline(entity, ring, elevation.fill)
+    for ring in faces:
+        if len(ring) > 2:
+            _add_face(entity, ring, elevation.fill, opacity)
+    if elevation.sides is not None:
+        for ring in outlines:
+            if len(ring) > 1:
+                _add_sides(entity, ring, *elevation.sides, opacity)
+    if name is None:
+        return
+    label = entity.texts.add(
+        billboard=True,
+        font_size=_LABEL_PIXELS,
+        scale_invariant=True,
+        text=name,
+        pose=lying_at(elevation.label),
+    )
+    label.pose.position.x, label.pose.position.y = anchor
+    label.color.r, label.color.g, label.color.b, label.color.a = *LABEL, 1.0
+
+
+def point_at(entity: SceneEntity, label: str, lift: float) -> None:
+    """Add an arrow and its label to an entity; their positions and the arrow's length are to be filled in.
+
+    Args:
+        lift: height of flat objects above the plane, and a fifth of an arrow's width.
+    """
+    arrow = entity.arrows.add(
+        shaft_length=SLOT, shaft_diameter=5.0 * lift, head_length=SLOT, head_diameter=12.0 * lift
+    )
+    arrow.pose.position.x = arrow.pose.position.y = arrow.pose.position.z = SLOT
+    arrow.pose.orientation.z = arrow.pose.orientation.w = SLOT
+    arrow.color.r, arrow.color.g, arrow.color.b, arrow.color.a = *NEGATIVE, 1.0
+    text = entity.texts.add(billboard=True, font_size=_LABEL_PIXELS, scale_invariant=True, text=label)
+    text.pose.position.x = text.pose.position.y = text.pose.position.z = SLOT
+    text.pose.orientation.w = 1.0
+    text.color.r, text.color.g, text.color.b, text.color.a = *LABEL, 1.0
+
+
+def _add_outline(entity: SceneEntity, ring: Floats, z: float) -> None:
+    line = entity.lines.add(
+        type=LinePrimitive.LINE_LOOP, thickness=_LINE_PIXELS, scale_invariant=True, pose=lying_at(z)
+    )
+    for x, y in ring.tolist():
+        line.points.add(x=x, y=y)
+    line.color.r, line.color.g, line.color.b, line.color.a = SLOT, SLOT, SLOT, 1.0
+
+
+def _add_face(entity: SceneEntity, ring: Floats, z: float, opacity: float) -> None:
+    face = entity.triangles.add(pose=lying_at(z))
+    for x, y in ring.tolist():
+        face.points.add(x=x, y=y)
+    for corner in range(1, len(ring) - 1):
+        face.indices.extend((0, corner, corner + 1))
+    face.color.r, face.color.g, face.color.b, face.color.a = SLOT, SLOT, SLOT, opacity
+
+
+def _add_sides(entity: SceneEntity, ring: Floats, bottom: float, height: float, opacity: float) -> None:
+    sides = entity.triangles.add(pose=lying_at(bottom))
+    for x, y in ring.tolist():
+        sides.points.add(x=x, y=y)
+    for x, y in ring.tolist():
+        sides.points.add(x=x, y=y, z=height)
+    count = len(ring)
+    for low in range(count):
+        following = (low + 1) % count
+        sides.indices.extend((low, following, count + low, following, count + following, count + low))
+    sides.color.r, sides.color.g, sides.color.b, sides.color.a = SLOT, SLOT, SLOT, opacity
+
+
+def lying_at(z: float) -> Pose:
+    pose = Pose()
+    pose.position.z = z
+    pose.orientation.w = 1.0
+    return pose
+
 
 OBJECT_OPACITY: Final = 0.55
 REGION_OPACITY: Final = 0.3

@@ -15,18 +15,20 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spatial_replay.annotate.rings import boxes, extents, outlines_of, rings_of
 from spatial_replay.annotate.scene.scene_frames import (
     ABSENT,
     DELETED,
     FIRST_FORM,
     Arrows,
+    ArrowTexts,
     SceneContent,
     SceneFrames,
+    arrow_texts,
+    banners_of,
     colours,
+    labelled_objects,
     shade_codes,
 )
-from spatial_replay.annotate.scene.scene_numbers import LIFT, SceneNumbers
 from spatial_replay.annotate.scene.scene_template import (
     LEVELS,
     Banner,
@@ -36,10 +38,15 @@ from spatial_replay.annotate.scene.scene_template import (
     Region,
     SceneLayout,
     SceneTemplate,
+    boxes,
     encode_regions,
+    encoded_stamps,
+    extents,
     make_template,
+    numbers_of_witness,
+    outlines_of,
+    rings_of,
 )
-from spatial_replay.annotate.scene.scene_text import ArrowTexts, arrow_texts, banners_of, labelled_objects
 from spatial_replay.annotate.violations import (
     EvaluatedResult,
     Presence,
@@ -48,10 +55,65 @@ from spatial_replay.annotate.violations import (
     worst_robustness,
 )
 from spatial_replay.geometry.arrays import Floats, Integers, combined, equal_places
-from spatial_replay.logs.wire import placed
+from spatial_replay.logs.wire import Words, placed, words_of
 from spatial_replay.monitor.atoms.terms import footprint_from_outline
 from spatial_replay.spec.formula import Outline
 from spatial_replay.trace.trace import Trace
+
+LIFT: Final = 0.01
+"""Height of flat objects above the plane, by the scale of the scene."""
+
+
+class SceneNumbers:
+    """The numbers of S messages that show R objects in all."""
+
+    def __init__(
+        self,
+        times_ns: Integers,
+        regions: Floats,
+        objects: Floats,
+        content: SceneContent,
+        scale: float,
+    ) -> None:
+        """Take over what the messages show.
+
+        Args:
+            times_ns: (S,).
+            regions: (S, regions, 3), their colours.
+            objects: (R, 3), colours of the objects that are shown, message by message.
+            content: of the messages.
+            scale: the size of objects in the scene.
+        """
+        self._stamps = encoded_stamps(times_ns)
+        self._regions = regions.reshape(len(times_ns), -1)
+        self._content, self._scale = content, scale
+        self._of_objects = [objects, content.middles]
+        if any(form.has_height for form in content.rings.forms):
+            top, bottom = content.footprints.top, content.footprints.bottom
+            self._of_objects.append(np.stack([top, bottom, top - bottom, top + LIFT * scale], axis=-1))
+
+    def of_messages(self, layout: SceneLayout, samples: Integers) -> Words:
+        """Return (K, N) what to fill in a layout's template, each number once, in some messages (K,)."""
+        columns = [self._stamps[samples], self._regions[samples]]
+        content, count = self._content, len(layout.objects)
+        if count:
+            # those that are shown follow each other
+            first = content.observations[samples, content.names.index(layout.objects[0].name)]
+            corners = sum(sum(drawn.form.rings) for drawn in layout.objects)
+            columns.append(_runs(content.rings.points, content.rings.start[first], corners))
+            of_objects = self._of_objects[: 3 if layout.has_heights else 2]
+            columns += [_runs(each, first, count) for each in of_objects]
+        if isinstance(layout.witness, CauseText):
+            found, labels = content.violations, [content.numbers[index] for index in samples.tolist()]
+            z = np.fmax(found.top[samples], 0.0) + 3.0 * LIFT * self._scale
+            columns += numbers_of_witness(found.points[samples], z, self._scale, labels, layout.witness.words)
+        return words_of(columns)
+
+
+def _runs(rows: Floats, first: Integers, count: int) -> Floats:
+    """Return rows (R, k) side by side, `count` from each of the first ones (K,) on: (K, count * k)."""
+    return np.asarray(rows[first[:, None] + np.arange(count)].reshape(len(first), -1))
+
 
 PERIOD_NS: Final = 20_000_000
 """The least time between two messages; viewers warn of more."""
