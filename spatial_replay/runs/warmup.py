@@ -22,7 +22,6 @@ from spatial_replay.geometry.footprint import Footprint, TrackedObject
 from spatial_replay.logs.source import MemorySource
 from spatial_replay.monitor.evaluate import evaluate
 from spatial_replay.monitor.monitor import Monitor
-from spatial_replay.monitor.online.step import ROOM
 from spatial_replay.recording.recorder import Recorder
 from spatial_replay.replay import run_replay
 from spatial_replay.runs.planned import warm_up_planner
@@ -41,9 +40,6 @@ spec open = G (forall x in things: x dist goal >= 0) and (load >= 1) U[0, 3] (cu
 spec nested = G (F[0, 2] G[0, 1] (cup ovlp jug))
 spec crowd = G (forall x, y in things: x dist y >= 0)
 """
-_NO_WINDOWS = "spec apart = G (cup dist jug >= 0)"
-"""Takes the monitors' shorter way, which windows below operators keep others from."""
-_LONG_WINDOW = f"spec late = G (load >= 1 -> F[0, {2 * ROOM}] load <= 0)"
 _PAPER = "region goal = box(0, 0, 4, 4)\nspec reach = (F (cup enclosedin goal)) and G[0, 2] (cup ovlp jug)"
 
 
@@ -99,14 +95,9 @@ def _evaluate() -> None:
 
 
 def _monitor() -> None:
-    for text in (_SPECIFICATION, _NO_WINDOWS):
-        monitor = Monitor(parse_specification(text))
-        for sample in _samples():
-            monitor.update(sample)
-    # more samples than a run has room for at first
-    monitor = Monitor(parse_specification(_LONG_WINDOW))
-    for time_ns in range(2 * ROOM):
-        monitor.update(Sample(time_ns, {}, {"load": 1.0}))
+    monitor = Monitor(parse_specification(_SPECIFICATION))
+    for sample in _samples():
+        monitor.update(sample)
 
 
 def _evaluate_as_the_paper() -> None:
