@@ -177,7 +177,7 @@ class OnlineRun:
         series_at = NUMBERS * (parts + reports)
         self._numbers = self._work[NUMBERS * parts : series_at].reshape(reports, NUMBERS, shape[1])
         self._series = self._work[series_at : series_at + SERIES * reports].reshape(reports, SERIES, shape[1])
-        self._ended = np.zeros((reports, 2))
+        self._newest = 0, [0, 0]  # where the numbers of the newest sample stand
         self._open = [
             (number, [_OpenPart(rows, room)])
             for number, rows in enumerate(program.part_rows)
@@ -192,7 +192,8 @@ class OnlineRun:
     @property
     def final(self) -> Floats:
         """(N, 2): lower and upper end of each node's value if the run ends here."""
-        return self._ended.copy()
+        newest, ends = self._newest
+        return np.asarray(self._numbers[:, ends, newest] + 0.0)
 
     def extend(self, leaves: Floats, times_ns: Integers, empty: Empty = np.empty) -> Floats:
         """Add samples.
@@ -280,8 +281,7 @@ class OnlineRun:
                     self._run_open(number, channel, part, begin, count)
             run_samples(*arrays, *numbers, FINISH)
         self._position += count
-        ends = self._numbers[:, [0, 0] if self._channels == 1 else [6, 7], count - 1]
-        np.add(ends, 0.0, out=self._ended)
+        self._newest = count - 1, [0, 0] if self._channels == 1 else [6, 7]
         return self._series[:, :, :count]
 
     def _run_open(self, number: int, channel: int, part: _OpenPart, begin: int, count: int) -> None:
