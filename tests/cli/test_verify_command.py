@@ -13,7 +13,7 @@ import pytest
 from click.testing import CliRunner
 
 import spatial_replay as sr
-from planning.plans import PUSH, record_plan_of
+from planning.plans import PUSH, record_plan_of, write_usual_run
 from spatial_replay.bags import open_messages
 from spatial_replay.cli.application import application
 from spatial_replay.logs import LogWriter
@@ -76,7 +76,7 @@ def test_a_truncated_log_has_no_certificate(recorded: Path, tmp_path: Path) -> N
 
 
 def test_decisions_are_recomputed(tmp_path: Path) -> None:
-    record_plan_of(tmp_path / "run.mcap")
+    write_usual_run(tmp_path / "run.mcap")
     code, said = call("verify", tmp_path / "run.mcap", "--decisions")
     assert code == 0
     assert "3 decisions recomputed with 9 maps" in said
@@ -90,7 +90,7 @@ def test_decisions_that_differ_are_reported(tmp_path: Path) -> None:
 
 
 def test_decisions_of_the_source_are_recomputed(tmp_path: Path) -> None:
-    record_plan_of(tmp_path / "run.mcap")
+    write_usual_run(tmp_path / "run.mcap")
     call("replay", tmp_path / "run.mcap", "-o", tmp_path / "layer.mcap", "--layer")
     call("replay", tmp_path / "run.mcap", "-o", tmp_path / "cut.mcap", "--from", "50ms")
     for name in ("layer.mcap", "cut.mcap"):
@@ -102,7 +102,7 @@ def test_decisions_of_the_source_are_recomputed(tmp_path: Path) -> None:
 
 
 def test_decisions_are_printed_step_by_step(tmp_path: Path) -> None:
-    record_plan_of(tmp_path / "run.mcap", slips=1)
+    write_usual_run(tmp_path / "run.mcap", slips=1)
     code, said = call("info", tmp_path / "run.mcap", "--decisions")
     lines = said.splitlines()
     assert code == 0
@@ -116,7 +116,7 @@ def test_decisions_are_printed_step_by_step(tmp_path: Path) -> None:
 
 def test_decisions_fit_the_terminal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "70")
-    record_plan_of(tmp_path / "run.mcap")
+    write_usual_run(tmp_path / "run.mcap")
     _, said = call("info", tmp_path / "run.mcap", "--decisions")
     assert max(map(len, said.splitlines())) <= 70
     _, whole = call("info", tmp_path / "run.mcap", "--decisions", "--json")
@@ -140,7 +140,7 @@ def test_a_motion_cut_off_by_the_end_of_the_log_is_marked(tmp_path: Path) -> Non
 
 
 def test_decisions_of_a_truncated_log_are_printed(tmp_path: Path) -> None:
-    record_plan_of(tmp_path / "run.mcap", slips=1)
+    write_usual_run(tmp_path / "run.mcap", slips=1)
     whole = (tmp_path / "run.mcap").read_bytes()
     # the samples of so short a run come after its maps
     (tmp_path / "cut.mcap").write_bytes(whole[: whole.index(b"spatial_replay_certificate")])
@@ -154,7 +154,7 @@ def test_decisions_of_a_truncated_log_are_printed(tmp_path: Path) -> None:
 
 
 def test_decisions_are_available_as_json(tmp_path: Path) -> None:
-    record_plan_of(tmp_path / "run.mcap")
+    write_usual_run(tmp_path / "run.mcap")
     code, said = call("info", tmp_path / "run.mcap", "--decisions", "--json")
     decisions = json.loads(said)["decisions"]
     assert code == 0

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import spatial_replay as sr
 from planning.kinematics import BLOCKS, PUSHING, Table
@@ -79,3 +82,17 @@ def record_plan_of(
             if step.kind == "execute":
                 record(box.conclude(table.execute(step)))
     return steps
+
+
+@cache
+def _usual_run(slips):
+    with TemporaryDirectory() as folder:
+        path = Path(folder, "run.mcap")
+        return record_plan_of(path, slips=slips), path.read_bytes()
+
+
+def write_usual_run(path, slips=0):
+    """Write the log of the usual run, which is planned once for all tests, and return its steps."""
+    steps, log = _usual_run(slips)
+    path.write_bytes(log)
+    return [*steps]

@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 
 import spatial_replay as sr
 from planning.kinematics import BLOCKS, block
-from planning.plans import PUSH, record_plan_of
+from planning.plans import PUSH, record_plan_of, write_usual_run
 from spatial_replay import LogError, Settings, UsageError, load_specification
 from spatial_replay.logs import LogWriter
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
@@ -41,7 +41,7 @@ def payloads(path, topic, kind):
 
 
 def test_decisions_are_logged_with_their_outcomes(tmp_path):
-    steps = record_plan_of(tmp_path / "run.mcap", slips=1)
+    steps = write_usual_run(tmp_path / "run.mcap", slips=1)
     decisions = read_decisions(tmp_path / "run.mcap").decisions
     assert [each.number for each in decisions] == list(range(len(steps)))
     assert [each.outcome.succeeded for each in decisions[:-1]] == [False, *[True] * (len(steps) - 2)]
@@ -53,7 +53,7 @@ def test_decisions_are_logged_with_their_outcomes(tmp_path):
 
 
 def test_recomputed_decisions_are_the_same(tmp_path):
-    steps = record_plan_of(tmp_path / "run.mcap", slips=1)
+    steps = write_usual_run(tmp_path / "run.mcap", slips=1)
     recomputed = recompute_decisions(open_source(tmp_path / "run.mcap"))
     assert recomputed.differences == ()
     assert recomputed.decisions == len(steps)
@@ -119,7 +119,7 @@ def cut(log, to, window):
 
 
 def test_the_beginning_of_a_run_can_be_recomputed_and_the_end_cannot(tmp_path):
-    record_plan_of(tmp_path / "run.mcap", slips=1)
+    write_usual_run(tmp_path / "run.mcap", slips=1)
     first, second, *_ = read_decisions(tmp_path / "run.mcap").decisions
     cut(tmp_path / "run.mcap", tmp_path / "begun.mcap", Window(end_ns=second.time_ns + 1))
     recomputed = recompute_decisions(open_source(tmp_path / "begun.mcap"))
@@ -133,7 +133,7 @@ def test_the_beginning_of_a_run_can_be_recomputed_and_the_end_cannot(tmp_path):
 
 
 def test_a_replay_keeps_decisions(tmp_path):
-    record_plan_of(tmp_path / "run.mcap")
+    write_usual_run(tmp_path / "run.mcap")
     (tmp_path / "edited.spatial").write_text("use spatial_spec\nF (red above blue)\n")
     edited = load_specification(tmp_path / "edited.spatial")
     run_replay(open_source(tmp_path / "run.mcap"), [edited], output=tmp_path / "annotated.mcap")
@@ -141,7 +141,7 @@ def test_a_replay_keeps_decisions(tmp_path):
 
 
 def test_certificates_cover_decisions(tmp_path):
-    record_plan_of(tmp_path / "run.mcap")
+    write_usual_run(tmp_path / "run.mcap")
     verified = verify_certificate(open_source(tmp_path / "run.mcap"))
     assert "plan_sha256" in verified.recorded
     assert verified.differences == ()
@@ -244,7 +244,7 @@ def test_the_last_map_of_a_step_is_that_of_the_chosen_object(tmp_path, options):
 
 
 def test_maps_are_numbered_on_their_topic(tmp_path):
-    record_plan_of(tmp_path / "run.mcap")
+    write_usual_run(tmp_path / "run.mcap")
     with (tmp_path / "run.mcap").open("rb") as stream:
         messages = list(make_reader(stream).iter_messages([GRADIENT_MAP]))
     assert [message.sequence for _, _, message in messages] == list(range(len(messages)))
@@ -281,7 +281,7 @@ def test_decisions_of_the_recorded_push_are_recomputed_byte_for_byte():
 
 
 def test_the_planned_path_is_drawn_first_and_then_the_travelled_one(tmp_path):
-    steps = record_plan_of(tmp_path / "run.mcap")
+    steps = write_usual_run(tmp_path / "run.mcap")
     planned, travelled, *_, last = payloads(tmp_path / "run.mcap", PLAN_PATH, SceneUpdate)
     points = [(point.x, point.y) for point in planned.entities[0].lines[0].points]
     assert points == list(steps[0].target.waypoints)
@@ -291,7 +291,7 @@ def test_the_planned_path_is_drawn_first_and_then_the_travelled_one(tmp_path):
 
 
 def test_all_messages_of_a_decision_have_the_time_of_its_sample(tmp_path):
-    steps = record_plan_of(tmp_path / "run.mcap")
+    steps = write_usual_run(tmp_path / "run.mcap")
     times = {
         message.timestamp.ToNanoseconds()
         for message in payloads(tmp_path / "run.mcap", GRADIENT_MAP, GridMessage)
@@ -301,7 +301,7 @@ def test_all_messages_of_a_decision_have_the_time_of_its_sample(tmp_path):
 
 
 def test_the_planner_and_the_log_agree_on_the_states_of_the_automaton(tmp_path):
-    steps = record_plan_of(tmp_path / "run.mcap", slips=1)
+    steps = write_usual_run(tmp_path / "run.mcap", slips=1)
     logged = payloads(tmp_path / "run.mcap", "/spatial/automaton", AutomatonState)
     states = {message.time_ns: tuple(message.states) for message in logged}
     assert [states[step.time_ns] for step in steps] == [step.states for step in steps]
