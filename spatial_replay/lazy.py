@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from html import escape
 from importlib import import_module
 from typing import Any
 
@@ -46,6 +47,24 @@ class Displayed:
 
     def _repr_html_(self) -> str:
         return str(_notebook().html(self))
+
+
+class Printed:
+    """A result with one text, which terminals print and notebooks show."""
+
+    __slots__ = ()
+
+    def lines(self) -> Iterator[str]:
+        """Yield the text."""
+        raise NotImplementedError
+
+    def _repr_html_(self) -> str:
+        return page_of(self.lines())
+
+
+def page_of(lines: Iterable[str]) -> str:
+    """Return lines of text as HTML."""
+    return f"<pre>{escape(chr(10).join(lines))}</pre>"
 
 
 def _notebook() -> Any:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -22,7 +21,16 @@ from spatial_replay.cli.options import (
     warn_of_input,
 )
 from spatial_replay.cli.output import MANY, VERDICT_COLOURS, counts_text, others_text, worst_of
-from spatial_replay.cli.terminal import Coloured, Line, fitted, progress, show, show_json, warn
+from spatial_replay.cli.terminal import (
+    Coloured,
+    Line,
+    fitted,
+    progress,
+    show,
+    show_json,
+    terminal_width,
+    warn,
+)
 from spatial_replay.errors import UsageError
 from spatial_replay.text import requirement_text, time_text
 from spatial_replay.trace.trace import time_point_from_text
@@ -113,14 +121,12 @@ def explain(
 
 def _lines_on_terminal(lines: Sequence[str]) -> Iterator[Line]:
     """Yield lines that fit onto the terminal, with verdicts in their colours."""
-    width = shutil.get_terminal_size((100, 24)).columns
-    for line in lines:
-        for part in fitted(line, width):
-            pieces = re.split(_VERDICT, part)
-            yield tuple(
-                Coloured(piece, VERDICT_COLOURS[piece]) if number % 2 else piece
-                for number, piece in enumerate(pieces)
-            )
+    for part in fitted(lines, terminal_width()):
+        pieces = re.split(_VERDICT, part)
+        yield tuple(
+            Coloured(piece, VERDICT_COLOURS[piece]) if number % 2 else piece
+            for number, piece in enumerate(pieces)
+        )
 
 
 _VERDICT: Final = re.compile(r"(?<=is )(satisfied|violated|unknown)\b")

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
@@ -20,13 +18,6 @@ from spatial_replay.cli.options import (
 from spatial_replay.cli.record import SCENARIOS
 from spatial_replay.cli.terminal import progress, show, show_json
 from spatial_replay.logs.remote import LogFile
-from spatial_replay.text import counted, with_unit
-
-if TYPE_CHECKING:
-    from spatial_replay.falsification.failures import Coverage, Failure, Falsification, SearchedRun
-
-_MOST_LISTED = 20
-"""The most failures that are listed; JSON and `failures.json` have all."""
 
 
 @click.command(cls=JsonCommand)
@@ -120,70 +111,5 @@ def falsify(
     if as_json:
         show_json(found.document)
     else:
-        show(*_lines(found))
+        show(*found.lines())
     return exit_code_from_verdicts([str(found.verdict)])
-
-
-def _lines(found: Falsification) -> Iterator[str]:
-    yield f"run 1, with nothing varied: {_judged(found.first)}"
-    for each in found.parameters:
-        if each.unit == "s" and found.first.seconds < each.high < math.inf:
-            yield (
-                f"{each.name}@{each.low:g}s:{each.high:g}s goes on after the end of that run, at"
-                f" {found.first.seconds:g} s: from there on nothing happens"
-            )
-    if found.first.is_violated:
-        yield "  the search ended with it: what fails without any variation needs no search"
-    unknown = sum(run.verdict == "unknown" for run in found.runs)
-    doubt = f", {unknown:,} unknown" if unknown else ""
-    runs = counted(len(found.runs), "run")
-    if found.failures:
-        yield f"{runs} of {found.name}: {len(found.failures):,} violated{doubt}; the worst first:"
-        for failure in found.failures[:_MOST_LISTED]:
-            yield from _shown(found, failure)
-        if len(found.failures) > _MOST_LISTED:
-            yield f"  … and {len(found.failures) - _MOST_LISTED:,} more in failures.json"
-    else:
-        lowest = found.lowest
-        yield f"{runs} of {found.name}: none violated{doubt}"
-        yield f"  the lowest: run {lowest.number}, {_judged(lowest)}, with {found.text_of(lowest.case)}"
-        if len({run.robustness for run in found.runs}) == 1 < len(found.runs):
-            yield "  it is the same in every run: what is varied does not change it"
-        elif not found.is_exhausted:
-            yield "  that is no proof: the same command with a larger --budget goes on from there"
-    if found.is_exhausted:
-        yield "  the search ended early: there was nothing else to try"
-    if len(found.runs) > 1:
-        yield "covered, with the runs in each tenth of a range:"
-        yield from _table(found.coverage)
-    if found.impossible:
-        yield f"  {counted(found.impossible, 'case')} left out, in which objects would lie in each other"
-    if found.simulations:
-        yield f"{counted(found.simulations, 'more run')} made the failures smaller"
-    worst = min(found.failures, key=lambda each: each.smaller.robustness, default=None)
-    if worst is not None and worst.command is not None:
-        less = " with less" if worst.is_smaller else ""
-        yield f"the worst again, run {worst.run.number}{less}: {worst.command}"
-
-
-def _judged(run: SearchedRun) -> str:
-    return f"{run.verdict}, {run.spec} {with_unit(run.robustness, run.unit)}"
-
-
-def _shown(found: Falsification, failure: Failure) -> Iterator[str]:
-    run = failure.run
-    yield f"  {failure.log}  {run.spec} {with_unit(run.robustness, run.unit)}  {found.text_of(run.case)}"
-    if failure.is_smaller:
-        smaller = failure.smaller
-        number = with_unit(smaller.robustness, smaller.unit)
-        yield f"    with less: {failure.smaller_log}  {smaller.spec} {number}  {found.text_of(smaller.case)}"
-    yield f"    clip: {failure.clip}"
-
-
-def _table(covered: tuple[Coverage, ...]) -> Iterator[str]:
-    names = max(len(each.parameter) for each in covered)
-    spans = [f"{each.low:g} to {each.high:g}{f' {each.unit}' if each.unit else ''}" for each in covered]
-    width = max(map(len, spans))
-    for each, span in zip(covered, spans, strict=True):
-        counts = " ".join(f"{count:3}" for count in each.tenths)
-        yield f"  {each.parameter:<{names}}  {span:<{width}}  {counts}"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -14,7 +13,6 @@ from typing import TYPE_CHECKING
 import click
 
 from spatial_replay.cli.application import ExitCode
-from spatial_replay.cli.decisions import decision_lines, decision_rows
 from spatial_replay.cli.options import (
     JsonCommand,
     LogPath,
@@ -24,7 +22,17 @@ from spatial_replay.cli.options import (
     reading_options,
 )
 from spatial_replay.cli.output import MANY, WORST_FIRST, counts_text
-from spatial_replay.cli.terminal import printing_to, progress, show, show_bytes, show_file, show_json, warn
+from spatial_replay.cli.terminal import (
+    fitted,
+    printing_to,
+    progress,
+    show,
+    show_bytes,
+    show_file,
+    show_json,
+    terminal_width,
+    warn,
+)
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import LogFile
 from spatial_replay.text import counted, counted_from, escaped, requirement_text
@@ -163,11 +171,9 @@ def _print_decisions(log: LogFile, as_json: bool) -> int:
     recorded = read_decisions(log)
     warn(*counted_from(recorded.faults, known_start_ns(open_source(log)) if recorded.faults else 0))
     if as_json:
-        rows = decision_rows(recorded.decisions)
-        document = {"name": log.name, "damaged": bool(recorded.faults), "decisions": rows}
-        show_json(document)
+        show_json(recorded.document)
     else:
-        show(*decision_lines(log, recorded.decisions, shutil.get_terminal_size((100, 24)).columns))
+        show(*fitted(recorded.lines(), terminal_width()))
     return ExitCode.DAMAGED if recorded.faults else ExitCode.SATISFIED
 
 

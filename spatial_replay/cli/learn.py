@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
@@ -20,13 +18,6 @@ from spatial_replay.cli.options import (
 from spatial_replay.cli.terminal import progress, show, show_file, show_json
 from spatial_replay.cli.tune import ManyLogs
 from spatial_replay.logs.remote import LogFile
-from spatial_replay.text import counted
-
-if TYPE_CHECKING:
-    from spatial_replay.learning.learned import Learned
-
-_MOST_LISTED = 10
-"""The most bad runs that are listed; JSON has all."""
 
 
 @click.command(cls=ManyLogs)
@@ -82,38 +73,9 @@ def learn(
     if as_json:
         show_json(learned.document)
     elif output is not None or not learned.text:
-        show(*_lines(learned))
+        show(*learned.lines())
         if learned.text:
             show(f"wrote {output}")
     else:
         show_file(learned.text)
     return ExitCode.SATISFIED if learned.is_found else ExitCode.VIOLATED
-
-
-def _lines(learned: Learned) -> Iterator[str]:
-    from spatial_replay.learning.learned import checked_text
-
-    bad = sum(not is_good for _, is_good in learned.runs)
-    good = len(learned.runs) - bad
-    runs = counted(good, "good run") + (f" and {counted(bad, 'bad run')}" if bad else "")
-    if learned.lines:
-        yield f"learned {counted(len(learned.lines), 'spec')} from {runs}:"
-    else:
-        what = "distinguishes any bad run" if bad else "is worth a line"
-        yield f"nothing that holds in all of {counted(good, 'good run')} {what}"
-    width = max((len(line.title) for line in learned.lines), default=0)
-    for line in learned.lines:
-        violating = (
-            f"  violated by {len(line.violated_by)} of {bad}"
-            if bad
-            else f"  robustness at least {line.lowest:.4g}"
-        )
-        yield f"  {line.title:<{width}}{violating}"
-    if learned.checked:
-        yield checked_text(learned.checked).rstrip(".")
-    for name in learned.missed[:_MOST_LISTED] if learned.lines else ():
-        yield f"{name} violates none of these lines"
-    if learned.lines and len(learned.missed) > _MOST_LISTED:
-        yield f"… nor do {counted(len(learned.missed) - _MOST_LISTED, 'more bad run')}"
-    for each in learned.left_out:
-        yield f"not compared: {each}"

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import math
 import shlex
-import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from functools import cache, wraps
 from importlib.resources import files
 from pathlib import Path
@@ -15,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from spatial_replay.cli.application import ExitCode, exit_code_from_verdicts, most_severe
-from spatial_replay.cli.decisions import choice_text, decision_rows, fitted_lines
 from spatial_replay.cli.options import (
     LogOutput,
     LogPath,
@@ -35,16 +32,13 @@ from spatial_replay.cli.record import (
     show_film,
     simulation_options,
 )
-from spatial_replay.cli.terminal import progress, show, show_json, warn
+from spatial_replay.cli.terminal import fitted, progress, show, show_json, terminal_width, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import LogFile, local_files
-from spatial_replay.text import counted, counted_from, time_text
+from spatial_replay.text import counted, counted_from
 
 if TYPE_CHECKING:
     from spatial_replay.logs.output_file import Durability
-    from spatial_replay.logs.schemas.PlanDecision_pb2 import PlanCandidate, PlanDecision
-    from spatial_replay.logs.source import Source
-    from spatial_replay.planning.read import Replanned
 
 
 @cache
@@ -101,7 +95,7 @@ def _changes(file: LogFile | None, texts: Mapping[str, str | None]) -> Mapping[s
     return changes
 
 
-def redo(
+def _redo(
     log: LogFile,
     output: Path | None,
     spec: LogFile | None,
@@ -113,13 +107,14 @@ def redo(
 ) -> int:
     """Decide again on the samples of a log, and show the first decision that differs."""
     # imported here so that --help stays fast
-    from spatial_replay.planning.read import ReplannedSource, redo_decisions
+    from spatial_replay.planning.read import ReplannedSource, planner_of, redo_decisions
     from spatial_replay.replay import ReplayOptions, known_start_ns, load_files, run_replay
     from spatial_replay.sources.open_log import open_source
 
     source = open_source(log)
     named = [] if spec is None else [spec]
-    file = next(iter(load_spec_options(named, profile, constants, lambda: _recorded(source))), None)
+    files = load_spec_options(named, profile, constants, lambda: planner_of(source).specification)
+    file = next(iter(files), None)
     if file is not None:
         require_choice(file, of)
     with progress("samples") as advance:
@@ -130,113 +125,14 @@ def redo(
         beside = ReplannedSource(source, redone.messages)
         run_replay(beside, files, ReplayOptions(), output=output, inputs=local_files([log, *named]))
     if as_json:
-        show_json(_document(redone))
+        show_json(redone.document)
     else:
-        width = shutil.get_terminal_size((100, 24)).columns
-        show(*fitted_lines(_lines(redone), width), *_maps_side_by_side(redone, (width - 13) // 2))
+        width = terminal_width()
+        show(*fitted(redone.lines(width), width))
         if output is not None:
             show(f"wrote {output}: {shlex.join(['spatial-replay', 'report', str(output)])} shows both")
     code = ExitCode.VIOLATED if redone.is_different else ExitCode.SATISFIED
     return most_severe([code, ExitCode.DAMAGED]) if redone.faults else code
-
-
-def _recorded(source: Source) -> Any:
-    from spatial_replay.planning.read import planner_of
-
-    return planner_of(source).specification
-
-
-def _document(redone: Replanned) -> dict[str, Any]:
-    sides = {
-        side: None if step is None else decision_rows([step.message])[0]
-        for side, step in (("recorded", redone.recorded), ("redone", redone.redone))
-    }
-    return {
-        "name": redone.name,
-        "damaged": bool(redone.faults),
-        "changes": redone.changes,
-        "decisions": redone.decisions,
-        "same": redone.same,
-        "alike": redone.alike,
-        "differs_ns": None if redone.sample is None else redone.sample.time_ns,
-        **sides,
-    }
-
-
-def _lines(redone: Replanned) -> Iterator[str]:
-    changed = ", ".join(redone.changes) or "nothing changed"
-    yield f"{redone.name}: {counted(redone.decisions, 'decision')}, redone with {changed}"
-    if redone.same:
-        yield f"{_first(redone.same, redone.decisions)} the same, byte for byte, with all maps"
-    if redone.alike > redone.same:
-        number = redone.alike - redone.same
-        also = "then " if redone.same else ""
-        verb = "does" if number == 1 else "do"
-        yield f"{also}{counted(number, 'decision')} {verb} the same, with other maps or reasons"
-    if redone.redone is None or redone.sample is None:
-        return
-    at = time_text(redone.sample.time_ns)
-    new = redone.redone.message
-    if redone.recorded is None:
-        yield f"at {at}, where the log has no decision, the wait is over:"
-    else:
-        old = redone.recorded.message
-        yield f"decision {old.number} at {at} differs"
-        yield f"  recorded  {choice_text(old)}"
-    yield f"  redone    {choice_text(new)}"
-    if new.HasField("lost") and new.lost.text:
-        yield f"            at {time_text(new.lost.time_ns)}: {new.lost.text}"
-
-
-def _first(count: int, of: int) -> str:
-    if count == of:
-        return "all decisions are" if of > 1 else "the decision is"
-    return f"the first {counted(count, 'decision')} are" if count > 1 else "the first decision is"
-
-
-def _maps_side_by_side(redone: Replanned, column: int) -> Iterator[str]:
-    """Yield what the maps of the last edges say, of each object in two columns.
-
-    Args:
-        column: characters of a column.
-    """
-    if redone.recorded is None or redone.redone is None:
-        return
-    messages = redone.recorded.message, redone.redone.message
-    sides = [{each.object: each for each in _candidates(message)} for message in messages]
-    for name in dict.fromkeys((*sides[0], *sides[1])):
-        yield f"{f'map of {name}':<13}{'recorded':<{column}}redone"
-        rows = [_rows(side.get(name)) for side in sides]
-        for key in dict.fromkeys((*rows[0], *rows[1])):
-            ours, theirs = ([_cut(text, column) for text in row.get(key, ())] for row in rows)
-            for place in range(max(len(ours), len(theirs))):
-                left, right = (each[place] if place < len(each) else "" for each in (ours, theirs))
-                yield f"  {key if not place else '':<11}{left:<{column}}{right}".rstrip()
-
-
-def _cut(text: str, column: int) -> str:
-    return text if len(text) < column else f"{text[: column - 2]}…"
-
-
-def _candidates(message: PlanDecision) -> list[PlanCandidate]:
-    return list(message.considered[-1].candidates) if message.considered else []
-
-
-def _rows(candidate: PlanCandidate | None) -> dict[str, list[str]]:
-    from spatial_replay.planning.decisions import candidate_lines
-
-    if candidate is None:
-        return {}
-    best = "nowhere free" if math.isinf(candidate.best) else f"{candidate.best:.4g}"
-    rows = {"best": [best]}
-    if candidate.HasField("target"):
-        target = candidate.target
-        rows["target"] = [f"({target.x:.4g}, {target.y:.4g}), robustness {target.robustness:.4g}"]
-    elif candidate.rejected:
-        rows["rejected"] = [candidate.rejected]
-    for key, line in candidate_lines(candidate):
-        rows.setdefault(key, []).append(line)
-    return rows
 
 
 @click.group(invoke_without_command=True)
@@ -279,9 +175,7 @@ def plan(
       spatial-replay plan --redo push.mcap --spec edited.spatial -o both.mcap
     """
     if log is not None and context.invoked_subcommand is None:
-        # imported here so that --help stays fast
-
-        return redo(log, changes=changes, **options)
+        return _redo(log, changes=changes, **options)
     if log is not None:
         raise UsageError(f"--redo takes no scenario; leave out {context.invoked_subcommand}")
     if changes or any(options.values()):

@@ -86,16 +86,22 @@ class StatusLine:
             self._is_shown = False
 
 
-def fitted(line: str, width: int) -> Iterator[str]:
-    """Yield a line cut at spaces, so that it fits into a width; its rest is indented."""
-    indent = " " * (len(line) - len(line.lstrip(" ")) + 4)
-    yield from wrap(
-        line,
-        max(width, _LEAST_WIDTH),
-        subsequent_indent=indent,
-        break_long_words=False,
-        break_on_hyphens=False,
-    ) or [line]
+def terminal_width() -> int:
+    """Return the characters of a line of the terminal, 100 where there is none."""
+    return shutil.get_terminal_size((100, 24)).columns
+
+
+def fitted(lines: Iterable[str], width: int) -> Iterator[str]:
+    """Yield lines cut at spaces, so that they fit into a width; the rest of a line is indented."""
+    for line in lines:
+        indent = " " * (len(line) - len(line.lstrip(" ")) + 4)
+        yield from wrap(
+            line,
+            max(width, _LEAST_WIDTH),
+            subsequent_indent=indent,
+            break_long_words=False,
+            break_on_hyphens=False,
+        ) or [line]
 
 
 def show_json(value: Any, indent: int | None = 2) -> None:

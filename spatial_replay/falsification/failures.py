@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
 from spatial_replay.falsification.simulations import TENTHS, Case, Parameter
-from spatial_replay.lazy import Displayed
+from spatial_replay.lazy import Printed
 from spatial_replay.monitor.verdict import Verdict
-from spatial_replay.notebook import html
-from spatial_replay.notebook.figures import Html, element, folded, quiet, table, verdict_mark
-from spatial_replay.text import counted, json_number, number_text
+from spatial_replay.text import counted, json_number, with_unit
+
+_MOST_FAILURES: Final = 20
+"""The most failures in the text; JSON has all."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +127,7 @@ class Coverage:
 
 
 @dataclass(frozen=True, eq=False)
-class Falsification(Displayed):
+class Falsification(Printed):
     """What a search for failures has found.
 
     Attributes:
@@ -183,6 +185,58 @@ class Falsification(Displayed):
             else:
                 shown[each.group] = f"{each.group} {value:.12g}" if known is None else f"{known},{value:.12g}"
         return ", ".join(shown.values()) or "nothing varied"
+
+    def lines(self) -> Iterator[str]:
+        """Yield the failures, the worst first, or the lowest run; and the coverage."""
+        yield f"run 1, with nothing varied: {_judged(self.first)}"
+        for each in self.parameters:
+            if each.unit == "s" and self.first.seconds < each.high < math.inf:
+                yield (
+                    f"{each.name}@{each.low:g}s:{each.high:g}s goes on after the end of that run, at"
+                    f" {self.first.seconds:g} s: from there on nothing happens"
+                )
+        if self.first.is_violated:
+            yield "  the search ended with it: what fails without any variation needs no search"
+        unknown = sum(run.verdict == "unknown" for run in self.runs)
+        doubt = f", {unknown:,} unknown" if unknown else ""
+        runs = counted(len(self.runs), "run")
+        if self.failures:
+            yield f"{runs} of {self.name}: {len(self.failures):,} violated{doubt}; the worst first:"
+            for failure in self.failures[:_MOST_FAILURES]:
+                yield from self._lines_of(failure)
+            if len(self.failures) > _MOST_FAILURES:
+                yield f"  … and {len(self.failures) - _MOST_FAILURES:,} more in failures.json"
+        else:
+            lowest = self.lowest
+            yield f"{runs} of {self.name}: none violated{doubt}"
+            yield f"  the lowest: run {lowest.number}, {_judged(lowest)}, with {self.text_of(lowest.case)}"
+            if len({run.robustness for run in self.runs}) == 1 < len(self.runs):
+                yield "  it is the same in every run: what is varied does not change it"
+            elif not self.is_exhausted:
+                yield "  that is no proof: the same command with a larger --budget goes on from there"
+        if self.is_exhausted:
+            yield "  the search ended early: there was nothing else to try"
+        if len(self.runs) > 1:
+            yield "covered, with the runs in each tenth of a range:"
+            yield from _table(self.coverage)
+        if self.impossible:
+            yield f"  {counted(self.impossible, 'case')} left out, in which objects would lie in each other"
+        if self.simulations:
+            yield f"{counted(self.simulations, 'more run')} made the failures smaller"
+        worst = min(self.failures, key=lambda each: each.smaller.robustness, default=None)
+        if worst is not None and worst.command is not None:
+            less = " with less" if worst.is_smaller else ""
+            yield f"the worst again, run {worst.run.number}{less}: {worst.command}"
+
+    def _lines_of(self, failure: Failure) -> Iterator[str]:
+        run = failure.run
+        yield f"  {failure.log}  {run.spec} {with_unit(run.robustness, run.unit)}  {self.text_of(run.case)}"
+        if failure.is_smaller:
+            smaller = failure.smaller
+            number = with_unit(smaller.robustness, smaller.unit)
+            case = self.text_of(smaller.case)
+            yield f"    with less: {failure.smaller_log}  {smaller.spec} {number}  {case}"
+        yield f"    clip: {failure.clip}"
 
     @property
     def document(self) -> dict[str, Any]:
@@ -248,41 +302,14 @@ def _relative(path: Path) -> str:
     return f"{path.parent.name}/{path.name}"
 
 
-# ----------------------------------------------------------------------------------------------- in notebooks
-
-_MOST_ROWS: Final = 20
-"""The most failures that are shown."""
+def _judged(run: SearchedRun) -> str:
+    return f"{run.verdict}, {run.spec} {with_unit(run.robustness, run.unit)}"
 
 
-@html.register(Falsification)
-def falsification_html(found: Falsification) -> Html:
-    """Return the failures, the worst first, or the lowest run; and what of each parameter was tried."""
-    runs, failures = counted(len(found.runs), "run"), counted(len(found.failures), "failure")
-    title = element("div", verdict_mark(found.verdict), f" {found.name}: {failures} in {runs}")
-    lowest = found.lowest
-    text = f"lowest: {number_text(lowest.robustness)} of {lowest.spec} with {found.text_of(lowest.case)}"
-    notes = [f"{len(found.failures) - _MOST_ROWS} more failures"] if len(found.failures) > _MOST_ROWS else []
-    notes += ["the search ended early: there was nothing else to try"] if found.is_exhausted else []
-    rows = [_row(found, each) for each in found.failures[:_MOST_ROWS]]
-    headings = ["robustness", "spec", "with", "made smaller", "clip"]
-    covered = [
-        (
-            each.parameter,
-            f"{each.low:g} to {each.high:g} {each.unit}".strip(),
-            " ".join(map(str, each.tenths)),
-        )
-        for each in found.coverage
-    ]
-    return element(
-        "div",
-        title,
-        table(headings, rows) if rows else element("div", text),
-        *(element("div", quiet(note)) for note in notes),
-        folded("what was tried", table(["parameter", "range", "runs in each tenth"], covered)),
-    )
-
-
-def _row(found: Falsification, failure: Failure) -> tuple[str, ...]:
-    run, smaller = failure.run, failure.smaller
-    least = found.text_of(smaller.case) if failure.is_smaller else "as it is"
-    return number_text(run.robustness), run.spec, found.text_of(run.case), least, failure.clip.name
+def _table(covered: tuple[Coverage, ...]) -> Iterator[str]:
+    names = max(len(each.parameter) for each in covered)
+    spans = [f"{each.low:g} to {each.high:g}{f' {each.unit}' if each.unit else ''}" for each in covered]
+    width = max(map(len, spans))
+    for each, span in zip(covered, spans, strict=True):
+        counts = " ".join(f"{count:3}" for count in each.tenths)
+        yield f"  {each.parameter:<{names}}  {span:<{width}}  {counts}"

@@ -11,7 +11,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from spatial_replay.errors import UsageError
-from spatial_replay.lazy import Displayed
+from spatial_replay.lazy import Printed
 from spatial_replay.learning.fit import (
     ALWAYS,
     EVENTUALLY,
@@ -378,6 +378,8 @@ def _joined(lines: Sequence[Line]) -> Iterator[Line]:
 
 MOST_LINES: Final = 100
 DEFAULT_LINES: Final = 20
+_MOST_MISSED: Final = 10
+"""The most missed bad runs in the text; JSON has all."""
 _FOLDS: Final = 10
 _FEWEST_SAMPLES: Final = 3
 _MOST_NAMED: Final = 3
@@ -420,13 +422,13 @@ class CheckedRun:
 
 
 @dataclass(frozen=True, eq=False)
-class Learned(Displayed):
+class Learned(Printed):
     """A specification learned from runs.
 
     Attributes:
         text: the specification file; comments say the evidence. "" if nothing was found.
         specification: the same, parsed; None if nothing was found.
-        lines: its specs, in its order, the most distinctive first.
+        specs: its specs, in its order, the most distinctive first.
         runs: every run's name, and whether it is good, in the order given.
         missed: bad runs that no line distinguishes.
         checked: runs that were left out in turn; none with fewer than three good runs.
@@ -435,7 +437,7 @@ class Learned(Displayed):
 
     text: str
     specification: Specification | None
-    lines: tuple[LearnedLine, ...]
+    specs: tuple[LearnedLine, ...]
     runs: tuple[tuple[str, bool], ...]
     missed: tuple[str, ...]
     checked: tuple[CheckedRun, ...]
@@ -444,10 +446,37 @@ class Learned(Displayed):
     @property
     def is_found(self) -> bool:
         """Whether there are lines, and they distinguish every bad run."""
-        return bool(self.lines) and not self.missed
+        return bool(self.specs) and not self.missed
 
     def __repr__(self) -> str:
-        return f"<Learned from {counted(len(self.runs), 'run')}: {counted(len(self.lines), 'spec')}>"
+        return f"<Learned from {counted(len(self.runs), 'run')}: {counted(len(self.specs), 'spec')}>"
+
+    def lines(self) -> Iterator[str]:
+        """Yield the specs with the evidence for each, as the command `learn` prints them."""
+        bad = sum(not is_good for _, is_good in self.runs)
+        good = len(self.runs) - bad
+        runs = counted(good, "good run") + (f" and {counted(bad, 'bad run')}" if bad else "")
+        if self.specs:
+            yield f"learned {counted(len(self.specs), 'spec')} from {runs}:"
+        else:
+            what = "distinguishes any bad run" if bad else "is worth a line"
+            yield f"nothing that holds in all of {counted(good, 'good run')} {what}"
+        width = max((len(line.title) for line in self.specs), default=0)
+        for line in self.specs:
+            violating = (
+                f"  violated by {len(line.violated_by)} of {bad}"
+                if bad
+                else f"  robustness at least {line.lowest:.4g}"
+            )
+            yield f"  {line.title:<{width}}{violating}"
+        if self.checked:
+            yield checked_text(self.checked).rstrip(".")
+        for name in self.missed[:_MOST_MISSED] if self.specs else ():
+            yield f"{name} violates none of these lines"
+        if self.specs and len(self.missed) > _MOST_MISSED:
+            yield f"… nor do {counted(len(self.missed) - _MOST_MISSED, 'more bad run')}"
+        for each in self.left_out:
+            yield f"not compared: {each}"
 
     @property
     def document(self) -> dict[str, Any]:
@@ -465,7 +494,7 @@ class Learned(Displayed):
                     "lowest_run": line.lowest_run,
                     "violated_by": list(line.violated_by),
                 }
-                for line in self.lines
+                for line in self.specs
             ],
             "runs": [{"name": name, "good": is_good} for name, is_good in self.runs],
             "missed": list(self.missed),

@@ -13,20 +13,18 @@ from types import MappingProxyType
 from typing import Any
 
 from spatial_replay.errors import UsageError
+from spatial_replay.lazy import Printed
 
 _VIEWS: Mapping[str, str] = MappingProxyType(
     {
         "spatial_replay.automata.automaton": "automaton_view",
         "spatial_replay.compare.runs": "study_view",
         "spatial_replay.compare.specifications": "study_view",
-        "spatial_replay.falsification.failures": ".falsification.failures",
-        "spatial_replay.learning.learned": "study_view",
         "spatial_replay.monitor.evaluate": "evaluation_view",
         "spatial_replay.monitor.result": "evaluation_view",
         "spatial_replay.planning.decisions": "planning_view",
         "spatial_replay.planning.maps": "planning_view",
         "spatial_replay.planning.read": "planning_view",
-        "spatial_replay.sanity.examine": "study_view",
         "spatial_replay.spec.formula": "evaluation_view",
         "spatial_replay.trace.trace": "evaluation_view",
         "spatial_replay.tuning.tuned": "study_view",
@@ -43,6 +41,11 @@ def html(value: Any) -> str:
         UsageError: there is no view of values of that type.
     """
     return str(_after_loading_view(html, value)(value))
+
+
+@html.register
+def _(value: Printed) -> str:
+    return value._repr_html_()
 
 
 @singledispatch

@@ -11,6 +11,7 @@ import numpy as np
 
 from spatial_replay.annotate.scene.scene_template import outlines_of
 from spatial_replay.geometry.footprint import Footprint, TrackedObject, moved_object
+from spatial_replay.lazy import page_of
 from spatial_replay.notebook import html, plot
 from spatial_replay.notebook.figures import (
     INK,
@@ -23,9 +24,10 @@ from spatial_replay.notebook.figures import (
     signed_colours,
     table,
 )
+from spatial_replay.planning.decision_log import decision_lines, decision_message
 from spatial_replay.planning.decisions import Candidate, Consideration, Step
 from spatial_replay.planning.maps import FREE, REASONS, GradientMap
-from spatial_replay.planning.read import LoggedStep, Replanned
+from spatial_replay.planning.read import LoggedStep
 from spatial_replay.text import counted
 from spatial_replay.trace.sample import Sample
 
@@ -34,7 +36,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.image import AxesImage
 
-    from spatial_replay.planning.decisions import Target
+    from spatial_replay.planning.decision_log import decision_lines, decision_message
+from spatial_replay.planning.decisions import Target
 
 _HATCHES: Final = ("", "////", "xxxx", "....", "oooo")
 """Hatches of blocked cells, by the number of the reason."""
@@ -170,16 +173,9 @@ def _draw_footprint(ax: Axes, footprint: Footprint, width: float, style: str = "
 
 
 @html.register(Step)
-def step_html(step: Step) -> Html:
+def step_html(step: Step) -> str:
     """Return the decision, with the edges and objects considered."""
-    states = ", ".join(map(str, step.states))
-    title = element("b", f"step {step.number}: {step.kind}")
-    place = quiet(f" at {step.time_ns / 1e9:.3f} s in state {states}")
-    shown = step.considered[-_MOST_EDGES:]
-    left_out = len(step.considered) - len(shown)
-    more = [element("div", quiet(f"{left_out} edges before were given up, too"))] if left_out else []
-    lines = element("div", title, place), element("div", step.reason)
-    return element("div", *lines, *more, *map(_edge, shown))
+    return page_of(decision_lines(decision_message(step)))
 
 
 @plot.register(Step)
@@ -252,70 +248,7 @@ def _arrow(edge: Consideration) -> str:
     return f"{edge.edge[0]} → {edge.edge[1]}"
 
 
-def _edge(edge: Consideration) -> Html:
-    """Return an edge considered, with a row for each object."""
-    path = " → ".join(map(str, edge.path))
-    rows = [
-        (element("b", each.name), f"{each.map.best():.4g}", _choice_text(each).replace("\n", " "), _way(each))
-        for each in edge.candidates
-    ]
-    lines = [f"to reach: {edge.progress}"]
-    if edge.constraints.texts:
-        lines.append(f"never: {edge.constraints}")
-    pruned = [element("div", element("b", "given up: "), edge.pruned.kind)] if edge.pruned else []
-    return element(
-        "div",
-        element("div", element("b", f"edge {_arrow(edge)}"), quiet(f" on the path {path}")),
-        *(element("div", line) for line in lines),
-        table(["object", "best", "choice", "way"], rows),
-        *pruned,
-        style="margin-top:0.5em",
-    )
-
-
-def _way(candidate: Candidate) -> str:
-    target = candidate.target
-    if target is None:
-        return ""
-    return f"to ({target.x:.4g}, {target.y:.4g}), {target.length:.3g} long"
-
-
 @plot.register(LoggedStep)
 def draw_logged_step(logged: LoggedStep) -> tuple[Axes, ...]:
     """Draw the maps of a logged step with the objects of its sample; see `draw_step`."""
     return draw_step(logged.step, logged.sample)
-
-
-@html.register(LoggedStep)
-def logged_step_html(logged: LoggedStep) -> Html:
-    """Return the step and its outcome."""
-    parts = [step_html(logged.step)]
-    if logged.outcome is not None and logged.end_ns is not None:
-        how = "done" if logged.outcome.succeeded else "failed"
-        ended = f" at {logged.end_ns / 1e9:.3f} s: {logged.outcome.reason}"
-        parts.append(element("div", element("b", how), ended))
-    return element("div", *parts)
-
-
-@html.register(Replanned)
-def redone_html(redone: Replanned) -> Html:
-    """Return what was changed, how many decisions are the same, and the first that differs, as both are."""
-    changes = ", ".join(redone.changes) or "nothing changed"
-    lines = [
-        element(
-            "div",
-            element("b", redone.name),
-            f": {counted(redone.decisions, 'decision')}, redone with {changes}",
-        ),
-        element("div", f"{redone.same} the same byte for byte, {redone.alike} do the same"),
-    ]
-    if redone.redone is not None and redone.sample is not None:
-        lines.append(element("div", f"the first that differs, at {redone.sample.time_ns / 1e9:.3f} s:"))
-        old = (
-            quiet("the log has no decision there")
-            if redone.recorded is None
-            else step_html(redone.recorded.step)
-        )
-        lines.append(table(["recorded", "redone"], [(old, step_html(redone.redone.step))]))
-    lines += [element("div", quiet(f"not read: {fault}")) for fault in redone.faults]
-    return element("div", *lines)

@@ -1,4 +1,4 @@
-"""Findings, learned and tuned specifications, and differences in notebooks."""
+"""Tuned specifications and differences in notebooks."""
 
 from __future__ import annotations
 
@@ -13,14 +13,12 @@ from spatial_replay.compare.runs import LogDiff
 from spatial_replay.compare.specifications import SpecDiff, SpecificationDiff
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.learning.learned import Learned, checked_text
 from spatial_replay.logs.output_file import replacing
 from spatial_replay.notebook import html, plot
 from spatial_replay.notebook.figures import (
     INK,
     Html,
     element,
-    folded,
     new_panel,
     new_panels,
     picture,
@@ -31,67 +29,11 @@ from spatial_replay.notebook.figures import (
     verdict_mark,
 )
 from spatial_replay.palette import CURVES, NEGATIVE, NEUTRAL, POSITIVE
-from spatial_replay.sanity.examine import Examination, SpecExamination
-from spatial_replay.sanity.examples import Example
-from spatial_replay.text import counted, number_text
+from spatial_replay.text import counted
 from spatial_replay.tuning.tuned import Surface, Tuning
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-
-@html.register(Examination)
-def examination_html(found: Examination) -> Html:
-    """Return the findings, and for each spec its shortest runs and what was left undecided."""
-    rows = [
-        (element("b", each.kind), ", ".join(each.specs), each.diagnostic.message) for each in found.findings
-    ]
-    title = f"{counted(len(rows), 'finding')} in {counted(len(found.specs), 'result')}"
-    return element(
-        "div",
-        element("div", title),
-        *([table(["what", "about", "why"], rows)] if rows else []),
-        table(["spec", "satisfied by", "violated by"], map(_spec_row, found.specs)),
-        *(element("div", quiet(note)) for note in found.notes),
-    )
-
-
-def _spec_row(spec: SpecExamination) -> tuple[str, str, str]:
-    left = [f"no automaton: {spec.reason}"] if spec.reason else []
-    left += [f"not decided: {question}" for question in spec.undecided]
-    left += [f"geometry says nothing about: {text}" for text in spec.unrelated]
-    name = element("div", element("b", spec.name), *(element("div", quiet(each)) for each in left))
-    return name, _example(spec.satisfied), _example(spec.violated)
-
-
-def _example(example: Example | None) -> str:
-    if example is None:
-        return quiet("none shown")
-    lines = [element("div", f"{number}  {sentence}") for number, sentence in enumerate(example.sentences)]
-    of = "in words only" if example.robustness is None else f"robustness {number_text(example.robustness)}"
-    return folded(f"{counted(len(lines), 'sample')}, {of}", *lines)
-
-
-@html.register(Learned)
-def learned_html(learned: Learned) -> Html:
-    """Return the specs in words and as text, with their evidence."""
-    bad = sum(not is_good for _, is_good in learned.runs)
-    rows = [
-        (line.title, line.text, number_text(line.lowest), f"{len(line.violated_by)} of {bad}")
-        for line in learned.lines
-    ]
-    notes = [f"Not distinguished: {', '.join(learned.missed)}."] if learned.missed else []
-    notes += [checked_text(learned.checked)] if learned.checked else []
-    notes += [f"Not compared: {each}." for each in learned.left_out]
-    return element(
-        "div",
-        element("div", f"learned {counted(len(rows), 'spec')} from {counted(len(learned.runs), 'run')}"),
-        table(
-            ["what it says", "formula", "lowest robustness of good runs", "bad runs that violate it"], rows
-        ),
-        *(element("div", quiet(each)) for each in notes),
-    )
-
 
 _MOST_RUNS: Final = 50
 """The most runs in a table."""

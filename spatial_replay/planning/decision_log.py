@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import accumulate, pairwise
 from types import MappingProxyType
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from foxglove_schemas_protobuf.Grid_pb2 import Grid as GridMessage
@@ -15,6 +17,7 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
 from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from google.protobuf.json_format import MessageToDict
 from google.protobuf.message import DecodeError, Message
 
 from spatial_replay.annotate.scene.scene_frames import cell_colours
@@ -50,6 +53,7 @@ from spatial_replay.planning.decisions import (
     Guards,
     Kind,
     Outcome,
+    Reason,
     Step,
     Target,
     wait_outcome,
@@ -57,6 +61,7 @@ from spatial_replay.planning.decisions import (
 from spatial_replay.planning.maps import MOST_LAYERS, CauseKind, GradientMap, MapLayers, map_layers, room_cost
 from spatial_replay.planning.planner import Planner
 from spatial_replay.planning.settings import Settings, text_from_settings
+from spatial_replay.text import counted, json_number, time_text
 from spatial_replay.trace.sample import Sample
 
 # ------------------------------------------------------------------------------------------------------- maps
@@ -111,15 +116,11 @@ def map_digest(gradient: GradientMap) -> bytes:
     return hashlib.sha256(np.ascontiguousarray(gradient.values, "<f8").tobytes()).digest()
 
 
-def map_message(turned: TurnedMap, time_ns: int, layers: MapLayers | None = None) -> GridMessage:
-    """Return a map as a message, drawn under the scene; blocked cells are transparent.
-
-    Args:
-        layers: what it is made of; None for a map as older logs have it.
-    """
+def map_message(turned: TurnedMap, time_ns: int, layers: MapLayers) -> GridMessage:
+    """Return a map as a message, drawn under the scene; blocked cells are transparent."""
     gradient = turned.candidate.map
     grid, values = gradient.grid, gradient.values[turned.turn]
-    added = {} if layers is None else dict(_fields(turned, layers))
+    added = dict(_fields(turned, layers))
     kinds = [(name, values.dtype.str) for name, values in added.items()]
     cells = np.empty(values.shape, np.dtype([*_CELL.descr, *kinds]))
     cells["robustness"] = values
@@ -209,8 +210,13 @@ def explain(message: PlanCandidate, candidate: Candidate, layers: MapLayers, set
 # -------------------------------------------------------------------------------------------------- decisions
 
 PLAN_VERSION: Final = 2
-"""What decisions and maps say: 1, the maps as they are; 2, also what they are made of, and how acceptance was
-lost. Logs without a version have 1."""
+"""Of the messages: a log of another version cannot be recomputed."""
+
+_MOST_LISTED: Final = 3
+"""Conjuncts and causes that are listed of a map."""
+
+_LONGEST: Final = 400
+"""Characters of alternatives in the text; JSON has all."""
 
 _DECISIONS: Final = protobuf_channel(PLAN_DECISION, PlanDecision)
 _MAPS: Final = protobuf_channel(GRADIENT_MAP, GridMessage)
@@ -240,19 +246,16 @@ class BlackBox:
 
     Attributes:
         planner: the planner.
-        version: of what messages say, see `PLAN_VERSION`.
     """
 
-    def __init__(self, planner: Planner, *, version: int = PLAN_VERSION, timings: bool = False) -> None:
+    def __init__(self, planner: Planner, *, timings: bool = False) -> None:
         """Begin before the first sample.
 
         Args:
-            version: of what messages say, see `PLAN_VERSION`.
             timings: also log how long each decision took, so that equal runs do not give equal logs.
         """
         self.planner = planner
         self._times = timings
-        self.version = version
         self._written = dict.fromkeys(_CHANNELS, 0)
         self._sample: Sample | None = None
         self._step: Step | None = None
@@ -289,9 +292,9 @@ class BlackBox:
         self._step = step
         self._tracked = self._object_moved()
         self._travelled = [] if self._tracked is None else [centre_of(self._tracked.footprint)]
-        layers = _layers_of(step, self.planner) if self.version > 1 else None
-        self._decision = decision_message(step, self.planner, self._written[_MAPS], layers)
-        maps = [map_message(each, step.time_ns, (layers or {}).get(each.candidate)) for each in maps_of(step)]
+        layers = _layers_of(step, self.planner)
+        self._decision = explained_decision(step, self.planner, self._written[_MAPS], layers)
+        maps = [map_message(each, step.time_ns, layers[each.candidate]) for each in maps_of(step)]
         path = path_message(step.target, self._tracked, step.time_ns)
         timings = [[_timing(step, took_s)]] if self._times else []
         return step, self._messages(step.time_ns, [*ended, self._decision], maps, [path], *timings)
@@ -398,42 +401,40 @@ def _layers_of(step: Step, planner: Planner) -> dict[Candidate, MapLayers]:
     return {each: map_layers(each.map, planner.settings, each.failed) for each in found}
 
 
-def explained_decision(step: Step, planner: Planner, first_map: int = 0) -> PlanDecision:
-    """Return a decision of a planner as the newest version of a message, without an outcome."""
-    return decision_message(step, planner, first_map, _layers_of(step, planner))
-
-
-def decision_message(
-    step: Step, planner: Planner, first_map: int, layers: Mapping[Candidate, MapLayers] | None
+def explained_decision(
+    step: Step, planner: Planner, first_map: int = 0, layers: Mapping[Candidate, MapLayers] | None = None
 ) -> PlanDecision:
-    """Return a decision as a message, without an outcome.
+    """Return a decision as a message without an outcome, with the layers of its maps.
 
     Args:
         planner: that made it.
         first_map: the number of the step's first map in the log.
-        layers: the maps taken apart; None for messages as older logs have them.
+        layers: the maps taken apart, if they are known.
     """
+    layers = layers or _layers_of(step, planner)
+    message = decision_message(step, planner.automaton.name, first_map)
+    for edge, of_edge in zip(step.considered, message.considered, strict=True):
+        for each, of_candidate in zip(edge.candidates, of_edge.candidates, strict=True):
+            explain(of_candidate, each, layers[each], planner.settings)
+    return message
+
+
+def decision_message(step: Step, specification: str = "", first_map: int = 0) -> PlanDecision:
+    """Return a decision as a message, without an outcome and without the layers of maps."""
     numbers = {turned: number for number, turned in enumerate(maps_of(step), first_map)}
     pruned = (PrunedEdge(source=edge[0], target=edge[1], reason=str(reason)) for edge, reason in step.pruned)
-    message = PlanDecision(
+    return PlanDecision(
         time_ns=step.time_ns,
         number=step.number,
-        specification=planner.automaton.name,
+        specification=specification,
         kind=_KINDS[step.kind],
         states=step.states,
         considered=[_edge(each, numbers) for each in step.considered],
         target=None if step.target is None else _target(step.target),
         pruned=pruned,
         reason=step.reason,
+        lost=None if step.lost is None else PlanLoss(time_ns=step.lost.time_ns, text=step.lost.text),
     )
-    if layers is None:
-        return message
-    if step.lost is not None:
-        message.lost.CopyFrom(PlanLoss(time_ns=step.lost.time_ns, text=step.lost.text))
-    for edge, of_edge in zip(step.considered, message.considered, strict=True):
-        for each, of_candidate in zip(edge.candidates, of_edge.candidates, strict=True):
-            explain(of_candidate, each, layers[each], planner.settings)
-    return message
 
 
 def _edge(consideration: Consideration, numbers: Mapping[TurnedMap, int]) -> PlanEdge:
@@ -526,3 +527,162 @@ def _line(
         line.points.add(x=x, y=y)
     line.color.r, line.color.g, line.color.b, line.color.a = *colour, 1.0
     return line
+
+
+# ------------------------------------------------------------------------------------------------------- text
+
+
+def plan_lines(name: str, decisions: Sequence[PlanDecision]) -> Iterator[str]:
+    """Yield lines about all decisions of a log."""
+    *before, last = decisions
+    motions = sum(decision.HasField("target") and decision.HasField("outcome") for decision in decisions)
+    is_cut = last.HasField("target") and not last.HasField("outcome")
+    yield (
+        f"{name}: {counted(len(decisions), 'decision')} for {last.specification!r}, "
+        f"{counted(motions, 'motion')}{' and one cut short' if is_cut else ''}, "
+        f"{counted(len(last.pruned), 'edge')} given up"
+    )
+    for decision in before:
+        yield from decision_lines(decision)
+    yield from decision_lines(last)
+    if is_cut:
+        yield "  the log ends during this motion"
+
+
+def decision_lines(decision: PlanDecision) -> Iterator[str]:
+    """Yield lines about one decision."""
+    states = ", ".join(map(str, decision.states))
+    yield f"step {decision.number} at {time_text(decision.time_ns)}, state {states}"
+    for place, edge in enumerate(decision.considered, 1):
+        yield from _edge_lines(edge, is_aim=place == len(decision.considered) and not edge.pruned)
+    if not decision.HasField("target"):
+        yield f"  {decision.reason}"
+    else:
+        yield f"  {choice_text(decision)}"
+        yield f"  {_target_text(decision.target)}"
+    if decision.HasField("lost"):
+        why = f": {decision.lost.text}" if decision.lost.text else ""
+        yield f"  since {time_text(decision.lost.time_ns)} it cannot be satisfied{why}"
+    if decision.HasField("outcome"):
+        outcome = decision.outcome
+        how = "done" if outcome.succeeded else f"failed ({outcome.at})" if outcome.at else "failed"
+        after = ", ".join(map(str, outcome.states))
+        yield f"  {how} at {time_text(outcome.end_ns)}: {outcome.reason}; state {after}"
+
+
+def choice_text(decision: PlanDecision) -> str:
+    """Return what is done, without what has to hold next, which is in the decision's edges."""
+    aim = _either([guard.text for edge in decision.considered[-1:] for guard in edge.progress])
+    return decision.reason.removesuffix(f": {aim}")
+
+
+def _edge_lines(edge: PlanEdge, *, is_aim: bool) -> Iterator[str]:
+    path = " -> ".join(map(str, edge.path))
+    yield f"  {'aimed at' if is_aim else 'looked into'} {edge.source} -> {edge.target} on the path {path}"
+    yield f"    to reach  {_some([guard.text for guard in edge.progress])}"
+    if edge.constraints:
+        yield f"    never     {_some([guard.text for guard in edge.constraints])}"
+    for candidate in edge.candidates:
+        yield f"    {_candidate_text(candidate)}"
+        yield from (f"      {key:<11}{text}" for key, text in candidate_lines(candidate))
+    if len(edge.motions) > 1:
+        yield f"    planned   {', then '.join(_place_text(each) for each in edge.motions)}"
+    if edge.pruned:
+        yield f"    given up: {Reason.from_text(edge.pruned).kind}"
+
+
+def _candidate_text(candidate: PlanCandidate) -> str:
+    name = f"{candidate.object}{_maps(candidate)}"
+    if candidate.rejected:
+        return f"{name}: rejected, {candidate.rejected}"
+    mark = "chosen" if candidate.chosen else "possible"
+    return f"{name}: {mark}, {candidate.best:.4g} at best; {_target_text(candidate.target)}"
+
+
+def _maps(candidate: PlanCandidate) -> str:
+    """Return the numbers of its messages on the topic of gradient maps."""
+    numbers = sorted(each.number for each in candidate.maps)
+    if len(numbers) < 2:
+        return "".join(f" (map {number})" for number in numbers)
+    return f" (maps {numbers[0]} to {numbers[-1]})"
+
+
+def _target_text(target: PlanTarget) -> str:
+    points = list(zip(target.waypoints[::2], target.waypoints[1::2], strict=True))
+    length = sum(math.dist(one, other) for one, other in pairwise(points))
+    turned = f", turned by {math.degrees(target.turn):.3g} deg" if target.turn else ""
+    return (
+        f"{target.object} to ({target.x:.4g}, {target.y:.4g}){turned}, path length {length:.4g}, "
+        f"robustness {target.robustness:.4g}"
+    )
+
+
+def _place_text(target: PlanTarget) -> str:
+    return f"{target.object} to ({target.x:.4g}, {target.y:.4g})"
+
+
+def _either(texts: Sequence[str]) -> str:
+    return " or ".join(f"({text})" for text in texts) if len(texts) > 1 else "".join(texts)
+
+
+def _some(texts: Sequence[str]) -> str:
+    """Return alternatives, or the first of them and the number of the others."""
+    ends = list(accumulate(map(len, texts)))
+    count = max(1, sum(end <= _LONGEST for end in ends))
+    more = f" or {len(texts) - count} more" if count < len(texts) else ""
+    return (f"({texts[0]})" if more and count == 1 else _either(texts[:count])) + more
+
+
+def candidate_lines(candidate: PlanCandidate) -> Iterator[tuple[str, str]]:
+    """Yield what limits, blocks and costs the target of an object: (key, text), the key as a first column."""
+    limiting = sorted((each for each in candidate.conjuncts if each.limits), key=lambda each: -each.limits)
+    for each in limiting[:_MOST_LISTED]:
+        here = f", {each.at_target:.4g} at the target" if each.HasField("at_target") else ""
+        yield "limited by", f"{each.text} in {counted(each.limits, 'cell')}{here}"
+    for cause in candidate.causes[:_MOST_LISTED]:
+        yield "blocked by", f"{cause_text(cause)} in {counted(cause.cells, 'cell')}"
+    if candidate.HasField("room"):
+        room = candidate.room
+        yield (
+            "room",
+            f"{candidate.target.robustness:.4g} chosen, {room.possible:.4g} possible with less room "
+            f"({max(room.clearance, 0.0):.3g} of {room.wanted:.3g})",
+        )
+
+
+def cause_text(cause: PlanCause) -> str:
+    """Return what keeps an object out of cells."""
+    match cause.kind:
+        case cause.KIND_CONSTRAINT | cause.KIND_OBJECT:
+            return cause.text
+        case cause.KIND_OBSTACLE:
+            return "an obstacle of the workspace"
+        case cause.KIND_REACH:
+            return "the robot's reach"
+        case cause.KIND_FAILED:
+            return "a motion that failed there"
+    return "something unknown"
+
+
+def decision_rows(decisions: Sequence[PlanDecision]) -> list[dict[str, Any]]:
+    """Return decisions as values for JSON."""
+    rows = [MessageToDict(decision, preserving_proto_field_name=True) for decision in decisions]
+    for row, decision in zip(rows, decisions, strict=True):
+        _write_numbers(row, decision)
+        row["kind"] = decision.Kind.Name(decision.kind).removeprefix("KIND_").lower().replace("_", " ")
+    return rows
+
+
+def _write_numbers(row: dict[str, Any], message: Message) -> None:
+    """Write numbers that protobuf writes as text, such as 64-bit integers, as in all our JSON."""
+    for field, value in message.ListFields():
+        written = row[field.name]
+        if field.type == field.TYPE_FIXED64:
+            row[field.name] = value
+        elif field.type == field.TYPE_DOUBLE:
+            many = isinstance(written, list)
+            row[field.name] = [json_number(each) for each in value] if many else json_number(value)
+        elif field.type == field.TYPE_MESSAGE:
+            parts = zip(written, value, strict=True) if isinstance(written, list) else [(written, value)]
+            for part, of_part in parts:
+                _write_numbers(part, of_part)

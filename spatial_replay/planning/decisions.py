@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import TYPE_CHECKING, Final, Literal, Protocol, TypeAlias, get_args
+from typing import TYPE_CHECKING, Literal, Protocol, TypeAlias, get_args
 
 from spatial_replay.errors import UsageError
 from spatial_replay.lazy import Displayed
-from spatial_replay.text import counted, time_text
+from spatial_replay.text import time_text
 
 if TYPE_CHECKING:
-    from spatial_replay.logs.schemas.PlanDecision_pb2 import PlanCandidate, PlanCause
-
     # a report reads reasons without loading the kernels behind maps
     from spatial_replay.planning.maps import Cubes, GradientMap
 
@@ -24,9 +21,6 @@ for time to pass; stop, since no path to acceptance is left."""
 
 Stage: TypeAlias = Literal["pick", "way", "place"]
 """Of a motion: taking hold of its object, moving it, leaving it at the target."""
-
-_MOST_LISTED: Final = 3
-"""Conjuncts and causes that are listed of a map."""
 
 Edge: TypeAlias = tuple[int, int]
 """A transition of the automaton, from one state to another."""
@@ -251,37 +245,6 @@ def sentence_of(step: Step) -> str:
         return step.reason
     why = f", when this held: {step.lost.text}" if step.lost.text else ""
     return f"{step.reason}; that was lost at {time_text(step.lost.time_ns)}{why}"
-
-
-def candidate_lines(candidate: PlanCandidate) -> Iterator[tuple[str, str]]:
-    """Yield what limits, blocks and costs the target of an object: (key, text), the key as a first column."""
-    limiting = sorted((each for each in candidate.conjuncts if each.limits), key=lambda each: -each.limits)
-    for each in limiting[:_MOST_LISTED]:
-        here = f", {each.at_target:.4g} at the target" if each.HasField("at_target") else ""
-        yield "limited by", f"{each.text} in {counted(each.limits, 'cell')}{here}"
-    for cause in candidate.causes[:_MOST_LISTED]:
-        yield "blocked by", f"{cause_text(cause)} in {counted(cause.cells, 'cell')}"
-    if candidate.HasField("room"):
-        room = candidate.room
-        yield (
-            "room",
-            f"{candidate.target.robustness:.4g} chosen, {room.possible:.4g} possible with less room "
-            f"({max(room.clearance, 0.0):.3g} of {room.wanted:.3g})",
-        )
-
-
-def cause_text(cause: PlanCause) -> str:
-    """Return what keeps an object out of cells."""
-    match cause.kind:
-        case cause.KIND_CONSTRAINT | cause.KIND_OBJECT:
-            return cause.text
-        case cause.KIND_OBSTACLE:
-            return "an obstacle of the workspace"
-        case cause.KIND_REACH:
-            return "the robot's reach"
-        case cause.KIND_FAILED:
-            return "a motion that failed there"
-    return "something unknown"
 
 
 class Executor(Protocol):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import groupby
@@ -13,10 +14,10 @@ from typing import Any, Final, NamedTuple, get_args
 import numpy as np
 
 from spatial_replay.errors import LogError, SpatialReplayError, UsageError
-from spatial_replay.lazy import Displayed
+from spatial_replay.lazy import Displayed, Printed
 from spatial_replay.logs.mcap.read import McapSource
 from spatial_replay.logs.messages import Block, Messages, merge, select
-from spatial_replay.logs.schemas.PlanDecision_pb2 import PlanDecision
+from spatial_replay.logs.schemas.PlanDecision_pb2 import PlanCandidate, PlanDecision
 from spatial_replay.logs.source import Source, SourceOf, read_blocks
 from spatial_replay.logs.topics import (
     ENDING,
@@ -33,10 +34,15 @@ from spatial_replay.logs.topics import (
 from spatial_replay.planning.decision_log import (
     PLAN_VERSION,
     BlackBox,
+    candidate_lines,
+    choice_text,
     decision_from_payload,
+    decision_lines,
+    decision_rows,
     explained_decision,
     latest_decisions,
     maps_of,
+    plan_lines,
 )
 from spatial_replay.planning.decisions import Outcome, Stage, Step
 from spatial_replay.planning.planner import Planner
@@ -45,7 +51,7 @@ from spatial_replay.sources.open_log import open_source
 from spatial_replay.spec import parse_specification
 from spatial_replay.spec.format import format_specification
 from spatial_replay.spec.formula import Specification
-from spatial_replay.text import counted
+from spatial_replay.text import counted, time_text
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import window_of
 
@@ -60,8 +66,19 @@ class LoggedDecisions(NamedTuple):
         faults: the parts of the log that could not be read.
     """
 
+    name: str
     decisions: tuple[PlanDecision, ...]
     faults: tuple[str, ...]
+
+    def lines(self) -> Iterator[str]:
+        """Yield lines about each decision: its aim, the candidates, the choice and the outcome."""
+        return plan_lines(self.name, self.decisions)
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """The decisions as values for JSON."""
+        rows = decision_rows(self.decisions)
+        return {"name": self.name, "damaged": bool(self.faults), "decisions": rows}
 
 
 def read_decisions(log: str | PathLike[str]) -> LoggedDecisions:
@@ -84,7 +101,7 @@ def read_decisions(log: str | PathLike[str]) -> LoggedDecisions:
                     faults.append(f"{source.name}: {error}")
     if not decisions:
         raise _without_decisions(source)
-    return LoggedDecisions(latest_decisions(decisions), tuple(faults))
+    return LoggedDecisions(source.name, latest_decisions(decisions), tuple(faults))
 
 
 def planner_of(source: Source) -> Planner:
@@ -125,17 +142,6 @@ def _plan_of(source: Source) -> Mapping[str, str]:
     return about
 
 
-def _version_of(source: Source) -> int:
-    """Return what messages of a log's planner say."""
-    text = _plan_of(source).get("version", "1")
-    if not text.isdecimal() or not 1 <= int(text) <= PLAN_VERSION:
-        raise LogError(
-            f"the plan in {source.name} has version {text[:20]!r}, and this version of spatial-replay "
-            f"recomputes 1 to {PLAN_VERSION}; use a newer one"
-        )
-    return int(text)
-
-
 def rerun_of(source: Source) -> Rerun:
     """Return the planned run of a log, to repeat it from before its first sample.
 
@@ -143,7 +149,13 @@ def rerun_of(source: Source) -> Rerun:
         UsageError: the log holds no plan.
         LogError: the settings or the specification of the plan cannot be read.
     """
-    return Rerun(planner_of(source), _version_of(source))
+    version = _plan_of(source).get("version", "")
+    if version != str(PLAN_VERSION):
+        raise LogError(
+            f"the plan in {source.name} has version {version[:20]!r}, and this version of spatial-replay "
+            f"recomputes {PLAN_VERSION}; use the version that wrote it"
+        )
+    return Rerun(planner_of(source))
 
 
 def _without_decisions(source: Source) -> UsageError:
@@ -151,22 +163,22 @@ def _without_decisions(source: Source) -> UsageError:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LoggedStep(Displayed):
-    """A step of a planned run, from its log.
+class LoggedStep(Printed, Displayed):
+    """A decision of a planned run.
 
     Attributes:
         step: the decision, with all maps that it depends on.
+        message: the same as a log has it, with the outcome if it has one.
         sample: the sample that it was made on.
-        outcome: how the motion or the wait ended; None without either, or if the log ends before.
-        end_ns: when it ended, if it did.
-        travelled: points (x, y) that the object passed.
     """
 
     step: Step
+    message: PlanDecision = field(repr=False)
     sample: Sample = field(repr=False)
-    outcome: Outcome | None
-    end_ns: int | None
-    travelled: tuple[tuple[float, float], ...] = field(repr=False)
+
+    def lines(self) -> Iterator[str]:
+        """Yield its aim, the candidates, the choice and the outcome."""
+        return decision_lines(self.message)
 
 
 def read_steps(log: str | PathLike[str]) -> tuple[LoggedStep, ...]:
@@ -192,19 +204,13 @@ def read_steps(log: str | PathLike[str]) -> tuple[LoggedStep, ...]:
                 )
             rerun.repeat(decision)
             if decision.HasField("outcome"):
-                steps[decision.number] = _ended(steps[decision.number], decision)
+                steps[decision.number] = replace(steps[decision.number], message=decision)
             elif rerun.last is not None:
                 refuse_other(source, rerun.last, decision)
-                steps[decision.number] = LoggedStep(rerun.last, sample, None, None, ())
+                steps[decision.number] = LoggedStep(rerun.last, decision, sample)
     if not steps:
         raise _without_decisions(source)
     return tuple(steps.values())
-
-
-def _ended(logged: LoggedStep, decision: PlanDecision) -> LoggedStep:
-    outcome = decision.outcome
-    travelled = tuple(zip(outcome.travelled[::2], outcome.travelled[1::2], strict=True))
-    return replace(logged, outcome=_outcome(decision), end_ns=outcome.end_ns, travelled=travelled)
 
 
 def refuse_other(source: Source, step: Step, decision: PlanDecision) -> None:
@@ -273,13 +279,9 @@ class Rerun:
         is_moving: whether its motion has not been concluded yet.
     """
 
-    def __init__(self, planner: Planner, version: int = PLAN_VERSION) -> None:
-        """Begin before the first sample.
-
-        Args:
-            version: of what messages say, see `PLAN_VERSION`.
-        """
-        self.box = BlackBox(planner, version=version)
+    def __init__(self, planner: Planner) -> None:
+        """Begin before the first sample."""
+        self.box = BlackBox(planner)
         self.last: Step | None = None
         self.is_moving = False
 
@@ -517,15 +519,7 @@ _REDONE: Final = MappingProxyType(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ReplannedStep:
-    """A decision as value and as message, which says what its maps are made of and has no outcome."""
-
-    step: Step
-    message: PlanDecision
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Replanned(Displayed):
+class Replanned(Printed):
     """What a planner would have decided on the samples of a log.
 
     After the first decision by which something else is done, the recorded samples say nothing more: they are
@@ -537,8 +531,8 @@ class Replanned(Displayed):
         decisions: how many the log has.
         same: how many, from the first on, are the same byte for byte, with all their maps.
         alike: how many in all, from the first on, do the same.
-        sample: of the first decision that differs; None if all do the same.
-        recorded, redone: that decision; `recorded` is None where the log has none at that sample.
+        recorded, redone: the first decision that differs, None if all do the same; `recorded` is None where
+            the log has none at that sample.
         messages: of what was redone, the decision that differs included.
         faults: the parts of the log that could not be read.
     """
@@ -548,16 +542,112 @@ class Replanned(Displayed):
     decisions: int
     same: int
     alike: int
-    sample: Sample | None = field(repr=False)
-    recorded: ReplannedStep | None = field(repr=False)
-    redone: ReplannedStep | None = field(repr=False)
+    recorded: LoggedStep | None = field(repr=False)
+    redone: LoggedStep | None = field(repr=False)
     messages: Messages = field(repr=False)
     faults: tuple[str, ...] = ()
+
+    def lines(self, width: int = 100) -> Iterator[str]:
+        """Yield how many decisions are the same, and the first that differs, with both maps.
+
+        Args:
+            width: of the two columns of maps, in characters.
+        """
+        changes = ", ".join(self.changes) or "nothing changed"
+        yield f"{self.name}: {counted(self.decisions, 'decision')}, redone with {changes}"
+        if self.same:
+            yield f"{_first(self.same, self.decisions)} the same, byte for byte, with all maps"
+        if self.alike > self.same:
+            number = self.alike - self.same
+            also = "then " if self.same else ""
+            verb = "does" if number == 1 else "do"
+            yield f"{also}{counted(number, 'decision')} {verb} the same, with other maps or reasons"
+        if self.redone is None:
+            return
+        at = time_text(self.redone.sample.time_ns)
+        new = self.redone.message
+        if self.recorded is None:
+            yield f"at {at}, where the log has no decision, the wait is over:"
+        else:
+            old = self.recorded.message
+            yield f"decision {old.number} at {at} differs"
+            yield f"  recorded  {choice_text(old)}"
+        yield f"  redone    {choice_text(new)}"
+        if new.HasField("lost") and new.lost.text:
+            yield f"            at {time_text(new.lost.time_ns)}: {new.lost.text}"
+        yield from _maps_side_by_side(self, (width - 13) // 2)
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """It as values for JSON."""
+        sides = {
+            side: None if step is None else decision_rows([step.message])[0]
+            for side, step in (("recorded", self.recorded), ("redone", self.redone))
+        }
+        return {
+            "name": self.name,
+            "damaged": bool(self.faults),
+            "changes": self.changes,
+            "decisions": self.decisions,
+            "same": self.same,
+            "alike": self.alike,
+            "differs_ns": None if self.redone is None else self.redone.sample.time_ns,
+            **sides,
+        }
 
     @property
     def is_different(self) -> bool:
         """Whether something else would have been done."""
         return self.redone is not None
+
+
+def _first(count: int, of: int) -> str:
+    if count == of:
+        return "all decisions are" if of > 1 else "the decision is"
+    return f"the first {counted(count, 'decision')} are" if count > 1 else "the first decision is"
+
+
+def _maps_side_by_side(redone: Replanned, column: int) -> Iterator[str]:
+    """Yield what the maps of the last edges say, of each object in two columns.
+
+    Args:
+        column: characters of a column.
+    """
+    if redone.recorded is None or redone.redone is None:
+        return
+    messages = redone.recorded.message, redone.redone.message
+    sides = [{each.object: each for each in _last_candidates(message)} for message in messages]
+    for name in dict.fromkeys((*sides[0], *sides[1])):
+        yield f"{f'map of {name}':<13}{'recorded':<{column}}redone"
+        rows = [_map_rows(side.get(name)) for side in sides]
+        for key in dict.fromkeys((*rows[0], *rows[1])):
+            ours, theirs = ([_cut(text, column) for text in row.get(key, ())] for row in rows)
+            for place in range(max(len(ours), len(theirs))):
+                left, right = (each[place] if place < len(each) else "" for each in (ours, theirs))
+                yield f"  {key if not place else '':<11}{left:<{column}}{right}".rstrip()
+
+
+def _cut(text: str, column: int) -> str:
+    return text if len(text) < column else f"{text[: column - 2]}…"
+
+
+def _last_candidates(message: PlanDecision) -> list[PlanCandidate]:
+    return list(message.considered[-1].candidates) if message.considered else []
+
+
+def _map_rows(candidate: PlanCandidate | None) -> dict[str, list[str]]:
+    if candidate is None:
+        return {}
+    best = "nowhere free" if math.isinf(candidate.best) else f"{candidate.best:.4g}"
+    rows = {"best": [best]}
+    if candidate.HasField("target"):
+        target = candidate.target
+        rows["target"] = [f"({target.x:.4g}, {target.y:.4g}), robustness {target.robustness:.4g}"]
+    elif candidate.rejected:
+        rows["rejected"] = [candidate.rejected]
+    for key, line in candidate_lines(candidate):
+        rows.setdefault(key, []).append(line)
+    return rows
 
 
 def redo_decisions(
@@ -623,11 +713,10 @@ class _Redoing:
     def __init__(self, source: Source, planner: Planner, changes: tuple[str, ...]) -> None:
         self._source, self._changes = source, changes
         self._old = rerun_of(source)
-        self._new = Rerun(planner, self._old.box.version)
+        self._new = Rerun(planner)
         self._decisions = self._same = self._alike = 0
-        self._sample: Sample | None = None
-        self._recorded: ReplannedStep | None = None
-        self._redone: ReplannedStep | None = None
+        self._recorded: LoggedStep | None = None
+        self._redone: LoggedStep | None = None
         self._messages: list[Messages] = []
 
     def take(self, sample: Sample | None, recorded: list[PlannerMessage]) -> None:
@@ -668,7 +757,7 @@ class _Redoing:
                 (m.number for e in decision.considered for c in e.candidates for m in c.maps), default=0
             )
             explained = explained_decision(old, self._old.box.planner, first)
-            self._differ(sample, ReplannedStep(old, explained), new, messages)
+            self._differ(sample, LoggedStep(old, explained, sample), new, messages)
             return False
         self._messages.append(_on_redone_topics(messages))
         if self._same == self._alike and _has_all(recorded, messages):
@@ -676,9 +765,9 @@ class _Redoing:
         self._alike += 1
         return True
 
-    def _differ(self, sample: Sample, recorded: ReplannedStep | None, step: Step, messages: Messages) -> None:
-        self._sample, self._recorded = sample, recorded
-        self._redone = ReplannedStep(step, explained_decision(step, self._new.box.planner))
+    def _differ(self, sample: Sample, recorded: LoggedStep | None, step: Step, messages: Messages) -> None:
+        self._recorded = recorded
+        self._redone = LoggedStep(step, explained_decision(step, self._new.box.planner), sample)
         self._messages.append(_on_redone_topics(messages))
 
     def redone(self, faults: tuple[str, ...]) -> Replanned:
@@ -698,7 +787,6 @@ class _Redoing:
             self._decisions,
             self._same,
             self._alike,
-            self._sample,
             self._recorded,
             self._redone,
             merge(self._messages),

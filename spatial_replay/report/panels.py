@@ -47,8 +47,14 @@ from spatial_replay.monitor.verdict import final_verdict
 from spatial_replay.perception.frame import Image
 from spatial_replay.perception.image_sources import ImageTopic
 from spatial_replay.perception.opencv import encode_jpeg
-from spatial_replay.planning.decision_log import decision_from_payload, latest_decisions, map_fields
-from spatial_replay.planning.decisions import Reason, candidate_lines, cause_text
+from spatial_replay.planning.decision_log import (
+    candidate_lines,
+    cause_text,
+    decision_from_payload,
+    latest_decisions,
+    map_fields,
+)
+from spatial_replay.planning.decisions import Reason
 from spatial_replay.report.compact import Packing, sentence_parts, singles
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Boolean, Formula, Temporal, iter_nodes, operands_of, operator_of

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
-from typing import Final, Literal, TypeAlias
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Final, Literal, TypeAlias
 
 from spatial_replay.errors import NoAutomatonError, SpecificationError
-from spatial_replay.lazy import Displayed
+from spatial_replay.lazy import Printed
 from spatial_replay.sanity.conditions import FactDiagrams, is_solid, members
 from spatial_replay.sanity.examples import Example, shortest_example
 from spatial_replay.sanity.relaxations import SpecReading, automaton_of, loosened, reading_of
@@ -29,7 +31,7 @@ from spatial_replay.spec.formula import (
 )
 from spatial_replay.spec.load import require_specification
 from spatial_replay.spec.walks import is_spatial, iter_formulas, looks_back, other_names, terms_of
-from spatial_replay.text import shortened_formula
+from spatial_replay.text import counted, json_number, number_text, shortened_formula
 
 MAX_PAIRS: Final = 300
 """How many pairs of specs are compared at most."""
@@ -41,6 +43,10 @@ _SHOWN: Final = 3
 """How many exclusions a sentence names."""
 
 Kind: TypeAlias = Literal["unsatisfiable", "always true", "idle antecedent", "implied", "contradiction"]
+
+
+_ENDS: Final[Mapping[str, str]] = MappingProxyType({"unsatisfiable": "satisfied", "always true": "violated"})
+"""The verdict that no run has, by the kind of the finding."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +91,7 @@ class SpecExamination:
 
 
 @dataclass(frozen=True)
-class Examination(Displayed):
+class Examination(Printed):
     """What is wrong with a specification, and what its specs mean by example.
 
     Attributes:
@@ -97,6 +103,103 @@ class Examination(Displayed):
     findings: tuple[Finding, ...]
     specs: tuple[SpecExamination, ...]
     notes: tuple[str, ...] = ()
+
+    def lines(self, files: Mapping[tuple[str, str], Path] = MappingProxyType({})) -> Iterator[str]:
+        """Yield the findings, and the shortest runs of each spec.
+
+        Args:
+            files: the files of runs, by spec and verdict.
+        """
+        for finding in self.findings:
+            yield from str(finding.diagnostic).split("\n")
+        if self.findings:
+            yield ""
+        ends = {(each.specs[0], _ENDS[each.kind]) for each in self.findings if each.kind in _ENDS}
+        for spec in self.specs:
+            yield spec.name
+            yield from (f"  {line}" for line in _remarks(spec))
+            for verdict, example in (("satisfied", spec.satisfied), ("violated", spec.violated)):
+                if (spec.name, verdict) in ends:
+                    yield f"  {verdict} by no run"
+                elif example is not None:
+                    yield from (f"  {line}" for line in _example(example, files.get((spec.name, verdict))))
+                elif spec.reason:
+                    why = "without an automaton runs are guesses, and none was confirmed"
+                    yield f"  {verdict}: no run is shown, since {why}"
+            yield ""
+        yield from self.notes
+        if self.findings:
+            yield f"{counted(len(self.findings), 'finding')} in {counted(len(self.specs), 'result')}"
+        else:
+            whole = not any(spec.reason or spec.undecided for spec in self.specs)
+            yield "nothing found" if whole else "nothing found in what could be decided"
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """The findings and examples as values for JSON."""
+        return {
+            "findings": [_finding(each) for each in self.findings],
+            "specifications": [
+                {
+                    "name": spec.name,
+                    "automaton": not spec.reason,
+                    "reason": spec.reason,
+                    "undecided": spec.undecided,
+                    "by_logic_alone": spec.unrelated,
+                    "satisfied": _example_document(spec.satisfied),
+                    "violated": _example_document(spec.violated),
+                }
+                for spec in self.specs
+            ],
+            "notes": self.notes,
+        }
+
+
+def _remarks(spec: SpecExamination) -> Iterator[str]:
+    """Yield how far a spec was examined."""
+    if spec.reason:
+        yield f"no automaton: {spec.reason}"
+        yield "  examined with its bounds and past operators read loosely: what that excludes is excluded"
+    for question in spec.undecided:
+        yield f"not decided: {question}"
+    for text in spec.unrelated:
+        yield f"decided by logic alone, since geometry says nothing about it: {text}"
+
+
+def _example(example: Example, file: Path | None) -> Iterator[str]:
+    length = counted(len(example.sentences), "sample")
+    if example.robustness is None:
+        yield f"{example.verdict} by {length}, in words only: {example.note}"
+    else:
+        where = "" if file is None else f": {file}"
+        yield f"{example.verdict} by {length}, robustness {number_text(example.robustness)}{where}"
+    for number, sentence in enumerate(example.sentences):
+        yield f"  {number}  {sentence}"
+
+
+def _finding(finding: Finding) -> dict[str, Any]:
+    place = finding.diagnostic
+    return {
+        "kind": finding.kind,
+        "specifications": finding.specs,
+        "message": place.message,
+        "hint": place.hint,
+        "reason": finding.reason,
+        "exclusions": finding.exclusions,
+        "line": place.line,
+        "column": place.column,
+    }
+
+
+def _example_document(example: Example | None) -> dict[str, Any] | None:
+    if example is None:
+        return None
+    return {
+        "samples": example.sentences,
+        "robustness": None if example.robustness is None else json_number(example.robustness),
+        "tracks": example.rows,
+        "note": example.note,
+    }
 
 
 def doctor(specification: Specification, *, examples: bool = True) -> Examination:

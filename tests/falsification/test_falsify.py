@@ -56,12 +56,12 @@ def test_failures_are_logs_that_violate_with_the_worst_first(folder: Path) -> No
 def test_a_notebook_shows_failures_and_what_was_covered(folder: Path, tmp_path: Path) -> None:
     found = search(folder)
     text = shown(found)
-    assert f"{len(found.failures)} failures in 30 runs" in text
+    assert f"30 runs of {found.name}: {len(found.failures)} violated" in text
     assert found.text_of(found.failures[0].smaller.case) in text
     assert all(each.parameter in text for each in found.coverage)
     calm = sr.parse_specification("spec calm = G (robot dist person >= -10)")
     kept = sr.falsify(crossing, calm, output=tmp_path / "kept", vary=VARIED, budget=2)
-    assert f"lowest: {kept.lowest.robustness:.4g} of calm" in shown(kept)
+    assert f"the lowest: run {kept.lowest.number}, " in shown(kept)
 
 
 def test_a_run_is_that_of_its_case(folder: Path) -> None:

@@ -58,19 +58,19 @@ def test_what_bad_runs_do_otherwise_is_written_with_who_does_it() -> None:
     assert verdicts(learned, GOOD) == ["satisfied"] * len(GOOD)
     assert verdicts(learned, BAD) == ["violated"] * len(BAD)
     # the distance to the person is between that of the good runs and that of the bad ones, in the middle
-    near = next(line for line in learned.lines if "dist person >=" in line.text)
+    near = next(line for line in learned.specs if "dist person >=" in line.text)
     assert near.title == "every dish and person are always at least 0.474 apart"
     assert near.violated_by == ("bad run 1", "bad run 2")
     assert (near.lowest, near.lowest_run) == (pytest.approx(0.52 - 0.474), "good run 1")
-    (first,) = learned.lines[:1]
+    (first,) = learned.specs[:1]
     assert (first.title, first.violated_by) == ("every dish ends inside table", ("bad run 3",))
-    assert any(line.pattern == "before" and "bad run 4" in line.violated_by for line in learned.lines)
+    assert any(line.pattern == "before" and "bad run 4" in line.violated_by for line in learned.specs)
 
 
 def test_good_runs_alone_say_how_they_end_and_what_they_keep() -> None:
     learned = sr.learn(GOOD)
     assert verdicts(learned, GOOD) == ["satisfied"] * len(GOOD)
-    found = {line.text for line in learned.lines}
+    found = {line.text for line in learned.specs}
     # both dishes are brought to the table, so their class is
     assert 'F (G (forall a in class "dish": (a enclosedin table)))' in found
     assert 'G (forall a in class "dish": (a dist person >= 0.5))' in found
@@ -92,7 +92,7 @@ def breakfast(off: float) -> sr.Trace:
 
 
 def test_where_objects_end_is_said_by_what_they_are_put_into_beside_and_far_from() -> None:
-    lines = sr.learn([breakfast(each) for each in (0.0, 0.004, 0.01, 0.013, 0.02)]).lines
+    lines = sr.learn([breakfast(each) for each in (0.0, 0.004, 0.01, 0.013, 0.02)]).specs
     assert "bun ends inside plate" in [line.title for line in lines]
     for distance in ("sugar dist tin", "can dist sugar", "plate dist sugar"):
         assert any(line.pattern == "finally" and distance in line.text for line in lines)
@@ -105,7 +105,7 @@ def test_objects_with_other_names_in_every_run_are_compared_by_their_class() -> 
     bad = [delivery(0.4, names="{} x"), delivery(0.3, names="{} y")]
     learned = sr.learn(good, bad)
     assert verdicts(learned, good + bad) == ["satisfied"] * 5 + ["violated"] * 2
-    (text,) = [line.text for line in learned.lines if line.pattern == "always"]
+    (text,) = [line.text for line in learned.specs if line.pattern == "always"]
     assert text.startswith('G (forall a in class "dish": (forall b in class "person": (a dist b >= 0.4')
 
 
@@ -117,7 +117,7 @@ def test_the_range_of_a_signal_is_learned_from_bad_runs() -> None:
         )
 
     learned = sr.learn([with_battery(each) for each in (0.5, 0.52, 0.55)], [with_battery(0.1)])
-    assert [line.text for line in learned.lines] == ["G (battery >= 0.424)"]
+    assert [line.text for line in learned.specs] == ["G (battery >= 0.424)"]
 
 
 def test_runs_left_out_in_turn_say_what_is_found_of_what_was_not_seen() -> None:
@@ -146,7 +146,7 @@ def test_whatever_the_runs_each_line_has_its_evidence(
         return
     assert not learned.specification.warnings
     assert verdicts(learned, good) == ["satisfied"] * len(good)
-    for spec, line in zip(learned.specification.specs, learned.lines, strict=True):
+    for spec, line in zip(learned.specification.specs, learned.specs, strict=True):
         # written as it would be formatted, below its evidence
         assert (
             f'spec {spec.name} "{spec.id}: {spec.title}" = {format_formula(spec.formula)}\n' in learned.text
@@ -158,7 +158,7 @@ def test_whatever_the_runs_each_line_has_its_evidence(
         assert list(line.violated_by) == [f"bad run {n}" for n in violated]
         assert violated or not bad
     assert set(learned.missed) == {f"bad run {n}" for n in range(1, len(bad) + 1)} - {
-        name for line in learned.lines for name in line.violated_by
+        name for line in learned.specs for name in line.violated_by
     }
 
 
@@ -265,7 +265,7 @@ def test_an_object_that_some_good_runs_lack_is_named() -> None:
 
 def test_of_lines_that_the_same_bad_runs_violate_the_shorter_ones_come_first() -> None:
     lengths: dict[tuple[str, ...], list[int]] = {}
-    for line in sr.learn(GOOD, BAD).lines:
+    for line in sr.learn(GOOD, BAD).specs:
         lengths.setdefault(line.violated_by, []).append(len(line.text.split()))
     assert any(len(each) > 1 for each in lengths.values())
     assert all(each == sorted(each) for each in lengths.values())
@@ -273,7 +273,7 @@ def test_of_lines_that_the_same_bad_runs_violate_the_shorter_ones_come_first() -
 
 def test_limits_that_good_runs_come_near_are_numbers_that_people_write() -> None:
     good = [delivery(0.5 + part) for part in (0.004, 0.011, 0.019, 0.026, 0.038)]
-    found = {line.text for line in sr.learn(good).lines}
+    found = {line.text for line in sr.learn(good).specs}
     assert 'G (forall a in class "dish": (a dist person >= 0.5))' in found
 
 

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from html import unescape
 
 import pytest
+
+import spatial_replay as sr
 
 WITHOUT = "import sys; sys.modules['matplotlib'] = None\n"
 
@@ -40,3 +43,9 @@ def test_without_matplotlib_pages_are_shown():
 def test_matplotlib_loads_when_something_is_drawn(used):
     program = f"import sys, {used}\nsys.exit('matplotlib' in sys.modules)"
     assert outcome(program) == (0, "")
+
+
+def test_a_notebook_shows_the_text_of_a_result():
+    found = sr.doctor(sr.parse_specification("spec late = G (cup dist jug < 0.5)"))
+    shown = found._repr_html_()
+    assert unescape(shown) == f"<pre>{chr(10).join(found.lines())}</pre>"

@@ -64,7 +64,7 @@ def test_the_stage_of_a_failure_is_logged_and_read_back(tmp_path):
     record_plan_of(tmp_path / "run.mcap", slips=1, stage="way")
     assert read_decisions(tmp_path / "run.mcap").decisions[0].outcome.at == "way"
     first, *_ = sr.planning.read_steps(tmp_path / "run.mcap")
-    assert first.outcome == sr.Outcome(False, "it slipped", "way")
+    assert (first.message.outcome.reason, first.message.outcome.at) == ("it slipped", "way")
     assert recompute_decisions(open_source(tmp_path / "run.mcap")).differences == ()
 
 

@@ -80,7 +80,7 @@ def test_a_planner_that_would_not_have_waited_differs_where_the_log_has_no_decis
     early = sr.parse_specification(text.replace("30", "12"))
     redone = redo_decisions(open_source(tmp_path / "run.mcap"), early)
     assert redone.recorded is None
-    assert redone.sample.time_ns == 11 * 100_000_000
+    assert redone.redone.sample.time_ns == 11 * 100_000_000
     assert redone.redone.step.kind == "execute"
 
 
