@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from spatial_replay.compiled import inlined, kernel
+from spatial_replay.compiled import inlined, kernel, piece
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.signals import past_value
@@ -44,7 +44,7 @@ def _distance(steps: Steps, unit: int, earlier: int, later: int) -> int:
     return int(abs(steps.stamps[_at(steps, later)] - steps.stamps[_at(steps, earlier)]))
 
 
-@kernel
+@piece
 def _run_past(code: int, first: Floats, second: Floats, target: Floats, steps: Steps) -> None:
     """Run an unbounded once, historically or since."""
     value = np.inf if code == codes.HISTORICALLY else -np.inf
@@ -54,7 +54,7 @@ def _run_past(code: int, first: Floats, second: Floats, target: Floats, steps: S
         target[k] = value
 
 
-@kernel
+@piece
 def _run_delay(
     source: Floats, target: Floats, steps: Steps, unit: int, distance: int, missing: float
 ) -> None:
@@ -66,7 +66,7 @@ def _run_delay(
         target[_at(steps, i)] = source[_at(steps, back)] if back >= 0 else missing
 
 
-@kernel
+@piece
 def _slide(
     source: Floats, target: Floats, steps: Steps, unit: int, near: int, far: int, sign: float, extrema: Floats
 ) -> None:
@@ -95,7 +95,7 @@ def _slide(
         target[_at(steps, i)] = sign * max(inside, recent)
 
 
-@kernel
+@piece
 def _run_boolean(
     row: Integers, columns: Floats, channel: int, mirror: int, target: Floats, begin: int, end: int
 ) -> None:
