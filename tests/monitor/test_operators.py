@@ -170,7 +170,7 @@ def test_an_infinite_comparison_of_a_mode_tests_something(formula):
 def test_a_reason_about_a_mode_has_no_margin():
     evaluation = judged("G (not (mode == 2))", numbers(mode=[0, 2, 2]))
     text = evaluation.explain()
-    assert "which holds at 1.000 s (within `spec`): mode is 2." in text
+    assert "holds at 1.000 s (within `spec`): mode is 2." in text
     assert "inf" not in text.split("What decides")[1] and "No number" not in text
 
 
