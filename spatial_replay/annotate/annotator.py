@@ -57,7 +57,6 @@ from spatial_replay.trace.trace import Trace
 from spatial_replay.trace.units import OUR_AXES, Axes
 
 if TYPE_CHECKING:
-    from spatial_replay.annotate.annotator import Annotator
     from spatial_replay.annotate.automaton_state import SpecAutomaton
     from spatial_replay.annotate.foxglove_layout import LayoutContents
     from spatial_replay.annotate.scene.scene_frames import SceneFrames
@@ -577,8 +576,6 @@ class AnnotatedEvaluation:
             scene: what a viewer already shows, if it continues with these messages.
             arrow: the title of the result whose violation the scene points at; "" for the first one.
         """
-        from spatial_replay.annotate.annotator import Annotator
-
         instances = [stream.instance for stream in self.streams]
         return Annotator(
             self._files,
