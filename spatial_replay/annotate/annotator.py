@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import numpy as np
 from foxglove_schemas_protobuf.Event_pb2 import Event
@@ -25,12 +24,11 @@ from spatial_replay.annotate.robustness import encode_robustness
 from spatial_replay.annotate.scene.scene_frames import SceneFrames
 from spatial_replay.annotate.scene.scene_template import encode_frame
 from spatial_replay.annotate.scene.scene_update import SceneEncoder, SceneState
-from spatial_replay.annotate.specification import ReportedTree, encode_specification, reported_trees
+from spatial_replay.annotate.specification import ReportedTree, encode_specification
 from spatial_replay.annotate.standing import FinalStanding, StandingEncoder
 from spatial_replay.annotate.violations import EvaluatedResult, ShadeTracker, violated_since
-from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.logs.messages import Attachment, Channel, Messages, merge, messages_of
+from spatial_replay.logs.messages import Channel, Messages, messages_of
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.schemas.Robustness_pb2 import Robustness, StandingUpdate
 from spatial_replay.logs.schemas.Specification_pb2 import Specification as SpecificationMessage
@@ -49,18 +47,14 @@ from spatial_replay.logs.topics import (
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.semantics import Semantics
-from spatial_replay.monitor.stream import EvaluationStream, SeriesBlock
+from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.spec.formula import Outline, Specification, iter_nodes
-from spatial_replay.text import nearest_hint
 from spatial_replay.trace.sample import LATEST_NS
 from spatial_replay.trace.trace import Trace
-from spatial_replay.trace.units import OUR_AXES, Axes
 
 if TYPE_CHECKING:
     from spatial_replay.annotate.automaton_state import SpecAutomaton
-    from spatial_replay.annotate.foxglove_layout import LayoutContents
     from spatial_replay.annotate.scene.scene_frames import SceneFrames
-    from spatial_replay.annotate.scene.scene_template import SceneBounds
     from spatial_replay.annotate.scene.scene_update import SceneState
 
 
@@ -386,209 +380,3 @@ def channels_of_results(trees: Sequence[ReportedTree]) -> tuple[Channel, ...]:
     specification = [_SPECIFICATION] if trees else []
     standing = [_STANDING] if trees else []
     return (_FRAME, *specification, _ROBUSTNESS, _AUTOMATON, *standing, _EVENTS, _EVENT_LOG, _SCENE)
-
-
-_MOST_NAMED: Final = 10
-"""The most results that an error lists."""
-
-
-class AnnotatedEvaluation:
-    """Specifications evaluated over samples as they come, with the messages of an annotated log.
-
-    Cutting the samples into blocks changes neither numbers nor messages.
-
-    Attributes:
-        trees: every result, under the name it is reported by.
-        streams: their evaluation, in the same order.
-    """
-
-    def __init__(
-        self,
-        files: Sequence[Specification],
-        instances: Sequence[Sequence[Instance]],
-        semantics: Semantics = "ltlf",
-        compiled_before: Callable[[], Sequence[Attachment]] = list,
-        known: Sequence[SpecAutomaton] = (),
-        show: Callable[[SceneFrames], None] = lambda frames: None,
-        arrow: str = "",
-        units: Mapping[str, str] = MappingProxyType({}),
-    ) -> None:
-        """Start before the first sample.
-
-        Args:
-            instances: what to evaluate of each file.
-            compiled_before: returns the attachments of a log; automata among them are not compiled with MONA.
-            known: automata of specs of these files, which are not compiled again.
-            show: takes what the messages of the scene show.
-            arrow: the title of the result whose violation the scene points at; "" for the first one.
-            units: those that are declared, see `unit_of`.
-
-        Raises:
-            UsageError: no result has that title.
-        """
-        self._files = files
-        self._semantics = semantics
-        self._compiled_before = compiled_before
-        self._known = known
-        self._show = show
-        self._arrow, self.units = arrow, units
-
-        self._evaluations = [
-            EvaluationStream(own, file.regions, semantics) for own, file in zip(instances, files, strict=True)
-        ]
-        self.streams = [stream for evaluation in self._evaluations for stream in evaluation.streams]
-        self.trees = reported_trees(files, instances)
-        titles = [tree.title for tree in self.trees]
-        if arrow and not any(tree.is_called(arrow) for tree in self.trees):
-            hint = nearest_hint(arrow, titles) or f"there are: {', '.join(titles[:_MOST_NAMED])}"
-            raise UsageError(f"there is no result {arrow!r} for the arrow to point at; {hint}")
-        self._extent: SceneBounds | None = None
-        self._has_samples = False
-
-    def extend(self, trace: Trace) -> list[SeriesBlock]:
-        """Evaluate the next samples; return one block for each of `trees`."""
-        return [block for evaluation in self._evaluations for block in evaluation.extend(trace)]
-
-    def messages(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> list[Messages]:
-        """Return what to write beside samples, from the blocks that `extend` returned for them."""
-        from spatial_replay.annotate.scene.scene_template import SceneBounds
-
-        self._extent = SceneBounds.of(trace, self._extent)
-        self._has_samples |= len(trace) > 0
-        return self._annotator.messages(trace, blocks)
-
-    def occurrence(self, time_ns: int, what: str, sentence: str) -> Messages:
-        """Return the event of what happens to a run beside its samples."""
-        return merge(self._annotator.occurrence(time_ns, what, sentence))
-
-    def redraw(self) -> None:
-        """Draw the whole scene with the next sample, for a viewer that shows nothing yet."""
-        self._annotator.redraw()
-
-    @property
-    def finals(self) -> list[Floats]:
-        """For each of `trees` (N, 2), lower and upper end of each node's value if the log ends here."""
-        return [stream.final for stream in self.streams]
-
-    def end(self, time_ns: int, results: Sequence[SpecResult] = ()) -> Messages:
-        """Return what to write after everything else of a log.
-
-        Args:
-            time_ns: that of its last sample or message, whichever is later.
-            results: for each of `trees` its result, if there is one: they know what they were tested by.
-        """
-        return merge(self._annotator.end(time_ns, self.finals, results))
-
-    @property
-    def worst_first(self) -> Sequence[int]:
-        """The places of `trees`, the worst first, after `end`."""
-        from spatial_replay.annotate.standing import worst_first
-
-        return worst_first(self._annotator.outcomes)
-
-    @property
-    def channels(self) -> tuple[Channel, ...]:
-        """The channels of the messages that annotate a sample."""
-        from spatial_replay.annotate.annotator import channels_of_results
-
-        return channels_of_results(self.trees)
-
-    def contents(
-        self,
-        extent: SceneBounds | None,
-        topics: Collection[str] = (),
-        axes: Axes = OUR_AXES,
-        images: Collection[str] = (),
-    ) -> LayoutContents:
-        """Return what an annotated log of these results has for a viewer to show.
-
-        Args:
-            extent: of all footprints; None without any.
-            topics: those of messages that are not derived from samples.
-            axes: those of the source.
-            images: those of the topics that have images.
-        """
-        from spatial_replay.annotate.foxglove_layout import LayoutContents
-
-        has_states = [each.automaton is not None for each in self.automata]
-        # every result has events: a verdict is reported when it is reached, or else when the log ends
-        derived = {SCENE, *(DERIVED if self.trees else ())} - set(() if any(has_states) else (AUTOMATON,))
-        return LayoutContents(
-            self.trees,
-            has_states,
-            extent,
-            derived | set(topics),
-            axes,
-            images=sorted(images),
-            units=self.units,
-        )
-
-    def layout(
-        self, topics: Collection[str] = (), axes: Axes = OUR_AXES, images: Collection[str] = ()
-    ) -> Attachment:
-        """Return the layout that opens the log in a viewer, once everything else is written.
-
-        Args:
-            topics: those of messages that are not derived from samples.
-            axes: those of the source.
-            images: those of the topics that have images.
-        """
-        from spatial_replay.annotate.foxglove_layout import LayoutContents, layout_attachment
-
-        if not self._has_samples:
-            return layout_attachment(
-                LayoutContents(
-                    self.trees,
-                    [False] * len(self.trees),
-                    None,
-                    topics,
-                    axes,
-                    images=sorted(images),
-                    units=self.units,
-                )
-            )
-        contents = self.contents(self._extent, topics, axes, images)
-        return layout_attachment(contents._replace(outcomes=self._annotator.outcomes))
-
-    def automata_metadata(self) -> Mapping[str, str]:
-        """Return the size of each spec's automaton, or the reason why it has none."""
-        from spatial_replay.annotate.automaton_state import automata_metadata
-
-        return automata_metadata(self.automata)
-
-    def automata_attachments(self, prefix: str) -> list[Attachment]:
-        """Return the automata as attachments, beside those of `specification_attachments`."""
-        from spatial_replay.annotate.automaton_state import automata_attachments
-
-        return automata_attachments(self.automata, prefix)
-
-    @cached_property
-    def automata(self) -> Sequence[SpecAutomaton]:
-        """Of each tree; compiled on first use, since not every evaluation is written to a log."""
-        from spatial_replay.annotate.automaton_state import automata_of
-
-        return automata_of(self._files, self.trees, self._semantics, self._compiled_before(), self._known)
-
-    def annotator(self, scene: SceneState | None = None, arrow: str = "") -> Annotator:
-        """Return an annotator that starts before the first sample.
-
-        Args:
-            scene: what a viewer already shows, if it continues with these messages.
-            arrow: the title of the result whose violation the scene points at; "" for the first one.
-        """
-        instances = [stream.instance for stream in self.streams]
-        return Annotator(
-            self._files,
-            self.trees,
-            instances,
-            self.automata,
-            self._semantics,
-            scene,
-            self._show,
-            arrow,
-            self.units,
-        )
-
-    @cached_property
-    def _annotator(self) -> Annotator:
-        return self.annotator(arrow=self._arrow)

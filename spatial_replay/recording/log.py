@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Protocol, TypeAlia
 import numpy as np
 
 from spatial_replay import __version__
-from spatial_replay.annotate.annotator import AnnotatedEvaluation
 from spatial_replay.annotate.automaton_state import SpecAutomaton
 from spatial_replay.annotate.certificate import EvaluationHashes, specifications_json
+from spatial_replay.annotate.evaluation import AnnotatedEvaluation
 from spatial_replay.annotate.events import (
     FAILING,
     HOLDING,

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from spatial_replay import __version__
-from spatial_replay.annotate.annotator import AnnotatedEvaluation
 from spatial_replay.annotate.certificate import EvaluationHashes, specifications_json
+from spatial_replay.annotate.evaluation import AnnotatedEvaluation
 from spatial_replay.annotate.specification import (
     ReportedTree,
     logged_specifications,

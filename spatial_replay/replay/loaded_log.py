@@ -18,7 +18,8 @@ from typing import Final
 
 import numpy as np
 
-from spatial_replay.annotate.annotator import AnnotatedEvaluation, Annotator, shown_regions
+from spatial_replay.annotate.annotator import Annotator, shown_regions
+from spatial_replay.annotate.evaluation import AnnotatedEvaluation
 from spatial_replay.annotate.foxglove_layout import live_layout_attachment
 from spatial_replay.annotate.robustness import encode_curves
 from spatial_replay.annotate.scene.scene_template import SceneBounds
