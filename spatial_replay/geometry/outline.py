@@ -9,7 +9,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from spatial_replay.compiled import elementwise, inlined, kernel, long_kernel
+from spatial_replay.compiled import elementwise, inlined, kernel
 from spatial_replay.errors import GeometryError
 from spatial_replay.geometry.arrays import Floats, Integers
 
@@ -72,18 +72,6 @@ def normalise_polygons(vertex_start: Integers, vertices: Floats) -> Outlines:
     return Outlines(start, tidy[:used], fault)
 
 
-def are_normalised(vertex_start: Integers, vertices: Floats) -> bool:
-    """Normalise outlines (V, 2) in place, as `normalise_polygons` does, while other threads run.
-
-    Returns:
-        whether all are sound and have as many vertices as before; else their vertices are of no use.
-    """
-    counts = np.empty(len(vertex_start) - 1, np.int64)
-    fault = np.empty(len(counts), np.int8)
-    used = _normalise_together(vertex_start, vertices, counts, fault)
-    return used == len(vertices) and not fault.any()
-
-
 def normalise_polygon(vertices: Floats) -> tuple[Floats, int]:
     """Normalise one outline (n, 2), in place; return its vertices and its fault (see `Outlines`)."""
     counts, fault = np.empty(1, np.int64), np.empty(1, np.int8)
@@ -126,12 +114,6 @@ def _normalise_all(start: Integers, vertices: Floats, counts: Integers, fault: N
         _copy(vertices, first, vertices, used, counts[p])
         used += counts[p]
     return used
-
-
-@elementwise
-@long_kernel
-def _normalise_together(start: Integers, vertices: Floats, counts: Integers, fault: NDArray[np.int8]) -> int:
-    return _normalise_all(start, vertices, counts, fault)
 
 
 @inlined

@@ -310,7 +310,7 @@ _LOW = FINGERTIP + 0.006
 _AWAY = 0.01
 """The distance behind a body at which the fingers come down, in metres."""
 _MARGIN = 0.001
-_FAST, _SLOW = 0.1, 0.015
+_PUSH_FAST, _PUSH_SLOW = 0.1, 0.015
 _CLOSE = 0.004
 """The distance to its goal, in metres, at which a body needs no further stroke."""
 _FAR = 0.015
@@ -443,7 +443,7 @@ def _advance(
             return True
         if travelled > length + back + _AWAY:
             return False
-        travelled += min(_FAST, _SLOW + 2.0 * remaining) / TICKS_PER_S
+        travelled += min(_PUSH_FAST, _PUSH_SLOW + 2.0 * remaining) / TICKS_PER_S
         scene.arm.aim(np.array([behind[0] + u * travelled, behind[1] + v * travelled, _LOW]), scene.arm.yaw)
         yield
 

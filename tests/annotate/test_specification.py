@@ -70,7 +70,7 @@ def test_every_node_is_there_with_its_text_and_place():
         (Temporal("U", (NEAR, Temporal("G", (NEAR,)))), ""),
         (Quantified("forall", ("a",), Group("all", class_name="*"), TURNED), "1"),
         (Atom("odd", "odd", Signal("load") + SignedDistance(CUP, Variable("a"))), "mixed"),
-        (Atom("none", "none", Number(1.0)), ""),
+        (Atom("none", "none", Number(1.0)), "1"),
     ],
 )
 def test_a_node_has_the_unit_that_its_atoms_share(formula, unit):

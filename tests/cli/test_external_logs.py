@@ -181,7 +181,7 @@ def test_a_clock_that_jumps_back_is_an_error_or_ends_the_log(
         schema = writer.register_schema("any.Pose", "jsonschema", b'{"type": "object"}')
         channel = writer.register_channel("/pose", "json", schema)
         # the simulation restarts, and its stamps with it, while recording continues
-        for number, seconds in enumerate([*range(10), *range(5)]):
+        for number, seconds in enumerate([*range(1, 11), *range(1, 6)]):
             data = json.dumps({"stamp": seconds * 10**9, "x": float(number), "y": 0.0}).encode()
             writer.add_message(channel, number * 10**9, data, number * 10**9)
         writer.finish()

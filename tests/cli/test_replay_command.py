@@ -97,7 +97,7 @@ def test_numbers_that_are_not_finite_are_counted_and_unknown(folder: Path) -> No
     with (folder / "run.jsonl").open("a") as stream:
         for index, bad in enumerate(("NaN", "Infinity")):
             cube = f'{{"name": "cube", "polygon": [[{bad}, 0], [1, 0], [1, 1]]}}'
-            stream.write(f'{{"time_ns": {10**10 + index}, "objects": [{cube}]}}\n')
+            stream.write(f'{{"time_ns": {3 * 10**9 + index}, "objects": [{cube}]}}\n')
     (folder / "a.spatial").write_text("G cube ovlp cube")
     done = run_program("replay", "run.jsonl", "--spec", "a.spatial", cwd=folder)
     assert done.returncode == 4

@@ -414,7 +414,7 @@ def test_a_recorder_takes_one_planner_before_its_first_sample(tmp_path):
             recorder.next_step()
         with pytest.raises(sr.UsageError, match="planner=planner"):
             recorder.attach(Planner(specification, TABLE))
-    with sr.Recorder(tmp_path / "run.mcap", specifications=[specification]) as recorder:
+    with sr.Recorder(tmp_path / "second.mcap", specifications=[specification]) as recorder:
         recorder.write(sr.Sample(0, THINGS))
         with pytest.raises(sr.UsageError, match="before the first one"):
             recorder.attach(Planner(specification, TABLE))
