@@ -6,6 +6,7 @@ end the process by a signal, and is compiled again. `SPATIAL_REPLAY_CACHE` names
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import os
 import shutil
@@ -49,21 +50,37 @@ def cache_folder() -> Path | None:
 
 
 def remove_damaged(folder: Path) -> None:
-    """Remove machine code that is not what was written."""
+    """Remove machine code that is not what was written.
+
+    Code newer than its digest may be in the making while other processes run that use the folder. It stays.
+    """
+    descriptor = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o600)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        is_alone = True
+    except OSError:
+        is_alone = False
     for path in folder.rglob("*.nb[ic]"):
         with suppress(OSError):
-            sealed = _seal_of(path)
-            if not sealed.exists() or sealed.read_text() != _digest_of(path):
+            is_damaged = not _is_sealed(path) or _seal_of(path).read_text() != _digest_of(path)
+            if is_damaged and (is_alone or _is_sealed(path)):
                 path.unlink()
+    # until this process ends
+    fcntl.flock(descriptor, fcntl.LOCK_SH)
 
 
 def seal(folder: Path) -> None:
     """Note what was written since the last time."""
     for path in folder.rglob("*.nb[ic]"):
         with suppress(OSError):
-            sealed = _seal_of(path)
-            if not sealed.exists() or sealed.stat().st_mtime_ns < path.stat().st_mtime_ns:
-                sealed.write_text(_digest_of(path))
+            if not _is_sealed(path):
+                _seal_of(path).write_text(_digest_of(path))
+
+
+def _is_sealed(path: Path) -> bool:
+    """Return whether a digest was noted after a file was written."""
+    sealed = _seal_of(path)
+    return sealed.exists() and sealed.stat().st_mtime_ns >= path.stat().st_mtime_ns
 
 
 def _seal_of(path: Path) -> Path:
