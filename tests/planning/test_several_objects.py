@@ -419,4 +419,4 @@ def test_a_recorder_takes_one_planner_before_its_first_sample(tmp_path):
         with pytest.raises(sr.UsageError, match="before the first one"):
             recorder.attach(Planner(specification, TABLE))
     with pytest.raises(sr.UsageError, match="block=True"):
-        sr.Recorder(tmp_path / "run.mcap", planner=Planner(specification, TABLE), block=False)
+        sr.Recorder(tmp_path / "third.mcap", planner=Planner(specification, TABLE), block=False)
