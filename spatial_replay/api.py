@@ -28,7 +28,7 @@ from spatial_replay.report.write import write_report as write_page
 from spatial_replay.sources.open_log import open_source, read_trace
 from spatial_replay.sources.overview import Overview, overview_of
 from spatial_replay.spec.formula import Specification
-from spatial_replay.spec.overrides import load_specifications
+from spatial_replay.spec.load import load_specifications
 from spatial_replay.spec.relations import DEFAULT_PROFILE
 from spatial_replay.text import nearest_hint
 from spatial_replay.trace.sample import FOREVER

@@ -39,8 +39,7 @@ from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Formula, Quantified, Specification, iter_nodes, operator_of
 from spatial_replay.spec.relations import RELATION_NAMES
-from spatial_replay.spec.units import declared_unit
-from spatial_replay.spec.walks import substitute
+from spatial_replay.spec.walks import declared_unit, substitute
 from spatial_replay.text import requirement_text, time_text, with_unit
 from spatial_replay.trace.sample import LATEST_NS
 

@@ -29,7 +29,7 @@ from spatial_replay.sources.open_log import bag_files_at
 from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.format import format_specification
 from spatial_replay.spec.formula import Specification
-from spatial_replay.spec.overrides import SpecificationText
+from spatial_replay.spec.load import SpecificationText
 from spatial_replay.text import counted, encodable
 
 HASH_DIGITS: Final = 32

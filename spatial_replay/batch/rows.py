@@ -32,7 +32,7 @@ from spatial_replay.replay.selection import ReplayOptions, Window, first_sample_
 from spatial_replay.sources.open_log import open_source
 from spatial_replay.spec.diagnostics import SourceText
 from spatial_replay.spec.formula import NamedSpec, Specification
-from spatial_replay.spec.overrides import SpecificationText, load_specifications
+from spatial_replay.spec.load import SpecificationText, load_specifications
 from spatial_replay.text import counted_from, encodable, printable
 from spatial_replay.trace.trace import time_point_from_text
 

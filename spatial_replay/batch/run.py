@@ -46,7 +46,7 @@ from spatial_replay.errors import Diagnosis, SpecificationError, UsageError
 from spatial_replay.logs.remote import log_file
 from spatial_replay.mapping.mapping_file import load_mapping
 from spatial_replay.mapping.yaml_document import MOST_FAULTS
-from spatial_replay.spec.overrides import SpecificationText
+from spatial_replay.spec.load import SpecificationText
 from spatial_replay.text import encodable
 
 if TYPE_CHECKING:

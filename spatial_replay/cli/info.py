@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from spatial_replay.logs.source import Source
     from spatial_replay.sources.overview import Overview, Survey
     from spatial_replay.spec.formula import NamedSpec
-    from spatial_replay.spec.overrides import SpecificationText
+    from spatial_replay.spec.load import SpecificationText
 
 _EPOCH_LIKELY_NS = 10**18
 """Later times are taken to count from 1970 (2001 or later), earlier ones from the start of the run."""

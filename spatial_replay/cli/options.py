@@ -184,7 +184,7 @@ def _read_constants(
     if not texts:
         return {}
     # imported here so that --help stays fast
-    from spatial_replay.spec.overrides import constants_from_texts
+    from spatial_replay.spec.load import constants_from_texts
 
     with naming_option("--const"):
         return constants_from_texts(texts)
@@ -519,7 +519,7 @@ def load_spec_options(
         SpecificationError: one of them has errors.
     """
     # imported here so that --help stays fast
-    from spatial_replay.spec.overrides import SpecificationText, load_specifications
+    from spatial_replay.spec.load import SpecificationText, load_specifications
 
     sources: list[Path | SpecificationText] = [*dict.fromkeys(map(local_copy, specs))]
     if constants and not sources and default is not None:

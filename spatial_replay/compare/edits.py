@@ -16,13 +16,13 @@ from lark import Token
 
 from spatial_replay.errors import SpecificationError, UsageError
 from spatial_replay.spec.diagnostics import Faults, SourceText
-from spatial_replay.spec.expressions import Expression
 from spatial_replay.spec.format import format_bound, format_formula, format_term
 from spatial_replay.spec.formula import (
     Atom,
     Boolean,
     Earlier,
     Enlarged,
+    Expression,
     Formula,
     Group,
     Measurement,

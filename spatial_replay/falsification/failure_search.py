@@ -45,8 +45,8 @@ from spatial_replay.sanity import refuse_decided
 from spatial_replay.sources.open_log import open_source
 from spatial_replay.spec.format import format_specification
 from spatial_replay.spec.formula import Specification
-from spatial_replay.spec.overrides import load_specifications
-from spatial_replay.spec.units import declared_unit
+from spatial_replay.spec.load import load_specifications
+from spatial_replay.spec.walks import declared_unit
 from spatial_replay.text import json_number
 from spatial_replay.trace.sample import Sample
 

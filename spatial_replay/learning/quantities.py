@@ -15,7 +15,6 @@ from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.monitor.offline import OfflineFormula, new_leaves
 from spatial_replay.monitor.online.codes import low_and_high
-from spatial_replay.spec.expressions import Signal
 from spatial_replay.spec.format import format_relation
 from spatial_replay.spec.formula import (
     Atom,
@@ -23,6 +22,7 @@ from spatial_replay.spec.formula import (
     Formula,
     Group,
     Quantified,
+    Signal,
     SignedDistance,
     TrackedName,
     Variable,

@@ -22,7 +22,7 @@ from spatial_replay.spec.checks import check_names, object_names, signal_names
 from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.formula import NamedSpec, Specification, iter_nodes
 from spatial_replay.spec.load import require_specification
-from spatial_replay.spec.units import declared_unit
+from spatial_replay.spec.walks import declared_unit
 from spatial_replay.text import counted, time_text, times_apart
 from spatial_replay.trace.sample import Sample, require_time
 from spatial_replay.trace.trace import duration_ns_from_text

@@ -37,7 +37,7 @@ from spatial_replay.monitor.witness.witness import Witness, find_witness, time_o
 from spatial_replay.spec.diagnostics import nearest_hint
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Formula, NamedSpec, iter_nodes, operator_of
-from spatial_replay.spec.units import declared_unit
+from spatial_replay.spec.walks import declared_unit
 from spatial_replay.text import Instant, Sentence, counted_from, shortened_formula, with_unit
 from spatial_replay.trace.sample import LATEST_NS
 

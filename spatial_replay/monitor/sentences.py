@@ -13,11 +13,9 @@ from spatial_replay.monitor.witness.evidence import Gap
 from spatial_replay.monitor.witness.path import End, MissedResponse
 from spatial_replay.monitor.witness.threshold import Threshold
 from spatial_replay.monitor.witness.witness import Witness, WitnessStep
-from spatial_replay.spec.expressions import Number, Scaled
 from spatial_replay.spec.format import format_number
-from spatial_replay.spec.formula import Atom, Formula
-from spatial_replay.spec.units import declared_unit
-from spatial_replay.spec.walks import iter_expressions, iter_formulas
+from spatial_replay.spec.formula import Atom, Formula, Number, Scaled
+from spatial_replay.spec.walks import declared_unit, iter_expressions, iter_formulas
 from spatial_replay.text import (
     Instant,
     Sentence,

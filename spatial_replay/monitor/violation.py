@@ -31,7 +31,7 @@ from spatial_replay.monitor.witness.witness import Witness, find_witness
 from spatial_replay.spec.checks import object_names, signal_names
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import NamedSpec, Number, Specification
-from spatial_replay.spec.units import declared_unit
+from spatial_replay.spec.walks import declared_unit
 from spatial_replay.text import Instant, Sentence, with_unit
 from spatial_replay.trace.sample import FOREVER, Sample
 from spatial_replay.trace.trace import Trace

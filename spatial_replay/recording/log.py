@@ -56,7 +56,7 @@ from spatial_replay.monitor.sentences import verdict_text
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.spec import object_names, signal_names
 from spatial_replay.spec.formula import Specification
-from spatial_replay.spec.units import declared_unit
+from spatial_replay.spec.walks import declared_unit
 from spatial_replay.text import requirement_text
 from spatial_replay.trace.sample import FOREVER, Sample
 from spatial_replay.trace.trace import Trace

@@ -17,7 +17,7 @@ from spatial_replay.monitor.witness.atom import Measured
 from spatial_replay.monitor.witness.witness import Witness
 from spatial_replay.replay.engine import Replayed
 from spatial_replay.spec.formula import iter_nodes
-from spatial_replay.spec.units import units_of, units_text
+from spatial_replay.spec.walks import units_of, units_text
 from spatial_replay.text import Sentence, counted_from, json_number, names_of
 
 

@@ -53,7 +53,7 @@ from spatial_replay.replay.selection import (
 )
 from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.formula import Specification
-from spatial_replay.spec.overrides import SpecificationText, load_specifications
+from spatial_replay.spec.load import SpecificationText, load_specifications
 from spatial_replay.text import counted, counted_from
 from spatial_replay.trace.trace import Trace
 

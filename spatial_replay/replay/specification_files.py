@@ -15,8 +15,7 @@ from spatial_replay.logs.output_file import replacing
 from spatial_replay.spec import parse_specification
 from spatial_replay.spec.format import format_duration
 from spatial_replay.spec.formula import Constant, Specification
-from spatial_replay.spec.load import load_specification
-from spatial_replay.spec.overrides import load_specifications
+from spatial_replay.spec.load import load_specification, load_specifications
 
 _MARK: Final = b"\xef\xbb\xbf"
 _SETTLE_S: Final = 0.04

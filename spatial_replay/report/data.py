@@ -40,7 +40,7 @@ from spatial_replay.report.panels import (
     tree_value,
 )
 from spatial_replay.spec.formula import Formula, NamedSpec, Specification
-from spatial_replay.spec.units import Unit
+from spatial_replay.spec.walks import Unit
 from spatial_replay.text import Sentence, json_number
 from spatial_replay.trace.units import Axes
 

@@ -25,7 +25,7 @@ from spatial_replay.report.compact import json_text, sentence_parts
 from spatial_replay.report.data import MANY, ReportedResult, RunReport, page_data
 from spatial_replay.report.panels import final_text
 from spatial_replay.spec.formula import iter_nodes
-from spatial_replay.spec.units import declared_unit, units_text
+from spatial_replay.spec.walks import declared_unit, units_text
 from spatial_replay.text import Instant, Sentence, counted, printable
 
 _CALENDAR_NS: Final = 500_000_000 * 10**9

@@ -42,7 +42,7 @@ from spatial_replay.report.panels import (
 )
 from spatial_replay.spec.formula import Formula, Quantified, Specification, iter_nodes
 from spatial_replay.spec.relations import RELATION_NAMES
-from spatial_replay.spec.units import units_of
+from spatial_replay.spec.walks import units_of
 
 _COLLECTED: Final = frozenset(
     (

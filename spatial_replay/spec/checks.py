@@ -30,8 +30,15 @@ from spatial_replay.spec.relations import RELATION_NAMES
 from spatial_replay.spec.resolve import Namespace, kind_of
 from spatial_replay.spec.syntax import BrokenStatement, ScaleStatement, SpecStatement, Statement
 from spatial_replay.spec.tokens import BINARY_TYPES, STATEMENT_TYPES, quoted, span_of, tokenize
-from spatial_replay.spec.units import LENGTHS, units_of
-from spatial_replay.spec.walks import base_of, iter_expressions, iter_formulas, substitute, terms_of
+from spatial_replay.spec.walks import (
+    LENGTHS,
+    base_of,
+    iter_expressions,
+    iter_formulas,
+    substitute,
+    terms_of,
+    units_of,
+)
 
 _NO_CHOICE: Mapping[str, str] = MappingProxyType({})
 _LISTED = 12

@@ -7,14 +7,506 @@ itself), `start_pos`, `end_pos` and `line`.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from itertools import pairwise
 from types import MappingProxyType
 
 from lark import Token
 
 from spatial_replay.spec.diagnostics import Faults
 from spatial_replay.spec.formula import Span
-from spatial_replay.spec.spellings import STARTS_FORMULA, meant_sign, read_spellings, unit_hint
+
+_PREFIX_WORDS: Mapping[str, tuple[str, str]] = MappingProxyType(
+    {
+        "always": ("PREFIX", "G"),
+        "eventually": ("PREFIX", "F"),
+        "next": ("PREFIX", "X"),
+        "once": ("PREFIX", "O"),
+        "historically": ("PREFIX", "H"),
+        "NOT": ("NOT", "not"),
+        **{f"{operator}_": ("PREFIX", operator) for operator in "GFXOH"},
+    }
+)
+_INFIX_WORDS: Mapping[str, tuple[str, str]] = MappingProxyType(
+    {
+        "until": ("INFIX", "U"),
+        "release": ("INFIX", "R"),
+        "since": ("INFIX", "S"),
+        "AND": ("AND", "and"),
+        "OR": ("OR", "or"),
+        "XOR": ("XOR", "xor"),
+        "IMPLIES": ("IMPLIES", "->"),
+        **{f"{operator}_": ("INFIX", operator) for operator in "URWS"},
+    }
+)
+_MEANT: Mapping[str, str] = MappingProxyType(
+    {
+        **{word: operator for word, (_, operator) in _PREFIX_WORDS.items()},
+        **dict.fromkeys(("g", "globally", "alw"), "G"),
+        **dict.fromkeys(("f", "finally", "ev", "sometime", "sometimes"), "F"),
+        **{"x": "X", "wx": "WX", "h": "H", "o": "O", "y": "Y", "never": "G not", "if": "->"},
+        **{"[]": "G", "<>": "F"},
+    }
+)
+"""What in lower case is taken for an operator, though it may just as well be a name, and the operator."""
+_MEANT_BETWEEN: Mapping[str, str] = MappingProxyType(
+    {
+        **{"iff": "<->", "unless": "W", "weak_until": "W", "releases": "R", "then": "->", "therefore": "->"},
+        **{word.lower(): operator for word, (_, operator) in _INFIX_WORDS.items()},
+    }
+)
+_MEANT_RELATIONS: Mapping[str, str] = MappingProxyType(
+    {
+        **dict.fromkeys(("in", "inside", "within", "contained_in"), "enclosedin"),
+        **dict.fromkeys(("near", "close", "close_to", "nearby"), "closeto[e]"),
+        **dict.fromkeys(("far", "far_from", "away_from"), "farfrom[e]"),
+        **dict.fromkeys(("overlap", "overlaps", "overlapping", "intersects", "collides", "hits"), "ovlp"),
+        **dict.fromkeys(("touches", "touching"), "touch[e]"),
+        **dict.fromkeys(("over", "on_top_of"), "above"),
+        **dict.fromkeys(("under", "beneath"), "below"),
+    }
+)
+_MEANT_SIGNS: Mapping[str, str] = MappingProxyType(
+    {
+        **dict.fromkeys(("/\\", "∧"), "write and, or &"),
+        **dict.fromkeys(("\\/", "\u2228"), "write or, or |"),
+        **dict.fromkeys(("~", "¬"), "write not, or !"),
+        **dict.fromkeys(("→", "⇒", "-->", "==>"), "write ->"),
+        **dict.fromkeys(("↔", "⇔", "<=>", "<-->"), "write <->"),
+        **dict.fromkeys(("□", "◻", "☐"), "always is written G, as in G (a ovlp b)"),
+        **dict.fromkeys(("◇", "◊", "⋄"), "eventually is written F, as in F (a ovlp b)"),
+        **{"○": "next is written X, as in X (a ovlp b)", "∀": "write forall", "∃": "write exists"},
+        **{"≤": "write <=", "≥": "write >=", "≠": "write not (... == ...)", "\u2212": "write -"},
+        **{"%": "a share is written as the log has it: 20 % of a signal from 0 to 1 is 0.2"},
+        **{";": "a statement ends with its line; leave it out"},
+        **dict.fromkeys(("{", "}"), "numbers stand in square brackets: F[0, 5s], closeto[0.1]"),
+        **dict.fromkeys(("//", "/*", "--"), "a comment begins with #"),
+        **{"~>": "leads to is written G (p -> F (q))", "\\A": "write forall p in people: ..."},
+        **{"\\E": "write exists p in people: ...", "\\in": "write in"},
+        **dict.fromkeys(
+            ("'", "“", "”", "„", "\u2018", "\u2019", "`"), 'names with other characters stand in "quotes"'
+        ),
+    }
+)
+_LENGTHS: Mapping[str, float] = MappingProxyType(
+    {"m": 1.0, "cm": 0.01, "mm": 0.001, "km": 1000.0, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
+)
+"""Units of length, in metres."""
+_TIMES: Mapping[str, float] = MappingProxyType({"us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "sec": 1.0})
+_OPPOSITE: Mapping[str, str] = MappingProxyType({"STAR": "/", "SLASH": "*", "PLUS": "-", "MINUS": "+"})
+"""Signs of arithmetic, and what each is on the other side of a comparison."""
+_SHAPES: Mapping[str, str] = MappingProxyType(
+    {
+        **dict.fromkeys(("rect", "rectangle", "square", "aabb"), "box(xmin, ymin, xmax, ymax)"),
+        **dict.fromkeys(("disc", "disk", "sphere", "ellipse"), "circle((x, y), r)"),
+    }
+)
+_TYPES = frozenset(
+    {"float", "float64", "double", "int", "bool", "real", "string", "input", "output", "signal"}
+)
+"""Words that declare signals elsewhere."""
+_AT_TIMES: Mapping[str, str] = MappingProxyType(
+    {
+        **dict.fromkeys(("for", "during"), "G[0s, {0}]"),
+        **dict.fromkeys(("within", "before", "until"), "F[0s, {0}]"),
+        **{"after": "G[{0}, inf]", "from": "G[{0}, inf]", "at": "F[{0}, {0}]"},
+    }
+)
+"""Operators that words of time stand for, given that time."""
+_DEFINING = frozenset({"let", "var", "val", "define", "param", "parameter", "constant", "set"})
+_WITH_NUMBER = frozenset({"closeto", "farfrom", "touch", "oriented", "moved"})
+_STATEMENTS = frozenset({"CONST", "REGION", "GROUP", "DEF", "SPEC"})
+
+_BEFORE_FORMULA = frozenset({"EQUAL", "LPAR", "RSQB", "COLON", "AND", "OR", "XOR", "IMPLIES", "IFF", "NOT"})
+_AFTER_OPERAND = frozenset({"NAME", "RPAR", "RSQB", "NUMBER", "TRUTH"})
+STARTS_FORMULA = frozenset(
+    {"LPAR", "NAME", "NOT", "PREFIX", "TRUTH", "QUANTIFIER", "NUMBER", "MINUS", "ENLARGE", "ALL", "CLASS"}
+)
+_RELATIONS = frozenset({"RELATION", "DIST", "CLOSER", "BETWEEN", "COMPARE"})
+
+
+def read_spellings(tokens: list[Token], faults: Faults) -> list[Token]:
+    """Return the tokens with operators in the place of words that can be nothing else.
+
+    A word counts only where no name could stand, so objects called `always` or `until` keep their names.
+    """
+    macros = {name.value for word, name in pairwise(tokens) if word.type in ("DEF", "SPEC")}
+    result: list[Token] = []
+    brackets: list[str] = []
+    for index, token in enumerate(tokens):
+        if token.type in ("LPAR", "LSQB"):
+            brackets.append(token.type)
+        elif token.type in ("RPAR", "RSQB") and brackets:
+            brackets.pop()
+        following = tokens[index + 1 : index + 4]
+        pair = token.value + following[0].value if following else ""
+        if pair in ("[]", "<>") and _starts(result) and following[0].start_pos == token.end_pos:
+            _report(_as(token, "ERROR", pair), faults)
+            result.append(_as(token, "ERROR", pair))
+        elif token.type == "COLON" and brackets and brackets[-1] == "LSQB":
+            # G[0:5], as other tools write windows
+            result.append(_as(token, "COMMA", ","))
+        elif token.type == "NAME" and following and not _is_quoted(token):
+            written = _word(token, result, following, macros)
+            if written.type == "ERROR" and not _holds_formula(tokens[index + 1 :]):
+                written = token
+            if written.type == "ERROR":
+                _report(token, faults)
+            result.append(written)
+        else:
+            result.append(token)
+    return result
+
+
+def _word(token: Token, before: Sequence[Token], after: Sequence[Token], macros: set[str]) -> Token:
+    prefix, infix = _PREFIX_WORDS.get(token.value), _INFIX_WORDS.get(token.value)
+    if infix is not None and _is_between(before, after):
+        return _as(token, *infix)
+    if (prefix is None and _plain(token) not in _MEANT) or not _is_in_front(before, after):
+        return token
+    if token.value in macros and after[0].type == "LPAR":
+        return token
+    return _as(token, "ERROR", token.value) if prefix is None else _as(token, *prefix)
+
+
+def _plain(token: Token) -> str:
+    """Return a word as the tables have it: `G_` and `Globally` are no more than other cases."""
+    return str(token.value).lower().removesuffix("_")
+
+
+def _holds_formula(after: Sequence[Token]) -> bool:
+    """Return whether what follows is no list of arguments: up to its closing bracket, it relates objects."""
+    depth = 0
+    for token in after:
+        depth += {"LPAR": 1, "LSQB": 1, "RPAR": -1, "RSQB": -1}.get(token.type, 0)
+        if token.type in _RELATIONS:
+            return True
+        if depth <= 0 and token.type == "RPAR":
+            return False
+    return False
+
+
+def _report(token: Token, faults: Faults) -> None:
+    meant = _MEANT[_plain(token)]
+    example = "a ovlp b -> c ovlp d" if meant == "->" else f"{meant} (a ovlp b)"
+    hint = f"the operator is written {meant}, as in {example}; a macro is defined with def"
+    end = (token.start_pos or 0) + len(token.value)
+    faults.add(Span(token.start_pos or 0, end), f"{token.value!r} is not an operator", hint)
+
+
+def _is_in_front(before: Sequence[Token], after: Sequence[Token]) -> bool:
+    """Return whether a prefix operator can stand here, and no name can."""
+    if not _starts(before):
+        return False
+    if after[0].type == "LSQB":
+        is_index = [each.type for each in after[1:]] == ["NAME", "RSQB"]
+        return len(after) > 1 and after[1].type != "MINUS" and not is_index
+    # "always until p" is the name `always`, unless a relation follows: then `until` is one
+    if after[0].value in _INFIX_WORDS and after[0].type == "NAME":
+        return len(after) > 1 and after[1].type in _RELATIONS
+    return after[0].type in STARTS_FORMULA - {"MINUS"}
+
+
+def _starts(before: Sequence[Token]) -> bool:
+    """Return whether a formula can start behind these tokens."""
+    first = (
+        not before or before[-1].type in _BEFORE_FORMULA or before[-1].type in ("PREFIX", "INFIX", "ERROR")
+    )
+    return first or (len(before) > 1 and before[-2].type == "USE")
+
+
+def _is_between(before: Sequence[Token], after: Sequence[Token]) -> bool:
+    """Return whether an infix operator can stand here, and no name can."""
+    if not before or before[-1].type not in _AFTER_OPERAND:
+        return False
+    if len(before) > 1 and before[-2].type in ("USE", "SPEC", "DEF", "CONST", "REGION", "GROUP", "SCALE"):
+        return False
+    if after[0].type == "LSQB":
+        return len(after) > 1 and after[1].type != "MINUS"
+    return after[0].type in STARTS_FORMULA
+
+
+def _as(token: Token, kind: str, value: str) -> Token:
+    return Token(kind, value, token.start_pos, token.line, None, token.line, None, token.end_pos)
+
+
+def _is_quoted(token: Token) -> bool:
+    return (token.end_pos or 0) - (token.start_pos or 0) > len(token.value)
+
+
+# ------------------------------------------------------------------------------------ what was meant
+
+
+def meant_sign(sign: str) -> str:
+    """Return how something is written that is a sign elsewhere, or ""."""
+    return _MEANT_SIGNS.get(sign) or _MEANT_SIGNS.get(sign[:1], "")
+
+
+def unit_hint(number: str, unit: str) -> str:
+    """Return how a number with a unit is written, or "" where the unit is none."""
+    if unit in _LENGTHS:
+        metres = format(float(number) * _LENGTHS[unit], "g")
+        return f"lengths are in the unit of the log's footprints: write {metres} if those are metres"
+    if unit == "px":
+        return f"lengths are in the unit of the log's footprints: write {number} if those are pixels"
+    if unit in _TIMES:
+        return f"units of time are s and ms: write {format(float(number) * _TIMES[unit], 'g')}s"
+    return f"write it without the blank: {number}{unit}" if unit in ("s", "ms") else ""
+
+
+def meant(tokens: Sequence[Token], position: int, accepted: Collection[str]) -> tuple[str, str] | None:
+    """Return message and hint for a token that cannot stand where it does, if it is of another language.
+
+    Args:
+        position: of the token; the number of tokens for their end.
+        accepted: types of tokens that could stand there.
+    """
+    missing = Token("$END", "")
+    token = tokens[position] if position < len(tokens) else missing
+    last, before, *_ = [*reversed(tokens[max(0, position - 2) : position]), missing, missing]
+    after = tokens[position + 1] if position + 1 < len(tokens) else missing
+    found = f"{token.value!r} cannot stand here"
+    if position == 1 and (statement := meant_statement(tokens)):
+        return f"{last.value!r} begins no statement", statement
+    if window := _meant_window(tokens, position):
+        return found, f"a window is written with both of its ends: {window}"
+    relation = last if last.type == "RELATION" else before
+    if token.type == "NUMBER" and relation.value in _WITH_NUMBER and last.type in ("RELATION", "LPAR"):
+        return found, f"the number of a relation stands in square brackets: {relation.value}[{token.value}]"
+    if before.type == "RSQB" and last.value in ("s", "ms"):
+        return f"{last.value!r} cannot stand here", "each number has its unit: [0s, 5s], [200ms, 1s]"
+    if token.type in _RELATIONS and before.type in ("SLASH", "MINUS") and last.type == "NAME":
+        first = tokens[position - 3].value if position > 2 else ""
+        hint = f'a name with {before.value} is written in quotes: "{first}{before.value}{last.value}"'
+        return f"{token.value!r} needs an object, region or group on its left", hint
+    if token.type == "MINUS" and before.type in _RELATIONS - {"COMPARE"} and after.type == "NAME":
+        return found, f'a name with - is written in quotes: "{last.value}-{after.value}"'
+    if token.type in _RELATIONS and before.type == "LPAR" and last.type == "NAME" and position > 2:
+        name = tokens[position - 3]
+        if name.type == "NAME" and (hint := function_hint(name.value, _argument(tokens, position - 1))):
+            return f"{name.value!r} is not a function", hint
+    if shape := _meant_shape(tokens, position, accepted):
+        return found, shape
+    if token.type == "NUMBER" and (operator := _AT_TIMES.get(last.value.lower())):
+        return found, f"a window stands behind its operator: {operator.format(token.value)} (...)"
+    if last.type in _STATEMENTS and token.type != "NAME" and token.value.isidentifier():
+        kind = "a relation" if "RELATION" not in accepted and token.type in _RELATIONS else "a reserved word"
+        return f"{token.value!r} is {kind}, so no name for a {last.value}", "give it another name"
+    if "EQUAL" in accepted and tokens[0].type in _STATEMENTS:
+        return _meant_definition(tokens, position)
+    if last.type == "NUMBER" and token.type == "NAME":
+        hint = unit_hint(last.value, token.value)
+        return f"{token.value!r} is no unit here", hint or f"only s and ms are units: leave out {token.value}"
+    if token.type == "COMMA" and last.type == after.type == "NUMBER" and token.end_pos == after.start_pos:
+        return "a comma within a number", f"decimals have a point: {last.value}.{after.value}"
+    if token.type == "NOT" and "RELATION" in accepted and after.type in _RELATIONS:
+        return (
+            "'not' cannot stand within a relation",
+            f"write it in front: not {last.value} {after.value} ...",
+        )
+    if token.type in ("NAME", "IN"):
+        return _meant_word(token, last, after, accepted)
+    if token.type in _OPPOSITE and before.type == "DIST" and "COMPARE" in accepted:
+        return f"a distance has no {token.value!r}", "it is compared as it is: put the number into its limit"
+    if last.type == "NAME" and before.type == token.type == "COMPARE":
+        return _meant_range(tokens, position)
+    if last.type == "COMPARE" and token.type in ("NUMBER", "MINUS") and _has_arithmetic(tokens, position):
+        return "a signal is compared as it is", _meant_arithmetic(tokens, position)
+    if token.type == "COMPARE" and (call := _meant_call(tokens[:position], token.value, after.value)):
+        return call
+    if token.type == "COMPARE" and last.type in ("RPAR", "AND", "OR"):
+        hint = "a comparison is about a signal, battery >= 1.5, or a distance, a dist b <= 2"
+        return found, f"{hint}; a range is two comparisons, joined by and"
+    return None
+
+
+def _meant_call(tokens: Sequence[Token], comparison: str, limit: str) -> tuple[str, str] | None:
+    """Return what was meant by a function of one or two names in front of a comparison."""
+    limit = limit or "..."
+    match [each.type for each in tokens[-4:]], [each.type for each in tokens[-6:]]:
+        case ["NAME", "LPAR", "NAME", "RPAR"], _:
+            name, signal = tokens[-4].value, tokens[-2].value
+            hint = f"a signal is compared as it is: {signal} {comparison} {limit}"
+            if name.lower() in ("abs", "fabs", "norm", "magnitude"):
+                turned = comparison.translate(str.maketrans("<>", "><"))
+                both = "and" if comparison[0] == "<" else "or"
+                hint = f"write {signal} {turned} -{limit} {both} {signal} {comparison} {limit}"
+        case _, ["NAME", "LPAR", "NAME", "COMMA", "NAME", "RPAR"]:
+            name, first, second = tokens[-6].value, tokens[-4].value, tokens[-2].value
+            hint = f"a distance is written between its objects: {first} dist {second} {comparison} {limit}"
+        case _:
+            return None
+    return f"{name!r} is not a function", hint
+
+
+def _meant_window(tokens: Sequence[Token], position: int) -> str:
+    """Return the window that was meant behind the nearest operator; "" where none was begun."""
+    start = next((n for n in range(position - 1, max(-1, position - 6), -1) if _is_temporal(tokens[n])), None)
+    if start is None:
+        return ""
+    inner = tokens[start + 1 : start + 6]
+    kinds = [each.type for each in inner]
+    numbers = [each.value.strip(".") for each in inner if each.type == "NUMBER"]
+    operator = tokens[start].value
+    match kinds:
+        case ["COMPARE", "NUMBER", *_] | ["LSQB", "COMPARE", "NUMBER", *_]:
+            sign = next(each.value for each in inner if each.type == "COMPARE")
+            return f"{operator}[{numbers[0]}, inf]" if sign[0] == ">" else f"{operator}[0, {numbers[0]}]"
+        case ["LSQB", "NUMBER", "RSQB", *_]:
+            return f"{operator}[0, {numbers[0]}]"
+        case (
+            ["LSQB", "NUMBER", "NUMBER", *_]
+            | ["LSQB", "NUMBER", "MINUS", "NUMBER", "RSQB"]
+            | ["LPAR", "NUMBER", "COMMA", "NUMBER", *_]
+            | ["LSQB", "NUMBER", "COMMA", "NUMBER", "RPAR"]
+        ):
+            return f"{operator}[{numbers[0]}, {numbers[1]}]"
+    return ""
+
+
+def _has_arithmetic(tokens: Sequence[Token], position: int) -> bool:
+    """Return whether the left side of the comparison in front of a token is computed."""
+    for token in reversed(tokens[: position - 1]):
+        if token.type in _OPPOSITE:
+            return True
+        if token.type not in ("NAME", "NUMBER"):
+            break
+    return False
+
+
+def _meant_arithmetic(tokens: Sequence[Token], position: int) -> str:
+    """Return how a comparison of a computed signal is written, with the arithmetic on its other side."""
+    before = [*tokens[max(0, position - 5) : position]]
+    match [each.type for each in before[-4:]]:
+        case ["NAME", sign, "NUMBER", "COMPARE"] if sign in _OPPOSITE:
+            name, _, number, comparison = (each.value for each in before[-4:])
+        case ["NUMBER", "STAR" | "PLUS" as sign, "NAME", "COMPARE"]:
+            number, _, name, comparison = (each.value for each in before[-4:])
+        case _:
+            return "write it with one signal and a number: battery >= 1.5; only constants are computed"
+    right = tokens[position]
+    is_alone = len(before) < 5 or before[0].type not in _OPPOSITE
+    if right.type != "NUMBER" or not is_alone:
+        return "put the numbers on the other side: battery >= 3 / 2"
+    return f"put the numbers on the other side: {name} {comparison} {right.value} {_OPPOSITE[sign]} {number}"
+
+
+def _is_temporal(token: Token) -> bool:
+    return token.type in ("PREFIX", "INFIX")
+
+
+def _meant_definition(tokens: Sequence[Token], position: int) -> tuple[str, str] | None:
+    """Return what was meant between the name of a statement and its =."""
+    token, name = tokens[position] if position < len(tokens) else None, tokens[1].value
+    if token is None or token.type in ("NAME", "EQUAL"):
+        return None
+    if token.type in ("MINUS", "SLASH", "PLUS", "STAR"):
+        return f"{token.value!r} cannot stand in a name", "a name has letters, digits and _"
+    return f"{token.value!r} stands where = is missing", f"write {tokens[0].value} {name} = ..."
+
+
+def _meant_word(token: Token, last: Token, after: Token, accepted: Collection[str]) -> tuple[str, str] | None:
+    word = str(token.value).lower()
+    if "RELATION" in accepted:
+        if word in ("is", "are") and after.type in _RELATIONS:
+            return f"{token.value!r} cannot stand here", f"leave it out: {last.value} {after.value} ..."
+        if word in _MEANT_RELATIONS:
+            hint = f"write {last.value} {_MEANT_RELATIONS[word]} {after.value or 'b'}"
+            return f"unknown relation {token.value!r}", hint
+    if "AND" in accepted and word in _MEANT_BETWEEN:
+        return f"{token.value!r} is not an operator", f"the operator is written {_MEANT_BETWEEN[word]}"
+    if "AND" in accepted and word in _AT_TIMES:
+        window = _AT_TIMES[word].format(after.value or "5s")
+        return f"{token.value!r} cannot stand here", f"a window stands behind its operator: {window} (...)"
+    return None
+
+
+def _meant_range(tokens: Sequence[Token], position: int) -> tuple[str, str]:
+    """Return what was meant by `5 <= battery <= 8`."""
+    limit, sign, name = (each.value for each in tokens[position - 3 : position])
+    turned = sign.translate(str.maketrans("<>", "><"))
+    then = tokens[position + 1].value if position + 1 < len(tokens) else "..."
+    return "a range of a signal", f"write {name} {turned} {limit} and {name} {tokens[position].value} {then}"
+
+
+def meant_statement(tokens: Sequence[Token]) -> str:
+    """Return how a line is written that begins with no word of a statement; "" where that is not known."""
+    line = [each for each in tokens if each.line == tokens[0].line]
+    if line[0].value.lower() in _TYPES and len(line) > 1 and line[1].type == "NAME":
+        return "signals are not declared: leave the line out"
+    if line[0].value.lower() in _DEFINING:
+        del line[0]
+    if len(line) < 3 or line[1].type not in ("EQUAL", "COLON"):
+        return ""
+    is_number = all(each.type in ("NUMBER", "NAME", *_OPPOSITE) for each in line[2:])
+    definition = f"{line[0].value} = {_as_written(line[2:])}"
+    if is_number:
+        return f"a number is defined by const {definition}; equality is written =="
+    return f"a formula is named by spec {definition}"
+
+
+def _as_written(tokens: Sequence[Token]) -> str:
+    """Return tokens as a text, with blanks where there were some."""
+    gaps = ["" if one.end_pos == other.start_pos else " " for one, other in pairwise(tokens)]
+    return "".join(token.value + gap for token, gap in zip(tokens, [*gaps, ""], strict=True))
+
+
+def _meant_shape(tokens: Sequence[Token], position: int, accepted: Collection[str]) -> str:
+    """Return how the shape of a region is written; "" where that is not what is wrong."""
+    token = tokens[position] if position < len(tokens) else None
+    if token is not None and "CIRCLE" in accepted and token.value.lower() in _SHAPES:
+        return f"it is written {_SHAPES[token.value.lower()]}"
+    start = next(
+        (n for n in range(position - 1, max(-1, position - 5), -1) if tokens[n].type in _SHAPE), None
+    )
+    if start is None or "HEIGHT" in accepted:
+        return ""
+    numbers = _numbers(tokens[start:])
+    pairs = [f"({x}, {y})" for x, y in zip(numbers[::2], numbers[1::2], strict=False)]
+    match tokens[start].type:
+        case "BOX" if len(numbers) == 4:
+            return f"a box has four numbers: box({', '.join(numbers)})"
+        case "CIRCLE" if len(numbers) == 3:
+            return f"the centre stands in brackets: circle({pairs[0]}, {numbers[2]})"
+        case "POLYGON" if len(numbers) > 5:
+            return f"each corner stands in brackets: polygon({', '.join(pairs)})"
+    return ""
+
+
+_SHAPE = frozenset({"BOX", "CIRCLE", "POLYGON"})
+
+
+def _numbers(tokens: Sequence[Token]) -> list[str]:
+    """Return the numbers up to the end of the line, with their signs."""
+    line = [each for each in tokens if each.line == tokens[0].line]
+    signs = ["-" if before.type == "MINUS" else "" for before in line]
+    return [sign + each.value for sign, each in zip(signs, line[1:], strict=False) if each.type == "NUMBER"]
+
+
+def _argument(tokens: Sequence[Token], start: int) -> str:
+    """Return what stands in brackets from a place on, with the brackets."""
+    depth, end = 1, start
+    while end < len(tokens) and depth:
+        depth += {"LPAR": 1, "RPAR": -1}.get(tokens[end].type, 0)
+        end += 1
+    return f"({_as_written(tokens[start : end - (depth == 0)])})"
+
+
+def function_hint(name: str, argument: str) -> str:
+    """Return how a function of other tools is written; "" where it is none that is known.
+
+    Args:
+        argument: what it was of, in brackets.
+    """
+    match name.lower():
+        case "rise" | "rising" | "rising_edge" | "rose":
+            return f"a rising edge is written (Y not {argument}) and {argument}"
+        case "fall" | "falling" | "falling_edge" | "fell":
+            return f"a falling edge is written (Y {argument}) and not {argument}"
+        case "abs" | "fabs" | "norm" | "magnitude" if " dist " in argument:
+            return f"a distance is compared as it is: leave {name} out"
+    return ""
+
 
 STATEMENT_TYPES: frozenset[str] = frozenset({"USE", "CONST", "SCALE", "REGION", "GROUP", "DEF", "SPEC"})
 BINARY_TYPES: frozenset[str] = frozenset({"AND", "OR", "XOR", "IMPLIES", "IFF", "INFIX"})

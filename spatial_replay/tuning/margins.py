@@ -24,7 +24,6 @@ from spatial_replay.monitor.online.codes import in_channels
 from spatial_replay.spec import check_names
 from spatial_replay.spec.constants import text_of, value_given
 from spatial_replay.spec.diagnostics import nearest_hint
-from spatial_replay.spec.expressions import Measurement
 from spatial_replay.spec.formula import (
     Atom,
     Boolean,
@@ -34,6 +33,7 @@ from spatial_replay.spec.formula import (
     Expression,
     Formula,
     Maximum,
+    Measurement,
     Minimum,
     Negative,
     Number,

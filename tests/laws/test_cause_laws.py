@@ -17,7 +17,6 @@ from spatial_replay.monitor.online.step import OnlineRun
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.witness.path import End, deciding_path
 from spatial_replay.monitor.witness.unfinished import evaluate_unfinished
-from spatial_replay.spec.expressions import TrackedName
 from spatial_replay.spec.format import format_term
 from spatial_replay.spec.formula import (
     FUTURE_OPERATORS,
@@ -27,6 +26,7 @@ from spatial_replay.spec.formula import (
     NamedSpec,
     Quantified,
     Temporal,
+    TrackedName,
     Truth,
     iter_nodes,
     operands_of,

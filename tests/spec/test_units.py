@@ -6,7 +6,7 @@ import pytest
 
 import spatial_replay as sr
 from spatial_replay.spec import format_specification
-from spatial_replay.spec.units import is_mixed, units_of
+from spatial_replay.spec.walks import is_mixed, units_of
 
 SPEC = "region plate = box(0, 0, 1, 1)\nspec s = G ((force <= 15) and (cup dist plate <= 0.2))\n"
 

@@ -20,7 +20,6 @@ from spatial_replay.monitor.witness.atom import DecidingAtom
 from spatial_replay.monitor.witness.evidence import Evidence
 from spatial_replay.monitor.witness.path import End
 from spatial_replay.monitor.witness.unfinished import evaluate_unfinished
-from spatial_replay.spec.expressions import NamedNumber
 from spatial_replay.spec.formula import (
     Atom,
     Boolean,
@@ -30,6 +29,7 @@ from spatial_replay.spec.formula import (
     Maximum,
     Measurement,
     Minimum,
+    NamedNumber,
     Negative,
     Number,
     Projection,

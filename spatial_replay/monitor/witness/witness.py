@@ -23,7 +23,7 @@ from spatial_replay.monitor.witness.threshold import Obstacle, Threshold, thresh
 from spatial_replay.monitor.witness.unfinished import evaluate_unfinished
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Atom, Formula, Quantified, iter_nodes, operator_of
-from spatial_replay.spec.units import declared_unit
+from spatial_replay.spec.walks import declared_unit
 
 
 @dataclass(frozen=True, slots=True)
