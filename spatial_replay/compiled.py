@@ -3,8 +3,8 @@
 Compiling every kernel takes longer than reading a short log, and loading the compiled ones from disk takes
 its time, too. So a kernel is interpreted while little work is due (see `_may_interpret`).
 
-Both ways give the same bits: kernels use sums, products, quotients, square roots, sines and cosines of IEEE
-doubles (no fast-math, no fused contraction), and nothing else whose result depends on who computes it.
+Both ways give the same bits. Kernels use only sums, products, quotients, square roots, sines and cosines of
+IEEE doubles, without fast-math and fused contraction.
 
 Machine code is kept on disk (see `code_cache`). `SPATIAL_REPLAY_KERNELS` is `compiled` or `interpreted` to
 have only one of the two ways.
@@ -220,7 +220,7 @@ def _names(function: FunctionType) -> set[str]:
 def _elements(values: object) -> int:
     """Return how many numbers arrays have, also within tuples.
 
-    Of bytes, which kernels copy at once or jump over from record to record, 64 take as long as a number.
+    64 bytes count as a number, because kernels copy bytes at once or skip records.
     """
     if isinstance(values, np.ndarray):
         return values.size // (64 if values.itemsize == 1 else 1)

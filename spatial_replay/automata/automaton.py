@@ -24,7 +24,7 @@ MAX_ROWS = 300_000
 """How many states an automaton has at most, and how many decisions."""
 
 _OF_MOVES = {"_moves", "_above", "distances", "can_accept", "can_reject", "transitions", "is_listable"}
-"""What of an automaton depends on its moves alone, and is worked out once."""
+"""Properties of an automaton that depend on its moves alone."""
 
 MAX_LISTED = 100_000
 """How many transitions are listed at most, and how many cubes their guards have together."""

@@ -80,8 +80,8 @@ class Obligations:
         """Split a function that decides on a chain first into cases.
 
         Returns:
-            Pairs of a count and the function that is left where fewer than so many of the chain's members do
-            not hold, and not as few as in the pair before.
+            Pairs of a count and a function. The function applies where fewer members of the chain fail than
+            the count, and at least as many as the count of the pair before.
         """
         found: list[tuple[int, int]] = []
         below = 0

@@ -159,8 +159,8 @@ class Skeleton:
     Attributes:
         nodes: by number.
         root: the number of the whole formula.
-        chains: for a subformula over a bounded window, and whether it is an until (which implies the longer
-            one) or a release (which is implied by it): the same over a window longer by one sample.
+        chains: the same subformula over a window longer by one sample, by the number of the shorter one and
+            whether it is an until. A shorter until implies the longer one; for a release it is the reverse.
     """
 
     def __init__(

@@ -36,7 +36,7 @@ _LEGEND_WIDTH = 100
 def words_text(automaton: Automaton) -> str:
     """Describe states, what they mean, and their moves in words.
 
-    Of an automaton whose transitions cannot all be listed, it has the states nearest to the start.
+    If not all transitions can be listed, it has the states nearest to the start.
     """
     lines = [f"automaton of {automaton.name}: {size_words(automaton)}"]
     lines += [f"  {each.name} means {each.text}" for each in automaton.propositions if each.name is not None]
@@ -94,8 +94,8 @@ def meanings(automaton: Automaton) -> list[str]:
 def dot_text(automaton: Automaton) -> str:
     """Return the automaton for Graphviz, with guards in words and long propositions in a legend.
 
-    Accepting states have a double outline; those that accept permanently are blue, traps are vermillion. Of
-    an automaton whose transitions cannot all be listed, it has the states nearest to the start.
+    Accepting states have a double outline; those that accept permanently are blue, traps are vermillion. If
+    not all transitions can be listed, it has the states nearest to the start.
     """
     short = abbreviated(automaton)
     cut = () if automaton.is_listable else (_left_out(automaton),)

@@ -3,9 +3,8 @@
 Columns, because a million small objects that live for a while make Python's garbage collection look through
 all of them again and again, which costs more than reading them.
 
-Chunks and files of a log may overlap in time, so their messages are merged. Logs whose clock was set back
-while they were recorded, as when a simulation restarts, are refused: in the order of time, the two passes
-over the same time would look like one.
+Chunks and files of a log may overlap in time, so their messages are merged. Logs whose clock jumped back, as
+when a simulation restarts, are refused: sorted by time, both passes would look like one.
 """
 
 from __future__ import annotations

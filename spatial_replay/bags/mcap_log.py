@@ -1,8 +1,8 @@
 """External MCAP logs, whole or damaged.
 
-The reader is our own because the MCAP library fails 112 of the 416 files of the format's conformance suite
-and gives up on truncated and unindexed files, which crashed recorders leave behind. It also yields columns
-of a chunk at a time rather than one object for each message.
+The reader is our own for two reasons. The MCAP library fails 112 of the 416 files of the format's conformance
+suite. It gives up on truncated and unindexed files, which crashed recorders leave behind. It also yields
+columns of a chunk at a time rather than one object for each message.
 """
 
 from __future__ import annotations

@@ -53,7 +53,7 @@ _MOST = 2**63
 
 @dataclass(frozen=True, slots=True)
 class BagMetadata:
-    """What a bag declares.
+    """Declarations of a bag.
 
     Attributes:
         files: names of its files, without folders, in order.
@@ -450,7 +450,7 @@ class SqliteBag(MessageReader):
 
 @dataclass(frozen=True, slots=True)
 class BagTables:
-    """What a file says about itself.
+    """Version and metadata of a file.
 
     Attributes:
         topics: by number.

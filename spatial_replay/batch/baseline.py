@@ -120,12 +120,12 @@ class Difference:
 
     @property
     def text(self) -> str:
-        """What changed, with both numbers, in one line."""
+        """The change with both numbers, in one line."""
         return f"{self.log}: {result_name(self.spec, self.object)} is {self.failure} in the baseline"
 
     @property
     def failure(self) -> str:
-        """What changed, with both numbers, in a few words."""
+        """The change with both numbers, in a few words."""
         now = "gone" if self.change == "gone" else _described(self.now, self.robustness)
         return f"{now}; it was {_described(self.before, self.before_robustness)}"
 

@@ -101,7 +101,7 @@ def choice_faults(case: Case, files: Sequence[Specification]) -> Iterator[str]:
 
 
 _ENDINGS: Final = (".mcap", ".bag", ".db3", ".jsonl", ".jsonl.gz", ".csv", ".xml")
-"""Of logs in a folder; any other file has to be named."""
+"""Name endings of logs in a folder; any other file has to be named."""
 _MOST_LOGS: Final = 2_000_000
 _MOST_FAULTS: Final = 100
 _TOGETHER: Final = 16

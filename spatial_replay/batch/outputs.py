@@ -54,7 +54,7 @@ _ANNOTATIONS: Final = 10
 """GitHub shows no more of one kind for a step."""
 _WORST: Final = 10
 _MOST_COMPARED: Final = 10_000
-"""Of the worst rows, so many are looked through for failures of different kinds."""
+"""Number of worst rows that are searched for failures of different kinds."""
 
 
 def is_github(environment: Mapping[str, str] = os.environ) -> bool:

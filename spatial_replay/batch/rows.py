@@ -135,8 +135,7 @@ def rows_from_task(task: Task) -> tuple[tuple[ResultRow, ...], ...]:
 
     Returns:
         For each of `task.specs` one row for each of its results, in the order of the text, and for each
-        object of a template. What goes wrong with the log is a row with the error for each of them: nothing
-        is raised but an interruption.
+        object of a template. An error of the log is a row for each of them; only an interruption is raised.
     """
     begin = time.perf_counter()
     try:

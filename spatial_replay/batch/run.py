@@ -89,7 +89,7 @@ def prepare(suite: Suite, progress: Progress = no_progress) -> tuple[PreparedCas
 
 @dataclass(slots=True)
 class _Faults:
-    """What is wrong with a suite, as far as it is known; each fault once."""
+    """Known faults of a suite, each once."""
 
     suite: Suite
     lines: dict[str, None] = field(default_factory=dict)
@@ -182,7 +182,7 @@ class StoredTask:
 
 @dataclass(frozen=True, eq=False)
 class BatchResult:
-    """What a batch found.
+    """Results of a batch.
 
     Attributes:
         table: one row for each case, log, spec and object of a template; see `store`.

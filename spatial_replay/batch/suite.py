@@ -70,7 +70,7 @@ DEFAULT_CONDITIONS: Final = Conditions()
 
 
 class Outcome(Protocol):
-    """What of a result decides whether it passes; see `ResultRow`."""
+    """The fields of a result that decide whether it passes; see `ResultRow`."""
 
     @property
     def verdict(self) -> Verdict | str | None: ...
@@ -96,7 +96,7 @@ DAMAGED: Final = "the log is damaged"
 
 @dataclass(frozen=True, slots=True)
 class Expectation:
-    """What a case expects of every result.
+    """Expectations of a case for every result.
 
     Attributes:
         verdict: the verdict that passes.
@@ -114,7 +114,7 @@ class Expectation:
 
     @property
     def text(self) -> str:
-        """What is expected, in words."""
+        """The expectation in words."""
         unknown = " or unknown" if self.allow_unknown else ""
         if self.at_least is not None:
             return f"robustness of at least {self.at_least:.6g}{unknown}"

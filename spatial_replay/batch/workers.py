@@ -57,7 +57,7 @@ class WorkerLost(Exception):  # noqa: N818 - a result, not raised by this module
 
 
 class Workers(Protocol):
-    """What works on tasks."""
+    """Executor of tasks."""
 
     def results(
         self, work: Callable[[_Task], _Result], tasks: Iterable[_Task]

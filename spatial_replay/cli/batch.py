@@ -58,7 +58,7 @@ _BATCH: Final = 10_000
 def print_totals(table: pa.Table, by: By) -> None:
     """Print how many results there are of each verdict, for each spec or for each log.
 
-    Of a table that was compared with a baseline, also how many are worse than there, or gone.
+    After a comparison with a baseline, also the numbers of worse and missing results.
     """
     # imported here so that --help stays fast
     from spatial_replay.batch.run_table import WORSE, counts_of, totals

@@ -198,7 +198,7 @@ def check(
 
 @dataclass(frozen=True, slots=True)
 class _Compared:
-    """What a comparison with a log found.
+    """Findings of a comparison with a log.
 
     Attributes:
         diagnostics: what does not fit.

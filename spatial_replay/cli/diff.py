@@ -53,12 +53,12 @@ def diff(
 ) -> int:
     """Compare two versions of a specification over a log, or two logs.
 
-    Of two specifications (--spec OLD --spec NEW; with one, OLD is that in the log): which verdicts and
-    numbers changed, at which sample first, and the edit that brought it about. That is checked by evaluating
-    with this edit alone, and with all others.
+    Two specifications (--spec OLD --spec NEW; with one, OLD is that of the log): changed verdicts and
+    numbers, the first such sample, and the edit that caused it. That is checked by evaluating with this edit
+    alone, and with all others.
 
-    Of two logs: which objects moved differently and since when, what that did to each spec, and the first
-    decision of the planner that differs.
+    Two logs: objects that moved differently and since when, the effect on each spec, and the planner's first
+    different decision.
 
     Exits with 0 if nothing differs but names of specs, otherwise with 1.
 

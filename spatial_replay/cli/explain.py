@@ -51,8 +51,8 @@ def explain(
 ) -> int:
     """Explain a verdict in plain sentences.
 
-    For each result: which sample, objects and relation decided it, by how much and since when, and which
-    change of a constant would flip it; for an unknown verdict, what was not known.
+    For each result: the sample, objects and relation that decided it, by how much and since when, and the
+    change of a constant that would flip it. For an unknown verdict: the missing parts.
 
     T is 12.5s or 1500ms after the first sample, 5250000000ns on the log's clock, or 2026-01-31T12:00:00Z.
     Exits with the code of the explained verdicts, as `replay` does, and with 4 if samples after T decide.

@@ -162,7 +162,7 @@ def log_output_option(text: str) -> Callable[[_Command], _Command]:
 
 
 overwrite_option = click.option("--overwrite", is_flag=True, help="Replace a log that exists already.")
-"""Of commands that record what nothing could make again."""
+"""For commands whose recordings cannot be repeated."""
 
 durability_option = click.option(
     "--durability",
@@ -343,7 +343,7 @@ def reading_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 @dataclass(frozen=True, slots=True)
 class ConditionArguments:
-    """What to evaluate over logs, and how to read these, as given on the command line."""
+    """Command-line options on specifications and on reading logs."""
 
     specs: tuple[LogFile, ...]
     start: str | None
@@ -358,7 +358,7 @@ class ConditionArguments:
 
 @dataclass(frozen=True, slots=True)
 class EvaluationArguments(ConditionArguments):
-    """What to evaluate over one log."""
+    """Specifications and options for one log."""
 
     log: LogFile
 

@@ -20,7 +20,11 @@ if TYPE_CHECKING:
 )
 @click.option("--where", metavar="EXPR", help="Only rows that fit a condition on columns.")
 @click.option(
-    "--by", type=click.Choice(["spec", "log"]), default="spec", show_default=True, help="What to sum up by."
+    "--by",
+    type=click.Choice(["spec", "log"]),
+    default="spec",
+    show_default=True,
+    help="Grouping of the summary.",
 )
 @click.option("--json", "json_file", metavar="FILE|-", help="Rows to write, as JSON objects, one a line.")
 def results(folder: str, worst: int, where: str | None, by: By, json_file: str | None) -> None:

@@ -1,4 +1,7 @@
-"""What is printed: everything goes through here, so that names from a log cannot steer a terminal."""
+"""Output to the terminal.
+
+Everything printed passes through here, so names from a log cannot control a terminal.
+"""
 
 from __future__ import annotations
 
@@ -175,7 +178,7 @@ COMPILING = "compiling, once on this machine"
 """Label of a bar while kernels are compiled."""
 
 _NOTEBOOK = "JPY_PARENT_PID"
-"""What kernels of notebooks set for the programs that their cells run."""
+"""Environment variable that notebook kernels set for programs in their cells."""
 
 Advance = Callable[[int], None]
 

@@ -68,7 +68,7 @@ def chosen_nodes(results: Sequence[SpecResult], of: Sequence[str]) -> list[KeptN
 
 
 class _Path(NamedTuple):
-    """What decides a node, as a clip has to repeat it.
+    """The decision of a node, which a clip has to repeat.
 
     Attributes:
         nodes: the ids on the path to the deciding atom.

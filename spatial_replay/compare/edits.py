@@ -342,7 +342,7 @@ def _text(file: Specification, span: Span) -> str:
 EditKind: TypeAlias = Literal[
     "constant", "region", "group", "definition", "replaced", "added", "removed", "moved", "renamed"
 ]
-"""What was edited: a number, a shape or group that is named, what a macro or relation means (`def`, profile,
+"""Kinds of edits: a number, a named shape or group, the meaning of a macro or relation (`def`, profile,
 `scale`), the node itself, one operand of a conjunction or disjunction, only its place or its name."""
 
 

@@ -626,9 +626,9 @@ def diff_sources(
 
     Args:
         options: how each log is evaluated.
-        align: "time" since the first sample, "progress" of the automaton that both go farthest through,
-            "progress:NAME" of that of a spec, or
-            the name of a spec, whose first change of sign in each run is the event.
+        align: "time" since the first sample, "progress" of the automaton with the most states in common, or
+            "progress:NAME" of a spec's automaton. The name of a spec aligns by its first change of sign in
+            each run.
         advance: called with the number of samples of each block that is read.
 
     Raises:

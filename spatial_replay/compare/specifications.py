@@ -72,7 +72,7 @@ class EditOutcome(NamedTuple):
 
 
 class EditOutcomes:
-    """What the old formula gives with some units of edits; atoms are those that were evaluated already."""
+    """Numbers of the old formula with some of the edits, from atoms that are evaluated already."""
 
     def __init__(self, one: SpecResult, other: SpecResult, diff: TreeDiff) -> None:
         self._diff = diff

@@ -469,8 +469,8 @@ def falsify(
     an earlier one ended, also with a larger budget.
 
     Args:
-        simulation: a scenario ("push", "pick-place", "table-setting"), or a function from the values of what
-            is varied, by name, to the samples of a run; equal values must give equal samples.
+        simulation: a scenario ("push", "pick-place", "table-setting"), or a function from the values of the
+            parameters, by name, to the samples of a run. Equal values must give equal samples.
         specifications: what has to hold, parsed or as files; without any, the scenario's own.
         output: the folder for runs, logs and clips.
         vary: of a scenario as on the command line, `["noise=0:0.01", "slip@T"]`, by default `["start"]`; of a

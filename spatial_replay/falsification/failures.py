@@ -110,7 +110,7 @@ class Failure:
 
 @dataclass(frozen=True, slots=True)
 class Coverage:
-    """What was tried of one parameter.
+    """The tried values of one parameter.
 
     Attributes:
         low, high: its range; of times in a run, `high` is the end of the first run.
@@ -128,7 +128,7 @@ class Coverage:
 
 @dataclass(frozen=True, eq=False)
 class Falsification(Printed):
-    """What a search for failures has found.
+    """Result of a search for failures.
 
     Attributes:
         name: of the scenario or the simulation.
@@ -168,7 +168,7 @@ class Falsification(Printed):
 
     @cached_property
     def coverage(self) -> tuple[Coverage, ...]:
-        """What was tried of each parameter."""
+        """The tried values of each parameter."""
         return tuple(map(self._covered, self.parameters))
 
     def text_of(self, case: Case) -> str:

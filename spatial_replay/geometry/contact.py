@@ -67,8 +67,9 @@ def contacts(batch: FootprintBatch, first: Operand, second: Operand, *, is_protr
     Heights are ignored.
 
     Returns:
-        (T, 6): a point of `first`, a point of `second`, their signed distance (or protrusion), and the upper
-        end of the higher of the two footprints, NaN if neither has a height. NaN where an operand is empty.
+        (T, 6): a point of `first`, a point of `second`, and their signed distance (or protrusion). The last
+        column is the upper end of the higher footprint, NaN if neither has a height. NaN where an operand is
+        empty.
     """
     result = np.full((len(first.rows), 6), np.nan)
     _contacts(

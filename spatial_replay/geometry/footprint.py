@@ -47,7 +47,7 @@ _pack_object: Final = Struct("=5d").pack
 PARTS, BOTTOM, TOP, YAW, UNCERTAINTY = range(5)
 """The numbers of a packed object: how many parts it has, NaN for a height or a yaw that it does not have."""
 _PLAIN: Final = _pack_object(1.0, math.nan, math.nan, math.nan, 0.0)
-"""What most objects are packed as: they share it."""
+"""Packed form that most objects share."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, init=False)
@@ -331,10 +331,10 @@ def _ring(vertices: Floats) -> tuple[tuple[float, float], ...]:
 class FootprintBatch:
     """R footprints made of P convex parts with V vertices in total, as ragged rows.
 
-    Footprint r has the parts part_start[r] up to part_start[r + 1]; part p has the vertices
-    vertex_start[p] up to vertex_start[p + 1]. Vertices of a part are in counter-clockwise order, without
-    repeated or collinear ones (one vertex: a point or disc, two: a segment or capsule); raw outlines go
-    through `normalise_polygons` first.
+    Footprint r has the parts part_start[r] up to part_start[r + 1]; part p has the vertices vertex_start[p]
+    up to vertex_start[p + 1]. Vertices of a part are in counter-clockwise order, without repeated or
+    collinear ones. One vertex is a point or disc, two are a segment or capsule. Raw outlines go through
+    `normalise_polygons` first.
 
     Attributes:
         part_start: (R + 1,) int64.

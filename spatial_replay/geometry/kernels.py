@@ -3,8 +3,8 @@
 All kernels share one layout, that of `FootprintBatch`: part p has the vertices `vertex_start[p]` up to
 `vertex_start[p + 1]`, row r the parts `part_start[r]` up to `part_start[r + 1]`.
 
-The result for one pair of parts never depends on the rest of the call, and every loop over two parts
-treats them alike: equal footprints give equal bits, in either order and in any batch.
+The result for a pair of parts does not depend on the rest of the call, and loops treat both parts alike.
+Equal footprints give equal bits, in either order and in any batch.
 """
 
 from __future__ import annotations
@@ -124,9 +124,9 @@ def _separate(
     """Return how far the edges of A separate it from B.
 
     Returns:
-        (separation, nearest): the greatest, over A's edges, of the least height of B above the edge's
-        line (-inf for a point); and the least height of a vertex of B above the edge that it projects
-        into (+inf if there is none).
+        (separation, nearest). The separation is the greatest, over A's edges, of the least height of B above
+        the edge's line (-inf for a point). The other is the least height of a vertex of B above the edge that
+        it projects into (+inf if there is none).
     """
     separation = -np.inf
     nearest = np.inf
@@ -356,7 +356,7 @@ def measure_rows(
 ) -> None:
     """Fill `values` (K, T) with K quantities in the samples from `begin` to before `end`; see `measure`.
 
-    Those whose quantity is `NOTHING` stay as they are.
+    Pairs with the quantity `NOTHING` stay as they are.
 
     In sample t, operand o has the `width[o]` rows from `members[member_start[o] + t * width[o]]` on;
     `member_start` (O + 1,) ends with the total. `edges` (V, 4), one for each vertex, is room to work in;

@@ -2,8 +2,7 @@
 
 The closest two of many footprints are found by a sweep over bounding boxes. It leaves out pairs whose boxes
 are farther apart than the closest two so far. The signed distance of two footprints is at least the gap
-between their boxes along either axis, also where that is negative: the result is that over all pairs, bit for
-bit.
+between their boxes along either axis, even a negative one. The result equals that of all pairs, bit for bit.
 """
 
 from __future__ import annotations
@@ -65,14 +64,14 @@ class MeasureRequest:
 def measure(batch: FootprintBatch, operands: Sequence[Operand], requests: Sequence[MeasureRequest]) -> Floats:
     """Compute each requested quantity in each sample.
 
-    signed_distance(A, B) is the least over pairs of parts of the signed distance of two rounded convex
-    parts: their distance when apart, minus their penetration depth when not (Def. 2-4 of the paper),
-    minus both radii; with height intervals on both footprints, that of upright prisms. protrusion(A, B)
-    is the greatest over parts of A, of the least over parts of B, of how far the one sticks out of the
-    other: max over vertices p of sd(p, B's polygon) + r_A - r_B, and for prisms the greatest of that,
-    B.bottom - A.bottom and A.top - B.top. Projections run over all parts (radius and enlargement
-    included; the centroid's: area centroids of the unrounded polygons). Over an empty union the
-    least is +inf and the greatest -inf. Along z, a footprint without a height gives NaN.
+    signed_distance(A, B) is the least over pairs of parts of the signed distance of two rounded convex parts:
+    their distance when apart, minus their penetration depth when not (Def. 2-4 of the paper), minus both
+    radii; with height intervals on both footprints, that of upright prisms. protrusion(A, B) is a maximum
+    over parts of A of a minimum over parts of B. For two parts it is the maximum over vertices p of sd(p, B's
+    polygon) + r_A - r_B. For prisms it is the greatest of that, B.bottom - A.bottom and A.top - B.top.
+    Projections run over all parts (radius and enlargement included; the centroid's: area centroids of the
+    unrounded polygons). Over an empty union the least is +inf and the greatest -inf. Along z, a footprint
+    without a height gives NaN.
 
     Returns:
         (K, T) float64 for K requests.

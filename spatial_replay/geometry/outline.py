@@ -19,10 +19,10 @@ LARGEST_COORDINATE = 1e100
 """Larger coordinates are rejected: products of a few of them must stay finite."""
 
 MOST_CORNERS = 2_000
-"""Of a polygon that is split: its parts are measured one by one, in each sample."""
+"""Limit for a polygon that is split: its parts are measured one by one, in each sample."""
 
 MOST_CONVEX_CORNERS = 10_000
-"""Of a convex polygon: each pair of objects is measured by its corners, in each sample."""
+"""Limit for a convex polygon: its corners are measured for each pair of objects, in each sample."""
 
 # A vertex counts as on a line within the greatest of these: relative to the outline's extent, to the
 # resolution of its coordinates, and a floor that keeps squares of the tolerance above zero.
@@ -53,9 +53,9 @@ class Outlines(NamedTuple):
 def normalise_polygons(vertex_start: Integers, vertices: Floats) -> Outlines:
     """Order each outline counter-clockwise and drop repeated or collinear vertices.
 
-    A vertex is superfluous if its distance from the segment between its neighbours is at most a
-    billionth of the outline's extent, or below the resolution of its coordinates; an outline no wider
-    than that becomes a segment or a point. Convex counter-clockwise input is returned bit for bit.
+    A vertex is superfluous if its distance from the segment between its neighbours is at most a billionth of
+    the outline's extent, or below the resolution of its coordinates. An outline no wider than that becomes a
+    segment or a point. Convex counter-clockwise input is returned bit for bit.
 
     Args:
         vertex_start: (P + 1,) int64; outline p has the vertices vertex_start[p] up to vertex_start[p + 1].

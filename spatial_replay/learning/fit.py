@@ -35,7 +35,7 @@ _PHRASES: Phrases = MappingProxyType(
         "prec": ("lower than {b}", "not lower than {b}"),
     }
 )
-"""What a relation is called, and its opposite."""
+"""Names of a relation and of its opposite."""
 _NAMED: Mapping[str, tuple[str, str]] = MappingProxyType(
     {
         "dist": ("apart", "near"),
@@ -48,7 +48,7 @@ _NAMED: Mapping[str, tuple[str, str]] = MappingProxyType(
         "prec": ("lower", "not_lower"),
     }
 )
-"""What a spec about it is named."""
+"""Name of a spec about it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +131,7 @@ class LimitedRelation:
 
     @property
     def name(self) -> str:
-        """What a spec about it may be called: letters, digits and underscores."""
+        """Name of a spec about it, in letters, digits and underscores."""
         which = _NAMED[self.quantity.relation][self.direction if self.other_limit is None else 1]
         names = [party.name for party in dict.fromkeys(self.quantity.parties)] or [self.quantity.signal]
         parts = [names[0], which, *names[1:]]
@@ -179,7 +179,7 @@ class Line:
 
     @property
     def title(self) -> str:
-        """What it says, in words."""
+        """The line in words."""
         words = self.fact.words
         if self.later is not None:
             if self.pattern == "until":
@@ -191,7 +191,7 @@ class Line:
 
     @property
     def name(self) -> str:
-        """What the spec may be called."""
+        """Name of the spec."""
         if self.later is not None:
             if self.pattern == "until":
                 return f"{self.later.opposite().name}_until_{self.fact.name}"
@@ -223,9 +223,9 @@ _SURE: Final = 4.0
 """A bad run so many margins away is distinguished as surely as any."""
 _MOST_EVENTS: Final = 40
 _STILL: Final = 1e-3
-"""What varies by less than this part of the greatest distance does not move."""
+"""Least movement, as a fraction of the greatest distance."""
 _STAYS: Final = 0.05
-"""What ends by less than this part of the farthest way from where it began is a landmark."""
+"""Greatest displacement of a landmark, as a fraction of the longest way."""
 _SCORED_RUNS: Final = 10
 _MOST_BITS: Final = 6.0
 
@@ -257,8 +257,8 @@ class FittedLimits:
     ) -> FittedLimits:
         """FittedLimits limits to the runs.
 
-        A limit keeps a margin from the lowest value of the good runs: three times the mean distance of their
-        values, or half the way to the nearest bad run beyond it, if that is less. A bad run that no limit
+        A limit keeps a margin from the lowest value of the good runs. The margin is three times the mean
+        distance of their values, at most half the way to the nearest bad run. A bad run that no limit
         distinguishes this way moves the limit that it is farthest behind, in margins, to the middle between
         it and the good runs.
         """
@@ -378,8 +378,8 @@ class FittedLimits:
 
     @cached_property
     def bits(self) -> Floats:
-        """(3, 2, Q), how much is said: of what holds at some time, how seldom it holds; of what always does,
-        how near it comes to not holding, as a part of how it varies."""
+        """(3, 2, Q), the information of each line. For `F`: how seldom it holds. For `G`: how close it comes
+        to failing, relative to its variation."""
         some = self.good[:_SCORED_RUNS]
         share = np.mean(
             [(each.sampled[None] >= self.limits[..., None]).mean(axis=-1) for each in some], axis=0

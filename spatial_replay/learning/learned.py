@@ -43,7 +43,7 @@ _ALIKE: Final = 1.25
 _ALIKE_ALWAYS: Final = 2.0
 """The greatest ratio of limits that are written as one of a class: at the end, and of what always holds."""
 _NEXT_LINE: Final = 0.6
-"""What a second line about an object is worth, and so on."""
+"""Weight of a second line about an object, and of each further one."""
 _LEAST_GAIN: Final = 0.25
 _LESS: Final = 0.5
 """The bad runs that a further line has to distinguish; by how much less a run counts after that."""
@@ -52,12 +52,12 @@ _NEVER: Final = 0.3
 _DISTANCES: Final = 2
 """How many distances from landmarks say where one object is put: two leave two places in the plane."""
 _LEAST_BITS_PLACED: Final = 2.0
-"""What the distance of an object from the nearest landmark is worth at least."""
+"""Least weight of an object's distance from the nearest landmark."""
 _SHARE_OF_ALWAYS: Final = 1 / 3
 """The most of all lines without bad runs that say what always holds, and that say orders."""
 _PLAIN_BEFORE: Final = 0.8
 _PLAIN_UNTIL: Final = 0.6
-"""What it is worth to distinguish a bad run in lines about orders; see `_plainness`."""
+"""Weight of a distinguished bad run in lines about orders; see `_plainness`."""
 _DIRECTIONS: Final = frozenset({"leftof", "below", "prec"})
 
 

@@ -54,7 +54,7 @@ class Unadvertised(NamedTuple):
 
 
 class StatusMessage(NamedTuple):
-    """What a server says about itself: level 0 is information, 1 a warning, 2 an error."""
+    """A server's message about itself: level 0 is information, 1 a warning, 2 an error."""
 
     level: int
     text: str
@@ -161,7 +161,7 @@ MOST_WARNINGS: Final = 1_000
 
 _MOST_CHANNELS: Final = 100_000
 _MOST_DEFINITION_BYTES: Final = 64 * 2**20
-"""Of all channels together."""
+"""Limit for all channels together."""
 _FRAMES: Final = 4
 """Frames that wait to be decoded, each of up to `LARGEST_FRAME` bytes."""
 _LONGEST_TURN_S: Final = 0.02
@@ -212,7 +212,7 @@ Item: TypeAlias = Received | Connected | Offered | Disconnected | Warned
 
 
 class Inbox:
-    """What came and was not yet taken, in its order; see `MOST_WAITING`.
+    """Arrived and unread items, in order; see `MOST_WAITING`.
 
     Attributes:
         dropped: messages that were dropped for lack of room.

@@ -66,7 +66,7 @@ class ObjectsAssembler:
         self.is_finished = False
 
     def add(self, messages: Sequence[Message], now_s: float) -> Trace:
-        """Add messages as they came; return their samples. Those that come late or twice are left out."""
+        """Add messages as they came; return their samples. Late and repeated samples are left out."""
         kept: list[Message] = []
         for message in messages:
             if message.log_time_ns < self._newest_ns - DISORDER_NS:
@@ -140,7 +140,7 @@ class SessionStatus:
 
 @dataclass(frozen=True, eq=False)
 class LiveUpdate:
-    """What one sample gives.
+    """Results of one sample.
 
     Attributes:
         sample: the objects and signals.
@@ -176,7 +176,7 @@ class LiveUpdate:
 
     @cached_property
     def violations(self) -> tuple[Violation, ...]:
-        """What is violated whatever comes; see `Update.violations`."""
+        """Permanent violations; see `Update.violations`."""
         return tuple(each for update in self.updates for each in update.violations)
 
     def node(self, name: str) -> NodeUpdate:

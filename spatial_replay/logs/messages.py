@@ -108,8 +108,8 @@ class Block:
 def merge(streams: Sequence[Messages]) -> Messages:
     """Merge messages in the order of time, topic and sequence.
 
-    Numbers of channels mean nothing outside their log, so channels are ordered by what they are: the same
-    messages come out in the same order from whichever log they were read.
+    Channel numbers mean nothing outside their log, so channels are ordered by their content. Equal messages
+    come out in the same order from any log.
     """
     joined = join(streams)
     return select(joined, np.lexsort((joined.sequence, joined.channel, joined.log_time_ns)))

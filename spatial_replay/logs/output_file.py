@@ -54,7 +54,7 @@ def replacing(output: Path, inputs: Iterable[Path] = ()) -> Iterator[BinaryIO]:
 
 
 Durability: TypeAlias = Literal["process", "disk"]
-"""What a flushed file survives: the end of the process, or that of the machine, too."""
+"""Durability of a flushed file: it survives the end of the process, or of the machine, too."""
 
 
 def open_output(output: Path, durability: Durability = "process", *, overwrite: bool = True) -> BinaryIO:

@@ -207,7 +207,7 @@ class FaultList:
 class FaultKinds(FaultList):
     """Faults of a run that goes on: the first of each kind is a line, the others are counted for the end.
 
-    Of one kind are those of a topic whose texts differ in numbers alone.
+    Remarks are of one kind if they are of one topic and their texts differ in numbers alone.
     """
 
     def __init__(self) -> None:

@@ -41,7 +41,7 @@ Range: TypeAlias = tuple[int, int]
 """Bytes from the first up to, not including, the second."""
 
 _BATCH_BYTES: Final = 2**26
-"""What is read at once if that is all; of more, the first batches are smaller, and one is read ahead."""
+"""Largest amount that is read at once. Longer reads begin with smaller batches, and read one ahead."""
 MOST_HELD_BYTES: Final = 2**28
 _WASTE: Final = 0.08
 """The share of bytes that may be read between ranges, unused, to save requests."""
@@ -208,7 +208,7 @@ _CREDENTIALS: Final = {
     "https": "give an address that may be read without a password",
     "http": "give an address that may be read without a password",
 }
-"""What helps where access is denied, by the scheme of an address."""
+"""Remedies for denied access, by the scheme of an address."""
 
 _SETTINGS: Final = ("AWS_", "GOOGLE_", "AZURE_")
 """How the names of the environment variables begin that the services' libraries read."""
@@ -221,7 +221,7 @@ _REASONS: Final[Mapping[str, str]] = MappingProxyType(
         "error sending request": "the server does not answer",
     }
 )
-"""What the library says, in other words."""
+"""Plain words for the library's messages."""
 WEB_SCHEMES: Final = ("http", "https")
 
 _TAIL_BYTES: Final = 2**19
@@ -278,7 +278,7 @@ def local_files(paths: Iterable[str | PathLike[str]]) -> list[Path]:
 
 @dataclass(frozen=True, slots=True)
 class FileVersion:
-    """What identifies the content of a remote file.
+    """Identity of the content of a remote file.
 
     Attributes:
         size: in bytes.

@@ -36,7 +36,7 @@ class Source(Protocol):
     def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
         """Return the samples from the first at or after `start_ns` to the last before `end_ns`.
 
-        What could not be read is in the blocks' `trace.faults`; the last block may hold nothing else.
+        Unreadable parts are in `trace.faults` of the blocks; the last block may hold nothing else.
 
         Raises:
             LogError: nothing in the log can be read as a sample.
@@ -144,7 +144,7 @@ class TrackSource(_Bare):
 
 @dataclass(frozen=True)
 class SourceOf:
-    """What a source that is made of another one has from it: everything but its blocks."""
+    """Attributes that a derived source takes from its original: everything but its blocks."""
 
     source: Source
 

@@ -113,7 +113,7 @@ def image_topics(channels: Iterable[Channel]) -> set[str]:
 
 
 ALL, MAPPED = "all", "mapped"
-"""What `is_kept` takes beside patterns: every topic, or those that the samples are made of."""
+"""Values of `is_kept` besides patterns: every topic, or the topics of the samples."""
 
 
 def is_kept(topic: str, keep: Collection[str], mapped: Collection[str]) -> bool:

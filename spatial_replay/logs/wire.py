@@ -1,8 +1,8 @@
 """Many messages of one layout at once.
 
-In protobuf's encoding, numbers of a fixed width are at the same place in every message that has the
-same fields, texts and list lengths. So one message, encoded by the protobuf library, serves as a template
-for all of its layout: only the slots differ, and those of many messages are filled or read together.
+In protobuf's encoding, numbers of a fixed width are at the same place in every message that has the same
+fields, texts and list lengths. One message, encoded by the protobuf library, therefore is a template for all
+of its layout. Only the slots differ; slots of many messages are filled or read together.
 """
 
 from __future__ import annotations

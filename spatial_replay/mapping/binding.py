@@ -44,7 +44,7 @@ from spatial_replay.mapping.message_types import Alternatives, MessageLayout
 from spatial_replay.trace.sample import LATEST_NS
 
 BY_PLACE = "only the places in the list distinguish objects: objects swap where these change"
-"""What to say where objects are named by their indices."""
+"""Remark on objects that are named by their indices."""
 _LONGEST_NAME = 500
 _UUID_BYTES = 16
 _MOST_IN_NAME = 16

@@ -39,10 +39,10 @@ from spatial_replay.mapping.transforms import (
 )
 
 BOX, DISC, CYLINDER, SPHERE, POLYGON, HULL = range(6)
-"""Kinds of solids, with the meaning of their three sizes: box: length, width, height (NaN if flat); disc:
-diameter; cylinder: diameters along x and y, height; sphere: diameters along x, y and z. A polygon has corners
-in order, a hull points in any order. Cylinders that are tilted or not round, and spheres that are not round,
-count as their bounding boxes."""
+"""Kinds of solids with their three sizes. Box: length, width, height (NaN if flat). Disc: diameter. Cylinder:
+diameters along x and y, height. Sphere: diameters along x, y and z. A polygon has corners in order, a hull
+points in any order. Cylinders that are tilted or not round, and spheres that are not round, count as their
+bounding boxes."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,7 @@ long, so a sample waits for three things only, and only so long:
     other clocks        with stamps inside messages, up to `max_delay`, since topics may lag behind others
     transforms          of its observations, up to `max_delay`
 
-What is missing after that is as in a log that lacks it: unknown, or the value before.
+A later message counts as missing, as in a log: its value is unknown, or the one before.
 """
 
 from __future__ import annotations

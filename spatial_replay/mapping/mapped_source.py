@@ -45,8 +45,8 @@ class MappedSource:
     """An external log, with a mapping from its messages to objects.
 
     Attributes:
-        keep: which messages its blocks hold for a copy, byte for byte: "mapped" for those of the topics that
-            the mapping reads, "all", or patterns of topics such as "/camera/*"; several add up.
+        keep: messages that its blocks hold for a copy, byte for byte: "mapped" for topics that the mapping
+            reads, "all", or patterns of topics such as "/camera/*". Several add up.
         late: how late messages may come, or "all".
         max_gap: what lies in a longer pause is unknown; None for what the mapping says.
     """
@@ -70,7 +70,7 @@ class MappedSource:
 
     @property
     def axes(self) -> Axes:
-        """Those of the messages; samples have ours."""
+        """Axes of the messages; samples are always y-up."""
         return self.mapping.axes
 
     @property

@@ -36,9 +36,9 @@ FOREVER_NS = 2**63 - 1
 """The `max_age` of observations that stay valid forever."""
 
 NO_TOPIC = "no topic was chosen: name one with objects or signals"
-"""What is wrong with a mapping without topics."""
+"""Error of a mapping without topics."""
 NO_FRAME = "no frame was chosen: name the one that coordinates are brought into"
-"""What is wrong with a mapping whose fixed frame is left open."""
+"""Error of a mapping with an open fixed frame."""
 
 Measure: TypeAlias = float | str
 """A number, or the field path of one."""
@@ -49,8 +49,8 @@ class ShapeMapping:
     """A footprint in an object's own frame.
 
     Attributes:
-        kind: "box" (sizes: length along x, width along y, or also height along z), "disc" (sizes: radius) or
-            "polygon" (points: its corners; or outline: the path of these in each message).
+        kind: "box" (sizes: length along x, width along y, optionally height along z), "disc" (sizes: radius)
+            or "polygon" (its corners as points, or as outline the path of them).
         offset: its centre (x, y) in the object's own frame, in footprint units.
     """
 

@@ -201,7 +201,7 @@ def _names_beside(guess: Guess, messages: Sequence[object]) -> Iterator[str]:
 def numbers_in(message: object) -> tuple[str, ...]:
     """Return the paths of the numbers and truth values in a message, but for times and the header.
 
-    Of lists only those beside a list `name` are found, such as `position[name=elbow]`.
+    A list is found only next to a list `name`, such as `position[name=elbow]`.
     """
     paths: list[str] = []
     for path, value in _iter_fields(message, is_skipped=_is_time):

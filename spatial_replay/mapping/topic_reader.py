@@ -105,7 +105,7 @@ class PlannedTopic:
 
 @dataclass(frozen=True, slots=True)
 class ReadingPlan:
-    """What to read of a log for a mapping that fits it.
+    """Selection of messages for a mapping that fits the log.
 
     Attributes:
         topics: every topic to read: those mapped, and those with transforms if frames are needed.

@@ -122,7 +122,7 @@ _LONGEST_CHAIN = 100
 _OFF_LENGTH = 0.01
 """By how much the squared length of a rotation's quaternion may differ from 1, as in tf2."""
 _LEAST_JUMP = 0.1
-"""Of a frame, in metres and radians."""
+"""Least jump of a frame, in metres and radians."""
 _MANY_JUMPS = 3
 
 

@@ -58,7 +58,7 @@ class Element:
 def iter_elements(path: Path, faults: FaultList, wanted: frozenset[str]) -> Iterator[Element]:
     """Yield the root, without its content, then each of its children that has a wanted name.
 
-    Of a broken file, the children before the damage are yielded, and the rest goes to `faults`.
+    A broken file yields the children before the damage, and `faults` has the rest.
 
     Raises:
         LogError: there is no root, the file declares a document type, or it exceeds the limits above.
@@ -260,7 +260,7 @@ def iter_scenario(path: Path, faults: FaultList, *, concave: Concave = "decompos
     """Yield the time steps of a CommonRoad scenario in blocks.
 
     A sample is a time step that some moving obstacle has a state for; obstacles that do not move are in each
-    of them. Roads, planning problems and goals are not objects. What is wrong goes to `faults`.
+    of them. Roads, planning problems and goals are not objects. Errors go to `faults`.
 
     Raises:
         LogError: the file is not a scenario.

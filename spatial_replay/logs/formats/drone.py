@@ -51,8 +51,8 @@ def iter_annotations(
 ) -> Iterator[Trace]:
     """Yield the frames of an `annotations.txt` in blocks; a frame that the file names is a sample.
 
-    Files are ordered by object, so the first frame is complete only after the last line: all boxes are read
-    first, as plain columns of 57 bytes a line, and everything else is made block by block.
+    Files are ordered by object, so the first frame is complete only after the last line. All boxes are read
+    first, as plain columns of 57 bytes a line; samples are built block by block.
 
     A frame with a line that cannot be read is left out as a whole and goes to `faults`.
 

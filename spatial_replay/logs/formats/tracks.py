@@ -31,7 +31,7 @@ LONGEST_LINE = 16 * 2**20
 """Bytes; a line beyond this is a file of another kind, or damage."""
 
 MOST_BLANK_LINES = 10_000_000
-"""Of a file; after that many the rest is not read."""
+"""Limit for a file; later lines are not read."""
 
 
 def open_text(path: Path) -> BinaryIO:

@@ -112,7 +112,7 @@ _CHUNK_INDEX = struct.Struct("<QQQQI")
 _SIZE_BYTES = 8
 """At the end of the index of a chunk: what it decompresses to."""
 _MESSAGE_INDEX = struct.Struct("<H8x")
-"""Of which only the channel matters here."""
+"""Only the channel matters here."""
 _LOOSE_BYTES = 2**22
 _LARGEST_RECORD = 2**30
 _STRIDE = 2**20

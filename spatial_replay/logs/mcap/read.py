@@ -1,7 +1,7 @@
 """Read our own MCAP logs, whole or damaged, in blocks of samples with their messages.
 
-The reader is our own because the MCAP library fails 112 of the 416 files of the format's conformance suite
-and gives up on truncated and unindexed files, which crashed recorders leave behind.
+The reader is our own for two reasons. The MCAP library fails 112 of the 416 files of the format's conformance
+suite. It gives up on truncated and unindexed files, which crashed recorders leave behind.
 
 Chunks may overlap in time. So they are read in the order of their first message, and a message is handed
 out only when no later chunk can hold an earlier one.
@@ -364,8 +364,8 @@ class McapSource:
     """An MCAP log with the topic /spatial/objects; its index is read once for all uses of the source.
 
     Attributes:
-        keep: which of its other messages its blocks hold, as `is_kept` takes them. What they do not hold is
-            not read, where chunks say what they hold.
+        keep: which of its other messages its blocks hold, as `is_kept` takes them. Chunks without these
+            topics are skipped, if chunks list their topics.
         max_gap: between samples that are farther apart, everything is unknown.
     """
 
@@ -424,7 +424,7 @@ class McapSource:
 
     @property
     def axes(self) -> Axes:
-        """Those of what the log was recorded from; its samples have ours."""
+        """Axes of the original source; samples are always y-up."""
         return Axes.from_metadata(dict(self.metadata()).get(METADATA, {}))
 
     @property

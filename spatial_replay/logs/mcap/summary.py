@@ -32,7 +32,7 @@ class AttachmentSummary:
 
 @dataclass(frozen=True, slots=True)
 class LogSummary:
-    """What an MCAP log holds.
+    """Content of an MCAP log.
 
     Attributes:
         name: the file's base name.

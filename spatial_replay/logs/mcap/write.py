@@ -47,8 +47,8 @@ WAITING_BYTES = 64 * 2**20
 COMPRESSION_LEVEL: Final = 1
 """Coordinates hardly shrink further at higher levels, which take several times as long."""
 _OWN_LEVEL, _OWN_HASH_LOG = -1, 12
-"""The same for our own messages, of which each is much like the one before: a small table finds what repeats,
-in three quarters of the time for a twentieth more bytes."""
+"""The same for our own messages, which resemble their predecessors. A small table finds the repetitions in
+three quarters of the time, for a twentieth more bytes."""
 
 _HEAD: Final = np.dtype(
     [
@@ -149,7 +149,7 @@ def _compressor(is_own: bool) -> zstandard.ZstdCompressor:
 
 @dataclass(slots=True)
 class _Summary:
-    """What a log holds, collected while it is written."""
+    """Content of a log, collected while it is written."""
 
     schemas: list[records.Schema] = field(default_factory=list)
     channels: list[records.Channel] = field(default_factory=list)
