@@ -38,7 +38,7 @@ from spatial_replay.logs.remote import LogFile
 from spatial_replay.text import counted, counted_from, escaped, requirement_text
 
 if TYPE_CHECKING:
-    from spatial_replay.logs.mcap.summary import LogSummary
+    from spatial_replay.logs.mcap.read import LogSummary
     from spatial_replay.logs.source import Source
     from spatial_replay.sources.overview import Overview, Survey
     from spatial_replay.spec.formula import NamedSpec

@@ -33,7 +33,7 @@ from spatial_replay.trace.trace import duration_ns_from_text
 
 if TYPE_CHECKING:
     from spatial_replay.live import LiveSession, LiveUpdate
-    from spatial_replay.live.viewing import Viewing
+    from spatial_replay.live.session import Viewing
     from spatial_replay.mapping import LogMapping
     from spatial_replay.recording import Recorder
     from spatial_replay.recording.clips import Trigger
@@ -308,7 +308,7 @@ def _refuse_inputs(output: Path, specs: Sequence[Path], mapping_file: Path | Non
 
 
 def _layout(files: Sequence[Specification], mapping: LogMapping | None) -> str:
-    from spatial_replay.live.viewing import layout_of_run
+    from spatial_replay.live.session import layout_of_run
 
     return layout_of_run(files, mapping)
 
@@ -320,7 +320,7 @@ def _viewing(
     serving: ServingArguments,
     fire: Callable[[str], None] | None,
 ) -> Iterator[Viewing]:
-    from spatial_replay.live.viewing import open_viewing
+    from spatial_replay.live.session import open_viewing
 
     host, port, origins = serving.host, serving.port, serving.origins
     with open_viewing(files, mapping, host=host, port=port, origins=origins, fire=fire) as viewing:

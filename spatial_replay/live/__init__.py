@@ -1,10 +1,7 @@
 """A running robot, monitored: messages over Foxglove's WebSocket protocol in; verdicts, logs and clips out.
 
-    protocol      what servers send, decoded
-    client        one connection: it is kept up, and what comes waits in a bounded inbox
-    live_session  messages to samples, samples to verdicts, one after the other
-    monitoring    a session with the logs that are written beside, in one call
-    viewing       what a session gives, as viewers see it
+    client   one connection: it is kept up, and its messages wait in a bounded inbox
+    session  messages to samples, samples to verdicts, logs, clips and viewers
 
 Names are loaded when they are first used.
 """

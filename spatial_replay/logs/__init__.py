@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 from spatial_replay.lazy import loaded_when_used
 
 if TYPE_CHECKING:
-    from spatial_replay.logs.mcap.read import McapSource
-    from spatial_replay.logs.mcap.summary import summarise_mcap
+    from spatial_replay.logs.mcap.read import McapSource, summarise_mcap
     from spatial_replay.logs.mcap.write import LogWriter
     from spatial_replay.logs.messages import Attachment, Block, Channel, MemorySink, Messages, Schema
     from spatial_replay.logs.objects import decode_objects, encode_objects
@@ -36,8 +35,7 @@ __all__ = [
 __getattr__, __dir__ = loaded_when_used(
     globals(),
     {
-        "mcap.read": ("McapSource",),
-        "mcap.summary": ("summarise_mcap",),
+        "mcap.read": ("McapSource", "summarise_mcap"),
         "mcap.write": ("LogWriter",),
         "messages": ("Attachment", "Block", "Channel", "MemorySink", "Messages", "Schema"),
         "objects": ("decode_objects", "encode_objects"),

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 from spatial_replay.lazy import loaded_when_used
 
 if TYPE_CHECKING:
-    from spatial_replay.mapping.assemble import Assembler
-    from spatial_replay.mapping.live_assembler import LiveAssembler
+    from spatial_replay.mapping.assemble import Assembler, LiveAssembler
     from spatial_replay.mapping.mapped_source import MappedSource
     from spatial_replay.mapping.mapping_file import LogMapping, load_mapping, parse_mapping
     from spatial_replay.mapping.suggest import suggest_mapping, suggest_topics
@@ -32,8 +31,7 @@ __all__ = [
 __getattr__, __dir__ = loaded_when_used(
     globals(),
     {
-        "assemble": ("Assembler",),
-        "live_assembler": ("LiveAssembler",),
+        "assemble": ("Assembler", "LiveAssembler"),
         "mapped_source": ("MappedSource",),
         "mapping_file": ("LogMapping", "load_mapping", "parse_mapping"),
         "suggest": ("suggest_mapping", "suggest_topics"),

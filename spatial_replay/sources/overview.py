@@ -16,8 +16,7 @@ from spatial_replay.bags.mcap_log import McapLog
 from spatial_replay.bags.open import open_messages
 from spatial_replay.bags.reader import MessageReader
 from spatial_replay.errors import LogError, MissingFileError, UsageError
-from spatial_replay.logs.mcap.read import McapSource
-from spatial_replay.logs.mcap.summary import LogSummary, summarise_mcap
+from spatial_replay.logs.mcap.read import LogSummary, McapSource, summarise_mcap
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.logs.remote import RemoteFile, log_file
 from spatial_replay.logs.source import Source, TrackSource, axes_of, reading_only

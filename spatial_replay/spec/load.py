@@ -1,15 +1,22 @@
-"""Specifications from texts and files, and constants given from outside."""
+"""Specifications from texts and files: names resolved, macros expanded, quantifiers written out or bound.
+
+A quantifier over a named group is written out for its members; over an open group it is one node, because
+the members are known only sample by sample.
+"""
 
 from __future__ import annotations
 
+import inspect
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
+from itertools import islice, permutations
 from os import PathLike
 from pathlib import Path, PurePath
 from reprlib import repr as shortened
-from typing import Any
+from types import MappingProxyType
+from typing import Any, get_args
 
 from lark import Token
 
@@ -23,14 +30,645 @@ from spatial_replay.spec.checks import (
 )
 from spatial_replay.spec.constants import replaced
 from spatial_replay.spec.diagnostics import Diagnostic, Faults, SourceText, nearest_hint
-from spatial_replay.spec.elaborate import Elaborator, TooLargeError, parameters_of
-from spatial_replay.spec.formula import Expression, Span, Specification
-from spatial_replay.spec.parser import parse_statements
-from spatial_replay.spec.relations import DEFAULT_PROFILE, PROFILES, RELATION_NAMES, Relation
-from spatial_replay.spec.resolve import Namespace
-from spatial_replay.spec.syntax import BrokenStatement, ConstStatement, SpecStatement, Statement, UseStatement
-from spatial_replay.spec.tokens import MAX_TOKENS, is_reserved, tokenize
-from spatial_replay.text import encodable
+from spatial_replay.spec.format import format_number, format_relation
+from spatial_replay.spec.formula import (
+    Atom,
+    Axis,
+    Boolean,
+    Bound,
+    Earlier,
+    Enlarged,
+    Equality,
+    Expression,
+    Formula,
+    Group,
+    Misalignment,
+    NamedSpec,
+    Quantified,
+    RegionName,
+    Signal,
+    SignedDistance,
+    Span,
+    Specification,
+    Temporal,
+    Term,
+    TrackedName,
+    Truth,
+    Variable,
+    as_expression,
+    minimum,
+)
+from spatial_replay.spec.parser import MAX_DEPTH, MIRRORED, parse_statements
+from spatial_replay.spec.relations import (
+    DEFAULT_PROFILE,
+    PROFILES,
+    RELATION_NAMES,
+    THREE_TERM_RELATIONS,
+    Relation,
+    compare,
+)
+from spatial_replay.spec.resolve import MAX_SIZE, Anything, Namespace, Resolver, Scope, Value, kind_of
+from spatial_replay.spec.syntax import (
+    Arithmetic,
+    BooleanSyntax,
+    BoundSyntax,
+    BrokenStatement,
+    Call,
+    ComparisonSyntax,
+    ConstStatement,
+    DefStatement,
+    DistanceSyntax,
+    FormulaSyntax,
+    Name,
+    NumberSyntax,
+    QuantifierSyntax,
+    Quantity,
+    RelationSyntax,
+    SpecStatement,
+    Statement,
+    TemporalSyntax,
+    TermSyntax,
+    TruthSyntax,
+    UseStatement,
+)
+from spatial_replay.spec.tokens import MAX_TOKENS, function_hint, is_reserved, quoted, tokenize
+from spatial_replay.spec.walks import (
+    base_of,
+    iter_expressions,
+    iter_formulas,
+    other_names,
+    scaled,
+    substitute,
+    terms_of,
+)
+from spatial_replay.text import encodable, text_number
+
+_MIRRORED = MappingProxyType({">=": "<=", ">": "<"})
+_AXES: tuple[str, ...] = get_args(Axis)
+
+
+def parameters_of(name: str, relation: Relation) -> tuple[inspect.Parameter, ...]:
+    """Return the parameters that are written in brackets behind a relation's name.
+
+    Raises:
+        UsageError: for a function that cannot be written as a relation.
+    """
+    taken = tuple(inspect.signature(relation).parameters.values())
+    kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    terms = 3 if name in THREE_TERM_RELATIONS else 2
+    if len(taken) < terms or any(parameter.kind not in kinds for parameter in taken):
+        hint = "give a function of two terms and, after them, numbers, all positional"
+        raise UsageError(f"relations: {name!r} cannot be written between two objects; {hint}")
+    return taken[terms:]
+
+
+@dataclass(frozen=True, slots=True)
+class AtomBuilder:
+    """Builds the atoms of one text in one profile."""
+
+    relations: Mapping[str, Relation]
+    names: frozenset[str]
+    resolver: Resolver
+    faults: Faults
+
+    def relation(self, written: RelationSyntax, scope: Scope) -> Atom | None:
+        """Return an atom of a relation; None, and a fault, where its parameters do not fit."""
+        terms = tuple([self.resolver.term(term, scope) for term in written.terms])
+        parameters = self._parameters(written, scope)
+        if parameters is None:
+            return None
+        try:
+            expression = as_expression(self.relations[written.relation](*terms, *parameters))
+        except TypeError as error:
+            raise UsageError(
+                f"relations: {written.relation!r} does not return an expression: {error}"
+            ) from error
+        self._check(expression, written, scope)
+        return self._atom(written.relation, expression, terms, parameters, written, scope)
+
+    def distance(self, written: DistanceSyntax, scope: Scope) -> Atom:
+        """Return the atom of `a dist b <= c`, c - sd(a, b); of a chain, the lesser of both comparisons."""
+        terms = (self.resolver.term(written.first, scope), self.resolver.term(written.second, scope))
+        limits = [(sign, self.resolver.number(limit, scope)) for sign, limit in written.comparisons]
+        quantity = SignedDistance(*terms)
+        comparisons = [compare(quantity, sign, limit) for sign, limit in limits]
+        (sign, limit), *upper = limits
+        if not upper:
+            return self._atom("dist", comparisons[0], terms, (sign, limit), written, scope)
+        parameters = (limit, _MIRRORED[sign], *upper[0])
+        return self._atom("dist", minimum(*comparisons), terms, parameters, written, scope)
+
+    def comparison(self, written: ComparisonSyntax, scope: Scope) -> Atom:
+        """Return the atom of `signal >= c`, signal - c; `==` and `!=` are exact."""
+        limit_name = written.limit if isinstance(written.limit, Name) else None
+        if limit_name is not None and self.resolver.is_number(limit_name, scope):
+            limit_name = None
+        name, shown = written.signal, None
+        if limit_name is not None and (
+            self.resolver.is_number(name, scope) or (name.is_quoted and not limit_name.is_quoted)
+        ):
+            turned = ComparisonSyntax(limit_name, MIRRORED[written.operator], name, written.span)
+            return self.comparison(turned, scope)
+        if limit_name is not None and limit_name.is_quoted:
+            shown, limit = quoted(limit_name.text), text_number(limit_name.text)
+            if written.operator not in ("==", "!="):
+                self.resolver.fault(written.span, scope, "a text has no order", "compare it by == or !=")
+        else:
+            limit = self.resolver.number(written.limit, scope)
+        defined = self.resolver.names.definitions.get(name.text)
+        if name.text in scope.values:
+            message = f"{name.text!r} is a parameter or variable here; a signal of the log is expected"
+            self.resolver.fault(name.span, scope, message)
+        elif defined is not None and not isinstance(defined, BrokenStatement):
+            message = f"{name.text!r} is {kind_of(defined)}; a signal of the log is expected"
+            self.resolver.fault(name.span, scope, message)
+        signal, is_equal = Signal(name.text), Equality(Signal(name.text), limit)
+        exact: Mapping[str, Expression] = {"==": is_equal, "!=": -is_equal}
+        expression = exact.get(written.operator) or compare(signal, written.operator, limit)
+        parameters = (name.text, written.operator, limit if shown is None else shown)
+        return self._atom("signal", expression, (), parameters, written, scope)
+
+    def _atom(
+        self,
+        relation: str,
+        expression: Expression,
+        terms: tuple[Term, ...],
+        parameters: tuple[float | str, ...],
+        written: RelationSyntax | DistanceSyntax | ComparisonSyntax,
+        scope: Scope,
+    ) -> Atom:
+        text = format_relation(relation, terms, parameters, self.names)
+        expression = scaled(expression, self.resolver.names.scales)
+        span = scope.call or written.span
+        return Atom(text, relation, expression, span=span, terms=terms, parameters=parameters)
+
+    # ------------------------------------------------------------------------------------ parameters
+
+    def _parameters(self, written: RelationSyntax, scope: Scope) -> tuple[float | str, ...] | None:
+        expected = parameters_of(written.relation, self.relations[written.relation])
+        given = written.parameters
+        missing = expected[len(given) :]
+        if len(given) > len(expected) or any(each.default is each.empty for each in missing):
+            self._report_parameters(written, expected, scope)
+            return None
+        values = [
+            self._axis(quantity, scope) if parameter.name == "axis" else self.resolver.number(quantity, scope)
+            for parameter, quantity in zip(expected, given, strict=False)
+        ]
+        values += [each.default if each.name == "axis" else float(each.default) for each in missing]
+        return tuple(values)
+
+    def _report_parameters(
+        self, written: RelationSyntax, expected: tuple[inspect.Parameter, ...], scope: Scope
+    ) -> None:
+        name = written.relation
+        bracket = ", ".join("x" if each.name == "axis" else each.name for each in expected)
+        if not expected:
+            self.resolver.fault(written.operator, scope, f"{name!r} takes no parameter", f"write a {name} b")
+            return
+        right = "(b, c)" if name == "between" else "b"
+        what = "an axis, x, y or z" if expected[0].name == "axis" else "a number"
+        hint = f"write a {name}[{bracket}] {right}, where {expected[0].name} is {what}"
+        if len(expected) == 1 and len(written.parameters) == 2:
+            hint += "; decimals have a point: 0.1"
+        count = f"{len(expected)} parameter{'s' if len(expected) > 1 else ''}, not {len(written.parameters)}"
+        self.resolver.fault(written.operator, scope, f"{name!r} takes {count}", hint)
+
+    def _axis(self, quantity: Quantity, scope: Scope) -> str:
+        if isinstance(quantity, Name) and quantity.text in _AXES:
+            return quantity.text
+        self.resolver.fault(quantity.span, scope, "an axis is expected here", "write x, y or z")
+        return "x"
+
+    # ---------------------------------------------------------------------------------------- checks
+
+    def _check(self, expression: Expression, written: RelationSyntax, scope: Scope) -> None:
+        """Refuse orientations of what has none, and discs of negative radius."""
+        for part in iter_expressions(expression):
+            if isinstance(part, Misalignment):
+                for term in (part.first, part.second):
+                    self._check_orientation(term, written, scope)
+        for term in terms_of(expression):
+            if isinstance(term, Enlarged) and term.radius < 0.0:
+                message = f"{written.relation!r} with the negative radius {format_number(term.radius)}"
+                self.resolver.fault(written.operator, scope, message, "write a number of at least 0")
+
+    def _check_orientation(self, term: Term, written: RelationSyntax, scope: Scope) -> None:
+        base = base_of(term)
+        if isinstance(base, (RegionName, Group)):
+            kind = "region" if isinstance(base, RegionName) else "group"
+            message = f"{written.relation!r} needs an orientation, and a {kind} has none"
+            self.resolver.fault(written.operator, scope, message, "compare single objects of the log")
+
+
+@dataclass(frozen=True, slots=True)
+class QuantifierBuilder:
+    """Builds the formulas of the quantifiers of one text.
+
+    Attributes:
+        words: every name that occurs in the text; variables that must be renamed avoid them.
+        elaborate: elaborates a body in a scope.
+    """
+
+    names: Namespace
+    relations: Mapping[str, Relation]
+    words: Collection[str]
+    resolver: Resolver
+    elaborate: Callable[[FormulaSyntax, Scope], Formula]
+
+    def formula(self, written: QuantifierSyntax, scope: Scope, span: Span) -> Formula:
+        """Return the formula of a quantifier; `true` in place of one with faults."""
+        doubled = first_repeated(written.variables)
+        if doubled is not None:
+            self.resolver.fault(doubled.span, scope, f"the variable {doubled.text!r} is given twice")
+        group = self.resolver.term(written.group, scope)
+        base = base_of(group)
+        if isinstance(base, Group) and base.is_open and isinstance(group, (Group, Earlier)):
+            return self._open_quantifier(written, group, scope, span)
+        if isinstance(group, Group):
+            return self._named_quantifier(written, group, scope, span)
+        if isinstance(base, Group):
+            hint = "quantify over the group, and write the delay or enlarge in the body"
+            message = f"{written.quantifier} runs over the members of a group, whose names never change"
+            self.resolver.fault(written.group.span, scope, message, hint)
+        elif not self.resolver.is_unknown(written.group, scope):
+            hint = 'define it: group NAME = a, b, or group NAME = class "name"'
+            message = f"{written.quantifier} runs over a group, and this is not one"
+            self.resolver.fault(written.group.span, scope, message, hint)
+        self._body_of_any(written, scope)
+        return Truth(True)
+
+    def _body_of_any(self, written: QuantifierSyntax, scope: Scope) -> None:
+        """Check a body for faults although it has no members."""
+        values = dict(scope.values) | {name.text: TrackedName(name.text) for name in written.variables}
+        self.elaborate(written.body, replace(scope.deeper(), values=values))
+
+    def _named_quantifier(self, written: QuantifierSyntax, group: Group, scope: Scope, span: Span) -> Formula:
+        if any(isinstance(each, Variable) for each in group.excluded):
+            message = "which members are left out is known only once the variable has a value"
+            hint = "quantify over a class or all, or define the group without that member"
+            self.resolver.fault(written.group.span, scope, message, hint)
+        excluded = {each.name for each in group.excluded}
+        members = [TrackedName(name) for name in group.members or () if name not in excluded]
+        choices = list(islice(permutations(members, len(written.variables)), MAX_SIZE))
+        if not choices:
+            self._body_of_any(written, scope)
+            return Truth(written.quantifier == "forall", span=span)
+        inner = scope.deeper()
+        instances: list[Formula] = []
+        for choice in choices:
+            bound = dict(zip((name.text for name in written.variables), choice, strict=True))
+            instances.append(self.elaborate(written.body, replace(inner, values={**scope.values, **bound})))
+        if len(instances) == 1:
+            return instances[0]
+        return Boolean("and" if written.quantifier == "forall" else "or", tuple(instances), span=span)
+
+    def _open_quantifier(
+        self, written: QuantifierSyntax, group: Group | Earlier, scope: Scope, span: Span
+    ) -> Formula:
+        variables: list[str] = []
+        for name in written.variables:
+            taken = scope.bound.union(variables)
+            variables.append(self._fresh(name.text, taken) if name.text in taken else name.text)
+        bound: dict[str, Value] = {
+            name.text: Variable(variable) for name, variable in zip(written.variables, variables, strict=True)
+        }
+        inner = replace(scope.deeper(), values={**scope.values, **bound}, bound=scope.bound.union(variables))
+        body = self.elaborate(written.body, inner)
+        temporal = next((each for each in iter_formulas(body) if isinstance(each, Temporal)), None)
+        if temporal is not None:
+            message = f"{temporal.operator!r} inside {written.quantifier} over an open group"
+            hint = "its members change from sample to sample; use a template: spec name(object) = ..."
+            self.resolver.fault(temporal.span, scope, message, hint)
+        quantified = Quantified(written.quantifier, tuple(variables), group, body, span=span)
+        return self._without_clash(quantified, scope)
+
+    def _without_clash(self, quantified: Quantified, scope: Scope) -> Quantified:
+        """Rename variables that are written like something else in the body."""
+        others = other_names(quantified.body)
+        renamed = {
+            variable: self._fresh(variable, scope.bound | others)
+            for variable in quantified.variables
+            if variable in others or variable in self.names.definitions
+        }
+        if not renamed:
+            return quantified
+        names = {old: Variable(new) for old, new in renamed.items()}
+        body = substitute(quantified.body, names, frozenset(self.relations))
+        variables = tuple(renamed.get(variable, variable) for variable in quantified.variables)
+        return replace(quantified, variables=variables, body=body)
+
+    def _fresh(self, name: str, taken: Collection[str]) -> str:
+        number = 2
+        while f"{name}_{number}" in taken or f"{name}_{number}" in self.words:
+            number += 1
+        return f"{name}_{number}"
+
+
+def first_repeated(names: Sequence[Name]) -> Name | None:
+    """Return the first of some names that an earlier one is equal to."""
+    texts: set[str] = set()
+    for name in names:
+        if name.text in texts:
+            return name
+        texts.add(name.text)
+    return None
+
+
+def _split_title(text: str | None) -> tuple[str | None, str | None]:
+    """Return the requirement's id, which stands before ": " and has no blanks, and the title."""
+    if text is None:
+        return None, None
+    identifier, _, rest = text.partition(": ")
+    if not rest or not identifier or any(character.isspace() for character in identifier):
+        return None, text
+    return identifier, rest.strip()
+
+
+_UNBOUNDED = frozenset({"X", "WX", "Y"})
+
+
+class TooLargeError(Exception):
+    """An expansion went past its bound; the fault is already reported."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Known:
+    """An elaborated spec; its size and depth count again wherever it is named."""
+
+    spec: NamedSpec
+    order: int
+    size: int
+    depth: int
+
+
+@dataclass(slots=True)
+class Elaborator:
+    """Elaborates the statements of one text.
+
+    Attributes:
+        words: every name that occurs in the text; variables that must be renamed avoid them.
+    """
+
+    names: Namespace
+    relations: Mapping[str, Relation]
+    words: Collection[str]
+    faults: Faults
+    resolver: Resolver = field(init=False)
+    atoms: AtomBuilder = field(init=False)
+    quantifiers: QuantifierBuilder = field(init=False)
+    known: dict[str, _Known] = field(default_factory=dict)
+    referred: set[str] = field(default_factory=set)
+    deepest: int = 0
+    shared: int = 0
+
+    def __post_init__(self) -> None:
+        self.resolver = Resolver(self.names, self.faults)
+        relation_names = frozenset(self.relations)
+        self.atoms = AtomBuilder(self.relations, relation_names, self.resolver, self.faults)
+        self.quantifiers = QuantifierBuilder(
+            self.names, self.relations, self.words, self.resolver, self.formula
+        )
+
+    # ----------------------------------------------------------------------------------------- specs
+
+    def specs(self, statements: Sequence[SpecStatement]) -> tuple[NamedSpec, ...]:
+        """Return every spec, in the order of the text.
+
+        Raises:
+            TooLargeError: where the text expands to more than `MAX_SIZE` nodes.
+        """
+        for order, statement in enumerate(statements):
+            if self.names.definitions.get(statement.name.text) is statement:
+                self._spec(statement, order)
+        for definition in self.names.definitions.values():
+            if isinstance(definition, DefStatement):
+                self._check_macro(definition)
+        done = [known.spec for known in self.known.values()]
+        total = sum(known.size for name, known in self.known.items() if name not in self.referred)
+        if total > MAX_SIZE:
+            self._too_large(statements[-1].name.span)
+        return tuple(replace(spec, is_result=spec.name not in self.referred) for spec in done)
+
+    def _spec(self, statement: SpecStatement, order: int) -> None:
+        name = statement.name.text
+        parameter = self._template_parameter(statement)
+        scope = Scope(order=order)
+        if parameter is not None:
+            values: dict[str, Value] = {parameter: Variable(parameter)}
+            scope = Scope(values, bound=frozenset(values), order=order)
+        before, self.deepest, self.shared = self.resolver.size, 0, 0
+        formula = self.formula(statement.formula, scope)
+        if parameter is not None:
+            self._check_capture(statement, formula)
+        if formula.name is not None:
+            formula = Boolean("spec", (formula,), span=statement.formula.span)
+            self.deepest += 1
+        formula = replace(formula, name=name)
+        requirement, title = _split_title(statement.title)
+        span = statement.name.span
+        spec = NamedSpec(name, formula, parameter, span=span, id=requirement, title=title)
+        size = self.resolver.size - before + self.shared
+        self.known[name] = _Known(spec, order, size, self.deepest)
+
+    def _template_parameter(self, statement: SpecStatement) -> str | None:
+        if not statement.parameters:
+            return None
+        parameter, *more = statement.parameters
+        if more:
+            message = f"the template {statement.name.text!r} has more than one parameter"
+            self.faults.add(more[0].span, message, "a template is evaluated per object; use def for macros")
+        defined = self.names.definitions.get(parameter.text)
+        if defined is not None:
+            message = f"{parameter.text!r} is already the name of {kind_of(defined)}"
+            self.faults.add(parameter.span, message, "give the parameter another name")
+        return parameter.text
+
+    def _check_capture(self, statement: SpecStatement, formula: Formula) -> None:
+        parameter = statement.parameters[0]
+        if parameter.text in other_names(formula):
+            message = f"{parameter.text!r} is the template's parameter, and an object in something it uses"
+            self.faults.add(parameter.span, message, "give the parameter another name")
+
+    def _check_macro(self, definition: DefStatement) -> None:
+        """Check the body of a macro that nothing uses, for any arguments."""
+        doubled = first_repeated(definition.parameters)
+        if doubled is not None:
+            self.faults.add(doubled.span, f"the parameter {doubled.text!r} is given twice")
+        if definition.name.text not in self.names.used:
+            values: dict[str, Value] = {parameter.text: Anything() for parameter in definition.parameters}
+            scope = Scope(values, macros=(definition.name.text,), order=len(self.known))
+            self.formula(definition.body, scope)
+
+    # -------------------------------------------------------------------------------------- formulas
+
+    def formula(self, written: FormulaSyntax, scope: Scope) -> Formula:
+        """Return the formula that was written; `true` in place of one with faults."""
+        span = scope.call or written.span
+        self._count(span, scope)
+        match written:
+            case TruthSyntax():
+                return Truth(written.value, span=span)
+            case Name():
+                return self._reference(written, scope)
+            case Call():
+                return self._call(written, scope)
+            case RelationSyntax():
+                return self.atoms.relation(written, scope) or Truth(True)
+            case DistanceSyntax():
+                return self.atoms.distance(written, scope)
+            case ComparisonSyntax():
+                return self.atoms.comparison(written, scope)
+            case BooleanSyntax():
+                inner = scope.deeper()
+                operands = tuple([self.formula(operand, inner) for operand in written.operands])
+                return Boolean(written.operator, operands, span=span)
+            case TemporalSyntax():
+                return self._temporal(written, scope, span)
+            case QuantifierSyntax():
+                return self.quantifiers.formula(written, scope, span)
+
+    def _count(self, span: Span, scope: Scope) -> None:
+        self.resolver.size += 1
+        if self.resolver.size + self.shared > MAX_SIZE:
+            self._too_large(span)
+        self._reach(scope.depth, span)
+
+    def _reach(self, depth: int, span: Span) -> None:
+        self.deepest = max(self.deepest, depth)
+        if depth > MAX_DEPTH:
+            message = f"more than {MAX_DEPTH} operators within one another, counting what names refer to"
+            self.faults.add(span, message, "nest specs and macros less deeply")
+            raise TooLargeError
+
+    def _too_large(self, span: Span) -> None:
+        message = f"with macros, quantifiers and names written out, this text has more than {MAX_SIZE} parts"
+        self.faults.add(span, message, "use smaller groups, or an open group (class or all)")
+        raise TooLargeError
+
+    def _temporal(self, written: TemporalSyntax, scope: Scope, span: Span) -> Formula:
+        if written.operator in _UNBOUNDED and written.bound is not None:
+            hint = f"F and G take windows; {written.operator} means one sample"
+            self.resolver.fault(written.bound.span, scope, f"{written.operator!r} takes no window", hint)
+        bound = self.resolver.bound(written.bound, scope)
+        if written.bound is not None and bound is not None:
+            self._check_unit(written, written.bound, bound, scope)
+        inner = scope.deeper()
+        operands = tuple([self.formula(operand, inner) for operand in written.operands])
+        return Temporal(written.operator, operands, bound, span=span)  # type: ignore[arg-type]
+
+    def _check_unit(self, written: TemporalSyntax, window: BoundSyntax, bound: Bound, scope: Scope) -> None:
+        """Refuse a window without a unit in the spelling of tools whose windows are seconds."""
+        text = self.faults.source.text
+        word, ends = (text[each.start : each.end] for each in (written.keyword, window.span))
+        is_ours = word == written.operator and ":" not in ends
+        if is_ours or bound.unit != "samples" or (bound.lower, bound.upper) in ((0, 0), (0, None)):
+            return
+        last, end = ("inf", "inf") if bound.upper is None else (bound.upper, f"{bound.upper}s")
+        samples, seconds = f"[{bound.lower}, {last}]", f"[{bound.lower}s, {end}]"
+        hint = f"write {written.operator}{samples} for samples, {written.operator}{seconds} for seconds"
+        self.resolver.fault(window.span, scope, "a window needs its unit in this spelling", hint)
+
+    # -------------------------------------------------------------------------------- names and calls
+
+    def _reference(self, name: Name, scope: Scope) -> Formula:
+        if name.text in scope.values:
+            message = f"{name.text!r} is an object or number; a formula is expected here"
+            self.resolver.fault(name.span, scope, message, f"write a relation, such as {name.text} ovlp b")
+            return Truth(True)
+        defined = self.names.definitions.get(name.text)
+        known = self.known.get(name.text)
+        if known is not None and known.order < scope.order and known.spec.parameter is None:
+            self.names.used.add(name.text)
+            self.referred.add(name.text)
+            self.shared += known.size
+            self._reach(scope.depth + known.depth, name.span)
+            return known.spec.formula
+        if not isinstance(defined, BrokenStatement):
+            self._report_reference(name, known, scope)
+        return Truth(True)
+
+    def _report_reference(self, name: Name, known: _Known | None, scope: Scope) -> None:
+        defined = self.names.definitions.get(name.text)
+        if known is not None and known.spec.parameter is not None:
+            hint = "a template is evaluated for each object by itself; share formulas by def"
+            self.resolver.fault(name.span, scope, f"{name.text!r} is a template, not a formula", hint)
+        elif isinstance(defined, SpecStatement):
+            hint = "a spec may name those above it; move it down"
+            self.resolver.fault(name.span, scope, f"{name.text!r} is not defined before this place", hint)
+        elif isinstance(defined, DefStatement):
+            arguments = ", ".join(parameter.text for parameter in defined.parameters)
+            hint = f"write {name.text}({arguments})"
+            self.resolver.fault(name.span, scope, f"{name.text!r} is a macro, and needs its arguments", hint)
+        elif defined is not None:
+            message = f"{name.text!r} is {kind_of(defined)}; a formula is expected here"
+            self.resolver.fault(name.span, scope, message, f"write a relation, such as a ovlp {name.text}")
+        else:
+            hint = self.faults.nearest(name.text, self._formula_names())
+            if name.text.lower() in ("true", "false"):
+                hint = f"truth values are written {name.text.lower()}"
+            written = name.text if name.text.isidentifier() else quoted(name.text)
+            hint = hint or (
+                f"a signal needs a comparison, such as {written} >= 1.0 or, for a flag, {written} == 1; "
+                f"an object needs a relation, such as {written} ovlp other"
+            )
+            self.resolver.fault(name.span, scope, f"no spec is named {name.text!r}", hint)
+
+    def _formula_names(self) -> Iterator[str]:
+        kinds = (SpecStatement, DefStatement)
+        return (name for name, each in self.names.definitions.items() if isinstance(each, kinds))
+
+    def _call(self, written: Call, scope: Scope) -> Formula:
+        name = written.name.text
+        macro = self.names.definitions.get(name)
+        if isinstance(macro, BrokenStatement):
+            return Truth(True)
+        if not isinstance(macro, DefStatement):
+            self._report_call(written, scope)
+            return Truth(True)
+        self.names.used.add(name)
+        if name in scope.macros:
+            message = f"def {name!r} is defined in terms of itself"
+            self.faults.add(written.span, message, "a macro is written out where it is used, so it must end")
+            return Truth(True)
+        if len(written.arguments) != len(macro.parameters):
+            wanted = ", ".join(parameter.text for parameter in macro.parameters)
+            count = f"{len(macro.parameters)} arguments ({wanted}), not {len(written.arguments)}"
+            self.resolver.fault(written.span, scope, f"{name!r} takes {count}")
+            return Truth(True)
+        values = {
+            parameter.text: self._argument(argument, scope)
+            for parameter, argument in zip(macro.parameters, written.arguments, strict=True)
+        }
+        call = scope.call or written.span
+        inner = replace(scope, values=values, call=call, macros=(*scope.macros, name), depth=scope.depth + 1)
+        return self.formula(macro.body, inner)
+
+    def _report_call(self, written: Call, scope: Scope) -> None:
+        name = written.name.text
+        defined = self.names.definitions.get(name)
+        if isinstance(defined, SpecStatement) and defined.parameters:
+            hint = "a template is evaluated for each object by itself; share formulas by def"
+            self.resolver.fault(written.name.span, scope, f"{name!r} is a template, not a macro", hint)
+            return
+        macros = (each for each, what in self.names.definitions.items() if isinstance(what, DefStatement))
+        inner = self.faults.source.text[written.name.span.end : written.span.end].strip()
+        hint = self.faults.nearest(name, macros) or function_hint(name, inner) or "define it with def"
+        self.resolver.fault(written.name.span, scope, f"no macro is named {name!r}", hint)
+
+    def _argument(self, written: TermSyntax | NumberSyntax | Arithmetic, scope: Scope) -> Value:
+        if isinstance(written, (NumberSyntax, Arithmetic)):
+            return self.resolver.quantity(written, scope)
+        if isinstance(written, Name):
+            local = scope.values.get(written.text)
+            if local is not None:
+                return local
+            constant = self.names.traced(written.text, self.names.constant(written.text))
+            if constant is not None:
+                self.names.used.add(written.text)
+                return constant
+        return self.resolver.term(written, scope)
+
 
 MAX_LENGTH = 256 * 1024
 """Characters of a text."""

@@ -13,7 +13,7 @@ import pytest
 import spatial_replay as sr
 from falsification.crossings import APART, VARIED, crossing
 from pages import shown
-from spatial_replay.falsification.failures import Falsification
+from spatial_replay.falsification.failure_search import Falsification
 
 pytest.importorskip("cma", reason="the search needs cma")
 

@@ -20,7 +20,7 @@ import spatial_replay as sr
 from live.robots import MAPPING, SPEC, Robot, files, messages_of, occurrence, robot, until
 from serve.viewer import PROTOCOL, viewer
 from spatial_replay.cli import run
-from spatial_replay.live.viewing import open_viewing
+from spatial_replay.live.session import open_viewing
 from spatial_replay.logs.topics import AUTOMATON, EVENTS, OBJECTS, ROBUSTNESS, SCENE, STANDING
 
 SHOWN = (OBJECTS, ROBUSTNESS, STANDING, AUTOMATON, SCENE)

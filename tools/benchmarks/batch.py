@@ -13,9 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import spatial_replay as sr
-from spatial_replay.batch.logs import read_specification_text
 from spatial_replay.batch.rows import Task, rows_from_task
-from spatial_replay.batch.run import prepare, run_batch
+from spatial_replay.batch.run import prepare, read_specification_text, run_batch
 from spatial_replay.batch.run_table import worst_rows
 from spatial_replay.batch.store import ResultsFolder, run_columns
 from spatial_replay.batch.suite import Suite
