@@ -12,7 +12,7 @@ NEGATIVE: Final = (0.835, 0.369, 0.0)
 NEUTRAL: Final = (0.55, 0.55, 0.55)
 HOLDING: Final = (0.337, 0.706, 0.914)
 FAILING: Final = (0.902, 0.624, 0.0)
-"""Of results that hold or fail so far: light blue and amber."""
+"""Colours of results that hold or fail so far: light blue and amber."""
 LABEL: Final = (0.95, 0.95, 0.95)
 """Red, green and blue from 0 to 1."""
 

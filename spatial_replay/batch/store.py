@@ -305,7 +305,7 @@ class ResultsFolder:
         Raises:
             UsageError: it holds something else, or results of another version.
             OutputError: it cannot be written.
-            MissingFileError, RemoteError: a bucket cannot be read.
+                MissingFileError, RemoteError: a bucket cannot be read.
         """
         _pyarrow()
         files = result_files(path)

@@ -789,7 +789,7 @@ class RemoteFolder:
 
         Raises:
             MissingFileError: one is not there; it may have been joined with others by another batch.
-            UsageError, RemoteError: one cannot be read.
+                UsageError, RemoteError: one cannot be read.
         """
         with ThreadPoolExecutor(_FILES_AT_ONCE, "remote-reading") as threads:
             yield from threads.map(self._read, names)

@@ -337,7 +337,7 @@ class TimeGetter:
 
         Raises:
             FieldError: one lies outside the times of a log.
-            TypeError, ValueError, OverflowError: one is not a time.
+                TypeError, ValueError, OverflowError: one is not a time.
         """
         read = map(self.get, values)
         if self.parts is None:

@@ -48,9 +48,9 @@ class Evaluation(Displayed):
     def remarks(self) -> tuple[Diagnostic, ...]:
         """Diagnostics about the specification's names in this trace (see `check_names`).
 
-        A warning for each object and signal that the trace never has, and which is therefore unknown in every
-        sample, for each class that a template was to be evaluated for and that it never has, and for each
-        object hidden by a definition of the same name.
+        A warning for each object and signal that the trace never has, which is therefore unknown in every
+        sample. Also for each class of a template without an object, and for each object hidden by a
+        definition of the same name.
         """
         # computed on demand: it takes as long as the evaluation itself
         found = check_names(
@@ -62,7 +62,7 @@ class Evaluation(Displayed):
     def vacuous(self) -> tuple[UntestedPart, ...]:
         """The templates without instances: no object fits them, so they decided nothing.
 
-        What decided nothing within a result is in its own `vacuous`.
+        Parts of a result that decided nothing are in its own `vacuous`.
         """
         evaluated = {result.name for result in self.results}
         return tuple(

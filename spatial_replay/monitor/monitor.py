@@ -87,7 +87,7 @@ class SpecUpdate:
 
 
 class Monitored(NamedTuple):
-    """What a monitor evaluates, the same after every sample.
+    """The specifications of a monitor, the same after every sample.
 
     Attributes:
         specs: the result specs, with the names of their nodes and the unit of each.
@@ -145,7 +145,7 @@ class Update:
 
     @cached_property
     def violations(self) -> tuple[Violation, ...]:
-        """What is violated whatever comes, in the order in which it became certain; found when asked for.
+        """Permanent violations, in the order in which they became certain; computed on demand.
 
         The parts of a conjunction are reported apart. None under the paper's semantics, where later samples
         may change every verdict.
@@ -215,8 +215,8 @@ class Monitor:
             strict_names: a missing name is an error of `update` then.
 
         Raises:
-            UsageError: something else than a specification, unknown semantics, a start that is no time, units
-                that are not texts, or a template: it stands for objects that are not known yet.
+            UsageError: not a specification, unknown semantics, an invalid start, units that are not texts, or
+                a template, whose objects are not known yet.
         """
         require_specification(specification)
         checked = checked_semantics(semantics, [specification])

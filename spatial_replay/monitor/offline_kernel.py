@@ -1,7 +1,7 @@
 """Kernels for operators over samples whose end is known: one pass each, independent of window widths.
 
-A future operator is a past one in reversed time, so each kernel works on *steps* 0, 1, … in the direction in
-which it looks back; step i stands at begin + i, or at end - 1 - i for an operator that looks ahead.
+A future operator is a past one in reversed time, so each kernel works on *steps* 0, 1, … and looks back. Step
+i stands at begin + i, or at end - 1 - i for a future operator.
 """
 
 from __future__ import annotations

@@ -49,7 +49,7 @@ _APART = 5.0
 
 @dataclass(frozen=True, slots=True)
 class ThresholdRange:
-    """What an atom compares with its threshold, over a log.
+    """An atom's quantity over a log, which it compares with its threshold.
 
     Attributes:
         atom: with one distance or signal in it.
@@ -80,7 +80,7 @@ class ThresholdRange:
 
     @property
     def objects(self) -> str | None:
-        """What its variables stand for, as `d in drinks`; None without any."""
+        """Its variables and their groups, as `d in drinks`; None without any."""
         over = [
             f"{', '.join(each.variables)} in {format_term(each.group).strip('()')}" for each in self.bound
         ]
@@ -107,7 +107,7 @@ class ThresholdRange:
 
 
 class LogNumbers:
-    """What a log holds in numbers, and what a specification compares with them, collected block by block.
+    """Quantities of a log and thresholds of a specification, collected block by block.
 
     Attributes:
         box: xmin, ymin, xmax, ymax of all footprints; empty (xmin > xmax) without any.
@@ -182,7 +182,7 @@ class LogNumbers:
 
     @property
     def ranges(self) -> Sequence[ThresholdRange]:
-        """What each atom with a threshold compares with it."""
+        """Quantity of each atom with a threshold."""
         return tuple(replace(each, samples=self.samples) for each in self._ranges.values())
 
     def range_of(self, atom: Atom, bound: tuple[Quantified, ...]) -> ThresholdRange | None:

@@ -238,8 +238,8 @@ class SpecResult(Displayed):
     def causes(self) -> tuple[Cause, ...]:
         """Why it is violated or unknown, one cause for each named spec that fails in it; else none.
 
-        Those that settled it come first, by time; then those that only the end of the log decided, the least
-        robustness first; then unknown ones.
+        Causes that settled it come first, by time. Causes that only the end of the log decided follow, the
+        least robustness first, then unknown ones.
         """
         return self.causes_of(0)
 
@@ -266,8 +266,8 @@ class SpecResult(Displayed):
     def to_pandas(self) -> Any:
         """Return the numbers of each sample as a pandas DataFrame, indexed by `time_ns`.
 
-        Its columns are `seconds` since the first sample evaluated, and for each node `NAME value`,
-        `NAME now`, `NAME lower` and `NAME upper`, where NAME is the spec's name, else the node's id and text.
+        Its columns are `seconds` since the first sample evaluated, and for each node `NAME value`, `NAME
+        now`, `NAME lower` and `NAME upper`. NAME is the spec's name, or else the node's id and text.
 
         Raises:
             UsageError: pandas is not installed, or the numbers of each sample were not kept.
@@ -290,7 +290,7 @@ class SpecResult(Displayed):
 
     @cached_property
     def worst(self) -> Witness | None:
-        """What decided the verdict: the first cause's witness or, of a satisfied result, what settled it.
+        """The deciding witness: that of the first cause, or of a satisfied result.
 
         None if the leaves were not stored, and under the paper's semantics.
         """
@@ -310,7 +310,8 @@ class SpecResult(Displayed):
 
     @property
     def tested(self) -> Tested:
-        """What the verdict was tested by; an unknown one is "full", since it claims nothing.
+        """Whether the whole formula, a cut window, or nothing tested the verdict. An unknown one is "full",
+        since it claims nothing.
 
         "nothing": it is the same whatever the atoms are, where the antecedents of a satisfied formula stay as
         they are. "cut": it could be another one if windows beyond the end of the log were whole. Else "full".
@@ -434,8 +435,8 @@ class SpecResult(Displayed):
     def explain(self, *, first_ns: int | None = None) -> str:
         """Explain the verdict in sentences, one a line, as the command `explain` prints them.
 
-        Of a result that is not satisfied, each cause with what decided it, and which change would flip that;
-        of a satisfied one, what it is satisfied by; then the parts that decided nothing.
+        A result that is not satisfied lists each cause, its deciding atom, and the change that would flip it.
+        A satisfied one names its deciding atom. The parts that decided nothing follow.
 
         Args:
             first_ns: the time that others are counted from; by default that of the log's first sample.
@@ -530,9 +531,9 @@ def no_such_node(name: str, names: Iterable[str], place: str = "") -> str:
 def worst_first(results: Sequence[SpecResult]) -> list[int]:
     """Return the places of results: those violated, those unknown, the others.
 
-    Of those violated, the one that was so for certain first, and those last that only the end of the log
-    decided; else they stay in the order of the files.
-    Robustness of different results is not compared: their units may differ.
+    Violated results come by the time of their verdict, and results that only the end of the log decided come
+    last. Otherwise they keep the order of the files. Robustness of different results is not compared: their
+    units may differ.
     """
     severity = {Verdict.VIOLATED: 0, Verdict.UNKNOWN: 1}
 

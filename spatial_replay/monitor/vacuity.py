@@ -1,4 +1,4 @@
-"""What a verdict was tested by: parts that decided nothing, windows that the end of the log cut short."""
+"""Tests of a verdict: parts that decided nothing, windows that the end of the log cut short."""
 
 from __future__ import annotations
 
@@ -71,10 +71,10 @@ class UntestedPart:
     Attributes:
         node: its id; None for a template without instances.
         text: its canonical text.
-        reason: "empty window": no sample ever lies in the window of an operator; "antecedent never held": of
-            an implication; "no members": an open group is empty; "past the end": the result is infinite, for
-            what decides looks past an end of the log; "no instances": a template that no object fits; "cut
-            window": it decides at a sample whose window ends after the log.
+        reason: "empty window": no sample ever lies in the window of an operator. "antecedent never held": of
+            an implication. "no members": an open group is empty. "past the end": the result is infinite,
+            because its deciding part looks past an end of the log. "no instances": no object fits a template.
+            "cut window": it decides at a sample whose window ends after the log.
         message: a sentence.
         time_ns: the sample at which it decides; None where it decides at none.
     """

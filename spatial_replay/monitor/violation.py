@@ -89,7 +89,7 @@ class Violation:
 
     @property
     def sentences(self) -> tuple[Sentence, ...]:
-        """What decided it and what would flip it, as `SpecResult.explain` says it."""
+        """The deciding atom and the change that would flip it, as in `SpecResult.explain`."""
         return () if self.witness is None else sentences_of(self.witness, first_ns=self.first_ns)
 
     def __str__(self) -> str:

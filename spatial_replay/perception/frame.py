@@ -24,7 +24,7 @@ _JPEG_FRAMES: Final = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
 NO_IMAGE: Final[Image] = np.zeros((0, 0), np.uint8)
-"""Of a frame of which only the tags were kept."""
+"""Marks a frame of which only the tags were kept."""
 NO_IMAGE.setflags(write=False)
 
 

@@ -142,8 +142,8 @@ def _out_of_square(corners: Floats, centre: Floats, along: Floats) -> float:
 def pose_in_space(plane: CameraPlane, corners: Floats, tag: MountedTag, sigmas: float) -> ObjectPose | None:
     """Return the pose of an object that may be above the plane; None if none fits.
 
-    Objects stand upright within a few degrees, in the robot's hand, too: how a small tag leans can hardly be
-    seen, and two poses that lean to opposite sides look alike.
+    Objects stand upright within a few degrees, in the robot's hand, too. The tilt of a small tag is hardly
+    visible, and two poses that lean to opposite sides look alike.
 
     Args:
         corners: (4, 2) in pixels, of the tag.
@@ -327,7 +327,7 @@ _MOVED: Final = 2.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """What one camera shows in one frame.
+    """Observation of one camera in one frame.
 
     Attributes:
         frame: it.
@@ -503,7 +503,7 @@ def tags_listed(numbers: list[str]) -> str:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observation:
-    """What the frames of one time show.
+    """Observation of the frames of one time.
 
     Attributes:
         sample: the objects.
@@ -537,9 +537,8 @@ class Observation:
 class TagObserver:
     """Turns the frames of cameras, which stand still, into samples; a process for one run.
 
-    An object whose tags are hidden from all cameras is unknown, and so is one whose tag cannot be where it
-    appears; when held, a hidden one stays where it was for a while, with an uncertainty that grows by its
-    highest speed.
+    An object is unknown if its tags are hidden from all cameras, or if its tag cannot be where it appears. A
+    held hidden object stays where it was for a while, with an uncertainty that grows with its highest speed.
 
     Attributes:
         tags: the tags file.

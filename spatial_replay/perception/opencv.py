@@ -204,7 +204,7 @@ _OURS_FROM_OPENCV: Final = [1, 0, 3, 2]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Camera:
-    """What a camera does to directions: a pinhole with lens distortion, as OpenCV calibrates it.
+    """Camera model: a pinhole with lens distortion, as OpenCV calibrates it.
 
     Attributes:
         focal: (fx, fy) in pixels.

@@ -40,7 +40,7 @@ _STEP: Final = 1e-6
 
 
 class Plane(Protocol):
-    """What takes pixels to places."""
+    """Map from pixels to places."""
 
     @property
     def corner_error(self) -> float:
@@ -130,10 +130,10 @@ class HomographyPlane:
         """Bound the error of reading pixels (N, 2) at heights (N,) as places in the plane.
 
         A ray at the angle t to the plane's normal gains |z| tan t on its way from the height z to the plane.
-        The map from the plane to the image is A B: B, to the sphere around the camera, has the singular
-        values (1, cos t) / d at the distance d; A, from the sphere to the image, has f / cos p and f / cos² p
-        at the angle p to the optical axis. So cos t is at least cos p times the ratio of those of A B, and
-        d at least f divided by the greater one.
+        The map from the plane to the image is A B. B, to the sphere around the camera, has the singular
+        values (1, cos t) / d at the distance d. A, from the sphere to the image, has f / cos p and f / cos² p
+        at the angle p to the optical axis. So cos t is at least cos p times the ratio of those of A B, and d
+        at least f divided by the greater one.
 
         Returns:
             How far places may be off, and by which share lengths may appear too large, (N,) each.
@@ -325,8 +325,8 @@ def _refuse_misfit(
 
 
 def _off_alone(tags: TagsFile, seen: Floats, known: Floats) -> tuple[int, float, float] | None:
-    """Return the place of the tag without which the others fit best, by how many pixels it is off from where
-    they place it, and by how many they are off at most."""
+    """Return the place of the tag without which the others fit best, its offset from where they place it, and
+    their greatest offset, in pixels."""
     found: list[tuple[float, int, float]] = []
     for place in range(len(known) // 4):
         others = np.arange(len(known)) // 4 != place

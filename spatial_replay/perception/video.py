@@ -35,7 +35,7 @@ _IDR, _SEQUENCE_PARAMETERS = 5, 7
 _MISSING: Final = "Frame num gap"
 """How the decoder of H.264 begins to say that frames are missing, at the level of its debugging."""
 _HARMLESS: Final = "SEI"
-"""What it says of notes beside the pictures, which many a camera writes wrongly, begins so."""
+"""Prefix of FFmpeg's messages about malformed SEI units, which are harmless."""
 
 _MOST_WAITING: Final = 32
 """Packets; codecs show a frame at most 16 later."""

@@ -58,10 +58,10 @@ class Trigger:
     """When a recorder writes a clip, and how much of what it holds.
 
     Attributes:
-        when: "violated" or "satisfied" for any spec, "NAME violated" for one; "NAME < 0.2" when its
-            robustness falls below a number; "event" for any change of a verdict, or of a sign that lasts;
-            "manual" for `Recorder.trigger` alone, which always fires. Several are given as a sequence.
-            Names are checked by the recorder, which has the specifications.
+        when: "violated" or "satisfied" for any spec, "NAME violated" for one. "NAME < 0.2" fires when its
+            robustness falls below a number, "event" at any change of a verdict or of a lasting sign. "manual"
+            is for `Recorder.trigger` alone, which always fires. Several are given as a sequence. Names are
+            checked by the recorder, which has the specifications.
         before_s, after_s: how much time is kept, on the clock of the samples.
         most_bytes: how much memory the ring takes; when that does not hold `before_s`, it is reported.
     """
@@ -183,7 +183,8 @@ _LATE_NS: Final = 10**9
 """How far samples may come behind messages, and messages behind samples."""
 
 _MESSAGE_BYTES, _SAMPLE_BYTES, _OBJECT_BYTES = 320, 400, 600
-"""What a message takes in memory besides its payload; a sample, each object of it besides its corners."""
+"""Memory of a message without its payload, of a sample, and of each of its objects without corners, in
+bytes."""
 
 _MOST_STATIC: Final = 256
 _MOST_EVENTS: Final = 256
@@ -230,7 +231,7 @@ class _HeldSample(NamedTuple):
 
 
 class _HeldEvent(NamedTuple):
-    """What happened to the run, in the ring."""
+    """Occurrences of the run in the ring."""
 
     time_ns: int
     event: RunEvent
@@ -383,7 +384,7 @@ class ClipLog:
 
     @property
     def held_bytes(self) -> int:
-        """What the ring takes in memory."""
+        """Memory of the ring, in bytes."""
         return self._bytes
 
     def fire(self, reason: str) -> None:

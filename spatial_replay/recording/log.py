@@ -67,7 +67,7 @@ if TYPE_CHECKING:
 
 
 class RunEvent(NamedTuple):
-    """What happens to a run beside its samples.
+    """An occurrence of a run besides its samples.
 
     Attributes:
         time_ns: on the clock of the samples.
@@ -316,7 +316,7 @@ class RunEnd(NamedTuple):
 
 
 class RecorderLog(Protocol):
-    """What the thread of a recorder writes to; only that thread calls it, but for `miss` and `close`."""
+    """Log of a recorder's thread. Only that thread calls it, except for `miss` and `close`."""
 
     @property
     def gather_s(self) -> float:

@@ -458,8 +458,8 @@ class MessageChannel:
             self._put(time_ns, time_ns, payload)
 
     def copy(self, time_ns: int, payload: bytes) -> None:
-        """Hand over a message of another program, which may come a little late: it is published at its time,
-        and logged then or, if that is later, when the one before was."""
+        """Hand over a message of another program, which may come a little late. It is published at its time,
+        and logged then or at the log time of its predecessor, whichever is later."""
         with self._queue.lock:
             self._queue.require_open()
             self._put(max(time_ns, self._last_ns), time_ns, payload)
@@ -798,9 +798,9 @@ class Recorder(SampleWriter):
     block of the main thread it raises SystemExit(143), unless the program has a handler of its own. A signal
     that arrives while the log is closed waits until that is done.
 
-    With a trigger, nothing is written until it fires. What came before it waits in memory, and each firing
-    leaves one log around it. With a planner, its decisions are recorded as well: samples, decisions and
-    outcomes go through the recorder, in their order; or `plan(planner, robot, recorder)` does that.
+    With a trigger, nothing is written until it fires. Earlier samples wait in memory, and each firing leaves
+    one log around it. With a planner, its decisions are recorded as well: samples, decisions and outcomes go
+    through the recorder, in their order; or `plan(planner, robot, recorder)` does that.
 
     Use as:
 
@@ -837,8 +837,9 @@ class Recorder(SampleWriter):
             about: further metadata of the log: a seed, where the samples come from.
             units: for sentences, axes and viewers: of signals by their names, of lengths by "".
             waiting: how many samples, and how many messages of channels, may wait for the writing thread.
-            block: when that many wait, or without a trigger more than 0.8 s of them have not reached the
-                operating system, let `write` wait, too; otherwise drop what comes, and count it in the log.
+            block: whether `write` waits while the queue is full, or, without a trigger, while more than 0.8 s
+                of samples have not reached the operating system. Otherwise new samples are dropped, and the
+                log counts them.
             trigger: when to write what, instead of everything.
             durability: "process" for a log that survives the end of the process; "disk" for one that
                 survives that of the machine, too: then each flush waits for the disk (fsync).
@@ -847,9 +848,8 @@ class Recorder(SampleWriter):
 
         Raises:
             UsageError: a specification that cannot be recorded, units that are not texts, a limit below 1, a
-                trigger that names none of the specs, a planner together with a trigger or without `block`, a
-                file that exists.
-            OutputError: the file cannot be written.
+                trigger without a spec of that name, a planner with a trigger or without `block`, an existing
+                file. OutputError: the file cannot be written.
         """
         if waiting < 1:
             raise UsageError(f"waiting is {waiting}; give 1 or more samples")
@@ -1010,7 +1010,7 @@ class Recorder(SampleWriter):
 
     @property
     def held_bytes(self) -> int:
-        """What waits for the trigger in memory."""
+        """Samples and messages that wait for the trigger."""
         return 0 if self._clips is None else self._clips.held_bytes
 
     def take_remarks(self) -> tuple[str, ...]:

@@ -63,7 +63,7 @@ if TYPE_CHECKING:
 
 
 _MOST_DIGITS = 18
-"""Of a count in the metadata of a log; more are no count."""
+"""Greatest valid count in the metadata of a log."""
 _KEPT_BYTES, _MOST_KEPT_BYTES = 2**22, 2**26
 """Samples of up to so many bytes for each result, and in all, stay in memory: each is explained by itself."""
 
@@ -77,7 +77,7 @@ class Dropped:
 
     @property
     def text(self) -> str:
-        """What is lost, in words; "" where nothing is."""
+        """The losses in words; "" if there are none."""
         return f"the recorder dropped {self.count:,} of {counted(self.of, 'sample')}" if self.count else ""
 
 

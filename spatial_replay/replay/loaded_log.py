@@ -307,7 +307,7 @@ class LoadedLog:
 
         Raises:
             UsageError: the files may not be written; no such constant.
-            SpecificationError, MissingFileError, OutputError: see `write_constants`.
+                SpecificationError, MissingFileError, OutputError: see `write_constants`.
         """
         if self._saved is None:
             raise UsageError(
@@ -566,8 +566,8 @@ _MOST_EVENTS: Final = 500
 class Playback:
     """The messages that an annotated log would have, in the order of time.
 
-    From a seek on they are those that a replay writes, however they are split into stretches, except for the
-    scene: it is drawn again at once, and what a viewer may still show of another time is deleted.
+    From a seek on they are those that a replay writes, for any division into stretches, except for the scene.
+    It is drawn again at once, and entities of another time are deleted.
 
     Attributes:
         evaluated: the evaluation; another one of the same log may replace it before a `seek`.
@@ -603,8 +603,8 @@ class Playback:
     def seek(self, time_ns: int) -> Messages:
         """Go to a time, and return what a viewer shows there.
 
-        That is the sample at or before it with all its messages, the specification, the events so far (the
-        latest, if they are many), and the last message of each of the log's own topics.
+        The state has the sample at or before it with all its messages, the specification, the latest events,
+        and the last message of each of the log's own topics.
 
         Raises:
             LogError: the log can no longer be read.

@@ -34,7 +34,7 @@ from spatial_replay.trace.sample import FOREVER
 from spatial_replay.trace.trace import Trace, window_of, within
 
 KEEP_ALL: Final = (ALL,)
-"""What a copy keeps unless it is given something else."""
+"""Default selection of a copy."""
 
 
 def source_keeping(source: Source, keep: Sequence[str] | None) -> Source:

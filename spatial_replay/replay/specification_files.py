@@ -30,7 +30,7 @@ _STEP_MS: Final = 10
 
 
 class _State(NamedTuple):
-    """What differs when a file is saved."""
+    """Fields that differ after a save."""
 
     file: int
     size: int

@@ -315,10 +315,9 @@ def record_seen(
         advance: called with 1 for each sample.
 
     Raises:
-        UsageError: a specification that cannot be recorded, reference tags that do not fit, a camera that was
-            calibrated for another size or that the tags file does not have, a video that cannot be copied.
-        LogError: there is no frame.
-        OutputError: the output cannot be written.
+        UsageError: a specification that cannot be recorded, reference tags that do not fit, a camera with a
+        calibration of another size, an unknown camera, a video that cannot be copied. LogError: there is no
+        frame. OutputError: the output cannot be written.
     """
     refuse_templates(files)
     names = camera_names(cameras)
@@ -429,7 +428,7 @@ class _Beside:
 
 
 class _Picture:
-    """What the log keeps of one camera: the picture, what is drawn on it, its calibration and its pose."""
+    """Messages of one camera in the log: picture, annotations, calibration and pose."""
 
     def __init__(self, number: int, camera: FrameSource, kept: KeepVideo) -> None:
         self._channels = CameraChannels(number)

@@ -19,7 +19,7 @@ from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
 
 _STRETCH = 30
-"""Samples that are written together. What was written can be read even if the process is killed."""
+"""Samples that are written together. The written part can be read even if the process is killed."""
 
 
 class RunLog:

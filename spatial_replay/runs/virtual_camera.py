@@ -59,7 +59,7 @@ class Plate(NamedTuple):
 
 
 class Backdrop(NamedTuple):
-    """What is behind the plates, and in front of them.
+    """Background and foreground of the plates.
 
     Attributes:
         image: (height, width) grey, or (height, width, 3).
@@ -72,7 +72,7 @@ class Backdrop(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Flaws:
-    """What makes an image worse.
+    """Degradation of an image.
 
     Attributes:
         noise: standard deviation of a pixel's brightness, of 255.

@@ -1,8 +1,7 @@
 """Compile every kernel ahead of time, for images and for machines that start often.
 
-Kernels are compiled for the types of their arguments, so the way to compile them all is to do a little of
-everything: record, replay, explain, plan, compare, read a bag. The tasks are shared among the processor's
-cores.
+Kernels are compiled for the types of their arguments. Warming up therefore does a little of everything:
+record, replay, explain, plan, compare, read a bag. The tasks are shared among the processor's cores.
 """
 
 from __future__ import annotations

@@ -258,8 +258,8 @@ class _Question:
 
 
 PLAYBACK: Final = ("playback.time", "playback.play", "playback.speed", "playback.loop")
-"""The parameters that steer the playback, for viewers without controls of their own: seconds after the first
-sample, whether it plays, seconds of the log in a second, whether it begins again at the end."""
+"""Parameters of the playback for viewers without controls: seconds after the first sample, whether it plays,
+seconds of the log per second, whether it starts again at the end."""
 
 ARROW: Final = "scene.arrow"
 """The parameter with the title of the result whose violation the arrow points at; "" for the first one."""
@@ -268,7 +268,7 @@ _LONGEST_S: Final = 9e9
 
 
 class PlaySpan(NamedTuple):
-    """What is to be played now: up to which time of the log, and the seconds that its last turn took."""
+    """The next stretch to play: its end on the log's clock, and the duration of the last turn in seconds."""
 
     time_ns: int
     elapsed_s: float
@@ -277,8 +277,8 @@ class PlaySpan(NamedTuple):
 class Session:
     """Collect viewers' requests, on any thread, and hand them to the thread that does them.
 
-    No method but `wait_for_evaluation` waits for work. Of requests that come faster than they are done, the
-    last one counts.
+    No method but `wait_for_evaluation` waits for work. If requests come faster than they are done, the last
+    one counts.
 
     Attributes:
         failure: why the last change that could not be evaluated could not, or None.
@@ -578,9 +578,9 @@ _DRAWN: Final = (
 class PlaybackThinning:
     """Thin the messages of a playback, turn by turn; in the thread of its player.
 
-    Of a topic that the layout draws, at most `MOST_DRAWN_A_SECOND` messages are sent for each second that
-    passes, and in any second less than 60; of any other, those of `MOST_A_SECOND` times. The last of each
-    turn is always sent, and so is every event.
+    Topics that the layout draws send at most `MOST_DRAWN_A_SECOND` messages per second of wall time, and
+    fewer than 60 in any one second. Other topics send the messages of `MOST_A_SECOND` samples. The last of
+    each turn is always sent, and so is every event.
     """
 
     def __init__(self) -> None:

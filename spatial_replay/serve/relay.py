@@ -47,7 +47,7 @@ def is_loopback(host: str) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Gate:
-    """What requests have to say.
+    """Fields of requests.
 
     Attributes:
         origins: of pages that may connect, besides those of this machine.
@@ -201,7 +201,7 @@ class Relay:
 
 
 class _Viewer:
-    """What is known of a viewer: whether it understands the state of the playback."""
+    """State of a viewer: whether it understands playback states."""
 
     def __init__(self, *, understands_state: bool) -> None:
         self.understands_state = understands_state

@@ -1,4 +1,4 @@
-"""What viewers can call and fetch: services that answer in JSON, and files such as the layout."""
+"""Services for viewers, which answer in JSON, and assets such as the layout."""
 
 from __future__ import annotations
 

@@ -130,9 +130,9 @@ def _outline(shape: Shape, pose: Pose) -> Floats:
 # ----------------------------------------------------------------------------------------------------- worlds
 
 Skill = Literal["push", "place"]
-"""What the robot does with an object: push it along a path, or pick and place it."""
+"""A motion of the robot: push an object along a path, or pick and place it."""
 Stage = Literal["pick", "way", "place"]
-"""Of a motion: taking hold of its object, moving it, leaving it at its goal."""
+"""Stages of a motion: picking the object, moving it, placing it at its goal."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,7 +229,7 @@ class World(Protocol):
 
     @property
     def skill(self) -> Skill:
-        """What the robot does with objects."""
+        """Motions of the robot."""
 
     @property
     def bodies(self) -> tuple[Body, ...]:

@@ -61,7 +61,7 @@ def open_source(
 ) -> Source:
     """Open the log in a file of any format; the content decides, not the name.
 
-    Of an MCAP log at an address only what is needed is read; a log of another format is downloaded once.
+    Only the needed parts of an MCAP log at an address are read; a log of another format is downloaded once.
 
     Args:
         path: on this machine, or an address: s3://bucket/run.mcap, gs://…, az://container/…, https://….

@@ -1,4 +1,4 @@
-"""What a log holds: its objects and signals, or the topics of an external log that could map to objects."""
+"""Overview of a log: its objects and signals, or the topics of an external log that could map to objects."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class TopicSurvey:
 
 @dataclass(frozen=True, slots=True)
 class Survey:
-    """What an external log holds.
+    """Overview of an external log.
 
     Attributes:
         start_ns, end_ns: log times of the first and the last message; None without messages.
@@ -212,7 +212,7 @@ class ObjectOverview:
 
 @dataclass(frozen=True, slots=True)
 class Overview:
-    """What a log holds.
+    """Overview of a log.
 
     Attributes:
         start_ns, end_ns: times of the first and the last sample; None without samples.

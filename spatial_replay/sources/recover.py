@@ -53,7 +53,7 @@ class SampleGap:
 
 @dataclass(frozen=True, slots=True)
 class Recovery:
-    """What was saved of a log, and what is missing.
+    """Saved and missing parts of a log.
 
     Attributes:
         name: of the damaged log.
@@ -89,7 +89,7 @@ class Recovery:
 
     @property
     def losses(self) -> str:
-        """What is missing, in a clause."""
+        """The missing parts, in a clause."""
         samples = sum(gap.last - gap.first + 1 for gap in self.samples)
         messages = sum(self.missing.values())
         if messages and samples:
@@ -119,7 +119,7 @@ def recover_log(
 
     Messages are copied byte for byte, in the order of their time, with their topics, types, numbers and
     times; so are metadata and attachments. Samples of ours that cannot be used, or repeat a time, are left
-    out. What is missing is in the result and in a metadata record of the output. An output in which nothing
+    out. The result and a metadata record of the output name the missing parts. An output in which nothing
     is missing gets no such record: recovered again, it gives the same bytes.
 
     Args:

@@ -239,9 +239,8 @@ def check_names(
         each: for parameters of templates, the objects that they stand for: "all", "class:NAME" or a name.
 
     Returns:
-        An error for each object and signal that the log never has, and each class that a template is to be
-        evaluated for, with the nearest that it has; a warning for each object of the log that a definition
-        of the same name hides.
+        An error for each object, signal and class of a template that the log never has, with the nearest
+        name. A warning for each object of the log that a definition of the same name hides.
     """
     objects, numeric = tuple(known), tuple(signals)
     known_classes = tuple(classes)

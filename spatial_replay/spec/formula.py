@@ -522,7 +522,7 @@ class NamedSpec:
 
 @dataclass(frozen=True, slots=True)
 class Constant:
-    """What a `const` statement stands for: a number, or the seconds of a duration.
+    """Value of a `const` statement: a number, or the seconds of a duration.
 
     Attributes:
         duration_ns: None for a number.
@@ -538,7 +538,7 @@ class Constant:
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """What the numbers of some atoms are divided by: those about one signal, or (None) about lengths."""
+    """Divisor of the numbers of some atoms: atoms of one signal, or (None) of lengths."""
 
     signal: str | None
     divisor: float

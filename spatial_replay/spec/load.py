@@ -696,9 +696,9 @@ def parse_specification(
             "2s"; `Specification.source` has them, with the comments and all else as it was.
 
     Raises:
-        SpecificationError: with every fault of the text.
-        UsageError: no text, an unknown profile, a relation that does not take terms and numbers, a
-            constant that the text does not have, a number for a duration or the reverse.
+        SpecificationError: with every fault of the text. UsageError: not a text, an unknown profile, a
+        relation that does not take terms and numbers, an unknown constant, a number for a duration or the
+        reverse.
     """
     _require_text(text)
     given = dict(relations or {})
@@ -881,7 +881,7 @@ def _profile(statements: Sequence[Statement], faults: Faults) -> str | None:
 
 
 _FORMULA = re.compile(r"[(<>=]")
-"""What a formula has, and the name of a file hardly ever."""
+"""Characters of a formula that file names hardly ever have."""
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?", re.ASCII)
 
 

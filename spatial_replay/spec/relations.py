@@ -8,9 +8,9 @@ relation holds. To add one, write such a function and pass it to `parse_specific
 
     parse_specification("F (cup near_but_apart[0.2] plate)", relations={"near_but_apart": near_but_apart})
 
-Its first two parameters are the terms left and right of its name; the others are numbers, written in
-brackets after the name, or left out where they have a default. A parameter called `axis` takes x, y
-or z instead. `closer` and `between` have three terms, and a syntax of their own.
+Its first two parameters are the terms left and right of its name. The others are numbers in brackets after
+the name; numbers with a default may be left out. A parameter called `axis` takes x, y or z instead. `closer`
+and `between` have three terms, and a syntax of their own.
 """
 
 from __future__ import annotations

@@ -48,7 +48,7 @@ _MEANT: Mapping[str, str] = MappingProxyType(
         **{"[]": "G", "<>": "F"},
     }
 )
-"""What in lower case is taken for an operator, though it may just as well be a name, and the operator."""
+"""Operators for lower-case words that may also be names."""
 _MEANT_BETWEEN: Mapping[str, str] = MappingProxyType(
     {
         **{"iff": "<->", "unless": "W", "weak_until": "W", "releases": "R", "then": "->", "therefore": "->"},
@@ -599,7 +599,7 @@ MAX_TOKENS = 40_000
 def tokenize(text: str, relations: frozenset[str], faults: Faults) -> list[Token]:
     """Return the tokens of a text; anything else is reported, and becomes a token of type ERROR.
 
-    Of a text of more than `MAX_TOKENS`, those up to the bound, which is reported.
+    A longer text yields its first `MAX_TOKENS` tokens, and the limit is reported.
     """
     tokens: list[Token] = []
     line = 1

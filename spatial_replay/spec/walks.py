@@ -250,7 +250,7 @@ def _substituted(leaf: Number | Signal | Measurement, names: Names) -> Expressio
 
 
 LENGTHS = "lengths"
-"""What `scale` calls the units of the footprints."""
+"""Name of the footprint units in `scale`."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -105,7 +105,7 @@ class Axes:
 
 
 OUR_AXES = Axes()
-"""Those of samples: y up."""
+"""Axes of samples: y up."""
 
 
 def units_metadata(units: Mapping[str, str] | None) -> dict[str, str]:
@@ -163,7 +163,7 @@ def signal_units_from_metadata(about: Mapping[str, str]) -> dict[str, str]:
 
 
 OTHER_UNITS: Final = 8.0
-"""What is so many times as large in one of two runs is in another unit there."""
+"""Size ratio from which two runs are taken to use different units."""
 
 _MOST_SIZES: Final = 256
 """Samples of an object that its size is the median of."""

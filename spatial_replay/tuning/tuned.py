@@ -1,4 +1,4 @@
-"""What tuning found: values with their ranges, the margin of every run, runs that conflict, and surfaces."""
+"""Result of tuning: values with their ranges, the margin of every run, runs that conflict, and surfaces."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ class TunedConstant:
 
     Attributes:
         value, written: the value found and the one in the text: a number, or a duration as a text.
-        low, high: the ends of the values around it that hold for every run, the other constants as found; a
-            step beyond either, unless it ends the range that was tried, some run does not.
+        low, high: ends of the interval around it that fits every run, with the other constants as found. One
+            step beyond either end, unless it ends the tried range, some run does not fit.
         tried: the range that was tried.
         step: the least difference of two values, or the seconds of it.
         direction: 1 if greater values are looser, -1 if they are tighter, None if neither is certain.
@@ -98,7 +98,7 @@ class Conflict:
 
     @property
     def sections(self) -> tuple[tuple[str, tuple[str, ...]], ...]:
-        """What the runs have in common, and what each of them needs: those that fit no values first."""
+        """Common and individual needs of the runs, runs without fitting values first."""
         needs = self.message.split("; ")
         count = min(len(self.alone), _MOST_NAMED) + (len(self.alone) > _MOST_NAMED)
         alone = "this one fits none by itself" if len(self.alone) == 1 else "these fit none by themselves"
@@ -145,9 +145,9 @@ class Tuning(Displayed):
         margin: the least margin of all runs.
         runs: every run, in the order given.
         conflict: why nothing was found, or None.
-        is_widest: whether other values are known to have no wider margin, or to be no tighter: not if the
-            search ran out of evaluations, or tried values of a constant without a direction, or if a constant
-            keeps its value since no bad run decides it.
+        is_widest: whether other values are known to have no wider margin, or to be no tighter. False if the
+            search ran out of evaluations, tried values of a constant without a direction, or kept a constant
+            that no bad run decides.
         specification: the specification with the values, its comments and layout kept.
     """
 

@@ -4,9 +4,9 @@ Most samples differ in their numbers, not in their names. A plan holds what foll
 arrays, so that a sample costs little more than its numbers. It serves every sample whose members of open
 groups fit into it; an object missing from a sample is only a flag.
 
-Without open groups one plan serves all samples. Otherwise it depends on how many members they have: objects
-that the specification does not name differ only in their classes, so a plan has placeholders for them, and
-each sample assigns objects to placeholders. Tracks that appear under new names need no new plan.
+Without open groups one plan serves all samples. Otherwise it depends on how many members they have. Objects
+that the specification does not name differ only in their classes, so a plan has placeholders for them. Each
+sample assigns objects to placeholders. Tracks that appear under new names need no new plan.
 """
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ each sample looked at, the regions, then the places, each an object in one of th
 or object has the class code `ABSENT`; an object that is there, but not known where, has its class, and no
 parts.
 
-What is worked with lies in few arrays: to allocate one takes as long as to measure a pair of boxes.
+Working memory lies in few arrays, because an allocation takes as long as measuring a pair of boxes.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _OF_OBJECT, _OF_PART = 5, 2
 
 
 class PlanArrays(NamedTuple):
-    """What a plan does with every sample; ragged lists come with the offsets of their rows.
+    """Work of a plan for every sample; ragged lists come with the offsets of their rows.
 
     Attributes:
         extent: (5,), how many samples, regions, places, signals and classes of places there are.
@@ -392,9 +392,9 @@ def measure_sample(whole: Integers, real: Floats, sample: Floats, leaves: Floats
 
     Args:
         whole, real: of a `PackedPlan`.
-        sample: for each sample looked at 0, or `ABSENT`; the value of each signal; if the plan distinguishes
-            classes, the code of that at each place; of each place, as its object is `packed`: as one of no
-            parts if it is not there, of -1 if it is not known where.
+        sample: 0 or `ABSENT` for each sample, then the value of each signal. If the plan distinguishes
+            classes, the class code of each place follows. Last comes each place's `packed` object: without
+            parts if it is absent, with -1 parts if its place is unknown.
         leaves: (MOST_CHANNELS, A, 1), receives them.
 
     Returns:

@@ -34,7 +34,7 @@ class Member(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PlanContext:
-    """What plans for a specification share.
+    """State that the plans of a specification share.
 
     Attributes:
         leaves: those of each formula.

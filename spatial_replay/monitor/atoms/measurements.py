@@ -163,8 +163,8 @@ def leaf_values(scene: TraceScene, leaves: Sequence[Formula], bindings: Bindings
     """Compute each leaf in each sample of a scene.
 
     Returns:
-        (C, A, T) with C = 1 where everything is known, C = 2 (low and high end) where something may not be,
-        C = 4 (the same with uncertainty behind them) where there is uncertainty.
+        (C, A, T). C = 1 if everything is known, C = 2 (low and high end) if something may be unknown, C = 4
+        (the same with uncertainty behind them) if there is uncertainty.
 
     Raises:
         UsageError: more than `MAX_BINDINGS`.

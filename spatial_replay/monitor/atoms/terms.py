@@ -100,8 +100,8 @@ class TraceScene:
         """Return the members of an open group.
 
         Returns:
-            Names of those who ever are (M,), (T, M) with 1 where they are and 0 where not, and (T,) where
-            that is unknown because the group is that of a time before the trace.
+            Names of all members (M,); their membership (T, M) as 1 or 0; and (T,), whether membership is
+            unknown because the group belongs to a time before the trace.
         """
         if group not in self._members:
             self._members[group] = self._find_members(group)

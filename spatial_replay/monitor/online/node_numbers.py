@@ -1,9 +1,9 @@
 """The tree as the user wrote it: the numbers of every node, from those of signals and parts.
 
 Where everything is known there are four for each sample: value, now, lower and upper. In more channels (see
-`codes`) there are eight: low and high end of the value, of what it is now, of its value over every
-continuation, and of its value if the run ends there. A number is made of those of the operands in the same
-row and in its mirror, which negation takes it from.
+`codes`) there are eight: low and high end of the value, of `now`, of the value over every continuation, and
+of the value if the run ends there. A number is made of those of the operands in the same row and in its
+mirror, which negation takes it from.
 """
 
 from __future__ import annotations

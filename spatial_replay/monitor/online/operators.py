@@ -163,8 +163,8 @@ class SignalTable:
         return running if low == 0 else self.delay(running, unit, low, ahead, is_weak=is_weak)
 
     def since(self, left: int, right: int, unit: int, low: int, high: int | None, ahead: int = 0) -> int:
-        """Write phi S[a,b] psi as O[a,b] psi and phi S[a,inf] psi, the latter as phi on the last a and
-        phi S psi before: since min distributes over max, both are exact for robustness too."""
+        """Write phi S[a,b] psi as O[a,b] psi and phi S[a,inf] psi, the latter as phi on the last a and phi S
+        psi before. Min distributes over max, so both are exact for robustness too."""
         result = self.row(codes.SINCE + ahead, left, right)
         if low > 0:
             before = self.delay(result, unit, low, ahead)
@@ -307,10 +307,10 @@ class WindowedPart(PartRows):
 
         Args:
             signals: receives the subformulas that do not look ahead.
-            anchored: whether the root is a bounded operator that is only ever asked for at the first
-                sample, so that its window is a fixed stretch of the run and needs no history.
-            ends: whether such a root, over what looks ahead itself, is an unbounded operator that joins no
-                more than its window, so that what has closed in there is kept as one table.
+            anchored: whether the root is a bounded operator that is only needed at the first sample. Its
+                window is a fixed stretch of the run then, and needs no history.
+            ends: whether such a root over a future operator is an unbounded operator that joins no more than
+                its window. Its closed positions are kept as one table then.
         """
         super().__init__()
         self._signals = signals

@@ -58,8 +58,8 @@ class Program:
         parts: (P, NODE_WIDTH).
         part_rows: for each part (D + 1, NODE_WIDTH), its nodes and itself.
         reports: (N, REPORT_WIDTH), in the order of node ids.
-        rows: (…, NODE_WIDTH), all of these: a row that says where they are, signals, parts, reports, the ids
-            of the nodes below each node of the tree, one after the other, and the parts' nodes.
+        rows: (…, NODE_WIDTH), all tables in one: a row with their offsets, signals, parts, reports, the ids
+            of the nodes below each node of the tree, and the parts' nodes.
         windows: how many rings of positions the signals keep.
         table_size: how many numbers the tables of parts without windows hold for one channel.
         keeps_history: whether any window, delay or part looks at more than the newest sample.

@@ -79,8 +79,8 @@ def at_last(node: Temporal) -> Formula | None:
 def after_lasting(node: Temporal) -> Temporal | None:
     """Return `F[a,b] y` for `x U[a,b] y`, as of `(G z) U y`, whose left operand never falls; else None.
 
-    Until y, x is least at once. So the node is `x and F[a,b] y`, or y itself where that may be at once: where
-    the window begins with the sample, and what the node is now is what y is.
+    Until y, x is least at once. So the node is `x and F[a,b] y`. If the window begins with the sample, y
+    itself may stand for it, because the node's present value is that of y.
     """
     if node.operator != "U" or not looks_ahead(node.operands[0]) or not _never_falls(node.operands[0]):
         return None
@@ -125,7 +125,7 @@ def _around(node: Temporal) -> Temporal | Boolean:
 def _sides(node: Temporal) -> tuple[list[Formula], list[Formula]]:
     """Return what a past operator over windows ahead that begin at once looks at behind, and what ahead.
 
-    What a sample before looks at is up to now, or ahead of now as far as now itself looks at most. In
+    An earlier sample looks no further ahead than the present one. In
     `a S F x`, a has to last for the shortest time from the very sample on that `F x` looks at, or not at all
     if that one is later than now. The same holds for each of several windows in one alternative, as in
     `O (x or F y)`, and below `H` for `G`, joined by `and`.

@@ -1,7 +1,7 @@
-"""What a part's root says of its bounds by its rows alone.
+"""Bounds of a part from the rows of its root alone.
 
-A root that joins by the minimum, as `G` does, cannot exceed any more what has closed of what it joins, and
-what comes may always be worse; by the maximum, as `F` does, all of it is the other way round.
+A root that joins by the minimum, such as `G`, cannot exceed the least of its closed positions, and later
+samples may always be worse. For the maximum, as in `F`, it is the reverse.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ NEVER = codes.SAMPLES, NOTHING
 
 
 class _Direction(NamedTuple):
-    """What a root that joins by the minimum meets below it; by the maximum, all of it the other way round.
+    """Operands of a root that joins by the minimum; for the maximum it is the reverse.
 
     Attributes:
         either, both: the nodes that are as great as the greater, and as the smaller one of their operands.
@@ -70,7 +70,7 @@ def root_end(rows: tuple[Row, ...], signals: SignalTable) -> tuple[int, int]:
 def known_bounds(rows: tuple[Row, ...], *, is_bounded: bool) -> int:
     """Return which bounds follow from a part's table, whatever is open, a bit for each.
 
-    What comes may always violate `G x`, so that its lower bound is as small as can be. Its upper one is as
+    Later samples may always violate `G x`, so its lower bound is -inf. Its upper one is as
     great as can be wherever x is: where it is `F y`, which what comes may always satisfy, or `F y or z`, say.
     The table then says what follows from what has closed, if the same holds for all of its variables.
 

@@ -27,7 +27,7 @@ ROOM = 256
 """Recent samples a live run has room for at first: few, so that they stay in the processor's cache."""
 
 BEGIN, FINISH = 1, 2
-"""What `run_samples` does: up to the parts without windows; the numbers of all nodes."""
+"""Tasks of `run_samples`: parts without windows, and the numbers of all nodes."""
 _UNKNOWN = -2
 """Stands for the newest sample that a set of columns knows, before it knows any."""
 
@@ -84,7 +84,7 @@ def run_samples(
 
 
 class _OpenPart:
-    """What `run_windows` carries from sample to sample, of one part in one channel."""
+    """State of `run_windows` between samples, for one part in one channel."""
 
     def __init__(self, rows: Integers, room: int) -> None:
         nodes, part = len(rows) - 1, rows[-1]
@@ -199,8 +199,8 @@ class OnlineRun:
         """Add samples.
 
         Args:
-            leaves: (C, A, T), the program's leaves: exact values for C = 1, the ends of the interval given
-                what is unknown for C = 2, those and the same ends with uncertainty for C = 4.
+            leaves: (C, A, T), the program's leaves. C = 1: exact values. C = 2: the ends of the interval with
+                unknown values. C = 4: also the same ends with uncertainty.
             times_ns: (T,), increasing and after the previous samples.
             empty: gives memory for what is returned.
 

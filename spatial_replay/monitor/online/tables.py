@@ -1,11 +1,11 @@
 """Tables: the value of a formula at the first sample as a function of what is still to come.
 
-Let x_1 … x_m be the values that the unbounded temporal subformulas of a part will have at the next sample.
-In negation normal form the part's value is a monotone lattice polynomial of them (minima and maxima only),
-so it is known from its values at the corners x in {-inf, +inf}^m: those are its table, of 2^m numbers. A new
+Let x_1 … x_m be the values that the unbounded temporal subformulas of a part will have at the next sample. In
+negation normal form the part's value is a monotone lattice polynomial of them (minima and maxima only). Its
+values at the corners x in {-inf, +inf}^m therefore determine it: they are its table of 2^m numbers. A new
 sample substitutes for each x_j the formula that it expands to (max(psi, min(phi, x)) for an until) and reads
-the old table at that point. The first and the last entry bound the value over every continuation; the corner
-where strong operators are -inf and weak ones +inf is the value if the run ends here.
+the old table at that point. The first and the last entry bound the value over every continuation. The corner
+with strong operators at -inf and weak ones at +inf is the value if the run ends here.
 """
 
 from __future__ import annotations

@@ -1,17 +1,17 @@
 """Windows below unbounded operators: the nodes of a part at every position that is still open.
 
 A part runs in one channel at a time. Each of its nodes is a row of numbers, its *column*, one number for each
-recent sample. A sample changes a column only where a window has begun to hold it or has closed with it, or
-where an operand has changed, so columns are brought up to it, operands first, and each says from where on
-it has changed.
+recent sample. A sample changes a column only where a window opens or closes with it, or where an operand has
+changed. Columns are updated operands first, and each says from where on it has changed.
 
 Positions of the root whose windows have all closed are absorbed into a table (see `tables`). It belongs to
-the *base*, the first position of the root that is not absorbed: it says what the root is at the first sample,
-by what each variable will be where the table ends for it, its *boundary*. A past operator over one that looks
-ahead has a table of its own, which says what it is at one position, its *state*.
+the *base*, the first position of the root that is not absorbed. It gives the root's value at the first sample
+as a function of each variable's value at the end of the table, its *boundary*. A past operator over one that
+looks ahead has a table of its own, which says what it is at one position, its *state*.
 
-Columns exist in up to three sets: as if the run ended with the newest sample, and as low and as high as what
-is still to come may make them. Positions are places among the recent samples; `last` is the newest of them.
+Columns exist in up to three sets: for a run that ends with the newest sample, and with the lowest and highest
+values that later samples can give. Positions are places among the recent samples; `last` is the newest of
+them.
 """
 
 from __future__ import annotations
@@ -214,8 +214,8 @@ def _slide(
 ) -> int:  # fmt: skip
     """Compute extrema over windows at begin … end - 1; return the first that changes, last + 1 for none.
 
-    What all of these hold is looked through once, and then what the first ones hold before it, and the last
-    ones after it.
+    Their common positions are scanned once, then the positions before them for the first windows, and those
+    after them for the last ones.
     """
     nothing, changed = -np.inf if is_greatest else np.inf, last + 1
     while begin < end:

@@ -42,7 +42,7 @@ from spatial_replay.monitor.paper.scans import (
 
 
 class PaperMemory(NamedTuple):
-    """What is carried from sample to sample; each array of numbers has one of what is lost beside it.
+    """State between samples; each array of numbers has a parallel one of lost numbers.
 
     Attributes:
         stamps: (room,), times of the samples in ns; of the first alone if nothing keeps a column.

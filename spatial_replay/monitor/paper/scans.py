@@ -49,8 +49,8 @@ class PaperTable:
     """A formula's nodes, by id.
 
     Attributes:
-        rows: (N, WIDTH): code; where the node's operands begin and end in `operands`; its window; whether it
-            is plain; its places in what `PaperMemory` keeps; a leaf's number, or the sign of a constant.
+        rows: (N, WIDTH): code; begin and end of the node's operands in `operands`; its window; whether it is
+            plain; its places in `PaperMemory`; a leaf's number, or the sign of a constant.
         operands: ids of the operands, node after node.
         columns: how many columns are kept.
         pairs: how many tables over pairs of samples are kept.

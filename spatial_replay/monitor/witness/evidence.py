@@ -168,7 +168,7 @@ class NamedPart(NamedTuple):
 
     @property
     def shown(self) -> str:
-        """What sentences call it."""
+        """Its name in sentences."""
         return f"signal {self.name!r}" if self.is_signal else self.name
 
 

@@ -146,8 +146,8 @@ class DecidingPath:
     """The path down from a node.
 
     Attributes:
-        steps: at least one; the last is at a leaf, at `true` or `false`, or at an operator that looks at no
-            sample: an empty window, a next sample beyond the log.
+        steps: at least one. The last is at a leaf, at `true` or `false`, or at an operator without a sample,
+            such as an empty window or a next sample beyond the log.
         end: which end of the last node's interval decides.
     """
 

@@ -53,8 +53,8 @@ class Dial:
     """A number that an atom's robustness depends on.
 
     Attributes:
-        kind: a number that the atom compares with; the radius by which a term is enlarged; or, where the
-            text has neither, the margin that the relation has to hold by, which is 0.
+        kind: the number that the atom compares with, the radius by which a term is enlarged, or else the
+            margin by which the relation has to hold, which is 0.
         value: the number.
         is_exact: whether the atom holds at one number only (`a dist b == c`).
         constant: the constant whose value it is, if every atom with that constant is changed; else "".
@@ -203,10 +203,10 @@ def _signed_atoms(formula: Formula, signs: frozenset[int] = frozenset({1})) -> I
 _FAR = 1e300
 _DOUBLINGS = 40
 _ROUNDS, _PARTS = 4, 16
-"""Search for a number that does not move all samples alike: each round reads the log once, and divides the
-interval between a number that does not flip the verdict and one that does into so many parts."""
+"""Parts per round of a search for a number that does not move all samples alike. Each round reads the log
+once, and divides the interval between a number that flips the verdict and one that does not."""
 _AT_FIRST = 64
-"""Of numbers that flip the verdict or not in no order, so many are tried before those in between."""
+"""Numbers tried before those in between, if flipping numbers have no order."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,8 +248,8 @@ def threshold_of(
 ) -> Threshold | Obstacle | None:
     """Compute how far the deciding atom's number has to move to flip a verdict, or why no number does.
 
-    A constant moves in all atoms. A number that is no constant moves in all atoms that were written in the
-    same place: those that a quantifier over a named group, or a macro, made of one text.
+    A constant moves in all atoms. A number without a name moves in all atoms of the same place in the text,
+    as a quantifier over a named group, or a macro, makes them.
 
     Args:
         leaves: (C, A, T), the instance's leaves in each sample.

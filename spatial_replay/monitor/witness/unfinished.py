@@ -1,8 +1,8 @@
 """Every node of a formula at every sample of a log that may go on.
 
-`evaluate_offline` takes a log as finished: an open `F` has the number of what has been. Here whatever comes
-after the last sample is anything, [-inf, +inf], so that the numbers at the first sample are those of a
-monitor, and the path through them leads to what settled a verdict before the log ended.
+`evaluate_offline` takes a log as finished: an open `F` has the number of what has been. Values after the last
+sample are unknown here, [-inf, +inf], so the numbers at the first sample are those of a monitor. The path
+through them leads to the atom that settled a verdict before the log ended.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def evaluate_with_whole_windows(
 ) -> UnfinishedNodes:
     """Evaluate the nodes of a formula over a finished log, but with windows that go on beyond its end.
 
-    What lies there is unknown, and only there (see `is_cut`). Arguments as of `evaluate_unfinished`.
+    Values there are unknown, and only there (see `is_cut`). Arguments as of `evaluate_unfinished`.
     """
     return UnfinishedNodes(formula, _Evaluator(_columns(order, leaves), times_ns, is_cut))
 

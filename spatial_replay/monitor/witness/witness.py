@@ -47,10 +47,10 @@ class WitnessStep:
 
 @dataclass(frozen=True, slots=True)
 class Witness:
-    """What decides a node's verdict over a finished log, or what settled it before the log ended.
+    """The atom that decides a node's verdict over a finished log, or settled it before the log ended.
 
-    Robustness consists of minima and maxima, so one atom at one sample determines it: the upper end of a
-    violated formula, the lower end of a satisfied one, the ends that leave an unknown one open.
+    Robustness consists of minima and maxima, so one atom at one sample determines it. It determines the upper
+    end of a violated formula, the lower end of a satisfied one, and the open ends of an unknown one.
 
     Attributes:
         name: of the spec.
@@ -67,8 +67,8 @@ class Witness:
             threshold are then those of that moment. None if it is about the whole log.
         missed: the outermost implication on the path that failed, or None.
         gaps: of an unknown atom, when what it is about is missing.
-        closest: of a missed response, the atom by which it came closest to holding, and the time of its
-            sample; None if that is what decides, or if there is no such atom.
+        closest: for a missed response, the atom that came closest to fulfilling it, and the time of its
+            sample. None if this atom decides, or if there is none.
         closest_path: from the response to that atom.
         units: those that the log declares, of signals by their names, of lengths by "".
         unit: the declared one of `lower` and `upper`, or "".
