@@ -1,4 +1,4 @@
-"""What commands do with whole logs, as functions: replay, report, diff, clip, tune, learn, verify, info."""
+"""The commands on whole logs as functions: replay, report, diff, clip, tune, learn, verify, info."""
 
 from __future__ import annotations
 
@@ -96,8 +96,8 @@ def replay_log(
         specifications: one or several, parsed or as files; None takes those that the log was written with.
         output: the annotated log to write (MCAP).
         layer: write the derived messages only, without the log's own.
-        keep: which of the log's own messages the output holds: "all" (as without it), "mapped" for those of
-            mapped topics, or patterns of topics such as "/camera/*"; several add up.
+        keep: the log's own messages in the output: "all" (the default), "mapped" for mapped topics, or
+            patterns of topics such as "/camera/*"; several add up.
         arrow: the title of the result whose violation the output's scene points at; "" for the first one.
         options: how to evaluate it (`constants`, `each`, `semantics`, `start_ns`, `end_ns`, `every`,
             `strict_names`; see `Evaluating`), and how to read it, as for `read_trace`.

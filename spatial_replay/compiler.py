@@ -23,7 +23,7 @@ _PATIENCE_S: Final = 1.0
 
 
 class Compiler:
-    """What this process knows of its kernels: which form they take, the compiler, the cache, who listens."""
+    """State of the kernels in this process: their form, the compiler, the cache, the listeners."""
 
     def __init__(self) -> None:
         self.only = os.environ.get("SPATIAL_REPLAY_KERNELS") or None

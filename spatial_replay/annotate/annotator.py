@@ -133,12 +133,12 @@ class Annotator:
 
     @property
     def scene(self) -> SceneState:
-        """What a viewer shows after the messages so far."""
+        """State of a viewer after the messages so far."""
         return self._scene
 
     @property
     def outcomes(self) -> Sequence[FinalStanding]:
-        """What each result came to, once the log has ended."""
+        """Outcome of each result at the end of the log."""
         return [
             outcome._replace(over_by=each.over_by)
             for outcome, each in zip(self._standing.outcomes, self._reporters, strict=False)
@@ -146,7 +146,7 @@ class Annotator:
 
     @property
     def _over(self) -> list[str]:
-        """What decided each result, as far as that has happened."""
+        """Deciding atoms of the results that are decided so far."""
         return [each.over for each in self._reporters]
 
     def redraw(self) -> None:

@@ -3,9 +3,9 @@
 Robustness is made of minima and maxima, so each number is that of some leaf at some sample, perhaps with its
 sign turned. If that sample is the newest, `find_leaf` compares the numbers of the leaves there.
 
-Over a whole log, `DecidingLeaves` does the same for Boolean combinations: an operand that is a leaf or
-temporal has the number of the sample at which its value last changed, which in most formulas is the sample of
-the leaf that decides. Where no number is equal, no leaf is reported.
+Over a whole log, `DecidingLeaves` does the same for Boolean combinations. A leaf or temporal operand has the
+number of the sample at which its value last changed. In most formulas that is the sample of the deciding
+leaf. Where no number is equal, no leaf is reported.
 """
 
 from __future__ import annotations
@@ -305,7 +305,7 @@ class DecidingLeaf(NamedTuple):
 
 
 class SettledViolation(NamedTuple):
-    """What made a violation certain before the end of a log.
+    """The leaf that made a violation certain before the end of a log.
 
     Attributes:
         time_ns: of the sample since which it is certain.
@@ -363,7 +363,7 @@ class LeafHistory:
     def settled(self, node: int, series: Floats, time_ns: int, verdict: Verdict) -> DecidingLeaf | None:
         """Return what settled a node's verdict at a sample, whatever comes; None beyond the bound.
 
-        Of a violated conjunction that is what settled its first conjunct that is violated then.
+        For a violated conjunction it settled the first violated conjunct.
 
         Args:
             series: (N, 4), the numbers of all nodes at that sample.
@@ -381,7 +381,7 @@ class LeafHistory:
     def finished(self, node: int, values: Floats, final: Floats) -> DecidingLeaf | None:
         """Return what decides a node that was pending up to the end of the log; None beyond the bound.
 
-        Of a violated conjunction that is what decides its first cause (see `find_causes`).
+        For a violated conjunction it decides the first cause (see `find_causes`).
 
         Args:
             values: (N,), each node's value on the whole log.

@@ -208,7 +208,7 @@ class AnnotatedEvaluation:
 
     @cached_property
     def automata(self) -> Sequence[SpecAutomaton]:
-        """Of each tree; compiled on first use, since not every evaluation is written to a log."""
+        """Automata of the trees; compiled on first use, since not every evaluation is written to a log."""
         from spatial_replay.annotate.automaton_state import automata_of
 
         return automata_of(self._files, self.trees, self._semantics, self._compiled_before(), self._known)

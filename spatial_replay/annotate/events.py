@@ -357,8 +357,8 @@ def encoded_occurrence(time_ns: int, what: str, sentence: str) -> EncodedEvent:
 class EventReporter:
     """Reports the changes of one result's root and of the named specs in it, up to the end of the log.
 
-    Its state between blocks is a few numbers for each of these nodes, for each operand of theirs the numbers
-    of the leaves at one sample, and up to a bound those of all samples (see `LeafHistory`).
+    Its state between blocks is a few numbers for each of these nodes, and the leaves of each operand at one
+    sample. Up to a limit it keeps the leaves of all samples (see `LeafHistory`).
 
     Attributes:
         settled: what settled the violation of the root before the end of the log, once it has happened.

@@ -241,7 +241,7 @@ def decision_reason() -> Panel:
 def image_panels(images: Sequence[str], topics: Collection[str]) -> list[Panel]:
     """Return the picture of each camera that objects were found by, with the outlines that we draw on it.
 
-    Of a log without such, that is the first of the topics with images.
+    A log without annotated images shows its first topic with images.
     """
     own = {topic_of_camera(CAMERA_VIDEO, number) for number in range(1, len(images) + 1)}
     copied = iter([each for each in images if each not in own])
@@ -385,7 +385,7 @@ _MARGIN = 1.5
 
 
 class LayoutContents(NamedTuple):
-    """What a layout shows of a log.
+    """Content of a layout for a log.
 
     Attributes:
         trees: its results.

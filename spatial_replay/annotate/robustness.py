@@ -149,7 +149,7 @@ def decode_robustness(payloads: Sequence[bytes]) -> list[RobustnessSeries]:
 
 _Heading = tuple[str, str, tuple[int, ...], tuple[str, ...]]
 _Rows = tuple[Integers, Integers, Floats, Codes]
-"""Of T messages: their indices (T,), times (T,), numbers (T, N, 4) and standing codes (T, N)."""
+"""Columns of T messages: indices (T,), times (T,), numbers (T, N, 4) and standing codes (T, N)."""
 
 
 def _by_length(payloads: Sequence[bytes]) -> list[Integers]:

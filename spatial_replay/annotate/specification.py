@@ -72,7 +72,7 @@ class ReportedTree(NamedTuple):
 
     @property
     def title(self) -> str:
-        """What a reader knows it by: "REQ-12 calm(bike)"."""
+        """Name for readers: "REQ-12 calm(bike)"."""
         title = self.name if self.object is None else f"{self.name}({self.object})"
         return title if self.requirement is None else f"{self.requirement} {title}"
 
@@ -92,7 +92,7 @@ class ReportedTree(NamedTuple):
     def written(self, source: str) -> list[str]:
         """Return the text of each node as the file writes it, with the object in place of the parameter.
 
-        What a `def` stands for is in canonical form, below the node that has its call. So is what a
+        The body of a `def` is in canonical form, below the node that has its call. So is what a
         quantifier stands for, with its objects, which the file writes once for all of them.
 
         Args:

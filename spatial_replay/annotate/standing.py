@@ -61,8 +61,8 @@ def worst_results(codes: Codes, violated_ns: Integers) -> Integers:
 
 
 class _Layout(NamedTuple):
-    """What messages with the same texts and lengths share: the worst result, the states of automata in words,
-    the violated results with what decided them, and whether it is about the finished log."""
+    """Shared parts of messages with the same texts and lengths: the worst result, the states of automata in
+    words, the violated results with their deciding atoms, and whether the log is finished."""
 
     worst: int
     words: tuple[str, ...]
@@ -71,7 +71,7 @@ class _Layout(NamedTuple):
 
 
 class FinalStanding(NamedTuple):
-    """What a result came to over the finished log.
+    """Outcome of a result over the finished log.
 
     Attributes:
         standing: satisfied, violated or unknown, a number of `Standing`.

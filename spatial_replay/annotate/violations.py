@@ -38,7 +38,7 @@ from spatial_replay.trace.sample import LATEST_NS
 from spatial_replay.trace.trace import Trace
 
 _MOST_BINDINGS: Final = 64
-"""Of a quantifier that binds more, all members have the number of the worst."""
+"""If a quantifier binds more, all members have the number of the worst."""
 
 _NO_NUMBERS: Final[Mapping[str, Floats]] = MappingProxyType({})
 
@@ -263,8 +263,8 @@ def worst_robustness(
 ) -> tuple[Floats, Floats]:
     """Return the least robustness of what is asked of each object and region, in the sign that counts.
 
-    Of a conjunction or quantifier that is what is about the object itself. Of a finished log it is what the
-    obligations come to, of others how they are met now.
+    In a conjunction or quantifier, it is the part about the object itself. For a finished log it is the
+    outcome of the obligations, otherwise their present state.
 
     Returns:
         (S, objects) and (S, regions); NaN where no requirement is known.
@@ -299,12 +299,11 @@ def worst_robustness(
 def first_violations(results: Sequence[EvaluatedResult], trace: Trace, samples: Integers) -> Violations:
     """Return the violation to point at in some samples of a trace: of those now, what was certain first.
 
-    It is shown at the atom that gives the requirement its number: between the two points at which the signed
-    distance of its two terms is attained or, of an enclosure, along which the one sticks out of the other.
-    In the sample that settled the formula's violation that is the atom that settled it. What is not asked of
-    every sample, but up to a deadline or in response, is still pointed at after that, with the number that
-    settled it. Conditions of implications
-    are not pointed at: those hold, and what had to follow does not.
+    It is shown at the atom that gives the requirement its number, between the two points that attain the
+    signed distance of its terms. For an enclosure it follows the protrusion. In the sample that settled the
+    formula's violation that is the atom that settled it. A requirement with a deadline or in response to a
+    condition keeps its arrow afterwards, with the number that settled it. Conditions of implications are not
+    pointed at: those hold, and what had to follow does not.
 
     Args:
         samples: (S,) int64, indices.
@@ -427,8 +426,8 @@ def _first(results: Sequence[EvaluatedResult], times_ns: Integers) -> tuple[Inte
 def _deciding(
     result: EvaluatedResult, pairs: LeafPairs, requirement: Integers, at: Integers
 ) -> tuple[Integers, NDArray[np.bool_]]:
-    """Return (H,) the leaf that gives a requirement (H,) its number in a sample (H,), -1 for none, and
-    whether that leaf counts with its sign turned, so that it holds where the requirement fails."""
+    """Return (H,) the leaf that gives a requirement (H,) its number in a sample (H,), -1 for none. Also
+    return whether that leaf is negated, so that it holds where the requirement fails."""
     leaf, is_turned = np.full(len(at), -1, np.int64), np.zeros(len(at), np.bool_)
     leaves = result.block.leaves
     low, high = low_and_high(len(leaves), wide=False)

@@ -231,9 +231,9 @@ def batch(
     LOG is a file, a folder, a pattern such as 'nightly/**/*.mcap', or an address. Results are kept in a
     folder; another run evaluates only what is new. A log that cannot be read is a result, too: its error.
 
-    Exits as replay does over all logs: 0 if everything is as expected, 1 if anything fails, 4 if results are
-    unknown, tested by nothing, or of logs whose recorder dropped samples, 3 if logs are damaged, 2 if some do
-    not fit, 70 if the machine failed.
+    Exits as replay does over all logs: 0 if everything is as expected, 1 if anything fails, 2 if some logs do
+    not fit, 3 if logs are damaged, 70 if the machine failed. It exits with 4 if results are unknown, tested
+    by nothing, or from logs with dropped samples.
 
     \b
     Examples:

@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     metavar="time|progress[:NAME]|NAME",
     default="time",
     show_default=True,
-    help="Two logs: align them by time since the first sample, by the progress of the automaton of "
-    "NAME, or of that with the most states in common, or by the first change of sign of the spec NAME.",
+    help="Alignment of two logs: time since the first sample, progress of an automaton (of NAME, or the one "
+    "with the most states in common), or the first change of sign of the spec NAME.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
 @output_option("Page to write (HTML), with both under one time cursor.")

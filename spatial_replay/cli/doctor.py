@@ -53,9 +53,9 @@ def doctor(
     """Find what is wrong with a specification before any run.
 
     Finds specs that no run can satisfy, that every run satisfies, that follow from another one or contradict
-    it, and implications whose antecedent never holds: by the automaton and by laws of geometry. For each
-    result prints the shortest run that satisfies it, and the shortest that violates it. Exits with 1 if it
-    finds something, otherwise with 0.
+    it. It also finds implications whose antecedent never holds. It uses the automaton and laws of geometry.
+    For each result prints the shortest run that satisfies it, and the shortest that violates it. Exits with 1
+    if it finds something, otherwise with 0.
 
     \b
     Examples:

@@ -36,8 +36,8 @@ from spatial_replay.logs.remote import LogFile
     "--vary",
     metavar="WHAT",
     multiple=True,
-    help="What to vary: noise=0:0.01, seed=0:999, start, start=0.02, start.OBJECT=0.02, drop@T, slip@T,"
-    " slip@2s:9s; repeat for several.  [default: start]",
+    help="A parameter to vary: noise=0:0.01, seed=0:999, start, start=0.02, start.OBJECT=0.02, drop@T,"
+    " slip@T, slip@2s:9s; repeat for several.  [default: start]",
 )
 @click.option(
     "--budget",
@@ -75,10 +75,10 @@ def falsify(
 ) -> ExitCode:
     """Search for runs of a simulated world that violate a specification.
 
-    An optimiser varies noise, mishaps and starts, with the robustness of each run as its cost. Each run that
-    violates is a log in DIR/runs; the same with as little varied as possible is in DIR/smaller, and the
-    shortest part that shows it in DIR/clips. Equal options give equal files, with any number of jobs. Needs
-    the extras `sim` and `falsify`.
+    An optimiser varies noise, mishaps and starts, with the robustness of each run as its cost. Each violating
+    run is a log in DIR/runs. DIR/smaller has it with as few changes as possible, and DIR/clips the shortest
+    part that shows the violation. Equal options give equal files, with any number of jobs. Needs the extras
+    `sim` and `falsify`.
 
     Exits with 1 if a run violates, 4 if none does and any is unknown, 0 if none was found.
 

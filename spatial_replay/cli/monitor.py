@@ -170,8 +170,8 @@ def monitor(
     Prints each change of a verdict with its reason, as it happens. While the connection is lost, everything
     is unknown; it is made again as soon as the server is back. Ctrl-C ends the run.
 
-    Exits with 0 if all specifications are satisfied by what was recorded, 1 if any is violated, 4 if none is
-    violated and any is unknown, 3 if the server does not answer, or its time jumps back.
+    Exits with 0 if the recording satisfies all specifications, 1 if any is violated, 4 if none is violated
+    and any is unknown. It exits with 3 if the server does not answer, or its time jumps back.
 
     With --clips nothing is written until a trigger fires; then a log of what came before and after. SIGUSR1
     fires it, too, and so does the service `trigger` of --serve.

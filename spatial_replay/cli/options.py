@@ -169,7 +169,7 @@ durability_option = click.option(
     type=click.Choice(["process", "disk"]),
     default="process",
     show_default=True,
-    help="What written chunks survive: the end of this process, or that of the machine, too (fsync).",
+    help="Written chunks survive the end of this process, or of the machine, too (fsync).",
 )
 
 
@@ -310,7 +310,7 @@ _READING = (
     click.option(
         "--max-gap",
         metavar="T",
-        help="What lies in a pause of samples, or of a mapped topic, longer than T is unknown.",
+        help="Pauses of samples, or of a mapped topic, are unknown if they are longer than T.",
     ),
     click.option(
         "--rate", metavar="N", type=float, help="Drone annotations: frames per second.  [default: 30]"

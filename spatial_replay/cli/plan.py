@@ -162,9 +162,9 @@ def plan(
 ) -> int | None:
     """Plan a run in a simulated world, and record it with every decision.
 
-    With --redo, show what the planner of a log would have decided, on the recorded samples, with another
-    specification or other settings: which decisions are the same, and the first one that differs, with both
-    maps. Exits with 0 if every decision does the same, otherwise with 1.
+    With --redo, show the planner's decisions on recorded samples with another specification or other
+    settings: the number of equal decisions, and the first one that differs, with both maps. Exits with 0 if
+    every decision does the same, otherwise with 1.
 
     \b
     Examples:

@@ -57,7 +57,7 @@ def duration_ns(context: click.Context, parameter: click.Parameter, text: str | 
     "topics",
     metavar="TOPIC",
     multiple=True,
-    help="Of a log: its topic with images or AprilTag detections; repeat for several cameras.  [default: the"
+    help="Topic of a log with images or AprilTag detections; repeat for several cameras.  [default: the"
     " only one]",
 )
 @click.option(
@@ -65,7 +65,7 @@ def duration_ns(context: click.Context, parameter: click.Parameter, text: str | 
     "offsets",
     metavar="NAME=T",
     multiple=True,
-    help="Of several cameras: shift the stamps of a video or topic, such as right.mp4=0.12s, or by its"
+    help="Several cameras: shift of the stamps of a video or topic, such as right.mp4=0.12s, or by its"
     " number, 2=-40ms.",
 )
 @click.option(
@@ -101,7 +101,7 @@ def duration_ns(context: click.Context, parameter: click.Parameter, text: str | 
     "--rate", metavar="HZ", type=float, help="Frames a second of a video, instead of its own stamps."
 )
 @click.option(
-    "--for", "length_ns", metavar="T", callback=duration_ns, help="Of a camera: end after so much time."
+    "--for", "length_ns", metavar="T", callback=duration_ns, help="Duration of a recording from a camera."
 )
 def video(
     sources: tuple[LogFile, ...],
@@ -128,7 +128,7 @@ def video(
     see the same scene: their frames of one time make one sample. Needs the extra `vision`.
 
     Exits with 0 if all specifications are satisfied, 1 if any is violated, 4 if none is violated and any is
-    unknown, 3 if the video is damaged: what was recorded up to then is whole.
+    unknown. It exits with 3 if the video is damaged; the recording up to there is complete.
 
     \b
     Examples:

@@ -86,15 +86,15 @@ def replay(
 
     T is 12.5s or 1500ms after the first sample, 5250000000ns on the log's clock, or 2026-01-31T12:00:00Z.
 
-    Exits with 0 if all results are satisfied, 1 if any is violated, 4 if none is violated and any is unknown,
-    3 if the log is damaged and the verdicts cover only what could be read. The code is also 4 if nothing
-    tested a result, or if the recorder dropped samples; --allow lets these pass. With --fail-on vacuous it is
-    1 if a part of a specification decided nothing: an empty window, an antecedent that never held, a group
-    without members, a template without objects. With --fail-on cut it is 1 if a window decides that the end
-    of the log cut short.
+    Exits with 0 if all results are satisfied, 1 if any is violated, 4 if none is violated and any is unknown.
+    It exits with 3 if the log is damaged; the verdicts cover only the readable part. The code is also 4 if
+    nothing tested a result, or if the recorder dropped samples; --allow lets these pass. With --fail-on
+    vacuous it is 1 if a part of a specification decided nothing: an empty window, an antecedent that never
+    held, a group without members, a template without objects. With --fail-on cut it is 1 if a window decides
+    that the end of the log cut short.
 
-    With --watch the log stays in memory, and is evaluated again whenever a specification file is saved; the
-    key w writes the values given with --const into the files, and Ctrl-C ends it, with exit code 130.
+    With --watch the log stays in memory, and is evaluated again whenever a specification file is saved. The
+    key w writes the values of --const into the files. Ctrl-C ends it with exit code 130.
 
     \b
     Examples:

@@ -104,7 +104,7 @@ def print_tags(family: str, ids: tuple[int, ...], size: float, paper: str, outpu
 
 @tags.command()
 @click.argument("source", metavar="VIDEO|LOG", type=LogPath())
-@click.option("--topic", metavar="TOPIC", help="Of a log: its image topic.  [default: the only one]")
+@click.option("--topic", metavar="TOPIC", help="Image topic of a log.  [default: the only one]")
 @_family
 @click.option("--ids", metavar="LIST", callback=_ids, help="Numbers on the sheet, as for `tags print`.")
 @click.option("--size", metavar="LENGTH", callback=_size, help="Their size, as for `tags print`.")
@@ -130,8 +130,8 @@ def calibrate(
     """Measure focal length, principal point and lens distortion from a video of tags.
 
     Film the first page of `tags print`, flat, from near and far, tilted to all sides, up to the corners of
-    the image; or move the camera around a table with reference tags. The result is the `camera` of a
-    tags file.
+    the image. Or move the camera around a table with reference tags. The result is the `camera` of a tags
+    file.
 
     \b
     Examples:

@@ -180,7 +180,7 @@ _MOST_POINTS: Final = 2_000
 
 _MOST_LABELS: Final = 25
 _NAME_SIZE: Final = 8.0
-"""Of the names of objects, in points."""
+"""Font size of object names, in points."""
 _STEPS: Final = (0.0, 1.2, -1.2, 2.4, -2.4, 3.6, -3.6, 4.8, -4.8)
 """How far a name may be above its place, in multiples of its size."""
 

@@ -95,8 +95,8 @@ def draw_tuning(tuning: Tuning, *names: str, points: int | None = None, ax: Axes
 def draw_surface(surface: Surface, ax: Axes | None = None) -> Axes:
     """Draw where which runs have the right verdict.
 
-    For one constant a curve for each run; for two the least margin as colours, and for each run a line where
-    its verdict changes, which is dashed if the run is bad. A circle marks the values found.
+    One constant gives a curve for each run. Two give the least margin as colours, and for each run a line
+    where its verdict changes, dashed for bad runs. A circle marks the values found.
 
     Raises:
         UsageError: matplotlib is not installed.

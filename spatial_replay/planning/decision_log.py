@@ -67,7 +67,7 @@ from spatial_replay.trace.sample import Sample
 # ------------------------------------------------------------------------------------------------------- maps
 
 _CELL: Final = np.dtype([("robustness", "<f4"), ("colour", "u1", (4,))])
-"""What every map has of a cell: its robustness, NaN where it is blocked, and red, green, blue and alpha."""
+"""Fields of every cell of a map: robustness (NaN if blocked), red, green, blue and alpha."""
 
 _COLOURS: Final = ("red", "green", "blue", "alpha")
 _DEPTH: Final = 0.1
@@ -210,7 +210,7 @@ def explain(message: PlanCandidate, candidate: Candidate, layers: MapLayers, set
 # -------------------------------------------------------------------------------------------------- decisions
 
 PLAN_VERSION: Final = 2
-"""Of the messages: a log of another version cannot be recomputed."""
+"""Version of the messages; a log of another version cannot be recomputed."""
 
 _MOST_LISTED: Final = 3
 """Conjuncts and causes that are listed of a map."""

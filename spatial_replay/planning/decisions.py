@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     from spatial_replay.planning.maps import Cubes, GradientMap
 
 Kind: TypeAlias = Literal["execute", "hold", "wait", "no path"]
-"""The kind of a step: move an object; hold, since the specification is satisfied; wait for an observation or
-for time to pass; stop, since no path to acceptance is left."""
+"""The kind of a step: move an object, hold because the specification is satisfied, wait for an observation or
+for time to pass, or stop because no path to acceptance is left."""
 
 Stage: TypeAlias = Literal["pick", "way", "place"]
-"""Of a motion: taking hold of its object, moving it, leaving it at the target."""
+"""Stages of a motion: picking the object, moving it, placing it at the target."""
 
 Edge: TypeAlias = tuple[int, int]
 """A transition of the automaton, from one state to another."""
@@ -189,12 +189,12 @@ class Step(Displayed):
 
     @property
     def progress(self) -> Guards:
-        """What has to hold next; empty without an aim."""
+        """Progress set: propositions that have to hold next; empty without an aim."""
         return self.aim.progress if self.aim is not None else _NOTHING
 
     @property
     def constraints(self) -> Guards:
-        """What must not hold on the way; empty without an aim."""
+        """Constraint set: propositions that must not hold on the way; empty without an aim."""
         return self.aim.constraints if self.aim is not None else _NOTHING
 
     @property

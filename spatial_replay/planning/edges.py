@@ -446,7 +446,7 @@ class Attempts:
     def failed_here(self, name: str, sample: Sample, settings: Settings) -> tuple[Target, ...]:
         """Return the targets for which motions of an object failed while everything stood as in a sample.
 
-        Of a push that left its object where it was, this asks only for what stands beside that.
+        After a push that did not move its object, only neighbours of the object are considered.
         """
         return tuple(each.target for each in self._here(name, sample, settings))
 

@@ -73,7 +73,7 @@ Cell: TypeAlias = tuple[int, int, int]
 
 @dataclass(frozen=True, eq=False)
 class _Field:
-    """What the cells of one object are like, with everything that cannot be moved where it is.
+    """Cells of one object, with all fixed objects in place.
 
     Attributes:
         turns: (A,) angles in radians.
@@ -520,11 +520,11 @@ _MOST_ORDERED: Final = 6
 _STILL_TURN: Final = math.radians(1.0)
 """The widest turn of an object that stays as it is."""
 _STRICTLY: Final = 1e-12
-"""What a constraint has to stay away from holding at least: at 0 it does."""
+"""Least distance of a constraint from holding; it holds at 0."""
 
 
 class Lookahead:
-    """What can be done from one sample on; made for one decision."""
+    """Possible motions from one sample on; made for one decision."""
 
     def __init__(
         self,

@@ -205,7 +205,7 @@ class PropositionMaps:
 
 
 class MapSubject(NamedTuple):
-    """What maps were measured of: propositions with their regions, and the sample whose object moves."""
+    """Subject of maps: propositions with their regions, and the sample whose object moves."""
 
     propositions: tuple[Formula, ...]
     regions: Mapping[str, Outline]
@@ -213,7 +213,7 @@ class MapSubject(NamedTuple):
 
 
 class MapParts(NamedTuple):
-    """What a gradient map was computed from: maps as now and after other motions, progress, constraints."""
+    """Inputs of a gradient map: maps of now and after other motions, progress, constraints."""
 
     now: PropositionMaps
     then: PropositionMaps
@@ -322,7 +322,7 @@ def _obstacle_distances(propositions: Sequence[Formula], name: str, obstacles: S
 
 
 class _Poses:
-    """What is measured with one object of a sample in as many poses at a time, everything else as it is.
+    """Measurements with one object of a sample in several poses, and all others in place.
 
     Each thread needs its own, since it measures in the same room each time.
 
@@ -475,8 +475,8 @@ MOST_CAUSES: Final = 1000
 """Causes that are listed; cells of any further ones name the last."""
 
 CauseKind: TypeAlias = Literal["constraint", "object", "obstacle", "reach", "unknown", "failed"]
-"""What keeps an object out of a cell: something of the constraint set would hold; an object or an obstacle of
-the workspace stands there; the robot's reach; an unknown progress set; a failed motion to a place near it."""
+"""Reasons why a cell is blocked: a member of the constraint set would hold, an object or obstacle stands
+there, the robot cannot reach it, the progress set is unknown, or a motion to a nearby place failed."""
 
 _KINDS: Final[tuple[CauseKind, ...]] = ("constraint", "object", "reach", "unknown", "failed")
 _KIND_OF: Final = {CONSTRAINED: 0, OCCUPIED: 1, OUT_OF_REACH: 2, UNKNOWN: 3}
@@ -486,7 +486,7 @@ _NUMBERS: Final = 1 << 24
 
 
 class BlockedBy(NamedTuple):
-    """What keeps an object out of cells.
+    """Reasons why cells are blocked.
 
     Attributes:
         name: of the object, or what of the constraint set would hold; else empty.
@@ -499,7 +499,7 @@ class BlockedBy(NamedTuple):
 
 
 class RoomCost(NamedTuple):
-    """What the room around a target costs: the robustness possible with less, and the room there."""
+    """Cost of the room around a target: the robustness possible with less, and the room there."""
 
     robustness: float
     room: float

@@ -588,7 +588,7 @@ class MotionOrder:
         return self._constraints if is_strict else self._expected.traps(state)
 
     def _spend(self, parked: Sequence[str], maps: int = 1) -> bool:
-        """Count maps; return whether there are any left. Those for what goes aside are counted apart."""
+        """Count maps; return whether there are any left. Motions that clear the way are counted apart."""
         if not (self._is_careful and parked):
             return self._expected.budget.spend(maps)
         return self._aside_maps.spend(maps) and self._expected.aside_budget.spend(maps)
@@ -768,8 +768,8 @@ class MotionOrder:
     ) -> Iterator[Target]:
         """Yield motions of an object to places where it is in no one's way, the nearest first.
 
-        There, nothing that must not hold does, neither now nor with the others where they are to go. What
-        stands beside an object that could not be moved goes away from it.
+        There, nothing that must not hold does, neither now nor with the others where they are to go.
+        Neighbours of an object that could not be moved are moved away from it.
         """
         settings, constraints = self._expected.settings, self._constraints_at(state, is_first)
         tracked = scene.sample.objects[name]

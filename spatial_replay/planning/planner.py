@@ -151,9 +151,9 @@ class Planner:
     def stop_reason(self) -> str:
         """Why a motion has to stop now; empty while it may go on.
 
-        A motion has to stop when one more sample like the newest two, with its object farther by as much as
-        between these, and turned by as much if it is to be turned, would lose acceptance. A robot that asks
-        after each sample can end the motion with `Outcome(False, planner.stop_reason)`.
+        A motion has to stop when one more sample would lose acceptance. In that sample the object moves, and
+        turns if it is to be turned, by as much as between the newest two. A robot that asks after each sample
+        can end the motion with `Outcome(False, planner.stop_reason)`.
         """
         return self._stop_reason
 

@@ -520,7 +520,7 @@ _REDONE: Final = MappingProxyType(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Replanned(Printed):
-    """What a planner would have decided on the samples of a log.
+    """Decisions of a planner on the samples of a log.
 
     After the first decision by which something else is done, the recorded samples say nothing more: they are
     what followed on the recorded one.

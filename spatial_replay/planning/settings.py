@@ -286,7 +286,7 @@ def member_faults(
 # --------------------------------------------------------------------------------------------------- settings
 
 Skill: TypeAlias = Literal["push", "place"]
-"""What the robot does with an object: push it along a path in the plane, or pick and place it."""
+"""Motion of the robot: push an object along a path in the plane, or pick and place it."""
 
 RoomFrom: TypeAlias = Literal["later", "all"]
 """From what a placed object keeps the preferred room: from what may still be moved, or from everything."""
@@ -323,8 +323,8 @@ class Settings:
         room: preferred clearance of a placed object, in footprint units, so that it and its neighbours can be
             grasped later; at least 0. Targets with less are used if there is no other.
         room_from: "later" keeps room only from objects that may still have to be moved on the way to
-            acceptance, and from everything if the object itself may: where room is not needed, robustness
-            counts. "all" always keeps it from everything, whatever robustness that costs.
+            acceptance, and from everything if the object itself may. Elsewhere robustness counts. "all"
+            always keeps it from everything, whatever robustness that costs.
         attempts: how many failed motions prune an edge, at least 1.
         motions: how many objects are moved for one edge at most, at least 1. With 1, the planner takes one
             edge by one motion and looks no further, as in the paper.

@@ -247,8 +247,8 @@ def _path_into_reach(
     """Return the path to the nearest free cell.
 
     Cells out of reach may be crossed only if the path starts in one. From a cell where a constraint would
-    hold, such cells may be crossed too, but no occupied ones; from an occupied cell the path first jumps to
-    the nearest cell that is not.
+    hold, such cells may be crossed too, but no occupied ones. From an occupied cell the path first jumps to
+    the nearest free cell.
     """
     free = gradient.blocked[0] == FREE
     is_reached = settings.workspace.within_reach(gradient.grid)[cell]

@@ -23,7 +23,7 @@ from spatial_replay.spec.formula import Specification
 from spatial_replay.text import Instant, Sentence
 
 Side: TypeAlias = tuple[Source, Sequence[Specification], ReplayOptions]
-"""What one side of a page shows: a log, what is evaluated over it, and how."""
+"""One side of a page: a log, its specifications and the options of their evaluation."""
 
 
 def write_comparison(

@@ -205,10 +205,9 @@ class NodeSeries(NamedTuple):
 def choose_samples(times_ns: Integers, curves: Sequence[NodeSeries], most: int) -> Integers:
     """Return the indices of the samples to keep, in order: all of them, or at most `most`.
 
-    Of a run that is too long those are the first and the last of all and of each curve, others at equal
-    distances, those before and after changes of sign, and those in which a curve has its least and its
-    greatest number within a stretch: in this order as long as there is room, and spread over the run where
-    there is not.
+    Samples of a run that is too long are chosen in this order, as long as there is room: the first and the
+    last of all and of each curve, others at equal distances, those around changes of sign, and the extrema of
+    each curve within a stretch. If the room does not suffice, they are spread over the run.
 
     Args:
         times_ns: (T,) int64, of all samples.
@@ -271,7 +270,7 @@ _FEWEST_SAMPLES: Final = 200
 
 @dataclass(frozen=True)
 class PageData:
-    """What the page reads: facts in JSON, numbers, and notes on what is left out.
+    """Data of the page: facts in JSON, numbers, and notes on omissions.
 
     Attributes:
         numbers: of `Packing.text`.
@@ -340,8 +339,8 @@ def _curves(each: ReportedResult) -> NodeSeries:
 def _shown_times(report: RunReport, times_ns: Integers, most: int) -> Integers:
     """Return samples that the page has whatever else it leaves out: `most` at most, but what decided.
 
-    Those are the samples that decided a verdict, those of events and, as far as there is room, at equal
-    distances those of the scene: at one cursor, the page shows one sample.
+    They are the samples that decided a verdict, the samples of events and, if there is room, samples of the
+    scene at equal distances. At one cursor, the page shows one sample.
     """
     decided_ns = [each.decided_ns for each in report.drawn if each.decided_ns is not None]
     events_ns = sorted({each.start_ns for each in report.events[:MOST_EVENTS]})[: most // 2]

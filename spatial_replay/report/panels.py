@@ -323,7 +323,7 @@ _FORMS: Final = ((320, 70), (320, 45), (200, 45), (120, 40), (60, 30))
 
 
 class ReportedPictures(NamedTuple):
-    """What the camera of a run saw.
+    """Pictures of a run's camera.
 
     Attributes:
         topic: with the images; "" without any.
@@ -339,7 +339,7 @@ class ReportedPictures(NamedTuple):
 
 
 NO_PICTURES: Final = ReportedPictures()
-"""Of a log without images."""
+"""Note for a log without images."""
 
 
 def pictures_of(source: Source, start_ns: int, end_ns: int, decided_ns: Collection[int]) -> ReportedPictures:
@@ -642,7 +642,7 @@ class DecisionCollector:
 
     @property
     def redone(self) -> DecisionCollector:
-        """What collects the decisions that would have been made otherwise."""
+        """Collector of the decisions that would have been different."""
         self._redone = self._redone or DecisionCollector()
         return self._redone
 

@@ -277,7 +277,7 @@ MAX_DECISIONS: Final = 200_000
 
 
 class Fact(NamedTuple):
-    """What a diagram decides on: an inequality between quantities, or something that is not looked into.
+    """Condition of a diagram: an inequality between quantities, or an opaque proposition.
 
     Attributes:
         weights: of a sum of quantities, the first 1; none for what is not looked into.

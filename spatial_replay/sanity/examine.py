@@ -1,4 +1,4 @@
-"""What is wrong with a specification before any run: it cannot be satisfied, or checks nothing."""
+"""Faults of a specification that need no run: it cannot be satisfied, or checks nothing."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class SpecExamination:
-    """What could be decided about one result of a specification.
+    """Findings about one result of a specification.
 
     Attributes:
         name: of the spec.
@@ -92,7 +92,7 @@ class SpecExamination:
 
 @dataclass(frozen=True)
 class Examination(Printed):
-    """What is wrong with a specification, and what its specs mean by example.
+    """Faults of a specification, and examples of its specs.
 
     Attributes:
         findings: in the order of the text.
@@ -205,9 +205,10 @@ def _example_document(example: Example | None) -> dict[str, Any] | None:
 def doctor(specification: Specification, *, examples: bool = True) -> Examination:
     """Find what is wrong with a specification before any run is evaluated.
 
-    It finds specs that no run satisfies with a margin (a robustness above 0), or that none violates with one;
-    specs that follow from another one, or contradict it; and implications whose antecedent never holds.
-    Automata decide, together with laws of geometry: a run is only considered if footprints could be so.
+    It finds specs that no run satisfies with a margin (a robustness above 0), or that none violates with one.
+    It also finds specs that follow from another one or contradict it, and implications whose antecedent never
+    holds. Automata decide, together with laws of geometry: a run is only considered if footprints could be
+    so.
 
     Args:
         examples: look for the shortest runs that satisfy and violate each spec, too.
@@ -258,7 +259,7 @@ class _Part:
 
     @cached_property
     def names(self) -> frozenset[str]:
-        """What it is about."""
+        """Its subject."""
         atoms = [each for each in iter_formulas(self.formula) if isinstance(each, Atom)]
         signals = {str(each.parameters[0]) for each in atoms if each.relation == "signal"}
         named = {each.name for each in iter_formulas(self.formula) if each.name is not None}

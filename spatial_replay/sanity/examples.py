@@ -146,7 +146,7 @@ class _Amount(NamedTuple):
 
 @dataclass(frozen=True)
 class Setting:
-    """What there is to place.
+    """Objects to place.
 
     Attributes:
         objects: names of tracked objects.
@@ -309,7 +309,7 @@ class _Attempt:
     ) -> Mapping[Any, float] | frozenset[int]:
         """Return values of the unknowns, or the labels of what excludes each other.
 
-        Of the choices, the first is made that the values so far do not keep. Where what excludes each other
+        The first choice is taken that the values so far do not fulfil. Where what excludes each other
         is not about a choice, another way does not help.
         """
         self._left -= 1

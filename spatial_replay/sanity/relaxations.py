@@ -39,8 +39,8 @@ class SpecReading:
 def reading_of(specification: Specification, name: str, formula: Formula) -> SpecReading:
     """Return the automata that decide on a formula: one for each of the parts that have to hold together.
 
-    What an automaton cannot follow is read loosely: a bounded `F` as one without a bound, a past operator as
-    one that may hold or not. Runs are only ever added, so that what the looser reading excludes is excluded.
+    Operators without an automaton are relaxed: a bounded `F` loses its bound, a past operator may hold or
+    not. Runs are only ever added, so that what the looser reading excludes is excluded.
     """
     reasons: list[str] = []
     satisfying: list[Side] = []

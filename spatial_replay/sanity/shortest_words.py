@@ -238,7 +238,7 @@ def clause(diagrams: Diagrams, cube: Cube) -> int:
 # ----------------------------------------------------------------------------------------- runs of any length
 
 Word: TypeAlias = tuple[Cube, ...]
-"""What has to hold in each sample of a run; whatever it leaves open, the end is the same."""
+"""Requirements on each sample of a run; the outcome is the same for all open propositions."""
 
 MAX_STEPS: Final = 100_000
 """How many steps one question takes, each a decision of a diagram that is visited."""

@@ -1,4 +1,4 @@
-"""What messages of the scene show, as values, for a page that draws them itself; and the scene's colours."""
+"""Frames of the scene as values, for a page that draws them itself; and the scene's colours."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def _banner(
 
 
 class ArrowTexts(NamedTuple):
-    """What the arrows of S messages say.
+    """Arrows of S messages.
 
     Attributes:
         causes: what decides violations, in words.
@@ -179,10 +179,10 @@ _LEAST: Final = 0.4
 
 _FROM_GREY: Final = np.subtract((NEGATIVE, POSITIVE), NEUTRAL)
 _FROM_GREY.flags.writeable = False
-"""What is added to grey in full colours."""
+"""Difference of full colours from grey."""
 
 _OPACITY: Final = 0.6
-"""Of a map's cells, so that the scene above them stays visible."""
+"""Opacity of a map's cells, so that the scene above them stays visible."""
 
 
 def colours(robustness: ArrayLike, scale: ArrayLike) -> Floats:
@@ -227,7 +227,7 @@ SHADES: Final = _shades()
 SHADES.flags.writeable = False
 
 ABSENT, DELETED, FIRST_FORM = -1, 0, 1
-"""What an object is in a message: not there, just gone, or drawn in one of the forms from here on."""
+"""State of an object in a message: absent, just gone, or drawn in one of the forms below."""
 
 
 class DrawnEntity(NamedTuple):
@@ -299,7 +299,7 @@ class Arrows(NamedTuple):
 
 
 class SceneFrame(NamedTuple):
-    """What one message shows.
+    """Content of one message.
 
     Attributes:
         entities: by their ids.
@@ -323,7 +323,7 @@ class SceneFrame(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class SceneFrames:
-    """What S messages show.
+    """Content of S messages.
 
     Attributes:
         times_ns: (S,) int64.
@@ -371,7 +371,7 @@ class SceneFrames:
 
 
 class SceneContent(NamedTuple):
-    """What S messages hold.
+    """Columns of S messages.
 
     Attributes:
         names: objects that are shown, or have just been.

@@ -329,7 +329,7 @@ def lying_at(z: float) -> Pose:
 
 OBJECT_OPACITY: Final = 0.55
 REGION_OPACITY: Final = 0.3
-"""Of faces: objects are more opaque than the regions that they lie in."""
+"""Opacity of faces: objects are more opaque than the regions that they lie in."""
 
 _BANNER_PIXELS: Final = 20.0
 
@@ -360,7 +360,7 @@ class Banner(NamedTuple):
 
 
 class CauseText(NamedTuple):
-    """What is written beside an arrow.
+    """Label of an arrow.
 
     Attributes:
         text: all before the number.
@@ -386,7 +386,7 @@ class DrawnObject(NamedTuple):
 
 
 class SceneLayout(NamedTuple):
-    """What decides at which bytes the numbers of a message are.
+    """Properties that determine the offsets of a message's numbers.
 
     Attributes:
         deleted: objects that were in the message before and are gone.
@@ -474,9 +474,9 @@ def encode_regions(regions: Sequence[Region]) -> EncodedRegions:
 def make_template(layout: SceneLayout, regions: EncodedRegions, lift: float) -> SceneTemplate:
     """Return the template of a layout.
 
-    The numbers of a message are, each once: its timestamp (2), the colours of the regions (3 each), the
-    points of all objects (2 each), their colours (3 each), the middles where names are (2 each), if any has
-    a height their tops, bottoms, heights and those of their names (4 each), and those of the arrow.
+    A message has these numbers, each once: its timestamp (2), the colours of the regions (3 each), the points
+    of all objects (2 each), their colours (3 each) and the places of names (2 each). If any object has a
+    height, tops, bottoms, heights and those of names follow (4 each). The arrow's numbers come last.
 
     Args:
         lift: height of flat objects above the plane, so that they cover regions.
@@ -576,7 +576,7 @@ def _corners(rings: tuple[int, ...], begin: int) -> list[list[tuple[int, int]]]:
 
 
 _ARROW_NUMBERS: Final = 10
-"""Of `numbers_of_witness`, but for its text."""
+"""Number of columns of `numbers_of_witness`, without its text."""
 
 
 def numbers_of_witness(

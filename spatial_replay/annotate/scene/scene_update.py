@@ -134,7 +134,7 @@ _BANNER_LIFT: Final = 0.06
 
 @dataclass(frozen=True, eq=False)
 class SceneState:
-    """What the next message depends on besides its own sample.
+    """State that the next message depends on, besides its own sample.
 
     Attributes:
         first_ns: the time of the first sample, or None before it.
