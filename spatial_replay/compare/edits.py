@@ -20,8 +20,7 @@ from spatial_replay.spec.format import format_bound, format_formula, format_term
 from spatial_replay.spec.formula import (
     Atom,
     Boolean,
-    Earlier,
-    Enlarged,
+    DerivedTerm,
     Expression,
     Formula,
     Group,
@@ -94,7 +93,7 @@ class SharedNames:
             return replace(term, name="")
         if isinstance(term, RegionName):
             return RegionName(self.regions.get(term.name, term.name))
-        if not isinstance(term, (Earlier, Enlarged)):
+        if not isinstance(term, DerivedTerm):
             return term
         return replace(term, term=self.term(term.term))
 
@@ -129,7 +128,7 @@ def _changed_leaf(leaf: Any, change: Callable[[Term], Term]) -> Any:
 def _with_region(term: Term, renamed: Mapping[str, str]) -> Term:
     if isinstance(term, RegionName):
         return RegionName(renamed.get(term.name, term.name))
-    if not isinstance(term, (Earlier, Enlarged)):
+    if not isinstance(term, DerivedTerm):
         return term
     inner: Any = _with_region(term.term, renamed)
     return replace(term, term=inner)

@@ -10,11 +10,12 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from struct import Struct
-from typing import Final, Literal, TypeAlias
+from typing import Final, Literal, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from spatial_replay.compiled import elementwise, inlined, long_kernel
 from spatial_replay.errors import GeometryError
 from spatial_replay.geometry.arrays import (
     Floats,
@@ -36,6 +37,8 @@ from spatial_replay.geometry.outline import (
     normalise_polygons,
 )
 from spatial_replay.text import is_encodable
+
+_Height = TypeVar("_Height", float, Floats)
 
 Concave: TypeAlias = Literal["decompose", "hull"]
 """How a non-convex polygon is treated: split into convex parts, or replaced by its convex hull."""
@@ -503,12 +506,43 @@ def centre_of(footprint: Footprint) -> tuple[float, float]:
     A part is weighted by its area, and has the centroid of its polygon before rounding, or the mean of the
     vertices if that polygon has no area. Areas of overlap count twice.
     """
-    weights, centres = zip(*map(_weight_and_centre, footprint.parts), strict=True)
-    if sum(weights) <= 0.0:
-        weights = (1.0,) * len(centres)
-    total = sum(weights)
-    x, y = (sum(w * each[axis] for w, each in zip(weights, centres, strict=True)) / total for axis in (0, 1))
+    ((x, y),) = centres_of(FootprintBatch.from_footprints([footprint])).vertices.tolist()
     return x, y
+
+
+def centre_object(tracked: TrackedObject) -> TrackedObject:
+    """Return an object as the point at its centre, halfway up."""
+    height = tracked.height and (_middle(*tracked.height),) * 2
+    return replace(tracked, footprint=Footprint.disc(*centre_of(tracked.footprint), 0.0), height=height)
+
+
+def centres_of(batch: FootprintBatch) -> FootprintBatch:
+    """Return the centre of each row (see `centre_of`) as a point, halfway up."""
+    centres, points = np.empty((len(batch), 2)), np.arange(len(batch) + 1, dtype=np.int64)
+    _fill_centres(batch.part_start, batch.vertex_start, batch.vertices, batch.radius, centres)
+    middle = _middle(batch.bottom, batch.top)
+    return FootprintBatch(points, points, centres, np.zeros(len(batch)), middle, middle)
+
+
+def _middle(bottom: _Height, top: _Height) -> _Height:
+    return bottom + 0.5 * (top - bottom)
+
+
+@elementwise
+@long_kernel
+def _fill_centres(
+    part_start: Integers, vertex_start: Integers, vertices: Floats, radius: Floats, centres: Floats
+) -> None:
+    """Fill `centres` (R, 2)."""
+    for row in range(len(part_start) - 1):
+        total = sum_x = sum_y = mean_x = mean_y = 0.0
+        for p in range(part_start[row], part_start[row + 1]):
+            area, x, y = _weight_and_centre(vertices, vertex_start[p], vertex_start[p + 1], radius[p])
+            total, sum_x, sum_y = total + area, sum_x + area * x, sum_y + area * y
+            mean_x, mean_y = mean_x + x, mean_y + y
+        if total <= 0.0:
+            total, sum_x, sum_y = part_start[row + 1] - part_start[row], mean_x, mean_y
+        centres[row, 0], centres[row, 1] = sum_x / total, sum_y / total
 
 
 def radius_of(tracked: TrackedObject) -> float:
@@ -575,21 +609,22 @@ def fill_placed(vertices: Floats, centre: Floats, positions: Floats, turn: float
         np.add(at, complex(x, y), out=filled[:, number])
 
 
-def _weight_and_centre(part: ConvexPart) -> tuple[float, tuple[float, float]]:
-    """Return a part's area, and the centroid of its polygon before rounding."""
-    # plain numbers are quicker than arrays for the few vertices of a part
-    corners = part.vertices.tolist()
-    (x0, y0), *_ = corners
-    doubled = sum_x = sum_y = length = 0.0
-    for (ax, ay), (bx, by) in zip(corners, corners[1:] + corners[:1], strict=True):
-        cross = (ax - x0) * (by - y0) - (bx - x0) * (ay - y0)
-        doubled += cross
-        sum_x += cross * (ax + bx - 2.0 * x0)
-        sum_y += cross * (ay + by - 2.0 * y0)
-        length += math.hypot(bx - ax, by - ay)
+@inlined
+def _weight_and_centre(vertices: Floats, start: int, stop: int, radius: float) -> tuple[float, float, float]:
+    """Return a part's area, and the centroid (x, y) of its polygon before rounding."""
+    # relative to the first vertex, so that coordinates far from the origin do not cancel
+    x0, y0 = vertices[start, 0], vertices[start, 1]
+    doubled = sum_x = sum_y = mean_x = mean_y = length = 0.0
+    for i in range(start, stop):
+        following = i + 1 if i + 1 < stop else start
+        ax, ay = vertices[i, 0] - x0, vertices[i, 1] - y0
+        bx, by = vertices[following, 0] - x0, vertices[following, 1] - y0
+        cross = ax * by - bx * ay
+        doubled, sum_x, sum_y = doubled + cross, sum_x + cross * (ax + bx), sum_y + cross * (ay + by)
+        mean_x, mean_y = mean_x + ax, mean_y + ay
+        length += math.sqrt((bx - ax) * (bx - ax) + (by - ay) * (by - ay))
     # a rounded polygon is the polygon, a strip along its sides, and sectors at its corners that make a disc
-    area = doubled / 2 + length * part.radius + math.pi * part.radius**2
-    if len(corners) > 2 and doubled > _FLAT * length**2:
-        return area, (x0 + sum_x / (3.0 * doubled), y0 + sum_y / (3.0 * doubled))
-    count = len(corners)
-    return area, (sum(x for x, _ in corners) / count, sum(y for _, y in corners) / count)
+    area = doubled / 2 + length * radius + math.pi * radius * radius
+    if stop - start > 2 and doubled > _FLAT * length * length:
+        return area, x0 + sum_x / (3.0 * doubled), y0 + sum_y / (3.0 * doubled)
+    return area, x0 + mean_x / (stop - start), y0 + mean_y / (stop - start)

@@ -43,7 +43,7 @@ from spatial_replay.spec.walks import (
     iter_expressions,
     iter_formulas,
     iter_terms,
-    without_enlargement,
+    standing,
 )
 from spatial_replay.text import (
     Instant,
@@ -315,7 +315,7 @@ def _empty_groups(
 
 def _open_groups(formula: Formula) -> Iterator[Group | Earlier]:
     """Yield the open groups that a leaf is about, as they are for any binding of its variables."""
-    for term in map(without_enlargement, iter_terms([formula])):
+    for term in map(standing, iter_terms([formula])):
         group = term.term if isinstance(term, Earlier) else term
         if isinstance(group, Group) and group.members is None:
             excluded = tuple(each for each in group.excluded if isinstance(each, TrackedName))

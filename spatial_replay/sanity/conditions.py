@@ -22,6 +22,7 @@ from spatial_replay.spec.formula import (
     ANY_CLASS,
     Atom,
     Boolean,
+    Centre,
     CentroidProjection,
     Earlier,
     Enlarged,
@@ -51,7 +52,7 @@ from spatial_replay.spec.formula import (
     expand,
 )
 from spatial_replay.spec.relations import compare
-from spatial_replay.spec.walks import base_of, iter_formulas, measured_terms
+from spatial_replay.spec.walks import base_of, iter_formulas, measured_terms, standing
 from spatial_replay.text import is_text_number
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
@@ -218,6 +219,8 @@ def members(term: Term) -> tuple[Term, ...]:
     term = plain(term)
     if isinstance(term, Enlarged):
         return tuple(Enlarged(each, term.radius) for each in members(term.term))
+    if isinstance(term, Centre):
+        return tuple(Centre(standing(each)) for each in members(term.term))
     group = term.term if isinstance(term, Earlier) else term
     if not isinstance(group, Group) or group.members is None:
         return (term,)

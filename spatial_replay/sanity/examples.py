@@ -433,7 +433,7 @@ def _object(term: Term, index: int) -> tuple[str, int]:
         return term.term.name, index - term.samples
     if isinstance(term, TrackedName):
         return term.name, index
-    raise CannotPlaceError("a group of a class, or of all objects, is not placed")
+    raise CannotPlaceError("a centre, a group of a class, or of all objects, is not placed")
 
 
 def _turns(setting: Setting, facts: Sequence[tuple[Fact, bool]]) -> dict[str, float]:

@@ -16,6 +16,7 @@ from spatial_replay.spec.formula import (
     Atom,
     Boolean,
     Bound,
+    Centre,
     Earlier,
     Enlarged,
     Formula,
@@ -65,6 +66,8 @@ def format_term(term: Term, relations: frozenset[str] = RELATION_NAMES) -> str:
     match term:
         case Enlarged():
             return f"enlarge({format_term(term.term, relations)}, {format_number(term.radius)})"
+        case Centre():
+            return f"center({format_term(term.term, relations)})"
         case Earlier(samples=int(samples)):
             return f"{format_term(term.term, relations)}[-{samples}]"
         case Earlier():

@@ -3,7 +3,7 @@
 Three layers, each built of the one before:
 
 - a *term* names footprints: a tracked object, a region, a group, one of these earlier in time or
-  enlarged;
+  enlarged, or its centre;
 - an *expression* is a number computed from terms in one sample: signed distance, enclosure,
   projections, and their sums, minima and maxima. Every spatial relation is such an expression
   (see `relations`), positive where the relation holds;
@@ -118,7 +118,16 @@ class Enlarged:
     radius: float
 
 
-Term: TypeAlias = TrackedName | Variable | RegionName | Group | Earlier | Enlarged
+@dataclass(frozen=True, slots=True)
+class Centre:
+    """The point at a term's centroid (`center(a)`), halfway up; of a group, that of each member."""
+
+    term: TrackedName | Variable | RegionName | Group | Earlier
+
+
+DerivedTerm: TypeAlias = Earlier | Enlarged | Centre
+"""A term made of another, which it has as `term`; `replace` makes the same of a further one."""
+Term: TypeAlias = TrackedName | Variable | RegionName | Group | DerivedTerm
 
 # ---------------------------------------------------------------------------------------- expressions
 

@@ -94,6 +94,7 @@ from spatial_replay.spec.syntax import (
 from spatial_replay.spec.tokens import MAX_TOKENS, function_hint, is_reserved, quoted, tokenize
 from spatial_replay.spec.walks import (
     base_of,
+    is_centre,
     iter_expressions,
     iter_formulas,
     other_names,
@@ -255,8 +256,8 @@ class AtomBuilder:
 
     def _check_orientation(self, term: Term, written: RelationSyntax, scope: Scope) -> None:
         base = base_of(term)
-        if isinstance(base, (RegionName, Group)):
-            kind = "region" if isinstance(base, RegionName) else "group"
+        if is_centre(term) or isinstance(base, (RegionName, Group)):
+            kind = "point" if is_centre(term) else "region" if isinstance(base, RegionName) else "group"
             message = f"{written.relation!r} needs an orientation, and a {kind} has none"
             self.resolver.fault(written.operator, scope, message, "compare single objects of the log")
 

@@ -26,6 +26,7 @@ from spatial_replay.spec.syntax import (
     BoundSyntax,
     BrokenStatement,
     Call,
+    CentreSyntax,
     ComparisonSyntax,
     ConstStatement,
     DefStatement,
@@ -346,6 +347,9 @@ class TreeBuilder:
 
     def enlarge(self, children: list[Any]) -> Enlargement:
         return Enlargement(children[2], children[4], _cover(children))
+
+    def center(self, children: list[Any]) -> CentreSyntax:
+        return CentreSyntax(children[2], _cover(children))
 
     def delayed(self, children: list[Any]) -> Delayed:
         term, _, amount, _ = children

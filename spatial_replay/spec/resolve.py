@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 from spatial_replay.spec.constants import constant_of, names_in, range_fault, value_of
 from spatial_replay.spec.diagnostics import Faults
@@ -13,6 +13,7 @@ from spatial_replay.spec.format import format_number
 from spatial_replay.spec.formula import (
     ANY_CLASS,
     Bound,
+    Centre,
     Constant,
     Earlier,
     Enlarged,
@@ -29,6 +30,7 @@ from spatial_replay.spec.formula import (
 from spatial_replay.spec.syntax import (
     BoundSyntax,
     BrokenStatement,
+    CentreSyntax,
     ConstStatement,
     DefStatement,
     Delayed,
@@ -47,7 +49,7 @@ from spatial_replay.spec.syntax import (
     UseStatement,
 )
 from spatial_replay.spec.tokens import quoted
-from spatial_replay.spec.walks import LENGTHS
+from spatial_replay.spec.walks import LENGTHS, standing
 
 Corner: TypeAlias = tuple[float, float]
 
@@ -458,6 +460,8 @@ class Resolver:
                 return self._delay(self.term(written.term, scope), written, scope)
             case Enlargement():
                 return self._enlarged(written, scope)
+            case CentreSyntax():
+                return Centre(standing(self.term(written.term, scope)))
 
     def _named(self, name: Name, scope: Scope) -> Term:
         value = scope.values.get(name.text)
@@ -506,8 +510,9 @@ class Resolver:
         return written.text not in scope.values and isinstance(defined, BrokenStatement)
 
     def _delay(self, term: Term, written: Delayed, scope: Scope) -> Term:
-        if isinstance(term, Enlarged):
-            return replace(term, term=self._delay(term.term, written, scope))
+        if isinstance(term, Enlarged | Centre):
+            inner: Any = self._delay(term.term, written, scope)
+            return replace(term, term=inner)
         if isinstance(term, Earlier):
             self.fault(written.span, scope, "a delay of a delayed object", "add the two up in one [-n]")
             return term

@@ -82,7 +82,14 @@ class Enlargement(NamedTuple):
     span: Span
 
 
-TermSyntax: TypeAlias = Name | OpenGroup | Exclusion | Delayed | Enlargement
+class CentreSyntax(NamedTuple):
+    """`center(term)`."""
+
+    term: TermSyntax
+    span: Span
+
+
+TermSyntax: TypeAlias = Name | OpenGroup | Exclusion | Delayed | Enlargement | CentreSyntax
 
 # ------------------------------------------------------------------------------------------- formulas
 

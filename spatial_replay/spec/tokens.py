@@ -514,8 +514,11 @@ BINARY_TYPES: frozenset[str] = frozenset({"AND", "OR", "XOR", "IMPLIES", "IFF", 
 KEYWORDS: Mapping[str, str] = MappingProxyType(
     {
         **{word: word.upper() for word in ("use", "const", "region", "group", "def", "spec")},
-        **{word: word.upper() for word in ("in", "except", "all", "class", "height", "enlarge", "than")},
-        **{word: word.upper() for word in ("polygon", "box", "circle", "dist", "closer", "between")},
+        **{word: word.upper() for word in ("in", "except", "all", "class", "height", "center", "than")},
+        **{
+            word: word.upper()
+            for word in ("enlarge", "polygon", "box", "circle", "dist", "closer", "between")
+        },
         **{word: word.upper() for word in ("not", "and", "or", "xor", "implies")},
         "not_t": "NOT",
         "implies_t": "IMPLIES",

@@ -11,7 +11,9 @@ from spatial_replay.spec.format import format_number, format_relation
 from spatial_replay.spec.formula import (
     Atom,
     Boolean,
+    Centre,
     CentroidProjection,
+    DerivedTerm,
     Earlier,
     Enlarged,
     Equality,
@@ -45,22 +47,27 @@ from spatial_replay.spec.relations import RELATION_NAMES
 
 
 def base_of(term: Term) -> TrackedName | Variable | RegionName | Group:
-    """Return what a term names, without delays and enlargements."""
-    while isinstance(term, (Earlier, Enlarged)):
+    """Return what a term names, without delays, enlargements and centres."""
+    while isinstance(term, DerivedTerm):
         term = term.term
     return term
 
 
-def without_enlargement(term: Term) -> TrackedName | Variable | RegionName | Group | Earlier:
-    """Return a term as it is before it is enlarged; a delay stays."""
-    while isinstance(term, Enlarged):
+def standing(term: Term) -> TrackedName | Variable | RegionName | Group | Earlier:
+    """Return a term as it stands in the log, without enlargements and centres; a delay stays."""
+    while isinstance(term, Enlarged | Centre):
         term = term.term
     return term
+
+
+def is_centre(term: Term) -> bool:
+    """Return whether a term is a centre, also an enlarged one."""
+    return isinstance(term, Centre) or (isinstance(term, Enlarged) and is_centre(term.term))
 
 
 def looks_back(term: Term) -> bool:
     """Return whether a term is that of an earlier sample."""
-    return isinstance(without_enlargement(term), Earlier)
+    return isinstance(standing(term), Earlier)
 
 
 def iter_expressions(expression: Expression) -> Iterator[Expression]:
@@ -194,11 +201,9 @@ def substitute_term(term: Term, names: Names) -> Term:
             return names.get(term.name, term)
         case Group():
             return replace(term, excluded=tuple(_object(each, names) for each in term.excluded))
-        case Earlier():
-            then: Any = substitute_term(term.term, names)
-            return replace(term, term=then)
-        case Enlarged():
-            return Enlarged(substitute_term(term.term, names), term.radius)
+        case Earlier() | Enlarged() | Centre():
+            inner: Any = substitute_term(term.term, names)
+            return replace(term, term=inner)
         case _:
             return term
 

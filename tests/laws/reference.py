@@ -20,6 +20,7 @@ from spatial_replay.spec.formula import (
     ANY_CLASS,
     Atom,
     Boolean,
+    Centre,
     CentroidProjection,
     Earlier,
     Enlarged,
@@ -344,6 +345,9 @@ class Observed:
             case Enlarged():
                 inner = self.members(term.term, t, bindings)
                 return None if inner is None else [_enlarged(each, term.radius) for each in inner]
+            case Centre():
+                inner = self.members(term.term, t, bindings)
+                return None if inner is None else [_centre(each) for each in inner]
             case RegionName():
                 return [self.regions[term.name]]
             case Earlier():
@@ -406,6 +410,21 @@ def _enlarged(tracked: TrackedObject, radius: float) -> TrackedObject:
     parts = tuple(ConvexPart(part.vertices, part.radius + radius) for part in tracked.footprint.parts)
     return TrackedObject(
         Footprint(parts), tracked.class_name, tracked.yaw, tracked.height, tracked.uncertainty
+    )
+
+
+def _centre(tracked: TrackedObject) -> TrackedObject:
+    shapes = [
+        (shapely.MultiPoint(part.vertices).convex_hull, part.radius) for part in tracked.footprint.parts
+    ]
+    # half of the length of a segment's outline is its own
+    around = [shape.length * (2 if shape.geom_type == "LineString" else 1) for shape, _ in shapes]
+    areas = [s.area + length * r + math.pi * r**2 for (s, r), length in zip(shapes, around, strict=True)]
+    weights = areas if sum(areas) > 0 else [1.0] * len(areas)
+    x, y = np.average([shape.centroid.coords[0] for shape, _ in shapes], axis=0, weights=weights)
+    height = tracked.height and (sum(tracked.height) / 2,) * 2
+    return TrackedObject(
+        Footprint.disc(x, y, 0.0), tracked.class_name, tracked.yaw, height, tracked.uncertainty
     )
 
 

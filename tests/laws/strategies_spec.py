@@ -67,7 +67,7 @@ numbers = st.one_of(
 def terms(draw: st.DrawFn, words: Vocabulary) -> str:
     kinds = ["object", "object"]
     kinds += ["delayed"] if words.delays else []
-    kinds += ["enlarged"]
+    kinds += ["enlarged", "centre"]
     kinds += ["region"] if words.regions else []
     kinds += ["group", "except"] if words.groups else []
     kinds += ["class", "all except"] if words.classes else []
@@ -77,6 +77,8 @@ def terms(draw: st.DrawFn, words: Vocabulary) -> str:
             return tracked + draw(st.sampled_from(["[-1]", "[-2]", "[-0.5s]", "[- 250ms]"]))
         case "enlarged":
             return f"enlarge({tracked}, {draw(numbers)})"
+        case "centre":
+            return f"center({tracked})"
         case "region":
             return draw(st.sampled_from(words.regions))
         case "group":
@@ -243,9 +245,9 @@ def specification_texts(draw: st.DrawFn) -> str:
 _SIGNS = 'abFGXUSt()[],:=-<>!&|"\\#.\n\r\t é\x00'
 _WORDS = (
     "spec", "def", "group", "region", "const", "use", "paper", "forall", "exists", "in", "all", "class",
-    "except", "enlarge", "dist", "closer", "than", "between", "ovlp", "closeto", "prec", "polygon", "box",
-    "circle", "height", "->t", "!t", "<->", "1", "2.5", "3s", "inf", "and", "or", "not", "s1", "oriented",
-    "true", "<=", "((", "))", "[-1]",
+    "except", "enlarge", "center", "dist", "closer", "than", "between", "ovlp", "closeto", "prec", "polygon",
+    "box", "circle", "height", "->t", "!t", "<->", "1", "2.5", "3s", "inf", "and", "or", "not", "s1",
+    "oriented", "true", "<=", "((", "))", "[-1]",
 )  # fmt: skip
 _PHRASES = ("(a ovlp b)", "spec s1 = ", "\nspec s2 = s1")
 _PIECES = st.sampled_from([*_SIGNS, *_WORDS, *_PHRASES])

@@ -30,6 +30,14 @@ def test_a_map_is_best_in_the_middle_of_the_enclosing_object():
     assert found.robustness[0, 5, 5] == 1.0
 
 
+def test_a_centre_moves_with_its_object():
+    turned = Workspace(GRID, yaws=(0.0, math.pi / 2), obstacles=(sr.Footprint.disc(9.5, 9.5, 0.2),))
+    found = maps(turned, "center(cup) dist center(mat) <= 1", "center(jug) dist cup >= 1")
+    to_mat = np.hypot(*(GRID.centres() - (6.0, 6.0)).T)
+    assert found.lower[0].reshape(2, -1) == pytest.approx(np.tile(1.0 - to_mat, (2, 1)), abs=1e-12)
+    assert found.lower[1, 0][GRID.cell(1.5, 9.5)] == pytest.approx(2.0)
+
+
 def test_blocked_cells_have_a_reason():
     workspace = Workspace(
         GRID,

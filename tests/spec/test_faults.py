@@ -138,6 +138,7 @@ spec template(ego) = ego ovlp goal
         ("spec s = X[1, 2] a ovlp b", "[1, 2]", "takes no window", ""),
         ("spec s = a[-1][-2] ovlp b", "a[-1][-2]", "a delay of a delayed object", "add"),
         ("spec s = a[-1.5] ovlp b", "1.5", "not a whole number of samples", ""),
+        ("spec s = center(a) oriented[1] b", "oriented", "a point has none", "compare single objects"),
         ("spec s = enlarge(a, -1) ovlp b", "-1", "negative radius", ""),
         ("spec s = a moved[-1] b", "moved", "negative radius", ""),
         ("spec s = a oriented[1] goal", "oriented", "a region has none", ""),

@@ -21,6 +21,7 @@ from spatial_replay.spec.formula import (
     Atom,
     Boolean,
     Bound,
+    Centre,
     Constant,
     Earlier,
     Enlarged,
@@ -146,6 +147,9 @@ def test_groups_stand_for_their_members() -> None:
         "people[-3]": Earlier(Group("people", class_name="person"), samples=3),
         "(everyone except c)": Group("everyone", class_name=ANY_CLASS, excluded=(TrackedName("c"),)),
         "enlarge(g, 2)[-1s]": Enlarged(Earlier(Group("g", ("a", "b")), duration_ns=10**9), 2.0),
+        "center(a)[-2]": Centre(Earlier(TrackedName("a"), samples=2)),
+        "center(enlarge(center(a), 1))": Centre(TrackedName("a")),
+        "enlarge(center(g), 1)": Enlarged(Centre(Group("g", ("a", "b"))), 1.0),
     }.items():
         assert atom_of(text.format(written)).terms[0] == term
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from spatial_replay.spec.formula import Earlier, Formula
-from spatial_replay.spec.walks import iter_terms, without_enlargement
+from spatial_replay.spec.walks import iter_terms, standing
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
 
@@ -30,7 +30,7 @@ NO_DELAY = Delay(0, None)
 
 def iter_delays(formulas: Iterable[Formula]) -> Iterator[Delay]:
     """Iterate over the delays of the terms in some formulas that look back."""
-    for term in map(without_enlargement, iter_terms(formulas)):
+    for term in map(standing, iter_terms(formulas)):
         if isinstance(term, Earlier):
             yield Delay.of(term)
 

@@ -23,7 +23,7 @@ import numpy as np
 
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats, Integers, starts_from_counts
-from spatial_replay.geometry.footprint import FootprintBatch
+from spatial_replay.geometry.footprint import FootprintBatch, TrackedObject, centre_object
 from spatial_replay.geometry.measure import QUANTITY_CODES
 from spatial_replay.monitor.atoms.delays import NO_DELAY, RecentSamples, iter_delays
 from spatial_replay.monitor.atoms.instructions import LeafCode
@@ -38,6 +38,7 @@ from spatial_replay.monitor.atoms.measurements import quantity_of
 from spatial_replay.monitor.atoms.terms import footprint_from_outline
 from spatial_replay.spec.formula import (
     ANY_CLASS,
+    Centre,
     Enlarged,
     Group,
     Misalignment,
@@ -46,7 +47,7 @@ from spatial_replay.spec.formula import (
     Term,
     TrackedName,
 )
-from spatial_replay.spec.walks import base_of, iter_terms, measured_terms
+from spatial_replay.spec.walks import base_of, is_centre, iter_terms, measured_terms
 from spatial_replay.trace.sample import Sample
 
 
@@ -103,11 +104,11 @@ class LeafPlan:
         lookups = [newest.objects.get]
         if len(samples) > 1:
             lookups = [sample.objects.get if sample else _NOTHING_THERE for sample in samples]
-        for place, name in self._places:
+        for place, name, is_point in self._places:
             name = stands_for.get(name, name) if stands_for else name
             tracked: Any = lookups[place](name)
             if tracked is not None:
-                packed += tracked.packed
+                packed += (centre_object(tracked) if is_point else tracked).packed
                 if self._has_classes:
                     numbers.append(codes[tracked.class_name])
                 continue
@@ -161,8 +162,8 @@ def _arrays(frame: PlanContext, rows: PlanRows, code: LeafCode, outputs: Sequenc
     closest = [rows.of_term(each.group) for each in code.closest]
     members = [rows.of_membership(each) for each in code.members]
     regions = FootprintBatch.from_footprints(
-        [footprint_from_outline(outline) for outline in frame.regions.values()],
-        [outline.height for outline in frame.regions.values()],
+        [each.footprint for each in frame.regions.values()],
+        [each.height for each in frame.regions.values()],
     )
     return PlanArrays(
         extent=_whole(
@@ -225,6 +226,11 @@ _NO_OBJECT = ""
 """A name that no object has."""
 _NOTHING: Mapping[str, str] = MappingProxyType({})
 
+
+def _region(outline: Outline) -> TrackedObject:
+    return TrackedObject(footprint_from_outline(outline), height=outline.height)
+
+
 _Classes: TypeAlias = tuple[int, ...]
 """Codes of the classes of one object in the samples looked at: nearly always one."""
 
@@ -237,15 +243,23 @@ class SampleLeaves:
 
     def __init__(self, leaves: Sequence[Leaves], regions: Mapping[str, Outline]) -> None:
         formulas = list(chain.from_iterable(leaves))
-        bases = [base_of(term) for term in iter_terms(formulas)]
+        terms = list(iter_terms(formulas))
+        bases = [base_of(term) for term in terms]
         open_classes = {base.class_name or "" for base in bases if isinstance(base, Group) and base.is_open}
-        regions_named = {base.name for base in bases if isinstance(base, RegionName)}
+        named = {name: _region(outline) for name, outline in regions.items() if RegionName(name) in bases}
         classes = sorted({name.casefold() for name in open_classes if name != ANY_CLASS})
         self._frame = PlanContext(
             leaves,
             tuple(dict.fromkeys((NO_DELAY, *iter_delays(formulas)))),
             {name: code for code, name in enumerate(classes, start=1)},
-            {name: outline for name, outline in regions.items() if name in regions_named},
+            {
+                **{RegionName(name): each for name, each in named.items()},
+                **{
+                    Centre(base): centre_object(named[base.name])
+                    for base in map(base_of, filter(is_centre, terms))
+                    if isinstance(base, RegionName)
+                },
+            },
         )
         self._regions = regions
         self._recent = RecentSamples(self._frame.delays)

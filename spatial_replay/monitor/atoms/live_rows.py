@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
+from spatial_replay.geometry.footprint import TrackedObject
 from spatial_replay.monitor.atoms.delays import NO_DELAY, Delay
 from spatial_replay.monitor.atoms.instructions import Membership
 from spatial_replay.monitor.atoms.live_kernel import ANY
@@ -13,14 +14,14 @@ from spatial_replay.monitor.atoms.terms import left_out_of, open_group
 from spatial_replay.spec.formula import (
     ANY_CLASS,
     Atom,
+    Centre,
     Earlier,
     Group,
-    Outline,
     Quantified,
     RegionName,
     Term,
 )
-from spatial_replay.spec.walks import without_enlargement
+from spatial_replay.spec.walks import base_of, is_centre, standing
 
 Leaves: TypeAlias = Sequence[Atom | Quantified]
 
@@ -40,13 +41,21 @@ class PlanContext:
         leaves: those of each formula.
         delays: the samples looked at, the newest first.
         classes: the code of each class that open groups ask for, by its name in lower case; others have 0.
-        regions: the shapes that formulas may name.
+        regions: the regions that formulas name, and those of which they name the centre.
     """
 
     leaves: Sequence[Leaves]
     delays: tuple[Delay, ...]
     classes: Mapping[str, int]
-    regions: Mapping[str, Outline]
+    regions: Mapping[RegionName | Centre, TrackedObject]
+
+
+class Place(NamedTuple):
+    """An object in one of the samples looked at, or the point at its centre."""
+
+    sample: int
+    name: str
+    is_centre: bool
 
 
 class Row(NamedTuple):
@@ -64,7 +73,7 @@ class PlanRows:
         self._members = members
         self._sample = {delay: number for number, delay in enumerate(frame.delays)}
         self._region = {name: len(self._sample) + number for number, name in enumerate(frame.regions)}
-        self.places: dict[tuple[int, str], int] = {}
+        self.places: dict[Place, int] = {}
 
     def candidates(self, group: Group | Earlier) -> tuple[str, ...]:
         base = open_group(group)
@@ -84,24 +93,23 @@ class PlanRows:
 
     def of_term(self, term: Term) -> list[Row]:
         """Return the rows whose union a term is."""
-        term = without_enlargement(term)
+        is_point, term = is_centre(term), standing(term)
         sample = self._sample_of(term)
         base = term.term if isinstance(term, Earlier) else term
         if isinstance(base, RegionName):
-            return [Row(self._region[base.name])]
+            return [Row(self._region[Centre(base) if is_point else base])]
         if not isinstance(base, Group):
-            return [Row(self._place(sample, base.name))]
+            return [Row(self._place(sample, base.name, is_point))]
         if base.members is None:
             wanted = self._class_wanted(base)
-            return [Row(self._place(sample, name), wanted) for name in self.candidates(base)]
+            return [Row(self._place(sample, name, is_point), wanted) for name in self.candidates(base)]
         left_out = left_out_of(base)
-        return [Row(self._place(sample, name)) for name in base.members if name not in left_out]
+        return [Row(self._place(sample, name, is_point)) for name in base.members if name not in left_out]
 
     def required(self, term: Term) -> list[int]:
         """Return the rows, its sample's among them, without which a term is unknown."""
-        term = without_enlargement(term)
-        base = term.term if isinstance(term, Earlier) else term
-        sample = [self._sample_of(term)] if isinstance(term, Earlier) else []
+        then, base = standing(term), base_of(term)
+        sample = [self._sample_of(then)] if isinstance(then, Earlier) else []
         if isinstance(base, RegionName) or (isinstance(base, Group) and base.members is None):
             return sample
         return sample + [each.row for each in self.of_term(term)]
@@ -114,6 +122,6 @@ class PlanRows:
             return ANY
         return self._frame.classes[(group.class_name or "").casefold()]
 
-    def _place(self, sample: int, name: str) -> int:
+    def _place(self, sample: int, name: str, is_centre: bool = False) -> int:
         first = len(self._sample) + len(self._region)
-        return self.places.setdefault((sample, name), first + len(self.places))
+        return self.places.setdefault(Place(sample, name, is_centre), first + len(self.places))

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
 from copy import copy
+from dataclasses import replace
 from functools import reduce
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +26,7 @@ from spatial_replay.monitor.atoms.closest_pair import ClosestPair
 from spatial_replay.monitor.atoms.instructions import LeafCode, Membership, run_instructions
 from spatial_replay.monitor.atoms.terms import Bindings, TraceScene
 from spatial_replay.spec.formula import (
+    Centre,
     CentroidProjection,
     Enlarged,
     Formula,
@@ -154,8 +157,9 @@ def _region(term: Term) -> str | None:
 
 
 def _unnamed(term: Term) -> Term:
-    if isinstance(term, Enlarged):
-        return Enlarged(_unnamed(term.term), term.radius)
+    if isinstance(term, Enlarged | Centre):
+        inner: Any = _unnamed(term.term)
+        return replace(term, term=inner)
     return RegionName("") if _region(term) is not None else term
 
 
@@ -209,6 +213,7 @@ class MovedLeaves:
         Args:
             vertices: (V or more, 2), in the places of the scene's.
         """
+        vertices = self._scene.with_centres(vertices)
         values = self._measured.measure(vertices)
         if self.compares_turns:
             if len(values):

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
 
 from spatial_replay.geometry.arrays import Booleans, Flags, Floats, Integers
-from spatial_replay.geometry.footprint import Footprint, FootprintBatch
+from spatial_replay.geometry.footprint import Footprint, FootprintBatch, centres_of
 from spatial_replay.geometry.measure import Operand
 from spatial_replay.spec.formula import (
     ANY_CLASS,
+    Centre,
     Earlier,
     Enlarged,
     Group,
@@ -60,6 +61,7 @@ class TraceScene:
         self.regions = regions
         self.skip = skip
         self._column = {name: index for index, name in enumerate(trace.names)}
+        self._has_centres = False
         self._resolved: dict[Term, ResolvedTerm] = {}
         self._members: dict[Group | Earlier, tuple[tuple[str, ...], Flags, Booleans]] = {}
 
@@ -71,9 +73,26 @@ class TraceScene:
         """Whether nothing in the trace is uncertain."""
         return not self.trace.uncertainty.any()
 
-    @cached_property
+    @property
     def batch(self) -> FootprintBatch:
-        """The trace's footprints, and after them the regions'."""
+        """The trace's footprints, after them the regions'; with a `Centre` resolved, the centres of all."""
+        return self._with_centres if self._has_centres else self._whole
+
+    @cached_property
+    def _with_centres(self) -> FootprintBatch:
+        return FootprintBatch.concatenate([self._whole, centres_of(self._whole)])
+
+    def with_centres(self, vertices: Floats) -> Floats:
+        """Return other vertices of the batch, followed by any, with the centres that belong to them."""
+        if not self._has_centres:
+            return vertices
+        count = len(self._whole.vertices)
+        moved = self._whole.with_outlines(self._whole.vertex_start, vertices[:count])
+        centres = centres_of(moved).vertices
+        return np.concatenate((vertices[:count], centres, vertices[count + len(centres) :]))
+
+    @cached_property
+    def _whole(self) -> FootprintBatch:
         regions = [footprint_from_outline(outline) for outline in self.regions.values()]
         if not regions:
             return self.trace.footprints
@@ -120,6 +139,10 @@ class TraceScene:
             inner = self.resolve(term.term)
             operand = Operand(inner.operand.rows, inner.operand.enlargement + term.radius)
             return ResolvedTerm(operand, inner.unknown, inner.spread, inner.yaw)
+        if isinstance(term, Centre):
+            inner, self._has_centres = self.resolve(term.term), True
+            rows = inner.operand.rows
+            return replace(inner, operand=Operand(np.where(rows < 0, rows, rows + len(self._whole))))
         base, source = self._base_and_source(term)
         if isinstance(base, RegionName):
             return self._found_region(base, source < 0)

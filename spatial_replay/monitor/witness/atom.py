@@ -22,8 +22,8 @@ from spatial_replay.spec.formula import (
     Atom,
     Boolean,
     CentroidProjection,
+    DerivedTerm,
     Earlier,
-    Enlarged,
     Equality,
     Expression,
     Formula,
@@ -48,9 +48,9 @@ from spatial_replay.spec.walks import (
     base_of,
     iter_expressions,
     measured_terms,
+    standing,
     substitute,
     terms_of,
-    without_enlargement,
 )
 from spatial_replay.text import is_text_number
 from spatial_replay.trace.trace import ABSENT
@@ -98,7 +98,7 @@ def _reasons_of_term(scene: TraceScene, part: Expression, term: Term) -> Iterato
 
 def _missing(scene: TraceScene, term: Term) -> Iterator[str]:
     """Iterate over the reasons why a term is unknown."""
-    term = without_enlargement(term)
+    term = standing(term)
     if isinstance(term, Earlier) and _is_before_the_first(scene, term):
         yield f"{format_term(term)} looks back to before the first sample"
         return
@@ -329,7 +329,7 @@ def _singles(scene: TraceScene, term: Term) -> list[Term]:
     if not isinstance(base, Group):
         return [term]
     if base.members is None:
-        group: Any = without_enlargement(term)
+        group: Any = standing(term)
         names, members, _ = scene.members(group)
         present = [name for name, is_member in zip(names, members[0].tolist(), strict=True) if is_member]
     else:
@@ -339,12 +339,10 @@ def _singles(scene: TraceScene, term: Term) -> list[Term]:
 
 
 def _of_member(term: Term, name: str) -> Term:
-    match term:
-        case Enlarged():
-            return Enlarged(_of_member(term.term, name), term.radius)
-        case Earlier():
-            return replace(term, term=TrackedName(name))
-    return TrackedName(name)
+    if not isinstance(term, DerivedTerm):
+        return TrackedName(name)
+    inner: Any = _of_member(term.term, name)
+    return replace(term, term=inner)
 
 
 def _contact(scene: TraceScene, part: Measurement) -> Contact | None:
