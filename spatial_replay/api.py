@@ -96,8 +96,8 @@ def replay_log(
         specifications: one or several, parsed or as files; None takes those that the log was written with.
         output: the annotated log to write (MCAP).
         layer: write the derived messages only, without the log's own.
-        keep: the log's own messages in the output: "all" (the default), "mapped" for mapped topics, or
-            patterns of topics such as "/camera/*"; several add up.
+        keep: the log's own messages in the output: "all", "mapped" for mapped topics, or patterns of topics
+            such as "/camera/*"; several add up. The default is all, of a ROS 2 bag none.
         arrow: the title of the result whose violation the output's scene points at; "" for the first one.
         options: how to evaluate it (`constants`, `each`, `semantics`, `start_ns`, `end_ns`, `every`,
             `strict_names`; see `Evaluating`), and how to read it, as for `read_trace`.

@@ -200,14 +200,14 @@ constants_option = click.option(
 )
 
 
-def keep_option(text: str) -> Callable[[_Command], _Command]:
-    """Return the repeatable option `--keep`, with the beginning of its help."""
+def keep_option(text: str, default: str = "all") -> Callable[[_Command], _Command]:
+    """Return the repeatable option `--keep`, with the beginning and the end of its help."""
     return click.option(
         "--keep",
         metavar="all|mapped|PATTERN",
         multiple=True,
         help=f"{text}: all, those of mapped topics, or of topics such as '/camera/*'; repeat for several."
-        "  [default: all]",
+        f"  [default: {default}]",
     )
 
 

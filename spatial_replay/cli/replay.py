@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 @evaluation_options
 @output_option("Annotated log to write (MCAP).")
 @click.option("--layer", is_flag=True, help="Write the derived messages only, without the log's own.")
-@keep_option("With -o: messages of the log to copy")
+@keep_option("With -o: messages of the log to copy", "all, of a ROS 2 bag none")
 @click.option(
     "--arrow",
     metavar="RESULT",
@@ -109,7 +109,7 @@ def replay(
     """
     # imported here so that --help stays fast
     from spatial_replay.logs.topics import MAPPED
-    from spatial_replay.replay import run_replay
+    from spatial_replay.replay import default_keep, run_replay
 
     if (series or signal) and json_file is None:
         option = "--series" if series else "--signal"
@@ -158,6 +158,11 @@ def replay(
         write_document(replayed, json_file, request.inputs, signal=signal, window_ns=window_ns)
     if json_file != "-":
         print_verdicts(replayed, output, window_ns)
+    if output is not None and not layer and not keep and not default_keep(inputs.source):
+        hint = f"{output} is opened next to it; with --keep all it holds its messages, too"
+        show_message(
+            "note", f"{inputs.source.name} stays as it is, for rosbags and `ros2 bag`: {hint}", "cyan"
+        )
     verdicts = [str(result.verdict) for result in replayed.results]
     if "violated" in verdicts and json_file != "-" and semantics == "ltlf" and sys.stderr.isatty():
         hint = "`spatial-replay explain` with the same log and specifications says what would have helped"

@@ -49,6 +49,7 @@ from spatial_replay.replay.selection import (
     ReplayOptions,
     Selection,
     Window,
+    default_keep,
     first_sample_ns,
 )
 from spatial_replay.spec.diagnostics import Diagnostic
@@ -432,7 +433,7 @@ def run_replay(
         OutputError: the output cannot be written.
     """
     if options.keep is None and output is not None and not layer:
-        options = replace(options, keep=KEEP_ALL)
+        options = replace(options, keep=default_keep(source))
     replay = Replay(
         source,
         files,

@@ -6,7 +6,7 @@ from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from types import MappingProxyType
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -33,8 +33,21 @@ from spatial_replay.text import time_text
 from spatial_replay.trace.sample import FOREVER
 from spatial_replay.trace.trace import Trace, window_of, within
 
+if TYPE_CHECKING:
+    from spatial_replay.bags.reader import MessageReader
+
 KEEP_ALL: Final = (ALL,)
 """Default selection of a copy."""
+
+
+def default_keep(source: Source) -> tuple[str, ...]:
+    """Return what an annotated log keeps of a source's messages: of ROS 2 nothing.
+
+    rosbags refuses a file with a channel that is not ROS, and `ros2 bag` plays none. So the bag stays as it
+    is, and the annotated log is opened next to it.
+    """
+    messages = _external(source)
+    return () if messages is not None and messages.profile == "ros2" else KEEP_ALL
 
 
 def source_keeping(source: Source, keep: Sequence[str] | None) -> Source:
@@ -75,13 +88,19 @@ def _topics(source: Source) -> list[str]:
     if isinstance(source, McapSource):
         with source.open_walk() as walk:
             return sorted({channel.topic for channel in walk.channels.values()})
-    path = getattr(source, "path", None)
-    if hasattr(source, "keep") and isinstance(path, LogFile):
-        # readers of external logs are loaded when there is one
-        from spatial_replay.bags.open import open_messages
+    messages = _external(source)
+    return [] if messages is None else [topic.name for topic in messages.topics()]
 
-        return [topic.name for topic in open_messages(path).topics()]
-    return []
+
+def _external(source: Source) -> MessageReader | None:
+    """Return a reader of the messages that a mapping reads; None for other sources."""
+    path = getattr(source, "path", None)
+    if not hasattr(source, "mapping") or not isinstance(path, LogFile):
+        return None
+    # readers of external logs are loaded when there is one
+    from spatial_replay.bags.open import open_messages
+
+    return open_messages(path)
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +133,7 @@ class ReplayOptions:
         strict_names: names that the log never has are errors; otherwise objects and signals are unknown, and
             a template has no result for a class.
         keep: which messages of the log a copy keeps: "all", "mapped", patterns of topics; () for the samples
-            only. None for all in a copy and, without one, those that need not be read for it.
+            only. None for `default_keep` in a copy and, without one, those that need not be read for it.
         arrow: the title of the result whose violation the scene points at; "" for the first one.
     """
 

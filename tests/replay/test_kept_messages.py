@@ -95,7 +95,7 @@ def _copy(log: Path, mapping: str, formula: str, folder: Path, *keep: str) -> Pa
     source = open_source(log, mapping=_write(folder / "m.yaml", mapping))
     output = folder / "annotated.mcap"
     spec = sr.parse_specification(formula)
-    run_replay(source, [spec], ReplayOptions(keep=keep or None), output=output)
+    run_replay(source, [spec], ReplayOptions(keep=keep or ("all",)), output=output)
     return output
 
 
@@ -173,6 +173,35 @@ def test_keep_says_which_messages_are_copied_and_the_copy_verifies(
     assert run(["verify", "copy.mcap", "--source", "drive.bag", *reading]) == 0
     about = dict(content_of(Path("copy.mcap")).metadata)["spatial_replay"]
     assert json.loads(about["options"]).get("keep", ["all"]) == (keep or ["all"])
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_a_ros_2_bag_stays_readable_by_rosbags_next_to_what_a_replay_writes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], storage: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_ros2(Path("drive"), drive(), storage=storage)  # type: ignore[arg-type]
+    _write(Path("m.yaml"), DRIVE)
+    _write(Path("s.spatial"), "spec s = F (a dist b >= 1)\n")
+
+    def read_by_rosbags() -> list[tuple[str, int, bytes]]:
+        with Reader2("drive") as reader:
+            return [(each.topic, time_ns, bytes(data)) for each, time_ns, data in reader.messages()]
+
+    before, files = read_by_rosbags(), sorted(Path("drive").iterdir())
+    replaying = ["replay", "drive", "--mapping", "m.yaml", "--spec", "s.spatial", "-o"]
+    assert run([*replaying, "ours.mcap"]) == 0
+    assert "ours.mcap is opened next to it" in capsys.readouterr().err
+    assert read_by_rosbags() == before
+    assert sorted(Path("drive").iterdir()) == files
+    assert len(before) == len(drive())
+    assert not _mcap(Path("ours.mcap"))
+    # ours stands for itself
+    for command in ("replay", "explain", "verify"):
+        assert run([command, "ours.mcap"]) == 0
+    assert run(["verify", "ours.mcap", "--source", "drive", "--mapping", "m.yaml"]) == 0
+    assert run([*replaying, "both.mcap", "--keep", "all"]) == 0
+    assert _mcap(Path("both.mcap")) == Counter(before)
 
 
 def test_a_recording_of_a_bag_verifies_against_the_bag(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
