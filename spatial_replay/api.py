@@ -7,13 +7,14 @@ from dataclasses import replace
 from os import PathLike, fspath
 from pathlib import Path
 from reprlib import repr as shortened
-from typing import TYPE_CHECKING, Literal, TypeAlias, TypedDict, Unpack
+from typing import TYPE_CHECKING, TypeAlias, Unpack
 
 from spatial_replay.compare.clips import Clip, cut_clip
 from spatial_replay.compare.runs import LogDiff, diff_sources
 from spatial_replay.compare.specifications import SpecificationDiff, diff_over_source
 from spatial_replay.errors import UsageError
 from spatial_replay.learning.learned import DEFAULT_LINES, Learned, learn_runs
+from spatial_replay.logs.read_options import Reading
 from spatial_replay.logs.remote import LogFile, local_copy, local_files, log_file, sendable
 from spatial_replay.logs.source import MemorySource, Source
 from spatial_replay.logs.topics import MAPPED
@@ -44,19 +45,6 @@ if TYPE_CHECKING:
 PathName: TypeAlias = str | PathLike[str]
 Log: TypeAlias = PathName | Trace
 Specifications: TypeAlias = Specification | PathName | Sequence[Specification | PathName]
-
-
-class Reading(TypedDict, total=False):
-    """How to read a log: the options of `read_trace`."""
-
-    mapping: PathName | None
-    concave: Literal["decompose", "hull"]
-    on_time_jump: Literal["error", "split"]
-    rate: float | None
-    lost: Literal["drop", "keep"]
-    y_down: bool | None
-    late: str
-    max_gap: str | None
 
 
 class Evaluating(Reading, total=False):

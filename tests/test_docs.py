@@ -133,7 +133,7 @@ def test_the_explanation_on_a_page_is_what_the_command_prints(
     shown = re.findall(r"^(`laid` is violated.*?)^```$", text, re.MULTILINE | re.DOTALL)
     recordings = ROOT / "recordings"
     files = [str(recordings / "table.jsonl"), "--spec", str(recordings / "table_edited.spatial")]
-    assert run_in_process(["explain", *files, "--node", "laid"]) == 1
+    assert run_in_process(["explain", *files, "--result", "laid"]) == 1
     assert [each.split() for each in shown] == [capsys.readouterr().out.split()]
 
 

@@ -264,8 +264,8 @@ def iter_counted(
 DISORDER_NS = 10**9
 """How far messages may be out of order by default: recorders write topics from several threads."""
 JUMP_REMEDY = (
-    "late='5s' (--late 5s) takes messages that come later, 'all' sorts the whole log; on_time_jump='split'"
-    " (--on-time-jump split) ends it where its clock jumps"
+    "max_lateness='5s' (--max-lateness 5s) takes messages that come later, 'all' sorts the whole log;"
+    " on_time_jump='split' (--read on_time_jump=split) ends it where its clock jumps"
 )
 
 

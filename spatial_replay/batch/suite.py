@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Final, Protocol, TypeAlias, TypeVar, cast
 
 from spatial_replay.errors import UsageError
+from spatial_replay.logs.read_options import KEYS
 from spatial_replay.logs.remote import is_address
 from spatial_replay.mapping.yaml_document import (
     Document,
@@ -33,7 +34,6 @@ from spatial_replay.trace.trace import time_point_from_text
 LARGEST_SUITE: Final = 8 * 2**20
 """Bytes of a suite file."""
 _Value = TypeVar("_Value")
-_READING: Final = ("on_time_jump", "late", "max_gap", "rate", "lost", "y_down", "concave")
 Pairs: TypeAlias = tuple[tuple[str, _Value], ...]
 """A table that can be hashed, and sent to another process."""
 
@@ -310,7 +310,7 @@ def _case(
         specs=tuple(_file(spec, folder) for spec in specs),
         conditions=Conditions(
             mapping=None if mapping is None else _file(mapping, folder),
-            reading=tuple((key, entry[key]) for key in _READING if key in entry),
+            reading=tuple((key, entry[key]) for key in KEYS if key in entry),
             start=None if start is None else str(start),
             end=None if end is None else str(end),
             every=entry.get("every", 1),

@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import click
 
@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from spatial_replay.batch.run_table import By, Total
     from spatial_replay.batch.suite import Suite
     from spatial_replay.batch.workers import Workers
+    from spatial_replay.logs.remote import LogFile
     from spatial_replay.monitor.semantics import Semantics
 
 
@@ -312,12 +313,11 @@ def _suite(logs: tuple[str, ...], given: ConditionArguments, semantics: Semantic
     """
     from spatial_replay.batch.suite import Conditions, Suite, load_suite
 
-    reading = given.reading
-    own = {name: value for name, value in reading.items() if name != "mapping"}
-    changed = {name: value for name, value in own.items() if value != _READING_DEFAULTS[name]}
+    reading = dict(given.reading)
+    mapping = reading.pop("mapping", None)
     conditions = Conditions(
-        mapping=None if reading["mapping"] is None else sendable(reading["mapping"]),
-        reading=tuple(sorted(changed.items())),
+        mapping=None if mapping is None else sendable(cast("LogFile", mapping)),
+        reading=tuple(sorted(reading.items())),
         start=given.start,
         end=given.end,
         every=given.every,
@@ -345,17 +345,6 @@ def _suite(logs: tuple[str, ...], given: ConditionArguments, semantics: Semantic
             f"{suites[0]} says how its logs are evaluated; change it there, or give logs and options"
         )
     return load_suite(suites[0])
-
-
-_READING_DEFAULTS: Mapping[str, Any] = {
-    "on_time_jump": "error",
-    "late": "1s",
-    "max_gap": None,
-    "rate": None,
-    "lost": "drop",
-    "y_down": None,
-    "concave": "decompose",
-}
 
 
 def _check_time(option: str, text: str) -> None:

@@ -13,9 +13,9 @@ import click
 
 from spatial_replay import __version__
 from spatial_replay.cli.options import (
+    OTHER_READING,
     JsonCommand,
     LogPath,
-    ReadArguments,
     constants_option,
     load_spec_options,
     profile_option,
@@ -34,6 +34,7 @@ from spatial_replay.spec.tokens import quoted
 from spatial_replay.text import counted, counted_from, json_number
 
 if TYPE_CHECKING:
+    from spatial_replay.logs.read_options import Reading
     from spatial_replay.monitor.plausibility import ThresholdRange
 
 
@@ -138,7 +139,7 @@ _AUTOMATON_FILES = (".dot", ".hoa", ".svg")
     metavar="FILE|-",
     help="Automaton to write, as .dot, .hoa or .svg; - prints it as text.",
 )
-@click.option("--of", metavar="NAME", help="With --dfa: which result, if SPEC has several.")
+@click.option("--result", "of", metavar="NAME", help="With --dfa: which result, if SPEC has several.")
 @click.option("--hz", metavar="N", type=float, help="With --dfa: samples per second, for bounds in seconds.")
 def check(
     specification: LogFile,
@@ -151,7 +152,7 @@ def check(
     dfa: str | None,
     of: str | None,
     hz: float | None,
-    reading: ReadArguments,
+    reading: Reading,
 ) -> None:
     """Check a specification and print its tree.
 
@@ -165,7 +166,7 @@ def check(
       spatial-replay check blocks.spatial --format github
     """
     if of is not None and dfa is None:
-        raise UsageError("--of chooses an automaton; add --dfa FILE")
+        raise UsageError("--result chooses an automaton; add --dfa FILE")
     if hz is not None and dfa is None:
         raise UsageError("--hz is for an automaton; add --dfa FILE")
     if as_json and dfa == "-":
@@ -221,19 +222,15 @@ def _examined(specification: Specification) -> list[Diagnostic]:
     return [each.diagnostic for each in doctor(specification, examples=False).findings]
 
 
-def _refuse_log_options(reading: ReadArguments, strict_names: bool) -> None:
+def _refuse_log_options(reading: Reading, strict_names: bool) -> None:
     """Refuse options that say something about a log where there is none."""
-    defaults = {"on_time_jump": "error", "lost": "drop", "concave": "decompose", "late": "1s"}
-    given = [name for name, value in reading.items() if value not in (None, defaults.get(name))]
-    for name in [*given, *(["strict_names"] if strict_names else [])]:
-        option = (
-            "--y-up" if reading["y_down"] is False and name == "y_down" else f"--{name.replace('_', '-')}"
-        )
+    for name in [*reading, *(["strict_names"] if strict_names else [])]:
+        option = f"--read {name}" if name in OTHER_READING else f"--{name.replace('_', '-')}"
         raise UsageError(f"{option} applies to the log to compare with; add --log LOG")
 
 
 def _compare_with_log(
-    specification: Specification, log: LogFile, reading: ReadArguments, strict_names: bool
+    specification: Specification, log: LogFile, reading: Reading, strict_names: bool
 ) -> _Compared:
     """Compare names, thresholds, regions and windows with what a log has."""
     # only needed with --log: log readers load the numerical libraries

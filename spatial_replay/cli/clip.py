@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 @evaluation_options
 @log_output_option("Clip to write (MCAP).")
 @click.option(
-    "--of",
+    "--result",
+    "of",
     metavar="NAME",
     multiple=True,
     help="Spec to keep the verdict of; repeat for several.  [default: the violated ones, or all]",
@@ -59,7 +60,7 @@ def clip(
     \b
     Examples:
       spatial-replay clip run.mcap --spec blocks.spatial -o bug.mcap
-      spatial-replay clip run.mcap --spec blocks.spatial --of passage --around 5s -o bug.mcap
+      spatial-replay clip run.mcap --spec blocks.spatial --result passage --around 5s -o bug.mcap
     """
     # imported here so that --help stays fast
     from spatial_replay.compare.clips import cut_clip
@@ -84,7 +85,7 @@ def clip(
     print_verdicts(found.replayed, output)
     show(_summary(found))
     if found.left_out and not of:
-        show(f"  not kept, since nothing failed there: {', '.join(found.left_out)}; --of NAME keeps one")
+        show(f"  not kept, since nothing failed there: {', '.join(found.left_out)}; --result NAME keeps one")
     for title in (each for each in found.changed if of or each not in found.left_out):
         warn(f"{title} has another verdict in the clip than in the log; only {', '.join(found.kept)} is kept")
     if found.added:

@@ -42,13 +42,15 @@ if TYPE_CHECKING:
 
 @click.command(cls=JsonCommand)
 @evaluation_options
-@click.option("--node", metavar="NAME", help="Named spec to explain.  [default: all results]")
-@click.option("--object", "object_name", metavar="NAME", help="Template: explain the result of this object.")
+@click.option(
+    "--result",
+    metavar="NAME[@OBJECT]",
+    default="",
+    help="Named spec to explain, of a template for one object.  [default: all results]",
+)
 @click.option("--at", metavar="T", help="Explain the verdict at time T, on the samples up to it.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
-def explain(
-    request: EvaluationArguments, node: str | None, object_name: str | None, at: str | None, as_json: bool
-) -> int:
+def explain(request: EvaluationArguments, result: str, at: str | None, as_json: bool) -> int:
     """Explain a verdict in plain sentences.
 
     For each result: the sample, objects and relation that decided it, by how much and since when, and the
@@ -60,7 +62,7 @@ def explain(
     \b
     Examples:
       spatial-replay explain run.mcap --spec blocks.spatial
-      spatial-replay explain run.mcap --spec blocks.spatial --node reach --at 12.3s
+      spatial-replay explain run.mcap --spec blocks.spatial --result reach --at 12.3s
     """
     # imported here so that --help stays fast
     from spatial_replay.logs.topics import MAPPED
@@ -72,6 +74,8 @@ def explain(
         verdict_of,
     )
 
+    name, _, object_of = result.partition("@")
+    node, object_name = name or None, object_of or None
     if at is not None and request.end is not None:
         raise UsageError("--at and --to both set the last sample; give only one")
     inputs = _until(open_inputs(request), at)

@@ -70,7 +70,7 @@ def export(request: EvaluationArguments, output: Path, quantity: Quantity) -> in
 def _is_evaluated(request: EvaluationArguments) -> bool:
     """Return whether a log is evaluated first; an annotated one has its numbers already."""
     options = (request.specs, request.constants, request.choices, request.start, request.end, request.profile)
-    return any(options) or request.every > 1 or request.reading["mapping"] is not None
+    return any(options) or request.every > 1 or request.reading.get("mapping") is not None
 
 
 def _evaluate(request: EvaluationArguments, output: Path) -> tuple[str, ...]:

@@ -16,7 +16,6 @@ from spatial_replay.cli.application import ExitCode
 from spatial_replay.cli.options import (
     JsonCommand,
     LogPath,
-    ReadArguments,
     input_files,
     output_option,
     reading_options,
@@ -39,6 +38,7 @@ from spatial_replay.text import counted, counted_from, escaped, requirement_text
 
 if TYPE_CHECKING:
     from spatial_replay.logs.mcap.read import LogSummary
+    from spatial_replay.logs.read_options import Reading
     from spatial_replay.logs.source import Source
     from spatial_replay.sources.overview import Overview, Survey
     from spatial_replay.spec.formula import NamedSpec
@@ -48,7 +48,7 @@ _EPOCH_LIKELY_NS = 10**18
 """Later times are taken to count from 1970 (2001 or later), earlier ones from the start of the run."""
 
 
-_OF_MESSAGES = frozenset({"mapping", "on_time_jump", "late", "max_gap"})
+_OF_MESSAGES = frozenset({"mapping", "on_time_jump", "max_lateness", "max_gap"})
 """Options of reading that say something about an external log."""
 
 
@@ -79,7 +79,7 @@ def info(
     layout: bool,
     panel: bool,
     output: Path | None,
-    reading: ReadArguments,
+    reading: Reading,
 ) -> int:
     """Show what a log contains: samples, objects, signals, topics, attachments.
 
@@ -131,7 +131,7 @@ def info(
         return _print_overview(log, as_json, reading)
 
 
-def _print_overview(log: LogFile, as_json: bool, reading: ReadArguments) -> int:
+def _print_overview(log: LogFile, as_json: bool, reading: Reading) -> int:
     """Print what a log contains."""
     # imported here so that --help stays fast
     from spatial_replay.logs.read_options import ReadOptions
@@ -143,7 +143,7 @@ def _print_overview(log: LogFile, as_json: bool, reading: ReadArguments) -> int:
     if reader is not None:
         with progress("messages") as advance:
             surveyed = survey(reader, advance)
-    if surveyed is not None and reading["mapping"] is None:
+    if surveyed is not None and reading.get("mapping") is None:
         ReadOptions(**reading).refuse_except(_OF_MESSAGES, surveyed.kind, surveyed.name)
         overview = overview_of_survey(log, surveyed)
     else:

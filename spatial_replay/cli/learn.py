@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from spatial_replay.cli.application import ExitCode
 from spatial_replay.cli.options import (
     LogPath,
-    ReadArguments,
     input_files,
     output_option,
     profile_option,
@@ -18,6 +18,9 @@ from spatial_replay.cli.options import (
 from spatial_replay.cli.terminal import progress, show, show_file, show_json
 from spatial_replay.cli.tune import ManyLogs
 from spatial_replay.logs.remote import LogFile
+
+if TYPE_CHECKING:
+    from spatial_replay.logs.read_options import Reading
 
 
 @click.command(cls=ManyLogs)
@@ -37,7 +40,7 @@ def learn(
     lines: int | None,
     as_json: bool,
     profile: str | None,
-    reading: ReadArguments,
+    reading: Reading,
 ) -> ExitCode:
     """Find a short specification that all GOOD runs satisfy and that bad ones violate.
 

@@ -91,11 +91,11 @@ def _bytes(context: click.Context, parameter: click.Parameter, text: str) -> int
     help="End when a spec is violated, when all are satisfied, or when each is one or the other.",
 )
 @click.option(
-    "--dead-man",
-    "dead_man_s",
+    "--topic-timeout",
+    "topic_timeout_s",
     metavar="T",
     callback=_seconds,
-    help="After so much silence of a topic, what it reported is unknown.",
+    help="Objects of a topic become unknown after T without messages.",
 )
 @click.option(
     "--max-delay",
@@ -154,7 +154,7 @@ def monitor(
     topics: tuple[str, ...],
     length_s: float | None,
     until: str | None,
-    dead_man_s: float | None,
+    topic_timeout_s: float | None,
     max_delay_s: float,
     triggers: tuple[str, ...],
     before_s: float,
@@ -199,7 +199,11 @@ def monitor(
         raise UsageError("--trigger writes clips; add --clips DIR")
     if clips is None:
         _refuse_given("before_s", "after_s", "ring")
-    for option, given in (("--for", length_s), ("--dead-man", dead_man_s), ("--max-delay", max_delay_s)):
+    for option, given in (
+        ("--for", length_s),
+        ("--topic-timeout", topic_timeout_s),
+        ("--max-delay", max_delay_s),
+    ):
         if given is not None and given <= 0:
             raise UsageError(f"{option} is 0; give it a length, as in {option} 2s")
     files = load_spec_options(specs, profile, constants)
@@ -228,7 +232,7 @@ def monitor(
             recorders=writers,
             topics=topics,
             max_delay_s=max_delay_s,
-            dead_man_s=dead_man_s,
+            topic_timeout_s=topic_timeout_s,
         )
         run = _Run(session, recorders, length_s, until)
         asyncio.run(run.follow())

@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import partial, wraps
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypedDict, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import click
 
@@ -23,6 +23,7 @@ from spatial_replay.trace.trace import time_point_from_text
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from spatial_replay.logs.read_options import Reading
     from spatial_replay.logs.source import Source
     from spatial_replay.monitor.semantics import Semantics
     from spatial_replay.recording.recorder import Recorded
@@ -203,7 +204,8 @@ constants_option = click.option(
 def keep_option(text: str, default: str = "all") -> Callable[[_Command], _Command]:
     """Return the repeatable option `--keep`, with the beginning and the end of its help."""
     return click.option(
-        "--keep",
+        "--topics",
+        "keep",
         metavar="all|mapped|PATTERN",
         multiple=True,
         help=f"{text}: all, those of mapped topics, or of topics such as '/camera/*'; repeat for several."
@@ -275,17 +277,30 @@ def add_options(options: Sequence[_Option], command: Callable[..., Any]) -> Call
     return command
 
 
-class ReadArguments(TypedDict):
-    """How to read a log: the keyword arguments of `open_source`."""
+OTHER_READING = {
+    "rate": "frames a second of drone annotations",
+    "lost": "keep boxes of drone annotations that are marked as lost",
+    "y_down": "y points down in tracks or annotations",
+    "concave": "take the hull of concave polygons",
+    "on_time_jump": "end an external log where its clock jumps back",
+}
 
-    mapping: LogFile | None
-    on_time_jump: Literal["error", "split"]
-    rate: float | None
-    lost: Literal["drop", "keep"]
-    y_down: bool | None
-    concave: Literal["decompose", "hull"]
-    late: str
-    max_gap: str | None
+
+def _read_pairs(
+    context: click.Context, parameter: click.Parameter, texts: tuple[str, ...]
+) -> dict[str, object]:
+    pairs: dict[str, object] = {}
+    for text in texts:
+        key, _, value = text.partition("=")
+        if key not in OTHER_READING or not value:
+            raise UsageError(f"--read {text!r:.100}: give KEY=VALUE with one of {', '.join(OTHER_READING)}")
+        try:
+            pairs[key] = {"true": True, "false": False}.get(value) if key == "y_down" else float(value)
+        except ValueError:
+            pairs[key] = value
+        if pairs[key] is None:
+            raise UsageError(f"--read {text!r:.100}: give y_down=true or y_down=false")
+    return pairs
 
 
 _READING = (
@@ -296,15 +311,8 @@ _READING = (
         help="Mapping file (YAML): which topics of an external log carry which objects.",
     ),
     click.option(
-        "--on-time-jump",
-        type=click.Choice(["error", "split"]),
-        default="error",
-        help="External logs whose clock jumps back: refuse, or end the log there.  [default: error]",
-    ),
-    click.option(
-        "--late",
+        "--max-lateness",
         metavar="T|all",
-        default="1s",
         help="External logs: how late messages may come, such as 2s; all sorts the whole log.  [default: 1s]",
     ),
     click.option(
@@ -313,32 +321,26 @@ _READING = (
         help="Pauses of samples, or of a mapped topic, are unknown if they are longer than T.",
     ),
     click.option(
-        "--rate", metavar="N", type=float, help="Drone annotations: frames per second.  [default: 30]"
-    ),
-    click.option(
-        "--lost",
-        type=click.Choice(["drop", "keep"]),
-        default="drop",
-        help="Drone annotations: drop or keep boxes marked as lost.  [default: drop]",
-    ),
-    click.option(
-        "--y-down/--y-up",
-        default=None,
-        help="Tracks, annotations: y points down in the file, as in images; it is turned over."
-        "  [default: down in drone annotations, else up]",
-    ),
-    click.option(
-        "--concave",
-        type=click.Choice(["decompose", "hull"]),
-        default="decompose",
-        help="Split concave polygons into convex parts, or take their hull.  [default: decompose]",
+        "--read",
+        metavar="KEY=VALUE",
+        multiple=True,
+        callback=_read_pairs,
+        help="Other options of reading, such as rate=29.97, lost=keep, y_down=true, concave=hull,"
+        " on_time_jump=split; repeat for several.",
     ),
 )
 
 
 def reading_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options that say how to read a log; the command takes them as `reading`."""
-    return add_options(_READING, gather("reading", ReadArguments, command))
+    """Add the options that say how to read a log; the command takes the given ones as `reading`."""
+
+    @wraps(command)
+    def gathered(*, read: dict[str, object], **arguments: Any) -> Any:
+        given = {name: arguments.pop(name) for name in ("mapping", "max_lateness", "max_gap")}
+        reading = {name: value for name, value in given.items() if value is not None} | read
+        return command(reading=reading, **arguments)
+
+    return add_options(_READING, gathered)
 
 
 @dataclass(frozen=True, slots=True)
@@ -353,7 +355,7 @@ class ConditionArguments:
     constants: Mapping[str, float | str]
     strict_names: bool
     profile: str | None
-    reading: ReadArguments
+    reading: Reading
 
 
 @dataclass(frozen=True, slots=True)
@@ -368,9 +370,9 @@ class EvaluationArguments(ConditionArguments):
         return input_files(self.log, *self.specs, reading=self.reading)
 
 
-def input_files(*files: LogFile, reading: ReadArguments) -> tuple[Path, ...]:
+def input_files(*files: LogFile, reading: Reading) -> tuple[Path, ...]:
     """Return the files on this machine that a command reads, the mapping among them."""
-    mapping = reading["mapping"]
+    mapping = reading.get("mapping")
     return tuple(local_files(files if mapping is None else (*files, mapping)))
 
 
@@ -529,14 +531,14 @@ def load_spec_options(
 
 
 def require_choice(specification: Specification, of: str | None) -> None:
-    """Require `--of` where a specification has several results.
+    """Require `--result` where a specification has several results.
 
     Raises:
         UsageError: it has several, and none was chosen.
     """
     if of is None and len(specification.results) > 1:
         names = ", ".join(spec.name for spec in specification.results)
-        raise UsageError(f"{specification.filename} has several results; choose one with --of: {names}")
+        raise UsageError(f"{specification.filename} has several results; choose one with --result: {names}")
 
 
 def warn_of_input(result: Replayed | Recorded) -> None:

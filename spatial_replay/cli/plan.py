@@ -148,7 +148,7 @@ def _redo(
 )
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of text.")
 @click.option("--spec", metavar="SPEC", type=LogPath(), help="Specification to plan for instead.")
-@click.option("--of", metavar="NAME", help="Result to plan for, if SPEC has several.")
+@click.option("--result", "of", metavar="NAME", help="Result to plan for, if SPEC has several.")
 @constants_option
 @profile_option
 @setting_options
@@ -213,7 +213,7 @@ def planning_command(scenario: str) -> click.Command:
         type=LogPath(),
         help="Specification to plan for.  [default: the scenario's own]",
     )
-    @click.option("--of", metavar="NAME", help="Result to plan for, if SPEC has several.")
+    @click.option("--result", "of", metavar="NAME", help="Result to plan for, if SPEC has several.")
     @click.option(
         "--also",
         metavar="SPEC",

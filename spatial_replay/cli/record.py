@@ -12,7 +12,6 @@ import click
 from spatial_replay.cli.application import ExitCode, exit_code_from_verdicts
 from spatial_replay.cli.options import (
     LogPath,
-    ReadArguments,
     add_options,
     constants_option,
     durability_option,
@@ -36,6 +35,7 @@ from spatial_replay.trace.trace import duration_ns_from_text
 
 if TYPE_CHECKING:
     from spatial_replay.logs.output_file import Durability
+    from spatial_replay.logs.read_options import Reading
     from spatial_replay.recording.log import VerdictChange
     from spatial_replay.runs.record_video import FrameSource, KeepVideo
     from spatial_replay.simulation.world import Injection, Start
@@ -90,7 +90,7 @@ def duration_ns(context: click.Context, parameter: click.Parameter, text: str | 
     "  [default: copy where possible, else h264]",
 )
 @click.option(
-    "--hold",
+    "--hold-hidden",
     "hold_ns",
     metavar="T",
     callback=duration_ns,
@@ -451,7 +451,7 @@ def tracks(
     specs: tuple[LogFile, ...],
     constants: Mapping[str, float | str],
     profile: str | None,
-    reading: ReadArguments,
+    reading: Reading,
     unit: str,
 ) -> int:
     """Record the objects of any readable log: tracks, annotations, scenarios, bags with a mapping.
@@ -462,7 +462,7 @@ def tracks(
     Examples:
       spatial-replay record tracks blocks.jsonl.gz -o run.mcap
       spatial-replay record tracks people.csv -o run.mcap --spec social.spatial --unit m
-      spatial-replay record tracks annotations.txt -o run.mcap --lost keep
+      spatial-replay record tracks annotations.txt -o run.mcap --read lost=keep
     """
     # imported here so that --help stays fast
     from spatial_replay.recording import record_source

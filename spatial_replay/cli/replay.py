@@ -53,7 +53,8 @@ if TYPE_CHECKING:
 )
 @click.option("--series", is_flag=True, help="With --json: add the numbers of every node at every sample.")
 @click.option(
-    "--signal",
+    "--to-end",
+    "signal",
     is_flag=True,
     help="With --json: --series, and the robustness of each node from each sample to the end.",
 )
@@ -105,26 +106,26 @@ def replay(
       spatial-replay replay run.mcap --spec blocks.spatial --watch
       spatial-replay replay walk.jsonl --spec walk.spatial --each ego=class:person
       spatial-replay replay drive.bag --mapping drive.yaml --spec drive.spatial
-      spatial-replay replay drive.bag --mapping drive.yaml -o annotated.mcap --keep mapped --keep '/camera/*'
+      spatial-replay replay drive.bag --mapping drive.yaml -o annotated.mcap --topics '/camera/*'
     """
     # imported here so that --help stays fast
     from spatial_replay.logs.topics import MAPPED
     from spatial_replay.replay import default_keep, run_replay
 
     if (series or signal) and json_file is None:
-        option = "--series" if series else "--signal"
+        option = "--series" if series else "--to-end"
         raise UsageError(f"{option} adds to the JSON object; add --json FILE or --json -")
     if layer and output is None:
         raise UsageError("--layer applies to the annotated log; add -o FILE")
     if keep and output is None:
-        raise UsageError("--keep applies to the annotated log; add -o FILE")
+        raise UsageError("--topics applies to the annotated log; add -o FILE")
     if arrow and output is None:
         raise UsageError("--arrow applies to the scene of the annotated log; add -o FILE")
     if keep and layer:
-        raise UsageError("--layer copies no messages; remove --keep or --layer")
+        raise UsageError("--layer copies no messages; remove --topics or --layer")
     window_ns = None if width is None else _width_ns(width)
     if semantics != "ltlf" and (signal or window_ns is not None):
-        option = "--signal" if signal else "--window"
+        option = "--to-end" if signal else "--window"
         raise UsageError(f"{option} is not defined under --semantics {semantics}; remove one of them")
     if watch:
         others = {

@@ -12,7 +12,6 @@ from spatial_replay.cli.application import ExitCode
 from spatial_replay.cli.options import (
     JsonCommand,
     LogPath,
-    ReadArguments,
     choices_option,
     constants_option,
     input_files,
@@ -28,6 +27,7 @@ from spatial_replay.logs.remote import LogFile, is_address, local_copy
 from spatial_replay.text import counted
 
 if TYPE_CHECKING:
+    from spatial_replay.logs.read_options import Reading
     from spatial_replay.tuning import TunedConstant, Tuning
     from spatial_replay.tuning.margins import Value
 
@@ -136,7 +136,7 @@ def tune(
     choices: tuple[str, ...],
     constants: Mapping[str, float | str],
     profile: str | None,
-    reading: ReadArguments,
+    reading: Reading,
 ) -> ExitCode:
     """Find the constants with which good runs satisfy a specification and bad runs violate it.
 

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from spatial_replay.cli.application import ExitCode
-from spatial_replay.cli.options import LogPath, ReadArguments, reading_options
+from spatial_replay.cli.options import LogPath, reading_options
 from spatial_replay.cli.terminal import progress, show, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import LogFile, local_files
 from spatial_replay.text import counted, counted_from
+
+if TYPE_CHECKING:
+    from spatial_replay.logs.read_options import Reading
 
 
 @click.command()
@@ -51,7 +55,7 @@ def verify(
     sign: Path | None,
     signer: Path | None,
     signature: Path | None,
-    reading: ReadArguments,
+    reading: Reading,
 ) -> int:
     """Recompute a log's certificate and compare it with the recorded one.
 
@@ -85,7 +89,7 @@ def verify(
         raise UsageError("--signature names the file of --sign or --signer; add one of them")
     if signature is None:
         signature = Path(f"{log}.sig") if isinstance(log, Path) else Path(f"{log.name}.sig")
-    if source is None and reading["mapping"] is not None:
+    if source is None and reading.get("mapping") is not None:
         raise UsageError("--mapping applies to the source of the log; add --source SOURCE")
     own = open_source(log)
     original = None

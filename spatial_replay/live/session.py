@@ -237,14 +237,14 @@ class LiveSession:
         recorders: Sequence[SampleWriter] = (),
         topics: Sequence[str] = (),
         max_delay_s: float = MAX_DELAY_S,
-        dead_man_s: float | None = None,
+        topic_timeout_s: float | None = None,
     ) -> None:
         """Compile everything, before the connection is made; see `monitor` for the arguments.
 
         Args:
             recorders: take every sample, and the messages of mapped topics and of `topics`, as they come.
         """
-        for name, value in (("max_delay_s", max_delay_s), ("dead_man_s", dead_man_s)):
+        for name, value in (("max_delay_s", max_delay_s), ("topic_timeout_s", topic_timeout_s)):
             if value is not None and not (math.isfinite(value) and value > 0):
                 raise UsageError(f"{name} is {value!r}; give seconds above 0")
         self.files = listed_specifications(specifications)
@@ -258,7 +258,7 @@ class LiveSession:
         # viewers may miss samples, a log may not
         self._logs = [each for each in recorders if isinstance(each, Recorder)]
         self._topics = tuple(topics)
-        self._max_delay_s, self._dead_man_s = max_delay_s, dead_man_s
+        self._max_delay_s, self._topic_timeout_s = max_delay_s, topic_timeout_s
         units = {} if self._mapping is None else self._mapping.axes.units_with(self._mapping.signal_units)
         self._monitors = [Monitor(file, units=units) for file in self.files]
         self._changes = VerdictChanges(self.files)
@@ -391,9 +391,9 @@ class LiveSession:
         times = [self._settled_s, self._offered_s]
         if self._assembler is not None:
             times.append(self._assembler.due_s() or math.inf)
-            if self._dead_man_s is not None:
+            if self._topic_timeout_s is not None:
                 waiting = (at for topic, at in self._last_s.items() if topic not in self._silent)
-                times.append(min(waiting, default=math.inf) + self._dead_man_s)
+                times.append(min(waiting, default=math.inf) + self._topic_timeout_s)
         due_s = min(times)
         if inbox.filled.is_set() or due_s <= now_s:
             # the client has to be let in, however much there is to evaluate
@@ -457,7 +457,7 @@ class LiveSession:
             self._silent |= {*silent}
             listed = ", ".join(silent)
             self._notes.append(
-                f"no message on {listed} for {self._dead_man_s:g} s: what it reports is unknown"
+                f"no message on {listed} for {self._topic_timeout_s:g} s: what it reports is unknown"
             )
             async for update in self._evaluated(self._lose(silent, f"silence on {listed}"), now_s):
                 yield update
@@ -488,10 +488,10 @@ class LiveSession:
 
     def _silent_topics(self, now_s: float) -> list[str]:
         """Return the topics that have been silent for too long since the last call."""
-        if self._dead_man_s is None or self._assembler is None or not self._is_connected:
+        if self._topic_timeout_s is None or self._assembler is None or not self._is_connected:
             return []
         watched = [topic for topic in self._assembler.topics if topic not in self._silent]
-        return [each for each in watched if now_s - self._last_s.get(each, now_s) >= self._dead_man_s]
+        return [each for each in watched if now_s - self._last_s.get(each, now_s) >= self._topic_timeout_s]
 
     # -------------------------------------------------------------------------------- planning
 
@@ -689,7 +689,7 @@ async def monitor(
     clips: str | PathLike[str] | None = None,
     topics: Sequence[str] = (),
     max_delay_s: float = MAX_DELAY_S,
-    dead_man_s: float | None = None,
+    topic_timeout_s: float | None = None,
     overwrite: bool = False,
 ) -> AsyncIterator[LiveUpdate]:
     """Monitor a running robot; yield an update for each sample.
@@ -704,7 +704,7 @@ async def monitor(
         trigger, clips: when to write which part of the run to a log of its own, and the folder of these.
         topics: patterns of the topics whose messages are written; those that are mapped by default.
         max_delay_s: how long a sample waits for transforms, and for topics whose stamps lag behind.
-        dead_man_s: after so much silence of a topic, what it reported is unknown.
+        topic_timeout_s: after so much silence of a topic, what it reported is unknown.
         overwrite: replace an output that exists.
 
     Raises:
@@ -726,7 +726,7 @@ async def monitor(
             recorders=recorders,
             topics=topics,
             max_delay_s=max_delay_s,
-            dead_man_s=dead_man_s,
+            topic_timeout_s=topic_timeout_s,
         )
         async for update in session.updates():
             yield update

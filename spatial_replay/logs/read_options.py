@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields
 from fractions import Fraction
 from os import PathLike, fspath
 from reprlib import repr as shortened
-from typing import Final, Literal, cast, get_args
+from typing import Final, Literal, TypedDict, cast, get_args
 
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.footprint import Concave
@@ -27,19 +27,39 @@ FASTEST_RATE = 10**9
 _CHOICES = {"lost": get_args(Lost), "on_time_jump": get_args(OnTimeJump), "concave": get_args(Concave)}
 
 
+class Reading(TypedDict, total=False):
+    """Options for reading a log, as keyword arguments; see `ReadOptions`."""
+
+    mapping: str | PathLike[str] | None
+    concave: Concave
+    on_time_jump: OnTimeJump
+    rate: float | None
+    lost: Lost
+    y_down: bool | None
+    max_lateness: str
+    max_gap: str | None
+
+
+KEYS: Final = tuple(key for key in Reading.__annotations__ if key != "mapping")
+"""Keys of suites and of metadata; a mapping file has a key of its own there."""
+
+
 @dataclass(frozen=True, slots=True)
 class ReadOptions:
     """Options for reading a log; the defaults fit every log.
 
     Attributes:
-        concave: how polygons that are not convex are handled.
-        mapping: the mapping file, which says which topics carry which objects.
-        on_time_jump: whether a clock that jumps back is an error or ends the log.
-        late: how late messages may come, such as "2s"; "all" for any lateness: the whole log is sorted.
-        max_gap: what lies in a longer pause of samples or of a topic is unknown, such as "1s"; or None.
-        rate: frames a second, for formats that count frames.
-        lost: whether rows marked as out of the picture are dropped or kept.
-        y_down: whether y points down in the file, as in images; None for what is usual in its format.
+        concave: how polygons that are not convex are handled: "decompose" or "hull".
+        mapping: a mapping file, which says which topics of an external log carry which objects.
+        on_time_jump: whether a clock of an external log that jumps back is an "error", or ends the log
+            ("split").
+        rate: frames a second of annotations that count frames; 30 unless given.
+        lost: "drop" or "keep" annotations that are marked as lost.
+        y_down: whether y points down in a file of tracks or annotations, as in images; samples have y up. By
+            default, it points down in drone annotations, and up in all other files.
+        max_lateness: how late messages of an external log may come, such as "2s"; "all" sorts the whole log,
+            which is then in memory.
+        max_gap: longer pauses of samples, or of a mapped topic, are unknown, such as "1s".
 
     Raises:
         UsageError: an invalid value.
@@ -51,7 +71,7 @@ class ReadOptions:
     rate: float | None = None
     lost: Lost = "drop"
     y_down: bool | None = None
-    late: str = "1s"
+    max_lateness: str = "1s"
     max_gap: str | None = None
 
     def __post_init__(self) -> None:
@@ -63,7 +83,7 @@ class ReadOptions:
             raise UsageError(f"mapping is {shortened(self.mapping)}; give the path of a mapping file")
         if self.y_down not in (None, True, False):
             raise UsageError(f"y_down is {shortened(self.y_down)}; give True, False or None")
-        late_ns(self.late)
+        late_ns(self.max_lateness)
         gap_ns(self.max_gap)
         if self.rate is not None:
             _check_rate(self.rate)
@@ -103,7 +123,7 @@ def late_ns(text: object) -> int:
         return LATEST_NS
     match = _LATENESS.fullmatch(text) if isinstance(text, str) else None
     if match is None:
-        raise UsageError(f"late is {shortened(text)}; give a duration such as 2s or 500ms, or all")
+        raise UsageError(f"max_lateness is {shortened(text)}; give a duration such as 2s or 500ms, or all")
     return int(Fraction(match[1]) * (10**9 if match[2] == "s" else 10**6))
 
 
@@ -125,7 +145,7 @@ def gap_ns(text: object) -> int | None:
 _REASONS = {
     "mapping": "it names its objects itself",
     "on_time_jump": "its times never go back",
-    "late": "its times never go back",
+    "max_lateness": "its times never go back",
     "max_gap": "it has no samples",
     "rate": "it has times, not numbers of frames",
     "lost": "it has no rows marked as lost",
@@ -138,10 +158,9 @@ _REASONS = {
 
 def _option(name: str, value: object) -> str:
     """Return an option as given on the command line, and as an argument in Python."""
-    option = f"--{name.replace('_', '-')} {value}"
-    if name == "y_down":
-        option = "--y-down" if value else "--y-up"
-    return f"{option} ({name}={value!r})"
+    if name in ("mapping", "max_lateness", "max_gap"):
+        return f"--{name.replace('_', '-')} {value} ({name}={value!r})"
+    return f"--read {name}={str(value).lower()} ({name}={value!r})"
 
 
 def _check_rate(rate: object) -> None:

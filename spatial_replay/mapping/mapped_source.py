@@ -83,7 +83,7 @@ class MappedSource:
         """The options of reading, for the metadata of a copy."""
         mapping = {"mapping": self.mapping.name, "mapping_sha256": self.mapping.sha256}
         given: dict[str, object] = {} if self.on_time_jump == "error" else {"on_time_jump": self.on_time_jump}
-        given |= {} if self.late == "1s" else {"late": self.late}
+        given |= {} if self.late == "1s" else {"max_lateness": self.late}
         return mapping | given | ({} if self.max_gap is None else {"max_gap": self.max_gap})
 
     @property

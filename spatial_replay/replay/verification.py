@@ -26,6 +26,7 @@ from spatial_replay.bags.mcap_log import McapLog
 from spatial_replay.errors import LogError, MissingFileError, UsageError
 from spatial_replay.logs.mcap.read import McapSource
 from spatial_replay.logs.messages import Messages
+from spatial_replay.logs.read_options import KEYS
 from spatial_replay.logs.remote import LogFile
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.schemas.Robustness_pb2 import Robustness
@@ -321,7 +322,6 @@ _NOT_COVERED = (
 )
 _NO_PLAN = "no plan settings: the log was planned, and its decisions cannot be recomputed without"
 
-_READING = ("on_time_jump", "late", "max_gap", "rate", "lost", "y_down", "concave")
 _WINDOW = ("start_ns", "end_ns", "every")
 
 
@@ -440,7 +440,7 @@ def recorded_reading(log: Source, source: str) -> dict[str, Any]:
         options = json.loads(about.get("options", "{}"))
     except ValueError:
         return {}
-    return {name: options[name] for name in _READING if name in options} if isinstance(options, dict) else {}
+    return {name: options[name] for name in KEYS if name in options} if isinstance(options, dict) else {}
 
 
 def _files(log: Source) -> list[Specification]:

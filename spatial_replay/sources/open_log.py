@@ -17,15 +17,14 @@ from os import PathLike
 from pathlib import Path
 from reprlib import repr as shortened
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import NamedTuple, Unpack
 from urllib.parse import quote
 
 from spatial_replay.errors import LogError, MissingFileError, RemoteError, UsageError
-from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.formats.csv_tracks import COLUMNS, iter_csv
 from spatial_replay.logs.formats.drone import FRAMES_A_SECOND, is_annotations, iter_annotations
 from spatial_replay.logs.formats.tracks import iter_jsonl, open_text
-from spatial_replay.logs.read_options import Lost, OnTimeJump, ReadOptions, count_of
+from spatial_replay.logs.read_options import Reading, ReadOptions, count_of
 from spatial_replay.logs.remote import (
     BAG_METADATA,
     LogFile,
@@ -47,34 +46,14 @@ _HEAD = 4096
 """Bytes by which a file's format is recognised."""
 
 
-def open_source(
-    path: str | PathLike[str],
-    *,
-    concave: Concave = "decompose",
-    mapping: str | PathLike[str] | None = None,
-    on_time_jump: OnTimeJump = "error",
-    rate: float | None = None,
-    lost: Lost = "drop",
-    y_down: bool | None = None,
-    late: str = "1s",
-    max_gap: str | None = None,
-) -> Source:
+def open_source(path: str | PathLike[str], **reading: Unpack[Reading]) -> Source:
     """Open the log in a file of any format; the content decides, not the name.
 
     Only the needed parts of an MCAP log at an address are read; a log of another format is downloaded once.
 
     Args:
         path: on this machine, or an address: s3://bucket/run.mcap, gs://…, az://container/…, https://….
-        concave: how polygons that are not convex are handled.
-        mapping: a mapping file, which says which topics of an external log carry which objects.
-        on_time_jump: whether a clock of an external log that jumps back is an error or ends the log.
-        rate: frames a second of annotations that count frames; 30 unless given.
-        lost: whether annotations that are marked as lost are dropped or kept.
-        y_down: whether y points down in a file of tracks or annotations, as in images; samples have y up. By
-            default, it points down in drone annotations, and up in all other files.
-        late: how late messages of an external log may come, such as "2s"; "all" sorts the whole log, which
-            is then in memory.
-        max_gap: what lies in a longer pause of samples, or of a mapped topic, is unknown, such as "1s".
+        reading: how to read it; see `ReadOptions`.
 
     Raises:
         UsageError: no path was given, or an option that means nothing to this format.
@@ -83,7 +62,7 @@ def open_source(
         RemoteError: an address does not answer.
     """
     _require_path(path)
-    options = ReadOptions(concave, mapping, on_time_jump, rate, lost, y_down, late, max_gap)
+    options = ReadOptions(**reading)
     path = readable_file(path)
     if isinstance(path, Path) and is_bag_folder(path):
         options.refuse_except(_MESSAGES, "ROS 2 bag", path.name)
@@ -101,42 +80,20 @@ def open_source(
     raise LogError(f"{path.name} is not a log in a known format; known formats are {', '.join(FORMATS)}")
 
 
-def read_trace(
-    path: str | PathLike[str],
-    *,
-    mapping: str | PathLike[str] | None = None,
-    concave: Concave = "decompose",
-    on_time_jump: OnTimeJump = "error",
-    rate: float | None = None,
-    lost: Lost = "drop",
-    y_down: bool | None = None,
-    late: str = "1s",
-    max_gap: str | None = None,
-    allow_damage: bool = False,
-) -> Trace:
+def read_trace(path: str | PathLike[str], *, allow_damage: bool = False, **reading: Unpack[Reading]) -> Trace:
     """Read a whole log into memory.
 
     Args:
         path: a log in any format that `open_source` knows.
-        mapping, concave, on_time_jump, rate, lost, y_down, late, max_gap: how to read it; see `open_source`.
-        allow_damage: return what can be read of a damaged log, with its `faults`.
+        allow_damage: return the readable part of a damaged log, with its `faults`.
+        reading: how to read it; see `ReadOptions`.
 
     Raises:
         UsageError: no path was given, or an option that means nothing to this format.
         MissingFileError: there is no such file.
         LogError: the file is not a log, or is damaged and `allow_damage` is not set.
     """
-    source = open_source(
-        path,
-        concave=concave,
-        mapping=mapping,
-        on_time_jump=on_time_jump,
-        rate=rate,
-        lost=lost,
-        y_down=y_down,
-        late=late,
-        max_gap=max_gap,
-    )
+    source = open_source(path, **reading)
     blocks = reading_only(source).iter_blocks()
     traces = [replace(block.trace, remarks=block.remarks) for block in blocks]
     trace = Trace.concatenate(traces)
@@ -344,7 +301,7 @@ def _open_messages(path: LogFile, kind: str, options: ReadOptions) -> Source:
         kind,
         options.concave,
         options.on_time_jump,
-        late=options.late,
+        late=options.max_lateness,
         max_gap=options.max_gap,
     )
 
@@ -361,7 +318,7 @@ def _open_mcap(path: LogFile, kind: str, options: ReadOptions) -> Source:
     return _open_messages(path, kind, options)
 
 
-_MESSAGES = frozenset({"mapping", "on_time_jump", "late", "max_gap"})
+_MESSAGES = frozenset({"mapping", "on_time_jump", "max_lateness", "max_gap"})
 
 FORMATS: dict[str, Format] = {
     "MCAP": Format(lambda head: head.startswith(MAGIC), _open_mcap, _MESSAGES),

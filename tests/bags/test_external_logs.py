@@ -314,7 +314,7 @@ def test_a_clock_that_jumps_back_is_refused_or_ends_the_log(
         log = write_ros1(tmp_path / "a.bag", sent, chunk_bytes=chunk_bytes)
     else:
         log = write_ros2(tmp_path / "bag", sent, storage=kind)
-    with pytest.raises(LogError, match=r"time jumps back: .*--on-time-jump split"):
+    with pytest.raises(LogError, match=r"time jumps back: .*--read on_time_jump=split"):
         read_trace(log, mapping=mapping)
     first = read_trace(log, mapping=mapping, on_time_jump="split")
     assert first == read_trace(write_ros2(tmp_path / "once", drive(60)), mapping=mapping)
@@ -355,12 +355,12 @@ def test_messages_may_be_as_late_as_is_said(tmp_path: Path, mapping: Path) -> No
     # a detector that takes three seconds
     late = [*sent[:20], *sent[24:90], *sent[20:24], *sent[90:]]
     log = write_ros1(tmp_path / "late.bag", late, chunk_bytes=10**6)
-    with pytest.raises(LogError, match=r"time jumps back.* at \d\.\d{3} s.*--late 5s"):
+    with pytest.raises(LogError, match=r"time jumps back.* at \d\.\d{3} s.*--max-lateness 5s"):
         read_trace(log, mapping=mapping)
-    assert read_trace(log, mapping=mapping, late="5s") == expected
-    assert read_trace(log, mapping=mapping, late="all") == expected
+    assert read_trace(log, mapping=mapping, max_lateness="5s") == expected
+    assert read_trace(log, mapping=mapping, max_lateness="all") == expected
     with pytest.raises(UsageError, match="late is 'soon'; give a duration such as 2s or 500ms, or all"):
-        read_trace(log, mapping=mapping, late="soon")
+        read_trace(log, mapping=mapping, max_lateness="soon")
 
 
 def test_chunks_of_a_ros_1_bag_may_come_in_any_order(tmp_path: Path, mapping: Path) -> None:

@@ -68,13 +68,13 @@ def test_one_of_several_results_has_to_be_chosen(tmp_path: Path, capsys: pytest.
     path, output = tmp_path / "two.spatial", tmp_path / "two.dot"
     path.write_text("spec reach = F p >= 0\nspec before = G (O p >= 0)\n")
     assert run(["check", str(path), "--dfa", str(output)]) == 2
-    assert "choose one with --of: reach, before" in capsys.readouterr().err
-    assert run(["check", str(path), "--dfa", str(output), "--of", "reach"]) == 0
+    assert "choose one with --result: reach, before" in capsys.readouterr().err
+    assert run(["check", str(path), "--dfa", str(output), "--result", "reach"]) == 0
     assert output.read_text().startswith('digraph "reach"')
-    assert run(["check", str(path), "--of", "reach"]) == 2
+    assert run(["check", str(path), "--result", "reach"]) == 2
     capsys.readouterr()
     for file in (str(output), "-"):
-        assert run(["check", str(path), "--dfa", file, "--of", "raech"]) == 2
+        assert run(["check", str(path), "--dfa", file, "--result", "raech"]) == 2
         captured = capsys.readouterr()
         assert "did you mean 'reach'" in captured.err
         assert not captured.out

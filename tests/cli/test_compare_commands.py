@@ -136,7 +136,7 @@ def test_of_two_runs_it_says_who_moved_differently_since_when_and_what_that_did(
         (["diff", *TABLE, "-o", "table.spatial"], "table.spatial"),
         (["diff", "table.jsonl", "push.mcap"], "the runs have no object in common"),
         (["diff", "push.mcap", "push.mcap", "--align", "gap"], "did you mean 'gaps'?"),
-        (["clip", *TABLE[:3], "-o", "bug.mcap", "--of", "lade"], "did you mean 'laid'?"),
+        (["clip", *TABLE[:3], "-o", "bug.mcap", "--result", "lade"], "did you mean 'laid'?"),
         (["clip", *TABLE[:3], "-o", "bug.mcap", "--around", "5"], "--around: '5' is not a duration"),
         (["clip", *TABLE[:3], "-o", "table.jsonl"], "table.jsonl"),
         (["clip", *TABLE[:3], "-o", "bug.mcap", "--every", "2"], "a clip keeps every sample"),
@@ -173,7 +173,7 @@ def test_runs_in_other_units_are_refused(capsys: pytest.CaptureFixture[str]) -> 
 def test_a_clip_says_how_small_it_got_and_is_replayed_without_other_files(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    arguments = ("clip", "push.mcap", "--spec", "push_edited.spatial", "--of", "gaps", "-o", "bug.mcap")
+    arguments = ("clip", "push.mcap", "--spec", "push_edited.spatial", "--result", "gaps", "-o", "bug.mcap")
     code, out, _ = said(capsys, *arguments)
     assert code == 0
     assert "gaps: 32 of 546 samples, 4.233 s to 5.267 s of the log" in out
@@ -206,8 +206,8 @@ def test_a_clip_of_several_results_keeps_those_that_failed_and_says_what_it_left
     code, out, err = said(capsys, *arguments)
     assert (code, "another verdict" in err) == (0, False)
     assert "\n  apart: " in out
-    assert "not kept, since nothing failed there: rest; --of NAME keeps one" in out
-    assert "not kept" not in said(capsys, *arguments, "--of", "rest", "--of", "apart")[1]
+    assert "not kept, since nothing failed there: rest; --result NAME keeps one" in out
+    assert "not kept" not in said(capsys, *arguments, "--result", "rest", "--result", "apart")[1]
 
 
 def test_a_clip_fails_for_the_reason_that_settled_the_verdict_not_only_with_the_least_number(

@@ -67,16 +67,16 @@ def test_every_result_is_explained_in_a_few_sentences(
         "cup is not in the sample.",
         "cup is missing in 2 of 4 samples, all before 1.000 s: --from 1.000s leaves them out.",
     ]
-    assert run_in_process([*EXPLAIN, "--from", "1.000s", "--node", "apart"]) == 0
+    assert run_in_process([*EXPLAIN, "--from", "1.000s", "--result", "apart"]) == 0
 
 
 def test_a_named_spec_is_explained_at_a_time(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code, text = said(capsys, *EXPLAIN, "--node", "reach", "--at", "1.2s")
+    code, text = said(capsys, *EXPLAIN, "--result", "reach", "--at", "1.2s")
     assert code == 4
     assert text.startswith("`reach` is pending: robustness -0.5 so far, and later samples decide.")
     assert "(its greatest so far within `reach`): cube sticks out of goal by 0.5" in text
     assert "violated" not in text
-    _, at_the_end = said(capsys, *EXPLAIN, "--node", "reach", "--at", "1500ms")
+    _, at_the_end = said(capsys, *EXPLAIN, "--result", "reach", "--at", "1500ms")
     assert at_the_end.startswith("`reach` is satisfied: robustness 0.5, certain since 1.500 s.")
 
 
@@ -101,8 +101,8 @@ def test_any_of_many_results_is_found_by_its_name_with_the_id_of_its_requirement
     lines.append('spec respond "R-1: it responds" = F (battery >= 0)')
     (folder / "run.spatial").write_text("\n".join(lines), encoding="utf-8")
     for name in ("respond", "R-1 respond", "respond [R-1]"):
-        assert "`respond` is satisfied" in said(capsys, *EXPLAIN, "--node", name)[1]
-    assert run_in_process([*EXPLAIN, "--node", "respnd"]) == 2
+        assert "`respond` is satisfied" in said(capsys, *EXPLAIN, "--result", name)[1]
+    assert run_in_process([*EXPLAIN, "--result", "respnd"]) == 2
     assert "did you mean 'respond'?" in capsys.readouterr().err
 
 
@@ -110,8 +110,8 @@ def test_options_that_cannot_be_explained_are_refused_by_name(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for arguments, expected in [
-        (("--node", "rech"), "did you mean 'reach'"),
-        (("--object", "7"), "no result is about object '7'"),
+        (("--result", "rech"), "did you mean 'reach'"),
+        (("--result", "@7"), "no result is about object '7'"),
         (("--at", "1s", "--to", "2s"), "give only one"),
         (("--at", "-3"), "is not a time"),
         (("--from", "1s", "--at", "0.2s"), "is before --from"),
@@ -121,7 +121,7 @@ def test_options_that_cannot_be_explained_are_refused_by_name(
 
 
 def test_explanations_are_available_as_json(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    _, text = said(capsys, *EXPLAIN, "--node", "charged", "--json")
+    _, text = said(capsys, *EXPLAIN, "--result", "charged", "--json")
     (found,) = json.loads(text)
     assert found["atom"]["text"] == "battery >= 0.3"
     assert (found["atom"]["value"], found["time_ns"], found["verdict"]) == (
@@ -147,7 +147,7 @@ def test_the_json_document_contains_the_witness_of_the_worst_result(
 
 
 def test_signals_and_windows_are_written_as_series(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    series = specifications(capsys, "--signal", "--window", "600ms")["done"]["series"]
+    series = specifications(capsys, "--to-end", "--window", "600ms")["done"]["series"]
     nodes = specifications(capsys)["done"]["nodes"]
     charged = next(node["id"] for node in nodes if node["name"] == "charged")
     assert series["signal"][charged] == pytest.approx([0.1, 0.1, 0.2, 0.2])
@@ -171,7 +171,7 @@ def test_an_unknown_verdict_names_what_was_unknown(folder: Path, capsys: pytest.
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        (("--signal",), "add --json"),
+        (("--to-end",), "add --json"),
         (("--window", "0s"), "contains no sample"),
         (("--window", "ten"), "is not a duration"),
         (("--window", "1s", "--semantics", "paper"), "not defined under --semantics paper"),

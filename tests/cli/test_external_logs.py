@@ -128,7 +128,7 @@ def test_drone_annotations_are_replayed(
     )
     each = ("--each", "ego=class:biker", "--to", "2s")
     dropped = replayed(capsys, log, *each, "--semantics", "paper")
-    kept = replayed(capsys, log, *each, "--semantics", "paper", "--lost", "keep", "--rate", "60")
+    kept = replayed(capsys, log, *each, "--semantics", "paper", "--read", "lost=keep", "--read", "rate=60")
     assert dropped["log"]["samples"] == 60
     assert kept["log"]["samples"] == 120
     assert len(kept["specifications"]) > len(dropped["specifications"]) > 0
@@ -193,8 +193,8 @@ def test_a_clock_that_jumps_back_is_an_error_or_ends_the_log(
     )
     arguments = ["replay", "jump.mcap", "--spec", "turtles.spatial", "--mapping", "turtles.yaml"]
     assert run(arguments) == 3
-    assert "--on-time-jump" in capsys.readouterr().err
-    assert run([*arguments, "--on-time-jump", "split", "--json", "-"]) == 1
+    assert "--read on_time_jump" in capsys.readouterr().err
+    assert run([*arguments, "--read", "on_time_jump=split", "--json", "-"]) == 1
     said = capsys.readouterr()
     assert json.loads(said.out)["log"]["samples"] == 10
     assert "the log is taken to end there" in said.err
@@ -241,3 +241,22 @@ def test_a_declared_unit_of_lengths_is_at_axes_in_tables_in_sentences_and_in_wha
     facts = re.search(r'id="facts">(.*?)</script>', page)
     assert facts is not None
     assert {node["unit"] for each in json.loads(facts[1])["results"] for node in each["nodes"]} == {"m"}
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ("rat=30", "give KEY=VALUE with one of rate, lost, y_down, concave, on_time_jump"),
+        ("lost", "give KEY=VALUE"),
+        ("y_down=perhaps", "give y_down=true or y_down=false"),
+        ("rate=fast", "rate is 'fast'; give frames a second"),
+        ("lost=sometimes", "lost is 'sometimes'; give one of drop, keep"),
+    ],
+)
+def test_an_invalid_option_of_reading_names_the_valid_ones(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], given: str, message: str
+) -> None:
+    log = tmp_path / "annotations.txt"
+    log.write_text('1 0 0 10 10 0 0 0 0 "Biker"\n')
+    assert run(["info", str(log), "--read", given]) == 2
+    assert message in capsys.readouterr().err

@@ -54,9 +54,9 @@ def test_a_plan_with_too_uncertain_objects_exits_with_4(
 
 def test_one_of_several_results_has_to_be_chosen(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert plan(tmp_path, IMPOSSIBLE + SATISFIED) == 2
-    assert "task.spatial has several results; choose one with --of: torn, calm" in capsys.readouterr().err
+    assert "task.spatial has several results; choose one with --result: torn, calm" in capsys.readouterr().err
     assert not (tmp_path / "run.mcap").exists()
-    assert plan(tmp_path, IMPOSSIBLE + SATISFIED, "--of", "calm") == 0
+    assert plan(tmp_path, IMPOSSIBLE + SATISFIED, "--result", "calm") == 0
     assert read_decisions(tmp_path / "run.mcap").decisions[0].specification == "calm"
     assert run(["verify", str(tmp_path / "run.mcap"), "--decisions"]) == 0
 
@@ -64,7 +64,7 @@ def test_one_of_several_results_has_to_be_chosen(tmp_path: Path, capsys: pytest.
 @pytest.mark.parametrize(
     ("text", "options", "message"),
     [
-        (SATISFIED, ["--of", "clam"], "task.spatial has no result 'clam'; its results are: calm"),
+        (SATISFIED, ["--result", "clam"], "task.spatial has no result 'clam'; its results are: calm"),
         ("spec calm = G O (green leftof red)\n", [], "past operators"),
         ("spec calm = F (pink leftof red)\n", [], "the world never has the object 'pink'"),
         ("spec calm = F (\n", [], "task.spatial:1"),

@@ -194,7 +194,7 @@ def test_explain_names_the_part_with_the_least_robustness(
 def test_a_named_part_is_explained_by_what_settled_it(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run(["explain", str(LOG), "--spec", "mission.spatial", "--node", "safe"]) == 1
+    assert run(["explain", str(LOG), "--spec", "mission.spatial", "--result", "safe"]) == 1
     assert capsys.readouterr().out.startswith(
         "`safe` is violated: robustness -0.1449, certain since 5.533 s, least at 9.767 s."
     )

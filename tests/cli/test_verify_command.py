@@ -190,10 +190,21 @@ def test_a_source_is_read_as_it_was_when_the_log_was_made(tmp_path: Path) -> Non
     boxes.write_text('1 0 10 4 20 0 0 0 0 "Biker"\n2 0 40 4 50 9 1 0 0 "Biker"\n')
     spec.write_text('F ("1" above "2")\n')
     call(
-        "replay", boxes, "--spec", spec, "--y-up", "--rate", "10", "--lost", "keep", "-o", tmp_path / "a.mcap"
+        "replay",
+        boxes,
+        "--spec",
+        spec,
+        "--read",
+        "y_down=false",
+        "--read",
+        "rate=10",
+        "--read",
+        "lost=keep",
+        "-o",
+        tmp_path / "a.mcap",
     )
     assert call("verify", tmp_path / "a.mcap", "--source", boxes)[0] == 0
-    assert call("verify", tmp_path / "a.mcap", "--source", boxes, "--y-down")[0] == 1
+    assert call("verify", tmp_path / "a.mcap", "--source", boxes, "--read", "y_down=true")[0] == 1
 
 
 def explained(said: str) -> dict[str, str]:

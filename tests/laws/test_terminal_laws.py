@@ -64,7 +64,7 @@ def _commands(folder: Path, name: str, other: str) -> list[list[str]]:
         ["replay", str(log), "--spec", str(folder / name.replace("/", " "))],
         ["explain", str(mcap), "--each", "ego=all"],
         ["explain", str(log), *each, "--json"],
-        ["explain", str(log), *each, "--node", name],
+        ["explain", str(log), *each, "--result", name],
         ["info", str(mcap)],
         ["verify", str(mcap)],
         ["report", str(log), *each, "-o", str(folder / "page.html")],

@@ -262,7 +262,7 @@ def test_what_a_silent_topic_reported_is_unknown(tmp_path: Path) -> None:
     with robot() as own:
         driving = drive(own, range(20))
         clips, event = tmp_path / "clips", Trigger("event", before_s=1, after_s=0)
-        options = {"dead_man_s": 0.5, "clips": clips, "trigger": event}
+        options = {"topic_timeout_s": 0.5, "clips": clips, "trigger": event}
         found = asyncio.run(
             updates_of(own.address, spec, mapped, lambda each: len(each.sample.unknown) == 2, **options)
         )

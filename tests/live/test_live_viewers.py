@@ -120,7 +120,7 @@ def test_a_viewer_hears_that_the_robot_falls_silent(tmp_path: Path) -> None:
             is_seen.set()
             os.kill(os.getpid(), signal.SIGINT)
 
-    command = ["--mapping", str(mapped), "--spec", str(spec), "--dead-man", "500ms", "--for", "60s"]
+    command = ["--mapping", str(mapped), "--spec", str(spec), "--topic-timeout", "500ms", "--for", "60s"]
     command += ["--clips", str(tmp_path / "clips"), "--trigger", "manual"]
     with robot() as own:
         threads = [threading.Thread(target=drive_until_seen, args=[own]), threading.Thread(target=watch)]

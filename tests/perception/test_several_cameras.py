@@ -64,7 +64,7 @@ def test_what_is_hidden_from_one_camera_is_seen_by_the_other(
 ) -> None:
     left, right, output = folder / "left.mp4", folder / "right.mp4", folder / "seen.mcap"
     options = ["--tags", f"{folder}/tags.yaml", "--spec", f"{folder}/apart.spatial", "-o", f"{output}"]
-    assert run(["record", "video", f"{left}", f"{right}", *options, "--hold", "1s"]) == 0
+    assert run(["record", "video", f"{left}", f"{right}", *options, "--hold-hidden", "1s"]) == 0
     said = capsys.readouterr()
     assert "reference tags fit within" in said.out
     assert "in right.mp4" in said.out
@@ -90,7 +90,9 @@ def test_what_is_hidden_from_one_camera_is_seen_by_the_other(
     # as topics of one log, they say the same
     again = folder / "again.mcap"
     topics = ["--topic", "/camera/video", "--topic", "/camera2/video"]
-    assert run(["record", "video", f"{output}", *topics, *options[:-1], f"{again}", "--hold", "1s"]) == 0
+    assert (
+        run(["record", "video", f"{output}", *topics, *options[:-1], f"{again}", "--hold-hidden", "1s"]) == 0
+    )
     assert read_trace(again).times_ns.tolist() == trace.times_ns.tolist()
     assert read_trace(again).names == trace.names
 

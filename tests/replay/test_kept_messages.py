@@ -164,7 +164,7 @@ def test_keep_says_which_messages_are_copied_and_the_copy_verifies(
 ) -> None:
     monkeypatch.chdir(bag.parent)
     _write(Path("s.spatial"), "spec s = F (a dist b >= 1)\n")
-    options = [option for each in keep for option in ("--keep", each)]
+    options = [option for each in keep for option in ("--topics", each)]
     reading = ["--mapping", "drive.yaml"]
     assert run(["replay", "drive.bag", *reading, "--spec", "s.spatial", "-o", "copy.mcap", *options]) == 0
     expected = {each: count for each, count in _original(bag).items() if each[0] in topics}
@@ -242,9 +242,9 @@ def test_keep_applies_to_own_logs_too_and_samples_always_stay(tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["-o", "c.mcap", "--keep", "/camrea/*"], "no topic of drive.bag fits '/camrea/*'; it has /a, /b"),
-        (["--keep", "all"], "--keep applies to the annotated log; add -o FILE"),
-        (["-o", "c.mcap", "--layer", "--keep", "all"], "--layer copies no messages"),
+        (["-o", "c.mcap", "--topics", "/camrea/*"], "no topic of drive.bag fits '/camrea/*'; it has /a, /b"),
+        (["--topics", "all"], "--topics applies to the annotated log; add -o FILE"),
+        (["-o", "c.mcap", "--layer", "--topics", "all"], "--layer copies no messages"),
     ],
 )
 def test_a_keep_that_cannot_work_is_refused(

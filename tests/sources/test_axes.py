@@ -86,7 +86,7 @@ def test_a_recording_of_an_image_is_not_turned_over_again(
 ) -> None:
     spec, recorded, annotated = tmp_path / "a.spatial", tmp_path / "run.mcap", tmp_path / "annotated.mcap"
     spec.write_text("bird above cat\n")
-    assert run(["record", "tracks", str(tracks), "--y-down", "-o", str(recorded)]) == 0
+    assert run(["record", "tracks", str(tracks), "--read", "y_down=true", "-o", str(recorded)]) == 0
     assert run(["replay", str(recorded), "--spec", str(spec), "-o", str(annotated)]) == 0
     assert run(["replay", str(annotated)]) == 0
     assert run(["replay", str(tracks), "--spec", str(spec)]) == 1
@@ -138,7 +138,9 @@ def test_axes_that_mean_nothing_are_refused(tmp_path: Path, line: str, message: 
 def test_y_down_is_refused_where_something_else_says_it(tmp_path: Path, tracks: Path) -> None:
     log = tmp_path / "run.mcap"
     assert run(["record", "tracks", str(tracks), "-o", str(log)]) == 0
-    with pytest.raises(sr.UsageError, match=r"--y-down \(y_down=True\) does not apply to run\.mcap \(MCAP\)"):
+    with pytest.raises(
+        sr.UsageError, match=r"--read y_down=true \(y_down=True\) does not apply to run\.mcap \(MCAP\)"
+    ):
         open_source(log, y_down=True)
     with pytest.raises(sr.UsageError, match="y_down is 'down'; give True, False or None"):
         open_source(tracks, y_down="down")  # type: ignore[arg-type]
