@@ -8,7 +8,8 @@
     ├── GeometryError           invalid footprint coordinates
     ├── TraceError              samples that do not form a trace
     ├── LogError                a log that is damaged or breaks its format
-    │   └── RemoteError         an address that does not answer, or whose file changes
+    │   ├── RemoteError         an address that does not answer, or whose file changes
+    │   └── UnfitLogError       a log without what a suite requires
     ├── OutputError             an output could not be written
     └── ClusterError            a cluster of computers is lost
 
@@ -127,6 +128,10 @@ class LogError(SpatialReplayError):
 
 class RemoteError(LogError):
     """A log at an address that does not answer, breaks off, or is replaced while it is read."""
+
+
+class UnfitLogError(LogError):
+    """A log that lacks what a suite requires: topics, rates, objects."""
 
 
 class OutputError(SpatialReplayError):

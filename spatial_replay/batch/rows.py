@@ -6,6 +6,7 @@ is open. Its rows are values, too. Nothing here knows where rows are stored or s
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,6 +20,7 @@ from spatial_replay.errors import (
     SpatialReplayError,
     SpecificationError,
     TraceError,
+    UnfitLogError,
     UsageError,
 )
 from spatial_replay.logs.remote import log_file
@@ -30,14 +32,18 @@ from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.replay.engine import Replay, Replayed
 from spatial_replay.replay.selection import ReplayOptions, Window, first_sample_ns
 from spatial_replay.sources.open_log import open_source
+from spatial_replay.sources.overview import fitness_of
 from spatial_replay.spec.diagnostics import SourceText
 from spatial_replay.spec.formula import NamedSpec, Specification
 from spatial_replay.spec.load import SpecificationText, load_specifications
 from spatial_replay.text import counted_from, encodable, printable
 from spatial_replay.trace.trace import time_point_from_text
 
-ErrorKind: TypeAlias = Literal["usage", "log", "machine"]
-"""Whose an error is: of the options or files given, of the log, or of the machine and this program."""
+ErrorKind: TypeAlias = Literal["usage", "log", "unfit", "machine"]
+"""Whose an error is: of the options or files given, of the log, or of the machine and this program.
+
+A log that is "unfit" can be read, and lacks what the suite requires.
+"""
 
 _LONGEST: Final = 2_000
 """Characters of a text in a row."""
@@ -46,6 +52,7 @@ _MOST: Final = 20
 _KINDS: Final[tuple[tuple[tuple[type[Exception], ...], ErrorKind], ...]] = (
     ((UsageError, SpecificationError), "usage"),
     ((LogError, TraceError, GeometryError), "log"),
+    ((UnfitLogError,), "unfit"),
 )
 
 
@@ -141,6 +148,7 @@ def rows_from_task(task: Task) -> tuple[tuple[ResultRow, ...], ...]:
     try:
         files = parsed_specifications(task.specs, task.conditions)
         source, options = opened_task(task, files)
+        _refuse_unfit(task, source)
         replay = Replay(source, files, options, keep_leaves=True, certify=False)
         replayed = replay.run()
         rows = [_rows_of_file(replay, replayed, file, index) for index, file in enumerate(files)]
@@ -148,6 +156,15 @@ def rows_from_task(task: Task) -> tuple[tuple[ResultRow, ...], ...]:
         return error_rows(task, *error_from_exception(error))
     seconds, name = time.perf_counter() - begin, encodable(log_file(task.log).name)
     return tuple(tuple(replace(row, seconds=seconds, source=name) for row in each) for each in rows)
+
+
+def _refuse_unfit(task: Task, source: Source) -> None:
+    """Raise UnfitLogError if a log lacks what its suite requires."""
+    if not task.conditions.requires:
+        return
+    lacks = list(fitness_of(task.log, source).lacks(json.loads(task.conditions.requires)))
+    if lacks:
+        raise UnfitLogError(f"{source.name} is unfit to be judged: {'; '.join(lacks)}")
 
 
 def opened_task(task: Task, files: Sequence[Specification]) -> tuple[Source, ReplayOptions]:

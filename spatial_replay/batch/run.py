@@ -629,6 +629,7 @@ def _key_of(conditions: Conditions) -> list[Any]:
         conditions.each,
         conditions.semantics,
         conditions.strict_names,
+        conditions.requires,
     ]
 
 

@@ -52,6 +52,7 @@ class Conditions:
         strict_names: names that a log never has are errors.
         constants: values in place of those that the specifications give their constants.
         profile: relation profile of specifications without a `use` line.
+        requires: what a log must have to be judged, as JSON; "" for nothing.
     """
 
     mapping: Path | str | None = None
@@ -64,6 +65,7 @@ class Conditions:
     strict_names: bool = False
     constants: Pairs[float | str] = ()
     profile: str | None = None
+    requires: str = ""
 
 
 DEFAULT_CONDITIONS: Final = Conditions()
@@ -318,6 +320,7 @@ def _case(
             semantics=entry.get("semantics", "ltlf"),
             strict_names=entry.get("strict_names", False),
             constants=_pairs(entry.get("constants", {})),
+            requires=json.dumps(entry["requires"], sort_keys=True) if entry.get("requires") else "",
         ),
         expectation=Expectation(
             Verdict(entry.get("expect", "satisfied")),

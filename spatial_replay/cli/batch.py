@@ -51,7 +51,12 @@ _COLOURS: Final = MappingProxyType(
         **dict.fromkeys(("error", "errors", "failed", "worse", "gone"), "red"),
     }
 )
-_KIND_CODES: Final = {"usage": ExitCode.USAGE, "log": ExitCode.DAMAGED, "machine": ExitCode.INTERNAL}
+_KIND_CODES: Final = {
+    "usage": ExitCode.USAGE,
+    "log": ExitCode.DAMAGED,
+    "unfit": ExitCode.DAMAGED,
+    "machine": ExitCode.INTERNAL,
+}
 _BATCH: Final = 10_000
 """Rows that are turned into JSON at once."""
 
@@ -452,9 +457,10 @@ def _warn_of_names(table: pa.Table) -> None:
 def _warn_of_damage(table: pa.Table) -> None:
     """Name the logs that are damaged or cannot be read, for which the exit code is 3."""
     rows = _columns(table, "log", "faults", "error_kind")
-    logs = list(dict.fromkeys(log for log, faults, kind in rows if faults or kind == "log"))
-    if logs:
-        warn(f"damaged, or not to be read: {_listed(logs)}")
+    for what, kind in (("damaged, or not to be read", "log"), ("unfit to be judged", "unfit")):
+        logs = dict.fromkeys(log for log, faults, own in rows if own == kind or (faults and kind == "log"))
+        if logs:
+            warn(f"{what}: {_listed(list(logs))}")
 
 
 def _listed(names: Sequence[str]) -> str:

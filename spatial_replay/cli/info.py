@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
@@ -56,6 +57,11 @@ _OF_MESSAGES = frozenset({"mapping", "on_time_jump", "max_lateness", "max_gap"})
 @click.argument("log", type=LogPath(), required=False)
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of text.")
 @click.option("--suggest-mapping", is_flag=True, help="Print a first mapping file (YAML) instead.")
+@click.option(
+    "--fit",
+    is_flag=True,
+    help="Print rates, gaps and known objects instead, as `requires` of a suite.",
+)
 @click.option("--decisions", is_flag=True, help="Print the decisions of a planned run instead.")
 @click.option(
     "--specification",
@@ -74,6 +80,7 @@ def info(
     log: LogFile | None,
     as_json: bool,
     suggest_mapping: bool,
+    fit: bool,
     decisions: bool,
     specification: str | None,
     layout: bool,
@@ -93,6 +100,7 @@ def info(
       spatial-replay info annotated.mcap
       spatial-replay info blocks.jsonl.gz --json
       spatial-replay info drive.bag --suggest-mapping -o drive.yaml
+      spatial-replay info drive.bag --mapping drive.yaml --fit
       spatial-replay info push.mcap --decisions
       spatial-replay info annotated.mcap --specification -o used.spatial
       spatial-replay info annotated.mcap --layout -o layout.json
@@ -102,6 +110,7 @@ def info(
         name
         for name, is_given in (
             ("--suggest-mapping", suggest_mapping),
+            ("--fit", fit),
             ("--decisions", decisions),
             ("--specification", specification is not None),
             ("--layout", layout),
@@ -128,6 +137,8 @@ def info(
             return _print_decisions(log, as_json)
         if suggest_mapping:
             return _print_mapping(log)
+        if fit:
+            return _print_fitness(log, reading)
         return _print_overview(log, as_json, reading)
 
 
@@ -175,6 +186,28 @@ def _print_decisions(log: LogFile, as_json: bool) -> int:
     else:
         show(*fitted(recorded.lines(), terminal_width()))
     return ExitCode.DAMAGED if recorded.faults else ExitCode.SATISFIED
+
+
+def _print_fitness(log: LogFile, reading: Reading) -> int:
+    """Print what a suite may require of logs like this one."""
+    from spatial_replay.sources.open_log import open_source
+    from spatial_replay.sources.overview import Regularity, fitness_of
+
+    def rows(found: Mapping[str, Regularity]) -> Iterator[str]:
+        for name, each in found.items():
+            # what comes once, such as a map, has no rate
+            regular = f"rate: {each.rate:g}, max_gap: {each.max_gap:g}s" if each.rate else ""
+            yield f"{name}: {{{regular}}}  # {each.count:,}"
+
+    with progress("messages"):
+        found = fitness_of(log, open_source(log, **reading))
+    topics = {json.dumps(name, ensure_ascii=False): each for name, each in found.topics.items()}
+    lines = ["requires:", *(f"  {row}" for row in rows({"samples": found.samples}))]
+    lines += ["  topics:"] * bool(topics) + [f"    {row}" for row in rows(topics)]
+    lines += ["  objects:  # the share of samples in which each is known"] * bool(found.objects)
+    lines += [f"    {json.dumps(name, ensure_ascii=False)}: {each:g}" for name, each in found.objects.items()]
+    show(*lines)
+    return ExitCode.SATISFIED
 
 
 def _print_layout(log: LogFile) -> int:

@@ -10,12 +10,12 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from struct import Struct
-from typing import Final, Literal, TypeAlias, TypeVar
+from typing import Final, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from spatial_replay.compiled import elementwise, inlined, long_kernel
+from spatial_replay.compiled import elementwise, long_kernel
 from spatial_replay.errors import GeometryError
 from spatial_replay.geometry.arrays import (
     Floats,
@@ -26,6 +26,7 @@ from spatial_replay.geometry.arrays import (
     read_only_integers,
     starts_from_counts,
 )
+from spatial_replay.geometry.kernels import weight_and_centre
 from spatial_replay.geometry.outline import (
     MOST_CONVEX_CORNERS,
     NOT_CONVEX,
@@ -37,8 +38,6 @@ from spatial_replay.geometry.outline import (
     normalise_polygons,
 )
 from spatial_replay.text import is_encodable
-
-_Height = TypeVar("_Height", float, Floats)
 
 Concave: TypeAlias = Literal["decompose", "hull"]
 """How a non-convex polygon is treated: split into convex parts, or replaced by its convex hull."""
@@ -496,9 +495,6 @@ class FootprintBatch:
 
 # ------------------------------------------------------------------------------------------------------ poses
 
-_FLAT: Final = 1e-12
-"""Twice the area over the squared perimeter; a polygon with less has no centroid of its area."""
-
 
 def centre_of(footprint: Footprint) -> tuple[float, float]:
     """Return the centre (x, y) of an object: the centroid of its parts' areas.
@@ -512,20 +508,16 @@ def centre_of(footprint: Footprint) -> tuple[float, float]:
 
 def centre_object(tracked: TrackedObject) -> TrackedObject:
     """Return an object as the point at its centre, halfway up."""
-    height = tracked.height and (_middle(*tracked.height),) * 2
-    return replace(tracked, footprint=Footprint.disc(*centre_of(tracked.footprint), 0.0), height=height)
+    point = centres_of(FootprintBatch.from_footprints([tracked.footprint], [tracked.height]))
+    return replace(tracked, footprint=Footprint.disc(*point.vertices[0], 0.0), height=point.height(0))
 
 
 def centres_of(batch: FootprintBatch) -> FootprintBatch:
     """Return the centre of each row (see `centre_of`) as a point, halfway up."""
     centres, points = np.empty((len(batch), 2)), np.arange(len(batch) + 1, dtype=np.int64)
     _fill_centres(batch.part_start, batch.vertex_start, batch.vertices, batch.radius, centres)
-    middle = _middle(batch.bottom, batch.top)
+    middle = batch.bottom + 0.5 * (batch.top - batch.bottom)
     return FootprintBatch(points, points, centres, np.zeros(len(batch)), middle, middle)
-
-
-def _middle(bottom: _Height, top: _Height) -> _Height:
-    return bottom + 0.5 * (top - bottom)
 
 
 @elementwise
@@ -537,7 +529,7 @@ def _fill_centres(
     for row in range(len(part_start) - 1):
         total = sum_x = sum_y = mean_x = mean_y = 0.0
         for p in range(part_start[row], part_start[row + 1]):
-            area, x, y = _weight_and_centre(vertices, vertex_start[p], vertex_start[p + 1], radius[p])
+            area, x, y = weight_and_centre(vertices, vertex_start[p], vertex_start[p + 1], radius[p])
             total, sum_x, sum_y = total + area, sum_x + area * x, sum_y + area * y
             mean_x, mean_y = mean_x + x, mean_y + y
         if total <= 0.0:
@@ -607,24 +599,3 @@ def fill_placed(vertices: Floats, centre: Floats, positions: Floats, turn: float
     filled = placed.view(np.complex128)[..., 0]
     for number, (x, y) in enumerate(local.tolist()):
         np.add(at, complex(x, y), out=filled[:, number])
-
-
-@inlined
-def _weight_and_centre(vertices: Floats, start: int, stop: int, radius: float) -> tuple[float, float, float]:
-    """Return a part's area, and the centroid (x, y) of its polygon before rounding."""
-    # relative to the first vertex, so that coordinates far from the origin do not cancel
-    x0, y0 = vertices[start, 0], vertices[start, 1]
-    doubled = sum_x = sum_y = mean_x = mean_y = length = 0.0
-    for i in range(start, stop):
-        following = i + 1 if i + 1 < stop else start
-        ax, ay = vertices[i, 0] - x0, vertices[i, 1] - y0
-        bx, by = vertices[following, 0] - x0, vertices[following, 1] - y0
-        cross = ax * by - bx * ay
-        doubled, sum_x, sum_y = doubled + cross, sum_x + cross * (ax + bx), sum_y + cross * (ay + by)
-        mean_x, mean_y = mean_x + ax, mean_y + ay
-        length += math.sqrt((bx - ax) * (bx - ax) + (by - ay) * (by - ay))
-    # a rounded polygon is the polygon, a strip along its sides, and sectors at its corners that make a disc
-    area = doubled / 2 + length * radius + math.pi * radius * radius
-    if stop - start > 2 and doubled > _FLAT * length * length:
-        return area, x0 + sum_x / (3.0 * doubled), y0 + sum_y / (3.0 * doubled)
-    return area, x0 + mean_x / (stop - start), y0 + mean_y / (stop - start)

@@ -10,7 +10,7 @@ Equal footprints give equal bits, in either order and in any batch.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,8 @@ NOTHING, SIGNED_DISTANCE, PROTRUSION = -1, 0, 1
 MIN_X, MAX_X, MIN_Y, MAX_Y, MIN_Z, MAX_Z = 2, 3, 4, 5, 6, 7
 CENTROID_MIN_X, CENTROID_MAX_X, CENTROID_MIN_Y, CENTROID_MAX_Y = 8, 9, 10, 11
 
+_FLAT: Final = 1e-12
+"""Twice the area over the squared perimeter; a polygon with less has no centroid of its area."""
 BOX = 4
 """The corners that most parts have: their loops are compiled for this number."""
 BLOCK = 64
@@ -203,24 +205,24 @@ def _convex_protrusion(
 
 
 @inlined
-def _centroid(vertices: Floats, start: int, stop: int) -> tuple[float, float]:
-    """Return the area centroid of a polygon, or the mean of its vertices if it has no area."""
+def weight_and_centre(vertices: Floats, start: int, stop: int, radius: float) -> tuple[float, float, float]:
+    """Return a part's area, and the centroid (x, y) of its polygon before rounding."""
     # relative to the first vertex, so that coordinates far from the origin do not cancel
     x0, y0 = vertices[start, 0], vertices[start, 1]
-    area = sum_x = sum_y = 0.0
-    for i in range(start + 1, stop - 1):
+    doubled = sum_x = sum_y = mean_x = mean_y = length = 0.0
+    for i in range(start, stop):
+        following = i + 1 if i + 1 < stop else start
         ax, ay = vertices[i, 0] - x0, vertices[i, 1] - y0
-        bx, by = vertices[i + 1, 0] - x0, vertices[i + 1, 1] - y0
+        bx, by = vertices[following, 0] - x0, vertices[following, 1] - y0
         cross = ax * by - bx * ay
-        area += cross
-        sum_x += cross * (ax + bx)
-        sum_y += cross * (ay + by)
-    if area > 0.0:
-        return x0 + sum_x / (3.0 * area), y0 + sum_y / (3.0 * area)
-    for i in range(start + 1, stop):
-        sum_x += vertices[i, 0] - x0
-        sum_y += vertices[i, 1] - y0
-    return x0 + sum_x / (stop - start), y0 + sum_y / (stop - start)
+        doubled, sum_x, sum_y = doubled + cross, sum_x + cross * (ax + bx), sum_y + cross * (ay + by)
+        mean_x, mean_y = mean_x + ax, mean_y + ay
+        length += math.sqrt((bx - ax) * (bx - ax) + (by - ay) * (by - ay))
+    # a rounded polygon is the polygon, a strip along its sides, and sectors at its corners that make a disc
+    area = doubled / 2 + length * radius + math.pi * radius * radius
+    if stop - start > 2 and doubled > _FLAT * length * length:
+        return area, x0 + sum_x / (3.0 * doubled), y0 + sum_y / (3.0 * doubled)
+    return area, x0 + mean_x / (stop - start), y0 + mean_y / (stop - start)
 
 
 @inlined
@@ -275,7 +277,7 @@ def _row_extreme(rows: Rows, quantity: int, row: int, enlargement: float) -> flo
     for p in range(rows.part_start[row], rows.part_start[row + 1]):
         start, stop = rows.vertex_start[p], rows.vertex_start[p + 1]
         if quantity >= CENTROID_MIN_X:
-            x, y = _centroid(rows.vertices, start, stop)
+            _, x, y = weight_and_centre(rows.vertices, start, stop, 0.0)
             greatest = max(greatest, sign * (x if quantity <= CENTROID_MAX_X else y))
         else:
             axis = 0 if quantity <= MAX_X else 1

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,10 +18,11 @@ from spatial_replay.bags.mcap_log import McapLog
 from spatial_replay.bags.open import open_messages
 from spatial_replay.bags.reader import MessageReader
 from spatial_replay.errors import LogError, MissingFileError, UsageError
+from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.mcap.read import LogSummary, McapSource, summarise_mcap
-from spatial_replay.logs.read_options import FaultList
+from spatial_replay.logs.read_options import FaultList, gap_ns
 from spatial_replay.logs.remote import RemoteFile, log_file
-from spatial_replay.logs.source import Source, TrackSource, axes_of, reading_only
+from spatial_replay.logs.source import Source, TrackSource, axes_of, read_blocks, reading_only
 from spatial_replay.logs.topics import OBJECTS
 from spatial_replay.mapping.suggest import EXAMPLES, suggest_mapping, suggest_topics
 from spatial_replay.sources.open_log import is_bag_folder, readable_file
@@ -129,6 +132,100 @@ def survey(
         mapping=suggest_mapping(reader.name, topics, counter.examples, counter.first_ns),
         faults=faults.take(last=True),
         remarks=(*reader.take_remarks(), *counter.take_remarks()),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Regularity:
+    """How regularly something comes over a log.
+
+    Attributes:
+        rate: how many a second, with two decimals, rounded down.
+        max_gap: the longest time without one, in seconds with three decimals, rounded up; also from the
+            beginning of the log to the first, and from the last to the end.
+    """
+
+    count: int
+    rate: float
+    max_gap: float
+
+    @classmethod
+    def of(cls, times_ns: Integers, start_ns: int, end_ns: int) -> Regularity:
+        gaps = np.diff(times_ns, prepend=start_ns, append=end_ns)
+        seconds = max(end_ns - start_ns, 1) / 1e9
+        return cls(
+            len(times_ns),
+            math.floor(100.0 * (len(times_ns) - 1) / seconds) / 100.0,
+            math.ceil(int(gaps.max()) / 1e6) / 1e3,
+        )
+
+    def lacks(self, wanted: Mapping[str, Any], what: str) -> Iterator[str]:
+        """Yield how something named `what` is less regular than wanted."""
+        if self.rate < (rate := wanted.get("rate", 0.0)):
+            yield f"{what} have {self.rate:g} a second, at least {rate:g} are required"
+        if self.max_gap > (gap_ns(wanted.get("max_gap")) or math.inf) / 1e9:
+            yield f"{what} pause for {self.max_gap:g} s, at most {wanted['max_gap']} is allowed"
+
+
+@dataclass(frozen=True, slots=True)
+class Fitness:
+    """What judging a log depends on.
+
+    Attributes:
+        topics: of a log of messages, by name.
+        objects: the share of samples in which each is known, with three decimals, rounded down.
+    """
+
+    samples: Regularity
+    topics: Mapping[str, Regularity]
+    objects: Mapping[str, float]
+
+    def lacks(self, required: Mapping[str, Any]) -> Iterator[str]:
+        """Yield how a log falls short of the `requires` of a suite."""
+        yield from self.samples.lacks(required.get("samples", {}), "samples")
+        for name, wanted in required.get("topics", {}).items():
+            if name in self.topics:
+                yield from self.topics[name].lacks(wanted, f"messages of {name}")
+            else:
+                yield f"there is no message of {name}"
+        for name, share in required.get("objects", {}).items():
+            if (known := self.objects.get(name, 0.0)) < share:
+                yield f"{name} is known in {known:g} of the samples, at least {share:g} are required"
+
+
+def fitness_of(path: str | PathLike[str], source: Source) -> Fitness:
+    """Read a log, and the times of all of its messages, and return what judging it depends on.
+
+    Raises:
+        LogError: nothing can be read.
+    """
+    tally, none = _Tally(), np.empty(0, np.int64)
+    times = [none]
+    for block in read_blocks(reading_only(source)):
+        tally.add(block.trace)
+        times.append(block.trace.times_ns)
+    samples = np.concatenate(times)
+    if not len(samples):
+        raise LogError(f"{source.name} has no sample")
+    of_topics: dict[str, list[Integers]] = defaultdict(list)
+    try:
+        reader: MessageReader | None = open_messages(readable_file(path))
+    except LogError:
+        reader = None
+    for columns in reader.iter_columns({each.name for each in reader.topics()}) if reader else ():
+        names = np.array(columns.topics)
+        for name in dict.fromkeys(columns.topics):
+            of_topics[name].append(columns.log_time_ns[names == name])
+    topics = {name: np.concatenate(each) for name, each in sorted(of_topics.items())}
+    start_ns = min((int(each[0]) for each in topics.values()), default=0)
+    end_ns = max((int(each[-1]) for each in topics.values()), default=0)
+    return Fitness(
+        Regularity.of(samples, int(samples[0]), int(samples[-1])),
+        {name: Regularity.of(each, start_ns, end_ns) for name, each in topics.items()},
+        {
+            each.name: math.floor(1000.0 * (each.samples - each.unreadable) / tally.samples) / 1000.0
+            for each in tally.objects()
+        },
     )
 
 

@@ -377,6 +377,38 @@ def test_the_reason_is_about_the_number_beside_it(fleet: Path) -> None:
     assert " Robustness 0.2: `cart dist person <= 0.3` holds by 0.2 at 0.200 s" in near["reason"]
 
 
+def test_a_suite_requires_what_info_prints_and_refuses_unfit_logs(fleet: Path) -> None:
+    with sr.Recorder("run.mcap") as recorder:
+        for step in (*range(10), *range(30, 40)):
+            cart = {} if step % 2 else {"cart": sr.Footprint.box(0, 0, 1, 1)}
+            person = sr.Footprint.box(3, 0, 4, 1)
+            recorder.write(sr.Sample(step * 10**8, {"person": person, **cart}))
+    fit = command("info", "run.mcap", "--fit").out
+    assert "samples: {rate: 4.87, max_gap: 2.1s}" in fit
+    assert '"cart": 0.5\n' in fit
+    Path("gate.spatial").write_text("spec apart = G (person dist person <= 0.3)")
+    suite = "specs: gate.spatial\ncases: [{name: all, logs: run.mcap}]\n"
+    Path("suite.yaml").write_text(suite + fit)
+    assert batch("suite.yaml").code == 0
+    for wanted, lacking in (
+        ("{samples: {rate: 5}}", "samples have 4.87 a second, at least 5 are required"),
+        ("{samples: {max_gap: 2s}}", "samples pause for 2.1 s, at most 2s is allowed"),
+        ("{topics: {/tf: {}}}", "there is no message of /tf"),
+        (
+            "{objects: {cart: 0.6, ghost: 0.1}}",
+            "cart is known in 0.5 of the samples, at least 0.6 are required",
+        ),
+    ):
+        Path("suite.yaml").write_text(f"{suite}requires: {wanted}")
+        done = batch("suite.yaml", "--junit", "junit.xml")
+        assert done.code == 3
+        (error,) = ElementTree.parse("junit.xml").getroot().iter("error")
+        assert error.get("type") == "unfit"
+        assert lacking in str(error.get("message"))
+    Path("suite.yaml").write_text(f"{suite}requires: {{topics: {{/tf: {{rates: 5}}}}}}")
+    assert "did you mean 'rate'?" in batch("suite.yaml").err
+
+
 def test_a_suite_says_what_passes(fleet: Path) -> None:
     Path("suite.yaml").write_text(
         "specs: gate.spatial\n"
