@@ -160,7 +160,7 @@ def replay(
     if json_file != "-":
         print_verdicts(replayed, output, window_ns)
     if output is not None and not layer and not keep and not default_keep(inputs.source):
-        hint = f"{output} is opened next to it; with --keep all it holds its messages, too"
+        hint = f"{output} is opened next to it; with --topics all it holds its messages, too"
         show_message(
             "note", f"{inputs.source.name} stays as it is, for rosbags and `ros2 bag`: {hint}", "cyan"
         )

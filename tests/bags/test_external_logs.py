@@ -208,7 +208,7 @@ def annotated(folder: Path, mapping: Path, name: str = "ours.mcap") -> Path:
     log = write_ros2(folder / f"source-{name}", drive())
     out = folder / name
     arguments = ["replay", str(log), "--mapping", str(mapping), "--spec", str(folder / "near.spatial")]
-    assert run([*arguments, "-o", str(out), "--keep", "all"]) == 0
+    assert run([*arguments, "-o", str(out), "--topics", "all"]) == 0
     return out
 
 

@@ -200,7 +200,7 @@ def test_a_ros_2_bag_stays_readable_by_rosbags_next_to_what_a_replay_writes(
     for command in ("replay", "explain", "verify"):
         assert run([command, "ours.mcap"]) == 0
     assert run(["verify", "ours.mcap", "--source", "drive", "--mapping", "m.yaml"]) == 0
-    assert run([*replaying, "both.mcap", "--keep", "all"]) == 0
+    assert run([*replaying, "both.mcap", "--topics", "all"]) == 0
     assert _mcap(Path("both.mcap")) == Counter(before)
 
 
