@@ -490,11 +490,9 @@ def grammar() -> Lark:
     tables: Any = json.loads(_resource(TABLES_FILE), object_hook=_with_numbers)
     if tables["made_from"] == made_from(text):
         data = tables["data"]
-        data["options"] |= {"lexer": _Tokens}
+        data["options"] |= {"lexer": _Tokens, "transformer": TreeBuilder()}
         data["parser"]["lexer_conf"]["lexer_type"] = _Tokens
-        load: Any = Lark._load_from_dict
-        loaded: Lark = load(data, tables["memo"], transformer=TreeBuilder())
-        return loaded
+        return Lark.load({"data": data, "memo": tables["memo"]})
     return built_grammar(text)
 
 
