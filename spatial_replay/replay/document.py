@@ -73,6 +73,7 @@ def _result(result: SpecResult, first_ns: int, signal: bool, window_ns: int | No
         "tested": result.tested,
         "untested": [_untested(each, first_ns) for each in result.untested],
         "vacuous": [_untested(each, first_ns) for each in result.vacuous],
+        "remarks": list(counted_from(result.remarks, first_ns)),
         "nodes": [
             {
                 "id": node.id,

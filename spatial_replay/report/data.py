@@ -144,7 +144,7 @@ class RunReport:
         axes: those of the source, as opposed to those of the samples.
         faults, remarks: what was lost while reading, and other notes of the reader.
         vacuous: templates that no object fits.
-        observed_ns: from when on all is observed that unknown results are about; or None.
+        gaps: sentences on what unknown results lack before or after a time.
         unreadable: how many observations have no finite numbers.
         declared_units: those of signals by their names, and of lengths by "".
     """
@@ -164,7 +164,7 @@ class RunReport:
     files: tuple[Specification, ...]
     results: tuple[ReportedResult, ...]
     vacuous: tuple[UntestedPart, ...]
-    observed_ns: int | None
+    gaps: tuple[str, ...]
     scene: ReportedScene
     events: tuple[ReportedEvent, ...]
     decisions: ReportedDecisions

@@ -114,12 +114,8 @@ def _notices(report: RunReport, omissions: Sequence[str]) -> Iterator[Html]:
         yield _notice("note", what, report.remarks)
     elif report.remarks:
         yield _notice("note", "The log says of its samples:", report.remarks)
-    if report.observed_ns is not None:
-        since = Instant(report.observed_ns, report.first_ns)
-        # whole milliseconds, not past the sample
-        start = (report.observed_ns - report.first_ns) // 10**6 / 1e3
-        what = f"Everything that the unknown results are about is observed from {since} on: "
-        yield _notice("note", what + f"--from {start:.3f}s evaluates from there.", ())
+    if report.gaps:
+        yield _notice("note", "Samples lack what unknown results are about:", report.gaps)
     if report.semantics != "ltlf" and report.results:
         yield _notice("note", "Explanations are given under the semantics ltlf alone.", ())
     if omissions:

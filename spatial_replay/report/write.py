@@ -24,7 +24,7 @@ from spatial_replay.logs.output_file import refuse_inputs, replacing
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.source import Source, axes_of
 from spatial_replay.logs.source import units_of as declared_units
-from spatial_replay.monitor.sentences import divisor_of, open_text
+from spatial_replay.monitor.sentences import divisor_of, gap_sentence, open_text
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.monitor.witness.witness import Witness, WitnessStep
 from spatial_replay.replay.engine import Replay, Replayed
@@ -177,7 +177,7 @@ def _report(source: Source, replay: Replay, replayed: Replayed, collector: Colle
         files=tuple(replay.files),
         results=tuple(_results(replay, replayed, collector, declared_units(source))),
         vacuous=replayed.vacuous,
-        observed_ns=_observed_ns(replayed),
+        gaps=_gaps(replayed),
         scene=collector.scene.scene,
         events=tuple(collector.events),
         decisions=collector.decisions.decisions,
@@ -253,14 +253,8 @@ def _explained(replayed: Replayed) -> frozenset[int]:
     return frozenset(worst_results(replayed.results))
 
 
-def _observed_ns(replayed: Replayed) -> int | None:
-    """Return from when on all is observed that results are about which are unknown; None if it never is."""
-    latest = replayed.start_ns
-    for result in replayed.results:
-        if result.verdict is not Verdict.UNKNOWN:
-            continue
-        for gap in result.gaps():
-            if gap.next_ns is None:
-                return None
-            latest = max(latest, gap.next_ns)
-    return latest if latest > replayed.start_ns else None
+def _gaps(replayed: Replayed) -> tuple[str, ...]:
+    """Return sentences on what unknown results lack at the ends of a log, with a window without that."""
+    unknown = [each for each in replayed.results if each.verdict is Verdict.UNKNOWN]
+    gaps = (gap for each in unknown for gap in each.gaps() if gap.window is not None)
+    return tuple(dict.fromkeys(gap_sentence(gap, replayed.first_ns) for gap in gaps))

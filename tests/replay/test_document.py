@@ -62,3 +62,9 @@ def test_series_have_one_list_per_node(found: dict[str, Any]) -> None:
 def test_there_are_no_series_by_default() -> None:
     replayed = run_replay(PiecewiseSource(run(), 5), [parse_specification(SPECIFICATION)])
     assert all("series" not in each for each in document_from_replay(replayed)["specifications"])
+
+
+def test_a_goal_that_holds_at_once_is_remarked() -> None:
+    spec = parse_specification("spec there = F (cube dist cube <= 1)")
+    (result,) = document_from_replay(run_replay(PiecewiseSource(run(), 5), [spec]))["specifications"]
+    assert result["remarks"] == ["`there` is already true at the first sample."]

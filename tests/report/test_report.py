@@ -333,18 +333,18 @@ def test_instances_of_a_template_have_their_own_results(tmp_path: Path) -> None:
     assert "calm(a)" in page.within("section#verdicts")
 
 
-def test_an_unknown_run_says_from_when_on_everything_is_observed(tmp_path: Path) -> None:
+def test_an_unknown_run_says_which_window_leaves_out_what_is_missing(tmp_path: Path) -> None:
     disc = sr.Footprint.disc
     samples = [
-        sr.Sample(t * 10**9, {"a": disc(0, 0, 1)} | ({"b": disc(5, 0, 1)} if t >= 3 else {}))
-        for t in range(6)
+        sr.Sample(t * 10**9, {"a": disc(0, 0, 1)} | ({"b": disc(5, 0, 1)} if 3 <= t < 6 else {}))
+        for t in range(7)
     ]
     page = report_of_samples(tmp_path / "run.html", samples, "spec apart = G (a dist b >= 1)")
-    assert "is observed from 3.000 s on: --from 3.000s evaluates from there." in page.within("header#")
+    assert "--from 3.000s --to 6.000s leaves them out." in page.within("header#")
     seen = report_of_samples(
-        tmp_path / "seen.html", samples, "spec apart = G (a dist b >= 1)", window=Window(start_ns=3 * 10**9)
+        tmp_path / "seen.html", samples, "spec apart = G (a dist b >= 1)", window=Window(3 * 10**9, 6 * 10**9)
     )
-    assert "is observed from" not in seen.text
+    assert "leaves them out" not in seen.text
 
 
 def test_arrows_of_the_automaton_have_the_words_of_its_drawing(planned: Page) -> None:

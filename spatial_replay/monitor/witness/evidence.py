@@ -39,7 +39,6 @@ class Gap:
         name: of the object, or the signal in quotes.
         missing, samples: in how many of how many samples it is missing.
         first_ns, last_ns: the first and the last of these.
-        next_ns: the sample after the last of these; None if there is none.
         window: the start, and the end (not included), of the samples between missing ones at the ends of a
             log; None if others are missing.
     """
@@ -49,7 +48,6 @@ class Gap:
     samples: int
     first_ns: int
     last_ns: int
-    next_ns: int | None
     window: tuple[int | None, int | None] | None
 
 
@@ -222,6 +220,5 @@ def _gap(name: str, missing: NDArray[np.bool_], times_ns: Integers) -> Gap:
         len(missing),
         int(times_ns[first]),
         int(times_ns[last]),
-        int(times_ns[last + 1]) if last + 1 < len(missing) else None,
         window if is_at_ends else None,
     )
