@@ -6,6 +6,7 @@ end the process by a signal, and is compiled again. `SPATIAL_REPLAY_CACHE` names
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import hashlib
 import os
@@ -19,6 +20,8 @@ from pathlib import Path
 from typing import Final
 
 _STALE_S: Final = 7 * 24 * 3600.0
+_ROOM_BYTES: Final = 2**25
+"""A disk with less space keeps no code: a kernel that cannot be written ends the process."""
 _PACKAGE: Final = Path(__file__).parent
 
 
@@ -35,9 +38,10 @@ def cache_folder() -> Path | None:
             is_new = not folder.exists()
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=folder):
-                pass
+                if shutil.disk_usage(folder).free < _ROOM_BYTES:
+                    raise OSError(errno.ENOSPC, "no space left")
         except OSError:
-            # code that was compiled when an image was built, and is read-only now
+            # code that was compiled when an image was built, and is read-only now, or on a full disk
             shipped = shipped or (folder if _holds_code(folder) else None)
             continue
         if is_new:
@@ -62,7 +66,7 @@ def remove_damaged(folder: Path) -> None:
         is_alone = False
     for path in folder.rglob("*.nb[ic]"):
         with suppress(OSError):
-            is_damaged = not _is_sealed(path) or _seal_of(path).read_text() != _digest_of(path)
+            is_damaged = not _is_sealed(path) or _seal_of(path).read_bytes() != _digest_of(path)
             if is_damaged and (is_alone or _is_sealed(path)):
                 path.unlink()
     # until this process ends
@@ -74,7 +78,7 @@ def seal(folder: Path) -> None:
     for path in folder.rglob("*.nb[ic]"):
         with suppress(OSError):
             if not _is_sealed(path):
-                _seal_of(path).write_text(_digest_of(path))
+                _seal_of(path).write_bytes(_digest_of(path))
 
 
 def _is_sealed(path: Path) -> bool:
@@ -87,8 +91,8 @@ def _seal_of(path: Path) -> Path:
     return path.with_name(f"{path.name}.sha256")
 
 
-def _digest_of(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+def _digest_of(path: Path) -> bytes:
+    return hashlib.sha256(path.read_bytes()).hexdigest().encode()
 
 
 def _cache_parents() -> Iterator[Path]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from importlib import import_module
 from pathlib import Path
@@ -9,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import spatial_replay as sr
+from cli.program import run_program
 
 TEXT = (Path(__file__).parents[1] / "SECURITY.md").read_text()
 ROW = re.compile(
@@ -40,15 +42,24 @@ def test_every_limit_is_the_one_of_the_code() -> None:
     assert len(rows()) > 30
 
 
-def test_a_crowd_beyond_a_limit_is_refused(tmp_path: Path) -> None:
+def test_a_crowd_beyond_a_limit_is_refused() -> None:
     crowd = {f"o{number}": sr.Footprint.disc(number, 0, 0.1) for number in range(20_001)}
-    trace = sr.Trace.from_samples([sr.Sample(0, crowd)])
-    closest = sr.parse_specification("G (forall x, y in all: x dist y >= 0.5)")
+    monitor = sr.Monitor(sr.parse_specification("G (forall x, y in all: x dist y >= 0.5)"))
     with pytest.raises(sr.UsageError, match="closest two of 20001 objects; 20000 is the limit"):
-        sr.evaluate(closest, trace)
-    with pytest.raises(sr.UsageError, match="has 20001 objects; a page draws at most 20000: map fewer"):
-        sr.write_report(trace, sr.parse_specification("o1 dist o2 >= 0"), output=tmp_path / "run.html")
-    assert not list(tmp_path.iterdir())
+        monitor.update(sr.Sample(0, crowd))
+    with pytest.raises(sr.TraceError, match="there are 20,001 objects; 20,000 is the limit"):
+        sr.Trace.from_samples([sr.Sample(0, crowd)])
+
+
+@pytest.mark.parametrize("command", ["replay", "report", "explain", "info"])
+def test_a_log_of_too_many_signals_is_refused(tmp_path: Path, command: str) -> None:
+    signals = {f"s{number}": number for number in range(20_001)}
+    (tmp_path / "run.jsonl").write_text(json.dumps({"time_ns": 0, "objects": [], "signals": signals}))
+    (tmp_path / "s.spatial").write_text("spec ready = G (s1 >= 0)")
+    spec = ["--spec", "s.spatial"] if command != "info" else []
+    done = run_program(command, "run.jsonl", *spec, cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (3, "")
+    assert "error: there are 20,001 signals; 20,000 is the limit: leave some out" in done.stderr
 
 
 @pytest.mark.parametrize(

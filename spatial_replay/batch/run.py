@@ -219,11 +219,9 @@ def _logs_at(address: str) -> Iterator[FoundLog]:
 
 
 def _logs_in(path: Path, folder: Path) -> Iterator[FoundLog]:
-    """Yield the logs in a folder: bags, and files with the ending of a log."""
-    if (path / BAG_METADATA).is_file():
-        yield _found(path, folder)
-        return
-    for parent, folders, names in os.walk(path):
+    """Yield the logs in a folder: bags, files with the ending of a log, and folders that cannot be read."""
+    closed: list[OSError] = []
+    for parent, folders, names in os.walk(path, onerror=closed.append):
         if BAG_METADATA in names:
             yield _found(Path(parent), folder)
             folders.clear()
@@ -236,6 +234,8 @@ def _logs_in(path: Path, folder: Path) -> Iterator[FoundLog]:
                 # as texts: paths would take most of the time
                 shown = name if here.name == "." else f"{here.name}/{name}"
                 yield FoundLog(encodable(shown), f"{here.path}/{name}")
+    # to open one is the error of its row: a batch does not pass over logs in silence
+    yield from (_found(Path(error.filename), folder) for error in closed)
 
 
 def _found(path: Path, folder: Path) -> FoundLog:

@@ -20,7 +20,7 @@ from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectState, ObjectStat
 from spatial_replay.logs.wire import Bytes, LayoutError, WireTemplate, Words, payloads_of, rows_of
 from spatial_replay.text import Instant, Sentence
 from spatial_replay.trace.observations import Observations, trace_from_observations
-from spatial_replay.trace.trace import ABSENT, Trace
+from spatial_replay.trace.trace import ABSENT, Trace, require_few
 
 UNKNOWN, ZERO = -2, -1
 """Slots of numbers that a message does not hold, after its last slot: they read as NaN and 0."""
@@ -350,6 +350,7 @@ def _observations(groups: Sequence[_Group], times_ns: Integers) -> Observations:
         return np.concatenate([np.empty(0, np.int64), *tiled])
 
     signals = sorted({name for g in groups for name in g.layout.signals})
+    require_few(names, signals)
     samples = (np.repeat(g.samples, len(g.layout.names)) for g in groups)
     return Observations(
         times_ns=times_ns,

@@ -429,10 +429,6 @@ class ReportedScene:
         return replace(self, times_ns=self.times_ns[is_kept], frames=frames)
 
 
-MOST_OBJECTS = 20_000
-"""Objects of a log that a page draws."""
-
-
 class SceneCollector:
     """Collects frames as they come; if there are too many, it drops every other one."""
 
@@ -442,14 +438,7 @@ class SceneCollector:
         self._last_ns: int | None = None
 
     def add(self, frames: SceneFrames) -> None:
-        """Take in what the next messages show.
-
-        Raises:
-            UsageError: more objects than a page draws.
-        """
-        if (count := frames.objects.shape[1]) > MOST_OBJECTS:
-            remedy = "map fewer of them, or write a log with the ones that matter"
-            raise UsageError(f"the log has {count} objects; a page draws at most {MOST_OBJECTS}: {remedy}")
+        """Take in what the next messages show."""
         # no others have a place
         chosen = np.arange(-self._count % self._stride, len(frames.times_ns), self._stride)
         is_again = len(frames.times_ns) > 0 and int(frames.times_ns[0]) == self._last_ns

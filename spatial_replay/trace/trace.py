@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from bisect import bisect_left
 from collections import OrderedDict
-from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
 from decimal import Decimal
@@ -23,6 +23,8 @@ from spatial_replay.text import times_apart
 from spatial_replay.trace.sample import FOREVER, LATEST_NS, Sample
 from spatial_replay.trace.units import checked_units
 
+MOST_NAMES = 20_000
+"""Objects, and signals, of a trace."""
 _BYTES = 1 << 30
 
 
@@ -176,7 +178,7 @@ class Trace(Displayed):
         cache: measurements already taken from this trace.
 
     Raises:
-        TraceError: columns whose lengths do not fit together, or times that do not increase.
+        TraceError: columns whose lengths do not fit together, times that do not increase, or too many names.
     """
 
     times_ns: Integers
@@ -250,11 +252,13 @@ class Trace(Displayed):
             units: for sentences and axes: of signals by their names, of lengths by "".
 
         Raises:
-            TraceError: times that do not increase.
+            TraceError: times that do not increase, or too many names.
             UsageError: units that are not texts.
         """
         listed = list(samples)
         names = tuple(sorted({name for each in listed for name in (*each.objects, *each.unknown)}))
+        signals = sorted({name for sample in listed for name in sample.signals})
+        require_few(names, signals)
         number = {name: index for index, name in enumerate(names)}
         rows = np.full((len(listed), len(names)), ABSENT, np.int64)
         observed: list[TrackedObject] = []
@@ -271,7 +275,6 @@ class Trace(Displayed):
                 blank.append(sample.unknown[name])
         named = [*(tracked.class_name for tracked in observed), *blank]
         classes = _class_order(named)
-        signals = sorted({name for sample in listed for name in sample.signals})
         footprints, heights = [each.footprint for each in observed], [each.height for each in observed]
         columns = {name: [sample.signals.get(name, np.nan) for sample in listed] for name in signals}
         shapes = FootprintBatch.from_footprints(footprints, heights)
@@ -419,7 +422,19 @@ def within(trace: Trace, start_ns: int | None, end_ns: int | None) -> Trace:
     return trace if (begin, end) == (0, len(trace)) else trace.slice(begin, end)
 
 
+def require_few(objects: Collection[str], signals: Collection[str]) -> None:
+    """Check the number of names, each of which takes a number in every sample.
+
+    Raises:
+        TraceError: more objects or signals than `MOST_NAMES`.
+    """
+    for names, what in ((objects, "objects"), (signals, "signals")):
+        if len(names) > MOST_NAMES:
+            raise TraceError(f"there are {len(names):,} {what}; {MOST_NAMES:,} is the limit: leave some out")
+
+
 def _check_shapes(trace: Trace) -> None:
+    require_few(trace.names, trace.signals)
     samples, observations = len(trace.times_ns), len(trace.footprints)
     if trace.times_ns.ndim != 1 or trace.rows.shape != (samples, len(trace.names)):
         raise TraceError(

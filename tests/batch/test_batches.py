@@ -6,8 +6,11 @@ import json
 import os
 import random
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.resources import files
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from urllib.request import Request, urlopen
 from xml.etree import ElementTree
 
@@ -49,6 +52,44 @@ def test_a_row_says_what_a_replay_of_the_log_says(fleet: Path) -> None:
             )
     assert [row["failure"] for row in result.failures.to_pylist()] == ["violated, expected satisfied"] * 2
     assert sr.read_results("results").equals(result.table)
+
+
+@contextmanager
+def plain_user() -> Iterator[None]:
+    """Be a user who may not read everything, also in tests by root."""
+    before = os.geteuid()
+    if before == 0:
+        os.seteuid(65534)
+    try:
+        yield
+    finally:
+        os.seteuid(before)
+
+
+def test_a_folder_that_cannot_be_read_is_an_error_and_not_a_batch_without_its_logs() -> None:
+    # where every user may look
+    with TemporaryDirectory(dir="/tmp") as name:
+        folder = Path(name)
+        folder.chmod(0o755)
+        write_fleet(folder, DISTANCES[:2])
+        (folder / "logs/theirs").mkdir()
+        (folder / "logs/run-1.jsonl").rename(folder / "logs/theirs/run-1.jsonl")
+        (folder / "out").mkdir()
+        (folder / "out").chmod(0o777)
+
+        def outcome(logs: str, results: str) -> tuple[int, str]:
+            spec, output = str(folder / "gate.spatial"), str(folder / "out" / results)
+            done = batch(str(folder / logs), "--spec", spec, "-o", output, "--json", "-")
+            return done.code, done.out
+
+        assert outcome("logs", "all")[0] == 0
+        (folder / "logs/theirs").chmod(0)
+        for logs, results in (("logs", "most"), ("logs/theirs", "none")):
+            with plain_user():
+                code, printed = outcome(logs, results)
+            assert code == 70
+            assert "theirs: Permission denied" in printed
+        (folder / "logs/theirs").chmod(0o755)
 
 
 def test_only_what_is_new_is_evaluated(fleet: Path) -> None:

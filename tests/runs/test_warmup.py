@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 
@@ -52,3 +53,16 @@ def test_a_relative_cache_folder_is_ignored(monkeypatch, tmp_path):
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.delenv("SPATIAL_REPLAY_CACHE", raising=False)
     assert user_cache_folder("downloads") == tmp_path / ".cache/spatial-replay/downloads"
+
+
+def test_machine_code_is_kept_on_no_disk_that_is_full(monkeypatch, tmp_path):
+    full, roomy = tmp_path / "full", tmp_path / "roomy"
+    free = {full: 2**20, roomy: 2**30}
+    monkeypatch.setenv("SPATIAL_REPLAY_CACHE", str(full))
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(roomy))
+    usage = shutil.disk_usage(tmp_path)
+    # no user can fill a disk for a test
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: usage._replace(free=free[folder.parent]))
+    assert cache_folder().parent == roomy
+    free[full] = 2**30
+    assert cache_folder().parent == full

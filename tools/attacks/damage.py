@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import io
 import json
 import random
 import zlib
@@ -12,6 +13,8 @@ from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
+
+from mcap.reader import make_reader
 
 from attacks.cases import Case, Outcome
 from attacks.program import Said, problems_of, said_by
@@ -97,7 +100,7 @@ class Damage:
                 outcome.problems.append(f"{expected} became {found} without a remark")
             outcome.counts["unchecked changes"] = int(not form.is_checked)
         if case["more"] in ("recover", "all") and form.recovers:
-            outcome.problems += _recovered(log, folder, [*mapped, *spec], found, form)
+            outcome.problems += _recovered(log, folder, [*mapped, *spec], found, kind)
         out = ["-o", str(folder / "copy.mcap")]
         commands = {
             "info": [["info", str(log), *mapped]],
@@ -120,8 +123,9 @@ class Damage:
         return outcome
 
 
-def _recovered(log: Path, folder: Path, options: list[str], found: Any, form: Format) -> list[str]:
+def _recovered(log: Path, folder: Path, options: list[str], found: Any, kind: str) -> list[str]:
     """Recover a log, and what was recovered again; return what is wrong with either."""
+    form = FORMATS[kind]
     once, twice = folder / "once.mcap", folder / "twice.mcap"
     first = said_by(["recover", str(log), "-o", str(once)])
     problems = problems_of(first)
@@ -136,6 +140,8 @@ def _recovered(log: Path, folder: Path, options: list[str], found: Any, form: Fo
     # without a checksum, a message that is wrong inside is copied as it is
     if replayed.code == 3 and found is not None and form.is_checked:
         problems.append(f"what was recovered is damaged: {replayed.said[:300]}")
+    if form.is_checked and not messages_of(once.read_bytes()) <= _sound_messages(kind):
+        problems.append("what was recovered has messages that the undamaged log has not")
     saved = verdicts_of(replayed)
     # of a damaged database, reading all topics may give a row more than reading some
     if found is not None and saved is not None and saved != found and saved[0] <= found[0]:
@@ -226,6 +232,18 @@ def _placed(case: Case, folder: Path) -> Path:
         path.parent.mkdir(exist_ok=True)
         path.write_bytes(data)
     return folder / sorted(_files(case["format"]))[0].split("/")[0]
+
+
+def messages_of(log: bytes) -> set[tuple[str, int, bytes]]:
+    """Return topic, time and bytes of each message of an MCAP log."""
+    found = make_reader(io.BytesIO(log)).iter_messages(log_time_order=False)
+    return {(channel.topic, message.log_time, message.data) for _, channel, message in found}
+
+
+@cache
+def _sound_messages(kind: str) -> set[tuple[str, int, bytes]]:
+    (log,) = _files(kind).values()
+    return messages_of(log)
 
 
 @cache

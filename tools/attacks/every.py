@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 from attacks.cases import Attack
 from attacks.clients import Clients
+from attacks.code import Code
 from attacks.commands import Interrupts, Names
 from attacks.damage import Damage
 from attacks.kills import Kills
@@ -16,6 +17,7 @@ ATTACKS: dict[str, Callable[[], Attack]] = {
     "kills": Kills,
     "damage": Damage,
     "results": Results,
+    "code": Code,
     "texts": Texts,
     "names": Names,
     "interrupts": Interrupts,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import random
 import shutil
 from functools import cache
@@ -28,13 +29,7 @@ class Results:
         _sound()
 
     def draw(self, rng: random.Random) -> Case:
-        kinds = ("flip", "flip", "flip", "cut", "zero", "remove")
-        return {
-            "edits": [
-                [rng.random(), rng.choice(kinds), rng.random(), rng.randrange(8)]
-                for _ in range(rng.choice((1, 1, 1, 2, 5)))
-            ]
-        }
+        return {"edits": draw_edits(rng), "keeps_time": rng.random() < 0.5}
 
     def kept(self, case: Case, folder: Path) -> Case:
         """See `Attack`."""
@@ -43,7 +38,7 @@ class Results:
     def run(self, case: Case, folder: Path) -> Outcome:
         sound, results = _sound(), folder / "results"
         shutil.copytree(sound.results, results)
-        edited = {_edit(results, *edit) for edit in case["edits"]}
+        edited = {edit_file(results, *edit, keeps_time=case["keeps_time"]) for edit in case["edits"]}
         shown = said_by(["results", str(results)])
         evaluated = _batch(sound.logs, results)
         outcome = Outcome([*problems_of(shown), *problems_of(evaluated)], {f"exit {evaluated.code}": 1})
@@ -96,13 +91,28 @@ def _rows(said: Said) -> list[dict[str, Any]]:
     return [{name: value for name, value in row.items() if name != "seconds"} for row in rows]
 
 
-def _edit(results: Path, which: float, kind: str, place: float, bit: int) -> str:
-    """Edit a file of the folder; return its name."""
-    files = sorted(file for file in results.rglob("*") if file.is_file())
+def draw_edits(rng: random.Random) -> list[list[Any]]:
+    """Draw edits of files of a folder, as `edit_file` takes them."""
+    kinds = ("flip", "flip", "flip", "cut", "zero", "remove")
+    return [
+        [rng.random(), rng.choice(kinds), rng.random(), rng.randrange(8)]
+        for _ in range(rng.choice((1, 1, 1, 2, 5)))
+    ]
+
+
+def edit_file(
+    folder: Path, which: float, kind: str, place: float, bit: int, *, keeps_time: bool = False
+) -> str:
+    """Edit a file of the folder; return its name.
+
+    Args:
+        keeps_time: whether it seems not to have been written since.
+    """
+    files = sorted(file for file in folder.rglob("*") if file.is_file())
     if not files:
         return ""
     file = files[int(which * len(files))]
-    data = bytearray(file.read_bytes())
+    data, before = bytearray(file.read_bytes()), file.stat()
     at = int(place * len(data))
     if kind == "remove":
         file.unlink()
@@ -114,4 +124,6 @@ def _edit(results: Path, which: float, kind: str, place: float, bit: int) -> str
     elif data:
         data[at] ^= 1 << bit
     file.write_bytes(data)
+    if keeps_time:
+        os.utime(file, ns=(before.st_atime_ns, before.st_mtime_ns))
     return file.name

@@ -24,7 +24,7 @@ from spatial_replay.logs.read_options import FaultList
 from spatial_replay.text import Sentence, is_encodable, text_number, times_apart
 from spatial_replay.trace.observations import Observations, trace_from_observations
 from spatial_replay.trace.sample import LATEST_NS
-from spatial_replay.trace.trace import Trace
+from spatial_replay.trace.trace import Trace, require_few
 
 GZIP_MAGIC = b"\x1f\x8b"
 LONGEST_LINE = 16 * 2**20
@@ -137,6 +137,7 @@ class ReportColumns:
         ordered = sorted({r.class_name for r in reports}, key=lambda c: (c is not None, c or ""))
         classes = {name: index for index, name in enumerate(ordered)}
         signals = sorted({name for values in self._signals for name in values})
+        require_few(names, signals)
         return Observations(
             times_ns=np.array(self.times, np.int64),
             sample=np.repeat(np.arange(len(self.times)), self._counts),
