@@ -309,6 +309,16 @@ def is_list(value: object) -> TypeGuard[Sequence[object]]:
     )
 
 
+def enum_names(path: FieldPath, message: object) -> dict[object, str]:
+    """Return the names of the numbers of a protobuf enum at a path; none for anything else."""
+    if not path.steps:
+        return {}
+    owner = walk(FieldPath(path.text, path.steps[:-1]), message)
+    fields = getattr(getattr(owner, "DESCRIPTOR", None), "fields_by_name", {})
+    kind = getattr(fields.get(path.steps[-1]), "enum_type", None)
+    return {} if kind is None else {each.number: each.name for each in kind.values}
+
+
 def getter(path: FieldPath, style: Style) -> Get:
     """Compile a path without `[*]` to a function from a message to the value at the path.
 

@@ -45,6 +45,7 @@ from spatial_replay.mapping.field_paths import (
     Get,
     NameTemplate,
     elements_of,
+    enum_names,
     getter,
     iter_elements,
     keys_of,
@@ -772,6 +773,14 @@ class TopicReader:
         path = FieldPath.of(signal.field)
         value = walk(path, message)
         get, table = getter(path, style_of(message)), signal.table
+        if names := enum_names(path, message):
+            number = get
+
+            def get(message: object) -> object:
+                # as in JSON, whose enums are texts; a number without a name stays one
+                return names.get(number(message), number(message))
+
+            value = get(message)
         if table:
 
             def number_of(message: object) -> float:

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 from mapping.feeding import SECOND, Feed, Made, header, make, pose, pose_stamped, ros, tf, transform
 from spatial_replay import Footprint, TrackedObject, UsageError, evaluate, parse_specification
+from spatial_replay.text import text_number
 
 QUARTER = (0.0, 0.0, sin(pi / 4), cos(pi / 4))
 
@@ -41,6 +43,17 @@ def test_a_pose_is_an_object_named_after_its_topic() -> None:
     found = objects(pose_stamped(1.0, 2.0, turn=QUARTER))
     assert found["thing"].footprint == Footprint.disc(1.0, 2.0, 0.0)
     assert found["thing"].yaw == pytest.approx(pi / 2)
+
+
+def test_an_enum_of_protobuf_is_a_text_and_numbers_without_a_name_stay_numbers() -> None:
+    feed = Feed()
+    for second, level in enumerate((Log.Level.INFO, Log.Level.ERROR, 77), 1):
+        feed.add("/log", second * SECOND, Log(level=level))
+    plain = make("topics: {/log: {signals: {level: level}}}", feed).trace
+    assert plain.signals["level"].tolist() == [text_number("INFO"), text_number("ERROR"), 77.0]
+    table = "{field: level, names: {INFO: 1, ERROR: 5}}"
+    named = make(f"topics: {{/log: {{signals: {{level: {table}}}}}}}", feed).trace
+    assert np.array_equal(named.signals["level"], [1.0, 5.0, np.nan], equal_nan=True)
 
 
 def test_a_pose_takes_the_shape_and_the_height_that_the_mapping_gives() -> None:

@@ -74,8 +74,10 @@ def _reasons(scene: TraceScene, part: Expression) -> Iterator[str]:
             elif not np.isfinite(values[scene.skip]):
                 yield f"signal {name!r} has no finite value in the sample"
             elif is_text_number(compared) != is_text_number(values[scene.skip]):
-                kinds = "a number, not a text; leave out `names` of its mapping to compare texts"
-                yield f"signal {name!r} is {kinds if is_text_number(compared) else 'a text, not a number'}"
+                kinds = "a text, not a number; `names` of its mapping give texts numbers"
+                if is_text_number(compared):
+                    kinds = "a number, not a text; leave out `names` of its mapping to compare texts"
+                yield f"signal {name!r} is {kinds}"
         case Number() | Sum() | Negative() | Minimum() | Maximum() | Scaled():
             return
         case _:
