@@ -8,9 +8,11 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
+from mcap.writer import Writer
 
 import spatial_replay as sr
 from cli.program import run_program
+from spatial_replay.logs.topics import RECORDED_PREFIX
 
 TEXT = (Path(__file__).parents[1] / "SECURITY.md").read_text()
 ROW = re.compile(
@@ -75,3 +77,38 @@ def test_a_log_of_too_many_signals_is_refused(tmp_path: Path, command: str) -> N
 def test_a_specification_beyond_a_limit_is_refused(text: str) -> None:
     with pytest.raises(sr.SpecificationError):
         sr.parse_specification(text)
+
+
+def test_names_in_a_log_become_neither_paths_nor_parts_of_a_page(tmp_path: Path) -> None:
+    folder, script = tmp_path / "here" / "there", "<script>alert(1)</script>"
+    folder.mkdir(parents=True)
+    topics = {name: f"/{name}{script}" for name in "ab"}
+    with (folder / "run.mcap").open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        for topic in topics.values():
+            channel = writer.register_channel(topic, "json", 0)
+            writer.add_message(channel, 1, b'{"x": 1, "y": 2}', 1)
+        for number, name in enumerate(["../../out", f"{tmp_path}/out", "../out", f"../{script}"]):
+            text = f"spec s{number} = G (a dist b >= 1)"
+            for prefix in ("", RECORDED_PREFIX):
+                writer.add_attachment(1, 1, f"{prefix}{name}.spatial", "text/plain", text.encode())
+        writer.add_metadata("../../out", {"../../out": script})
+        writer.finish()
+    shape = f"{{position: [x, y], shape: {{disc: 0.1}}, class: '{script}'}}"
+    mapped = "".join(f"  '{topic}': {shape[:-1]}, name: {name}}}\n" for name, topic in topics.items())
+    (folder / "m.yaml").write_text(f"sample: {{topic: '{topics['b']}'}}\ntopics:\n{mapped}")
+    for command in (
+        "replay run.mcap --mapping m.yaml -o annotated.mcap",
+        "recover run.mcap -o recovered.mcap",
+        "info run.mcap --specification -o s.spatial",
+        "report run.mcap --mapping m.yaml -o run.html",
+        "batch run.mcap --mapping m.yaml --spec s.spatial --jobs 1 --html pages",
+    ):
+        done = run_program(*command.split(), cwd=folder)
+        assert done.returncode in (0, 1), done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["here"]
+    assert [path.name for path in (tmp_path / "here").iterdir()] == ["there"]
+    pages = [folder / "run.html", *(folder / "pages").rglob("*.html")]
+    assert len(pages) == 3
+    assert not [page for page in pages if script in page.read_text()]
