@@ -19,7 +19,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from spatial_replay.errors import LogError
-from spatial_replay.geometry.arrays import Integers
+from spatial_replay.geometry.arrays import Integers, concatenated, select
 from spatial_replay.logs.mcap.read import too_many_waiting
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.text import Instant
@@ -73,35 +73,10 @@ class MessageColumns:
     def __len__(self) -> int:
         return len(self.topics)
 
-    def slice(self, begin: int, end: int) -> MessageColumns:
-        """Return the messages from `begin` up to, not including, `end`."""
-        return MessageColumns(
-            self.topics[begin:end],
-            self.log_time_ns[begin:end],
-            self.publish_time_ns[begin:end],
-            self.sequence[begin:end],
-            self.payloads[begin:end],
-            self.place[begin:end],
-            self.channel[begin:end],
-        )
-
-    def take(self, places: Integers) -> MessageColumns:
-        """Return the messages in the given places, in that order."""
-        listed = places.tolist()
-        return MessageColumns(
-            [self.topics[place] for place in listed],
-            self.log_time_ns[places],
-            self.publish_time_ns[places],
-            self.sequence[places],
-            [self.payloads[place] for place in listed],
-            self.place[places],
-            self.channel[places],
-        )
-
     def of_topics(self, topics: Collection[str]) -> MessageColumns:
         """Return the messages of some topics, in the same order."""
         places = [place for place, topic in enumerate(self.topics) if topic in topics]
-        return self if len(places) == len(self) else self.take(np.array(places, np.int64))
+        return self if len(places) == len(self) else select(self, np.array(places, np.int64))
 
     def ordered(self) -> MessageColumns:
         """Return the same messages by log time, topic and sequence; equal ones keep their order."""
@@ -110,7 +85,7 @@ class MessageColumns:
             return self
         rank = {topic: number for number, topic in enumerate(sorted(set(self.topics)))}
         topics = np.fromiter(map(rank.__getitem__, self.topics), np.int64, len(self))
-        return self.take(np.lexsort((self.sequence, topics, times)))
+        return select(self, np.lexsort((self.sequence, topics, times)))
 
     def count_before(self, time_ns: int) -> int:
         """Count the messages, which are in order, before a time."""
@@ -132,26 +107,11 @@ class MessageColumns:
 Columns: TypeAlias = Iterator[MessageColumns]
 
 
-def joined(several: Sequence[MessageColumns]) -> MessageColumns:
-    """Join the messages of several columns, one after the other."""
-    if len(several) == 1:
-        return several[0]
-    return MessageColumns(
-        [topic for each in several for topic in each.topics],
-        np.concatenate([np.zeros(0, np.int64), *(each.log_time_ns for each in several)]),
-        np.concatenate([np.zeros(0, np.int64), *(each.publish_time_ns for each in several)]),
-        np.concatenate([np.zeros(0, np.int64), *(each.sequence for each in several)]),
-        [payload for each in several for payload in each.payloads],
-        np.concatenate([np.zeros(0, np.int64), *(each.place for each in several)]),
-        np.concatenate([np.zeros(0, np.int64), *(each.channel for each in several)]),
-    )
-
-
 def in_pieces(columns: Columns, size: int = _TOGETHER) -> Columns:
     """Yield the same messages, at most `size` at a time."""
     for each in columns:
         for begin in range(0, len(each), size):
-            yield each.slice(begin, begin + size)
+            yield select(each, slice(begin, begin + size))
 
 
 def one_by_one(columns: Columns) -> Iterator[Message]:
@@ -194,13 +154,13 @@ def in_order(
         held += sum(map(len, chunk.payloads))
         if held > most_bytes:
             raise too_many_waiting(name, most_bytes)
-        waiting = joined([waiting, chunk] if len(waiting) else [chunk]).ordered()
+        waiting = concatenated([waiting, chunk] if len(waiting) else [chunk]).ordered()
         if number == len(starts_ns):
             break
         ready = waiting.count_before(starts_ns[number])
         if ready:
-            yield waiting.slice(0, ready)
-            waiting = waiting.slice(ready, len(waiting))
+            yield select(waiting, slice(ready))
+            waiting = select(waiting, slice(ready, None))
             held = sum(map(len, waiting.payloads))
     if len(waiting):
         yield waiting
@@ -233,9 +193,9 @@ def merged(files: Iterable[TimedColumns]) -> Columns:
         limits = [file.start_ns for file in waiting[-1:]] + [each[0] for each in active[:1]]
         # equal times come in the order of the files
         ready = columns.count_before(min(limits) + 1) if limits else len(columns)
-        yield columns.slice(0, ready)
+        yield select(columns, slice(ready))
         if ready < len(columns):
-            rest = columns.slice(ready, len(columns))
+            rest = select(columns, slice(ready, None))
             heapq.heappush(active, (int(rest.log_time_ns[0]), number, rest, following))
         else:
             _push_next(active, number, following)

@@ -30,6 +30,7 @@ from spatial_replay.bags.sqlite import (
     unpacked_size,
 )
 from spatial_replay.errors import LogError, MissingFileError
+from spatial_replay.geometry.arrays import select
 from spatial_replay.logs.messages import Attachment, Channel
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.logs.remote import LogFile, open_file
@@ -185,7 +186,7 @@ class BagFolder(MessageReader):
             for number, payload in enumerate(packed.payloads, 1):
                 size += unpacked_size(payload)
                 if size >= _MOST_UNPACKED or number == len(packed):
-                    yield self._unpacked(packed.slice(begin, number), plain)
+                    yield self._unpacked(select(packed, slice(begin, number)), plain)
                     begin, size = number, 0
 
     def channels(self, topics: Collection[str]) -> Mapping[int, Channel]:
@@ -282,7 +283,7 @@ class BagFolder(MessageReader):
             latest = Instant(int(packed.log_time_ns[-1]), 0)
             more = Sentence(f"; so are {len(others)} more up to ", latest) if others else ""
             self._faults.add(Sentence(f"{self.name}: ", first, ", and is lost", more))
-        return replace(packed.take(np.array(places, np.int64)), payloads=payloads)
+        return replace(select(packed, np.array(places, np.int64)), payloads=payloads)
 
 
 def _rank(name: str) -> tuple[str | int, ...]:

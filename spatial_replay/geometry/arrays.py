@@ -5,8 +5,10 @@ Ragged rows keep rows of unequal length in one flat array: row r is `values[star
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any, Final, TypeAlias
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import fields, replace
+from itertools import chain
+from typing import Any, Final, TypeAlias, TypeVar, cast
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -95,3 +97,45 @@ def equal_places(code: Integers) -> Iterator[Integers]:
     order = np.argsort(code, kind="stable")
     edges = np.flatnonzero(np.diff(code[order])) + 1
     yield from (places for places in np.split(order, edges) if len(places))
+
+
+_Table = TypeVar("_Table")
+
+
+def select(table: _Table, rows: Integers | slice) -> _Table:
+    """Return some rows of a dataclass of columns, in the order given.
+
+    Its arrays and sequences have one element for each row; all rows share its mappings.
+    """
+    if isinstance(rows, slice):
+        return _mapped(table, lambda name: getattr(table, name)[rows])
+    listed = rows.tolist()
+
+    def chosen(name: str) -> Any:
+        column = getattr(table, name)
+        if isinstance(column, np.ndarray):
+            return column[rows]
+        return [column[row] for row in listed] if isinstance(column, Sequence) else column.select(rows)
+
+    return _mapped(table, chosen)
+
+
+def concatenated(tables: Sequence[_Table]) -> _Table:
+    """Join dataclasses of columns, at least one, with the mappings of the last; see `select`."""
+    if len(tables) == 1:
+        return tables[0]
+
+    def joined(name: str) -> Any:
+        columns = [getattr(table, name) for table in tables]
+        if isinstance(columns[0], np.ndarray):
+            return np.concatenate(columns)
+        is_listed = isinstance(columns[0], Sequence)
+        return list(chain.from_iterable(columns)) if is_listed else type(columns[0]).concatenate(columns)
+
+    return _mapped(tables[-1], joined)
+
+
+def _mapped(table: _Table, column: Callable[[str], Any]) -> _Table:
+    names = (each.name for each in fields(cast(Any, table)))
+    columns = {name: column(name) for name in names if not isinstance(getattr(table, name), Mapping)}
+    return cast(_Table, replace(cast(Any, table), **columns))

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from spatial_replay.geometry.arrays import Integers
+from spatial_replay.geometry.arrays import Integers, concatenated, select
 from spatial_replay.text import Sentence
 from spatial_replay.trace.pauses import Pauses
 from spatial_replay.trace.trace import Trace
@@ -75,6 +75,11 @@ class Messages:
     def __len__(self) -> int:
         return len(self.payloads)
 
+    @property
+    def nbytes(self) -> int:
+        """The size of the payloads in bytes."""
+        return sum(map(len, self.payloads))
+
 
 def messages_of(channel: Channel, times_ns: Integers, payloads: Sequence[bytes], first: int) -> Messages:
     """Return messages of one channel, published when they are logged, numbered from `first`."""
@@ -130,26 +135,8 @@ def join(streams: Sequence[Messages]) -> Messages:
         if not merged or _rank(merged[len(merged) - 1]) != rank:
             merged[len(merged)] = channel
         number[identity] = len(merged) - 1
-    return Messages(
-        channels=merged,
-        channel=_joined([_renumbered(stream, number) for stream in streams]),
-        sequence=_joined([stream.sequence for stream in streams]),
-        log_time_ns=_joined([stream.log_time_ns for stream in streams]),
-        publish_time_ns=_joined([stream.publish_time_ns for stream in streams]),
-        payloads=[payload for stream in streams for payload in stream.payloads],
-    )
-
-
-def select(messages: Messages, chosen: Integers) -> Messages:
-    """Return the messages with the given indices, in that order."""
-    return Messages(
-        channels=messages.channels,
-        channel=messages.channel[chosen],
-        sequence=messages.sequence[chosen],
-        log_time_ns=messages.log_time_ns[chosen],
-        publish_time_ns=messages.publish_time_ns[chosen],
-        payloads=[messages.payloads[place] for place in chosen.tolist()],
-    )
+    renumbered = [replace(stream, channel=_renumbered(stream, number)) for stream in streams]
+    return replace(concatenated([Messages(), *renumbered]), channels=merged)
 
 
 def _rank(channel: Channel) -> tuple[str, str, str, str, bytes, tuple[tuple[str, str], ...]]:
@@ -165,10 +152,6 @@ def _renumbered(stream: Messages, number: dict[int, int]) -> Integers:
     for old, channel in stream.channels.items():
         new[old] = number[id(channel)]
     return new[stream.channel]
-
-
-def _joined(arrays: Sequence[Integers]) -> Integers:
-    return np.concatenate([np.zeros(0, np.int64), *arrays])
 
 
 @dataclass(frozen=True, slots=True)

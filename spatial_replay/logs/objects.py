@@ -14,7 +14,14 @@ import numpy as np
 from google.protobuf.message import DecodeError, Message
 from numpy.typing import NDArray
 
-from spatial_replay.geometry.arrays import Floats, Integers, combined, equal_places, starts_from_counts
+from spatial_replay.geometry.arrays import (
+    Floats,
+    Integers,
+    combined,
+    equal_places,
+    select,
+    starts_from_counts,
+)
 from spatial_replay.geometry.footprint import Concave, FootprintBatch
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectState, ObjectStates
 from spatial_replay.logs.wire import Bytes, LayoutError, WireTemplate, Words, payloads_of, rows_of
@@ -180,9 +187,6 @@ class _Pieces:
     samples: Integers
     payloads: Sequence[bytes]
 
-    def take(self, places: Integers) -> _Pieces:
-        return _Pieces(self.samples[places], [self.payloads[place] for place in places.tolist()])
-
 
 def decode_objects(
     payloads: Sequence[bytes], times_ns: Integers, *, concave: Concave = "decompose"
@@ -243,10 +247,10 @@ def _grouped(pieces: _Pieces, faults: dict[int, str], worth: int) -> tuple[list[
         if (tried - FIRST_LAYOUTS) * worth > served:
             left.append(places)
             continue
-        rows = rows_of(pieces.take(places).payloads)
+        rows = rows_of(select(pieces, places).payloads)
         while len(places) and (tried - FIRST_LAYOUTS) * worth <= served:
             tried += 1
-            group, same = _first_group(pieces.take(places[:1]), rows, faults)
+            group, same = _first_group(select(pieces, places[:1]), rows, faults)
             if group is not None:
                 groups.append(replace(group, samples=pieces.samples[places[same]]))
             served += int(np.count_nonzero(same))
@@ -255,7 +259,7 @@ def _grouped(pieces: _Pieces, faults: dict[int, str], worth: int) -> tuple[list[
             places = places[~same]
         left.append(places)
     rest = np.concatenate([np.empty(0, np.int64), *left])
-    return groups, pieces.take(np.sort(rest))
+    return groups, select(pieces, np.sort(rest))
 
 
 def _first_group(

@@ -22,7 +22,7 @@ import numpy as np
 from spatial_replay.bags.columns import DISORDER_NS, JUMP_REMEDY, Message, MessageColumns
 from spatial_replay.bags.decoders import Decoder, Topic
 from spatial_replay.errors import LogError, UsageError
-from spatial_replay.geometry.arrays import Integers
+from spatial_replay.geometry.arrays import Integers, select
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.read_options import FaultKinds, FaultList, OnTimeJump
 from spatial_replay.mapping.binding import BY_PLACE, Codes
@@ -147,7 +147,7 @@ class Assembler:
             read = int(ends[begin - 1]) if begin else 0
             by_size = int(np.searchsorted(ends, read + _STEP_BYTES - self._bytes)) + 1
             stop = min(begin + self._step - self._count, by_size, len(columns))
-            self._add_step(columns.slice(begin, stop))
+            self._add_step(select(columns, slice(begin, stop)))
             self._count += stop - begin
             self._bytes += int(ends[stop - 1]) - read
             begin = stop

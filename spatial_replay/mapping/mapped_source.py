@@ -15,11 +15,12 @@ from types import MappingProxyType
 
 import numpy as np
 
-from spatial_replay.bags.columns import Columns, MessageColumns, in_pieces, joined, without_jumps
+from spatial_replay.bags.columns import Columns, MessageColumns, in_pieces, without_jumps
 from spatial_replay.bags.decoders import Topic, full_type_name, why_unreadable
 from spatial_replay.bags.open import files_of_bag_around, open_messages
 from spatial_replay.bags.reader import MessageReader
 from spatial_replay.errors import LogError, UsageError
+from spatial_replay.geometry.arrays import concatenated, select
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.messages import Attachment, Block, Channel, Messages, noting_pauses
 from spatial_replay.logs.read_options import FaultList, OnTimeJump, gap_ns, late_ns
@@ -218,7 +219,7 @@ class _Blocks:
             inside = messages.log_time_ns >= start_ns
             if end_ns is not None:
                 inside &= messages.log_time_ns < end_ns
-            messages = messages.take(np.flatnonzero(inside))
+            messages = select(messages, np.flatnonzero(inside))
         self._copied.add(messages)
         for fault in trace.faults:
             self._faults.add(fault)
@@ -265,12 +266,12 @@ class _CopiedMessages:
         is_all = last or self._waiting_bytes > self._most_bytes
         if not self._waiting or not (is_all or len(trace)):
             return Messages()
-        waiting = joined(self._waiting)
+        waiting = concatenated(self._waiting)
         times = waiting.log_time_ns
         if not (times[1:] >= times[:-1]).all():
-            waiting = waiting.take(np.argsort(times, kind="stable"))
+            waiting = select(waiting, np.argsort(times, kind="stable"))
         ready = len(waiting) if is_all else waiting.count_before(int(trace.times_ns[-1]) + 1)
-        taken, rest = waiting.slice(0, ready), waiting.slice(ready, len(waiting))
+        taken, rest = select(waiting, slice(ready)), select(waiting, slice(ready, None))
         self._waiting = [rest] if len(rest) else []
         self._waiting_bytes = sum(map(len, rest.payloads))
         return Messages(

@@ -8,14 +8,14 @@ The tracker holds the last state of every object and signal, so that a log can b
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from spatial_replay.errors import UsageError
-from spatial_replay.geometry.arrays import Booleans, Floats, Integers
+from spatial_replay.geometry.arrays import Booleans, Floats, Integers, concatenated, select
 from spatial_replay.geometry.footprint import Concave, FootprintBatch
 from spatial_replay.mapping.binding import Codes
 from spatial_replay.mapping.detections import EVERY_OBJECT, Detections, Solids, footprints_from_solids
@@ -55,21 +55,15 @@ class Events:
     def none(cls) -> Events:
         return cls(*(np.empty(0, np.int64) for _ in range(5)))
 
-    def select(self, chosen: Integers) -> Events:
-        return Events(*(column[chosen] for column in self._columns()))
-
     def last(self) -> Events:
         """Return the last event of each object that has not left."""
         is_last = np.append(self.name[1:] != self.name[:-1], True)[: len(self.name)]
-        return self.select(np.flatnonzero(is_last & (self.row != LEFT)))
+        return select(self, np.flatnonzero(is_last & (self.row != LEFT)))
 
     def after(self, before: Events) -> Events:
         """Join earlier events of the same topic and these."""
-        joined = Events(*map(np.concatenate, zip(before._columns(), self._columns(), strict=True)))
-        return joined.select(np.argsort(joined.name, kind="stable"))
-
-    def _columns(self) -> tuple[Integers, ...]:
-        return self.name, self.time_ns, self.row, self.expires_ns, self.class_code
+        joined = concatenated([before, self])
+        return select(joined, np.argsort(joined.name, kind="stable"))
 
     def state(self, times_ns: Integers, max_age_ns: int) -> tuple[Integers, Integers, Integers]:
         """Return the state of all N objects at T times.
@@ -197,22 +191,6 @@ class ObservationRows:
         nowhere = FootprintBatch.unknown(count)
         return cls(nowhere, np.full(count, np.nan), np.zeros(count), class_code, np.zeros(count, np.bool_))
 
-    def select(self, rows: Integers) -> ObservationRows:
-        columns = self.yaw[rows], self.uncertainty[rows], self.class_code[rows], self.is_valid[rows]
-        return ObservationRows(self.shapes.select(rows), *columns)
-
-    @classmethod
-    def concatenate(cls, several: Sequence[ObservationRows]) -> ObservationRows:
-        if len(several) == 1:
-            return several[0]
-        return cls(
-            FootprintBatch.concatenate([rows.shapes for rows in several]),
-            np.concatenate([np.empty(0), *(rows.yaw for rows in several)]),
-            np.concatenate([np.empty(0), *(rows.uncertainty for rows in several)]),
-            np.concatenate([np.empty(0, np.int64), *(rows.class_code for rows in several)]),
-            np.concatenate([np.empty(0, np.bool_), *(rows.is_valid for rows in several)]),
-        )
-
 
 def rows_from_detections(
     detections: Detections,
@@ -298,8 +276,8 @@ def _checked(
         return rows
     lost = unknown.copy()
     lost[list(faults)] = True
-    both = ObservationRows.concatenate([rows, ObservationRows.blank(detections.class_code)])
-    return replace(both.select(np.where(lost, count + each, each)), is_valid=readable & ~lost)
+    both = concatenated([rows, ObservationRows.blank(detections.class_code)])
+    return replace(select(both, np.where(lost, count + each, each)), is_valid=readable & ~lost)
 
 
 _OLD_ADVANCES, _OLD_ROWS = 32, 256
@@ -411,14 +389,14 @@ class Tracker:
             # of stale objects only the class is known: one blank row for each class, after the others
             numbered = np.where(is_stale, -2 - (len(stored) + classes), numbered)
             blank = ObservationRows.blank(np.arange(len(self._classes), dtype=np.int64))
-            stored = ObservationRows.concatenate([stored, blank])
+            stored = concatenated([stored, blank])
         # codes follow the log; a trace must not depend on the order of its messages
         by_code = self._classes.by_code
         ordered = sorted(range(len(by_code)), key=lambda i: (by_code[i] is not None, by_code[i] or ""))
         rank = np.zeros(len(by_code), np.int64)
         rank[ordered] = np.arange(len(by_code))
         used, numbered = renumbered(numbered)
-        stored = stored.select(used)
+        stored = select(stored, used)
         return Trace(
             times_ns=times_ns,
             names=tuple(names[i] for i in order),
@@ -439,13 +417,13 @@ class Tracker:
         used = [np.empty(0, np.int64)]
         for name, events in self._events.items():
             last = events.last()
-            last = last.select(np.flatnonzero(last.expires_ns > upto_ns))
+            last = select(last, np.flatnonzero(last.expires_ns > upto_ns))
             self._events[name] = last
             used.append(last.row)
         chosen = np.concatenate(used)
         number = np.zeros(len(self._rows), np.int64)
         number[chosen] = np.arange(len(chosen))
-        self._rows = self._rows.select(chosen)
+        self._rows = select(self._rows, chosen)
         for name, last in self._events.items():
             self._events[name] = replace(last, row=number[last.row])
         self._signals = {key: (times[-1:], values[-1:]) for key, (times, values) in self._signals.items()}
@@ -456,7 +434,7 @@ class Tracker:
         """Make unknown, from a time on, what some topics have reported: objects stay, without a place."""
         for topic in topics:
             last = self._events[topic].last()
-            last = last.select(np.flatnonzero(last.expires_ns > time_ns))
+            last = select(last, np.flatnonzero(last.expires_ns > time_ns))
             rows = self._add(ObservationRows.blank(last.class_code))
             at = np.full(len(rows), time_ns, np.int64)
             forever = np.full(len(rows), FOREVER_NS, np.int64)
@@ -541,7 +519,7 @@ class Tracker:
 
     def _store_added(self) -> None:
         if self._added:
-            self._rows = ObservationRows.concatenate([self._rows, *self._added])
+            self._rows = concatenated([self._rows, *self._added])
             self._added = []
 
     def _add(self, rows: ObservationRows) -> Integers:

@@ -14,9 +14,10 @@ from typing import Any, Final, NamedTuple, get_args
 import numpy as np
 
 from spatial_replay.errors import LogError, SpatialReplayError, UsageError
+from spatial_replay.geometry.arrays import select
 from spatial_replay.lazy import Displayed, Printed
 from spatial_replay.logs.mcap.read import McapSource
-from spatial_replay.logs.messages import Block, Messages, merge, select
+from spatial_replay.logs.messages import Block, Messages, merge
 from spatial_replay.logs.schemas.PlanDecision_pb2 import PlanCandidate, PlanDecision
 from spatial_replay.logs.source import Source, SourceOf, read_blocks
 from spatial_replay.logs.topics import (

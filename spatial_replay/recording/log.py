@@ -29,11 +29,12 @@ from spatial_replay.annotate.events import (
 from spatial_replay.annotate.specification import logged_specifications, specification_attachments
 from spatial_replay.compiled import compile_ahead
 from spatial_replay.errors import OutputError, UsageError
+from spatial_replay.geometry.arrays import select
 from spatial_replay.geometry.contact import contacts
 from spatial_replay.geometry.footprint import Footprint, FootprintBatch, TrackedObject
 from spatial_replay.geometry.measure import Operand
 from spatial_replay.logs.mcap.write import LogWriter
-from spatial_replay.logs.messages import Attachment, Channel, Messages, Sink, merge, messages_of, select
+from spatial_replay.logs.messages import Attachment, Channel, Messages, Sink, merge, messages_of
 from spatial_replay.logs.objects import encode_objects
 from spatial_replay.logs.output_file import Durability, open_output
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates

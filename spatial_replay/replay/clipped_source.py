@@ -12,8 +12,9 @@ import numpy as np
 
 from spatial_replay.bags.decoders import Topic, decoder_of, full_type_name
 from spatial_replay.errors import LogError
+from spatial_replay.geometry.arrays import select
 from spatial_replay.logs.mcap.read import McapSource
-from spatial_replay.logs.messages import Block, Channel, Messages, merge, select
+from spatial_replay.logs.messages import Block, Channel, Messages, merge
 from spatial_replay.logs.source import Source, SourceOf, read_blocks
 from spatial_replay.logs.topics import OBJECTS
 from spatial_replay.mapping.field_paths import get_field

@@ -26,8 +26,8 @@ from spatial_replay.annotate.scene.scene_template import SceneBounds
 from spatial_replay.annotate.scene.scene_update import SceneState, scene_start
 from spatial_replay.annotate.specification import logged_specifications
 from spatial_replay.errors import SpecificationError, UsageError
-from spatial_replay.geometry.arrays import Integers
-from spatial_replay.logs.messages import Attachment, Block, Channel, Messages, join, merge, select
+from spatial_replay.geometry.arrays import Integers, select
+from spatial_replay.logs.messages import Attachment, Block, Channel, Messages, join, merge
 from spatial_replay.logs.source import MemorySource, Source, read_blocks, units_of
 from spatial_replay.monitor.result import SpecResult, worst_first
 from spatial_replay.monitor.stream import SeriesBlock

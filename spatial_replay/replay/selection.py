@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from spatial_replay.errors import LogError, SpecificationError, UsageError
-from spatial_replay.logs.messages import Block, Channel, Messages, merge, messages_of, select
+from spatial_replay.geometry.arrays import select
+from spatial_replay.logs.messages import Block, Channel, Messages, merge, messages_of
 from spatial_replay.logs.objects import encode_objects
 from spatial_replay.logs.remote import LogFile
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates

@@ -18,8 +18,8 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 from spatial_replay.annotate.robustness import CURVES_CHANNEL
 from spatial_replay.errors import SpatialReplayError, UsageError
-from spatial_replay.geometry.arrays import Booleans, Integers
-from spatial_replay.logs.messages import Channel, Messages, messages_of, select
+from spatial_replay.geometry.arrays import Booleans, Integers, select
+from spatial_replay.logs.messages import Channel, Messages, messages_of
 from spatial_replay.logs.topics import (
     CAMERA_ANNOTATIONS,
     CURVES_TOPIC,

@@ -17,10 +17,10 @@ from spatial_replay.bags.open import open_messages
 from spatial_replay.bags.reader import MessageReader
 from spatial_replay.bags.ros1 import Ros1Bag
 from spatial_replay.errors import LogError, UsageError
-from spatial_replay.geometry.arrays import Integers
+from spatial_replay.geometry.arrays import Integers, select
 from spatial_replay.logs.mcap.read import is_samples
 from spatial_replay.logs.mcap.write import WHOLE_CHUNK_NS, LogWriter
-from spatial_replay.logs.messages import Channel, Messages, select
+from spatial_replay.logs.messages import Channel, Messages
 from spatial_replay.logs.objects import decode_objects
 from spatial_replay.logs.output_file import refuse_inputs, replacing
 from spatial_replay.logs.read_options import FaultList

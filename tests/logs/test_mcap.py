@@ -35,6 +35,7 @@ from spatial_replay import (
     read_trace,
 )
 from spatial_replay.cli import run
+from spatial_replay.geometry.arrays import select
 from spatial_replay.logs import (
     Channel,
     LogWriter,
@@ -46,7 +47,7 @@ from spatial_replay.logs import (
     summarise_mcap,
 )
 from spatial_replay.logs.mcap.write import CHUNK_BYTES
-from spatial_replay.logs.messages import BLOCK_SAMPLES, select
+from spatial_replay.logs.messages import BLOCK_SAMPLES
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.topics import OBJECTS, ROBUSTNESS, protobuf_channel
 from spatial_replay.sources import open_source

@@ -16,6 +16,7 @@ from contextlib import contextmanager, suppress
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import compress
 from threading import Lock
 from types import MappingProxyType
 from typing import Any, BinaryIO, Final, TypeAlias
@@ -29,7 +30,7 @@ from mcap.opcode import Opcode
 
 from spatial_replay.cores import cores
 from spatial_replay.errors import LogError, UsageError
-from spatial_replay.geometry.arrays import Integers
+from spatial_replay.geometry.arrays import concatenated, select
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.mcap.index import (
     CHUNK_HEAD,
@@ -52,7 +53,6 @@ from spatial_replay.logs.messages import (
     Messages,
     Schema,
     noting_pauses,
-    select,
 )
 from spatial_replay.logs.objects import decode_objects
 from spatial_replay.logs.read_options import FaultList, gap_ns
@@ -231,37 +231,6 @@ def split_records(content: bytes, passed_over: Collection[int] = ()) -> Records:
     return Records(np.frombuffer(b"".join(heads), _HEAD), payloads, declarations, position < size)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RawMessages:
-    """M messages of chunks."""
-
-    heads: MessageHeads
-    payloads: Sequence[bytes]
-
-    @classmethod
-    def join(cls, several: Sequence[RawMessages]) -> RawMessages:
-        """Join messages, one after the other."""
-        heads = np.concatenate([np.empty(0, _HEAD), *(each.heads for each in several)])
-        return cls(heads, [payload for each in several for payload in each.payloads])
-
-    def __len__(self) -> int:
-        return len(self.payloads)
-
-    @property
-    def nbytes(self) -> int:
-        """The size of the messages in bytes."""
-        return sum(map(len, self.payloads))
-
-    def take(self, chosen: Integers) -> RawMessages:
-        """Return the messages with the given indices, in that order."""
-        return RawMessages(self.heads[chosen], [self.payloads[index] for index in chosen.tolist()])
-
-    def divided(self, count: int) -> tuple[RawMessages, RawMessages]:
-        """Return the first messages, and the others."""
-        first, rest = self.heads[:count], self.heads[count:]
-        return RawMessages(first, self.payloads[:count]), RawMessages(rest, self.payloads[count:])
-
-
 class ChunkWalk:
     """The messages of a log by chunk, with the channels that have been declared so far."""
 
@@ -286,7 +255,7 @@ class ChunkWalk:
 
     def iter_messages(
         self, places: Sequence[ChunkPlace], is_wanted: Callable[[str], bool] = lambda topic: True
-    ) -> Iterator[tuple[ChunkPlace, RawMessages]]:
+    ) -> Iterator[tuple[ChunkPlace, Messages]]:
         """Yield the messages of some topics in each place; what is lost of them goes to the faults."""
         declared, passed_over = -1, set[int]()
         for place, found in iter_records(self.stream, places):
@@ -295,31 +264,33 @@ class ChunkWalk:
                 passed_over = {n for n, each in self.channels.items() if not is_wanted(each.topic)}
             if isinstance(found, DamageError):
                 self._fault(place, f"{found}; the ", " are lost")
-                yield place, RawMessages.join([])
+                yield place, Messages(self.channels)
                 continue
             messages = self._messages(place, split_records(found, passed_over), found)
             if declared < len(self.channels):
                 # those that were declared in this chunk
-                topics = [self.channels[n].topic for n in messages.heads["channel"].tolist()]
-                messages = messages.take(np.flatnonzero(np.fromiter(map(is_wanted, topics), np.bool_)))
+                topics = [self.channels[n].topic for n in messages.channel.tolist()]
+                messages = select(messages, np.flatnonzero(np.fromiter(map(is_wanted, topics), np.bool_)))
             yield place, messages
 
-    def sample_count(self, messages: RawMessages) -> int:
+    def sample_count(self, messages: Messages) -> int:
         """Count the samples among messages."""
-        return int(np.count_nonzero(self._is_objects[messages.heads["channel"]]))
+        return int(np.count_nonzero(self._is_objects[messages.channel]))
 
-    def _messages(self, place: ChunkPlace, split: Records, content: bytes) -> RawMessages:
+    def _messages(self, place: ChunkPlace, split: Records, content: bytes) -> Messages:
         """Return the messages among the records of a place that can be used."""
         damage = self._take_in(split.declarations) or ("a record breaks off" if split.breaks_off else "")
         if damage:
             self._fault(place, f"{damage}; of the ", f", {len(split.heads)} could be read")
-        messages = RawMessages(split.heads, [content[own] for own in split.payloads])
         is_usable = self._is_declared[split.heads["channel"]] & (split.heads["log_time"] <= LATEST_NS)
-        if is_usable.all():
-            return messages
-        lost = len(messages) - np.count_nonzero(is_usable)
-        self._fault(place, f"{lost} of the ", " have no channel, or a time beyond 2**63 - 1 ns")
-        return messages.take(np.flatnonzero(is_usable))
+        if not is_usable.all():
+            lost = len(is_usable) - np.count_nonzero(is_usable)
+            self._fault(place, f"{lost} of the ", " have no channel, or a time beyond 2**63 - 1 ns")
+        names = ("channel", "sequence", "log_time", "publish_time")
+        columns = [split.heads[name][is_usable].astype(np.int64) for name in names]
+        return Messages(
+            self.channels, *columns, [content[own] for own in compress(split.payloads, is_usable)]
+        )
 
     def _find_channels(self) -> None:
         """Declare all channels of a log without a summary: chunks need not come in the order of time."""
@@ -514,9 +485,7 @@ def directory_remarks(
     )
 
 
-def _blocks(
-    walk: ChunkWalk, window: tuple[int, int], is_wanted: Callable[[str], bool]
-) -> Iterator[RawMessages]:
+def _blocks(walk: ChunkWalk, window: tuple[int, int], is_wanted: Callable[[str], bool]) -> Iterator[Messages]:
     """Yield the messages of the topics wanted, in order, in blocks of bounded size."""
     start_ns, end_ns = window
     numbers = {number for number, channel in walk.channels.items() if is_wanted(channel.topic)}
@@ -527,23 +496,23 @@ def _blocks(
         and place.end_ns >= start_ns
         and (place.channels is None or not place.channels.isdisjoint(numbers))
     ]
-    waiting: list[RawMessages] = []
+    waiting: list[Messages] = []
     most = most_waiting(place.length for place in places)
     size = samples = 0
     for number, (place, messages) in enumerate(walk.iter_messages(places, is_wanted), 1):
         if place.start_ns < start_ns or place.end_ns >= end_ns:
-            times = messages.heads["log_time"]
-            messages = messages.take(np.flatnonzero((times >= start_ns) & (times < end_ns)))
+            times = messages.log_time_ns
+            messages = select(messages, np.flatnonzero((times >= start_ns) & (times < end_ns)))
         waiting.append(messages)
         size += messages.nbytes
         samples += walk.sample_count(messages)
         if number < len(places) and (size >= BLOCK_BYTES or samples >= BLOCK_SAMPLES):
             ordered = _in_order(waiting)
-            ready = int(np.searchsorted(ordered.heads["log_time"], places[number].start_ns))
+            ready = int(np.searchsorted(ordered.log_time_ns, places[number].start_ns))
             waiting = [ordered]
             if ready:
-                block, rest = ordered.divided(ready)
-                yield block
+                yield select(ordered, slice(ready))
+                rest = select(ordered, slice(ready, None))
                 waiting, size, samples = [rest], rest.nbytes, walk.sample_count(rest)
             if size > most:
                 raise too_many_waiting(walk.name, most)
@@ -552,13 +521,13 @@ def _blocks(
         yield rest
 
 
-def _in_order(several: Sequence[RawMessages]) -> RawMessages:
+def _in_order(several: Sequence[Messages]) -> Messages:
     """Join messages by log time, channel and sequence; those that share all three keep their order."""
-    joined = RawMessages.join(several)
-    times = joined.heads["log_time"]
+    joined = concatenated([Messages(), *several])
+    times = joined.log_time_ns
     if (times[1:] > times[:-1]).all():
         return joined
-    return joined.take(np.lexsort((joined.heads["sequence"], joined.heads["channel"], times)))
+    return select(joined, np.lexsort((joined.sequence, joined.channel, times)))
 
 
 class _BlockDecoder:
@@ -571,10 +540,11 @@ class _BlockDecoder:
         self.any_sample = False
         self.first_fault: str | None = None
 
-    def block(self, messages: RawMessages) -> Block:
+    def block(self, messages: Messages) -> Block:
         """Decode the samples among some messages."""
-        columns = self._columns(messages)
-        samples = [number for number, channel in columns.channels.items() if self._is_objects(channel)]
+        wanted = {n: each for n, each in messages.channels.items() if self._source.is_wanted(each.topic)}
+        columns = replace(messages, channels=MappingProxyType(wanted))
+        samples = [number for number, channel in wanted.items() if self._is_objects(channel)]
         is_own = np.isin(columns.channel, samples)
         own = np.flatnonzero(is_own)
         times = columns.log_time_ns[own]
@@ -602,19 +572,6 @@ class _BlockDecoder:
         raise LogError(
             f"{self._source.name}: {OBJECTS!r} has messages of the schema {schema!r}, encoded as"
             f" {channel.encoding!r}; give {_SAMPLES} in protobuf"
-        )
-
-    def _columns(self, messages: RawMessages) -> Messages:
-        declared = self._walk.channels.items()
-        is_wanted = self._source.is_wanted
-        heads = messages.heads
-        return Messages(
-            channels=MappingProxyType({n: each for n, each in declared if is_wanted(each.topic)}),
-            channel=heads["channel"].astype(np.int64),
-            sequence=heads["sequence"].astype(np.int64),
-            log_time_ns=heads["log_time"].astype(np.int64),
-            publish_time_ns=heads["publish_time"].astype(np.int64),
-            payloads=messages.payloads,
         )
 
     def _fault(self, what: str) -> None:
@@ -709,7 +666,7 @@ def _counts(walk: ChunkWalk) -> tuple[Counter[int], int | None, int | None]:
     else:
         counts, times = Counter(), []
         for _, messages in walk.iter_messages(walk.places):
-            counts.update(messages.heads["channel"].tolist())
-            times += messages.heads["log_time"].tolist()
+            counts.update(messages.channel.tolist())
+            times += messages.log_time_ns.tolist()
             times = [min(times), max(times)] if times else []
     return counts, (times[0] if times else None), (times[-1] if times else None)
