@@ -10,19 +10,17 @@ from typing import TYPE_CHECKING
 from spatial_replay.lazy import loaded_when_used
 
 if TYPE_CHECKING:
-    from spatial_replay.bags.columns import Message
     from spatial_replay.bags.decoders import Decoder, Topic
     from spatial_replay.bags.open import open_messages
-    from spatial_replay.bags.reader import MessageReader
+    from spatial_replay.bags.reader import Message, MessageReader
 
 __all__ = ["Decoder", "Message", "MessageReader", "Topic", "open_messages"]
 
 __getattr__, __dir__ = loaded_when_used(
     globals(),
     {
-        "columns": ("Message",),
         "decoders": ("Decoder", "Topic"),
         "open": ("open_messages",),
-        "reader": ("MessageReader",),
+        "reader": ("Message", "MessageReader"),
     },
 )

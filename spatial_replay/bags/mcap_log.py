@@ -12,9 +12,8 @@ from functools import cached_property
 
 import numpy as np
 
-from spatial_replay.bags.columns import Columns, MessageColumns, in_order, places_in
 from spatial_replay.bags.decoders import Topic, topic_of, topics_by_name
-from spatial_replay.bags.reader import MessageReader
+from spatial_replay.bags.reader import Columns, MessageColumns, MessageReader, in_order, places_in
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.mcap.index import (
     ChunkPlace,

@@ -12,10 +12,9 @@ from typing import TypeAlias
 
 import numpy as np
 
-from spatial_replay.bags.columns import Columns, MessageColumns, TimedColumns, merged
 from spatial_replay.bags.decoders import Topic, full_type_name, topics_by_name
 from spatial_replay.bags.mcap_log import McapLog
-from spatial_replay.bags.reader import MessageReader
+from spatial_replay.bags.reader import Columns, MessageColumns, MessageReader, TimedColumns, merged
 from spatial_replay.bags.ros1 import BAG_MAGIC, Ros1Bag
 from spatial_replay.bags.sqlite import (
     LARGEST_METADATA,

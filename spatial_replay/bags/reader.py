@@ -1,19 +1,315 @@
-"""The interface of every log of messages: topics, raw messages, and a way to decode them."""
+"""Logs of messages: messages as columns, and the interface of every log.
+
+Columns, because a million small objects that live for a while make Python's garbage collection look through
+all of them again and again, which costs more than reading them.
+
+Chunks and files of a log may overlap in time, so their messages are merged. Logs whose clock jumped back, as
+when a simulation restarts, are refused: sorted by time, both passes would look like one.
+"""
 
 from __future__ import annotations
 
+import heapq
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterator, Mapping
+from collections import Counter, deque
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple, TypeAlias
 
-from spatial_replay.bags.columns import Columns, Message, iter_counted, one_by_one
+import numpy as np
+
 from spatial_replay.bags.decoders import Decoder, Topic, decoder_of
 from spatial_replay.errors import LogError
+from spatial_replay.geometry.arrays import Integers, concatenated, select
+from spatial_replay.logs.mcap.read import too_many_waiting
 from spatial_replay.logs.messages import Attachment, Channel
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.logs.remote import LogFile
-from spatial_replay.text import encodable
+from spatial_replay.text import Instant, encodable
 from spatial_replay.trace.sample import LATEST_NS
+
+_TOGETHER = 512
+"""Messages made at once: fewer than the garbage collector lets pass before it runs."""
+
+
+class Message(NamedTuple):
+    """One message of a log.
+
+    Attributes:
+        log_time_ns: when it was recorded.
+        publish_time_ns: when it was sent; the log time where the container does not know.
+        sequence: number within its topic as in the log, 0 where the log has none; of messages of one topic
+            and time, the later one has the greater number.
+        payload: in its topic's encoding.
+    """
+
+    topic: str
+    log_time_ns: int
+    publish_time_ns: int
+    sequence: int
+    payload: bytes
+
+
+_NEW_MESSAGE = partial(tuple.__new__, Message)
+
+
+@dataclass(frozen=True, slots=True)
+class MessageColumns:
+    """M messages.
+
+    Attributes:
+        topics: (M,) names.
+        log_time_ns, publish_time_ns, sequence: (M,) int64.
+        payloads: M messages, each in its topic's encoding.
+        place: (M,) int64, numbers that increase in the order in which the messages were recorded.
+        channel: (M,) int64, the numbers of their channels in `MessageReader.channels`: several publishers
+            of one topic have several channels.
+    """
+
+    topics: Sequence[str] = ()
+    log_time_ns: Integers = field(default_factory=lambda: np.zeros(0, np.int64))
+    publish_time_ns: Integers = field(default_factory=lambda: np.zeros(0, np.int64))
+    sequence: Integers = field(default_factory=lambda: np.zeros(0, np.int64))
+    payloads: Sequence[bytes] = ()
+    place: Integers = field(default_factory=lambda: np.zeros(0, np.int64))
+    channel: Integers = field(default_factory=lambda: np.zeros(0, np.int64))
+
+    def __len__(self) -> int:
+        return len(self.topics)
+
+    def of_topics(self, topics: Collection[str]) -> MessageColumns:
+        """Return the messages of some topics, in the same order."""
+        places = [place for place, topic in enumerate(self.topics) if topic in topics]
+        return self if len(places) == len(self) else select(self, np.array(places, np.int64))
+
+    def ordered(self) -> MessageColumns:
+        """Return the same messages by log time, topic and sequence; equal ones keep their order."""
+        times = self.log_time_ns
+        if (times[1:] > times[:-1]).all():
+            return self
+        rank = {topic: number for number, topic in enumerate(sorted(set(self.topics)))}
+        topics = np.fromiter(map(rank.__getitem__, self.topics), np.int64, len(self))
+        return select(self, np.lexsort((self.sequence, topics, times)))
+
+    def count_before(self, time_ns: int) -> int:
+        """Count the messages, which are in order, before a time."""
+        return int(np.searchsorted(self.log_time_ns, time_ns, side="left"))
+
+    def messages(self) -> list[Message]:
+        """Return the messages one by one."""
+        columns = zip(
+            self.topics,
+            self.log_time_ns.tolist(),
+            self.publish_time_ns.tolist(),
+            self.sequence.tolist(),
+            self.payloads,
+            strict=True,
+        )
+        return list(map(_NEW_MESSAGE, columns))
+
+
+Columns: TypeAlias = Iterator[MessageColumns]
+
+
+def in_pieces(columns: Columns, size: int = _TOGETHER) -> Columns:
+    """Yield the same messages, at most `size` at a time."""
+    for each in columns:
+        for begin in range(0, len(each), size):
+            yield select(each, slice(begin, begin + size))
+
+
+def one_by_one(columns: Columns) -> Iterator[Message]:
+    """Yield the messages one by one."""
+    for piece in in_pieces(columns):
+        yield from piece.messages()
+
+
+def unnumbered(
+    topics: Sequence[str], times_ns: Integers, payloads: Sequence[bytes], place: Integers, channel: Integers
+) -> MessageColumns:
+    """Return messages of a container with one time and no sequence."""
+    sequence = np.zeros(len(times_ns), np.int64)
+    return MessageColumns(topics, times_ns, times_ns, sequence, payloads, place, channel)
+
+
+def places_in(part: int, within: Integers) -> Integers:
+    """Return places in a log of several parts, such as chunks, in the order of the parts."""
+    return (np.int64(part) << 28) + within
+
+
+def in_order(
+    starts_ns: Sequence[int], chunks: Iterable[MessageColumns], name: str, most_bytes: int
+) -> Columns:
+    """Yield the messages of several chunks by log time, topic and sequence.
+
+    It holds no more messages than overlap.
+
+    Args:
+        starts_ns: when each chunk begins, in order; a message before that comes late.
+        name: of the log.
+        most_bytes: of the messages that it may hold.
+
+    Raises:
+        LogError: it would hold more.
+    """
+    waiting = MessageColumns()
+    held = 0
+    for number, chunk in enumerate(chunks, 1):
+        held += sum(map(len, chunk.payloads))
+        if held > most_bytes:
+            raise too_many_waiting(name, most_bytes)
+        waiting = concatenated([waiting, chunk] if len(waiting) else [chunk]).ordered()
+        if number == len(starts_ns):
+            break
+        ready = waiting.count_before(starts_ns[number])
+        if ready:
+            yield select(waiting, slice(ready))
+            waiting = select(waiting, slice(ready, None))
+            held = sum(map(len, waiting.payloads))
+    if len(waiting):
+        yield waiting
+
+
+@dataclass(frozen=True)
+class TimedColumns:
+    """Messages in order, with the time from which they may be opened."""
+
+    start_ns: int
+    read: Callable[[], Columns]
+
+
+_Active = list[tuple[int, int, MessageColumns, Columns]]
+"""A heap: time of the first message, number of the file, messages, and those that follow them."""
+
+
+def merged(files: Iterable[TimedColumns]) -> Columns:
+    """Merge the messages of several files by log time; a file is opened when its time has come."""
+    waiting = sorted(files, key=lambda file: file.start_ns, reverse=True)
+    active: _Active = []
+    opened = 0
+    while waiting or active:
+        while waiting and (not active or waiting[-1].start_ns <= active[0][0]):
+            _push_next(active, opened, waiting.pop().read())
+            opened += 1
+        if not active:
+            continue
+        _, number, columns, following = heapq.heappop(active)
+        limits = [file.start_ns for file in waiting[-1:]] + [each[0] for each in active[:1]]
+        # equal times come in the order of the files
+        ready = columns.count_before(min(limits) + 1) if limits else len(columns)
+        yield select(columns, slice(ready))
+        if ready < len(columns):
+            rest = select(columns, slice(ready, None))
+            heapq.heappush(active, (int(rest.log_time_ns[0]), number, rest, following))
+        else:
+            _push_next(active, number, following)
+
+
+def _push_next(active: _Active, number: int, following: Columns) -> None:
+    for columns in following:
+        if len(columns):
+            heapq.heappush(active, (int(columns.log_time_ns[0]), number, columns, following))
+            return
+
+
+def iter_counted(
+    columns: Columns, declared: Mapping[str, int | None], name: str, faults: FaultList
+) -> Columns:
+    """Yield the messages as they are; topics with more or fewer messages than declared go to `faults`."""
+    read = Counter[str]()
+    for each in columns:
+        read.update(each.topics)
+        yield each
+    for topic, count in declared.items():
+        if count is not None and count != read[topic]:
+            faults.add(f"{name}: it declares {count} messages on {topic!r}; {read[topic]} could be read")
+
+
+DISORDER_NS = 10**9
+"""How far messages may be out of order by default: recorders write topics from several threads."""
+JUMP_REMEDY = (
+    "max_lateness='5s' (--max-lateness 5s) takes messages that come later, 'all' sorts the whole log;"
+    " on_time_jump='split' (--read on_time_jump=split) ends it where its clock jumps"
+)
+
+
+def without_jumps(
+    columns: Columns, name: str, checked: Collection[str], disorder_ns: int = DISORDER_NS
+) -> Columns:
+    """Yield the messages as they are, which are in the order of time.
+
+    Args:
+        checked: the topics to check; others are only copied, in any order.
+        disorder_ns: how far they may have been recorded out of order.
+
+    Raises:
+        LogError: those of a topic were not recorded in that order: some of them come more than that before
+            others that were recorded earlier.
+    """
+    first_ns: int | None = None
+    # logs put together topic by topic are in order all the same, so each topic counts by itself
+    topics = dict[str, _Recorded]()
+    for each in columns:
+        first_ns = int(each.log_time_ns[0]) if first_ns is None and len(each) else first_ns
+        for topic, rows in _rows_by_topic(each.topics):
+            if topic not in checked:
+                continue
+            recorded = topics.setdefault(topic, _Recorded(disorder_ns))
+            jump = recorded.first_jump(each.log_time_ns[rows], each.place[rows])
+            if jump is not None:
+                at = Instant(int(each.log_time_ns[rows][jump]), first_ns or 0)
+                raise LogError(
+                    f"{name}: time jumps back: the message on {topic!r} logged at {at} was recorded before"
+                    f" others that were logged more than {disorder_ns / 1e9:g} s earlier; {JUMP_REMEDY}"
+                )
+        yield each
+
+
+def _rows_by_topic(topics: Sequence[str]) -> Iterator[tuple[str, Integers | slice]]:
+    names = sorted(set(topics))
+    if len(names) < 2:
+        yield from ((name, slice(None)) for name in names)
+        return
+    number = {name: code for code, name in enumerate(names)}
+    codes = np.fromiter(map(number.__getitem__, topics), np.int64, len(topics))
+    rows = np.split(np.argsort(codes, kind="stable"), np.cumsum(np.bincount(codes))[:-1])
+    yield from zip(names, rows, strict=True)
+
+
+class _Recorded:
+    """How far the recording had come at each message of the last moments, as long as the disorder."""
+
+    def __init__(self, disorder_ns: int) -> None:
+        self._disorder_ns = disorder_ns
+        self._latest: deque[tuple[Integers, Integers]] = deque()
+        self._before = -1
+        self._furthest = -1
+
+    def first_jump(self, times_ns: Integers, places: Integers) -> int | None:
+        """Return the first message recorded before one that is more than a second earlier, or None.
+
+        Args:
+            times_ns, places: (M,) of messages in the order of time, after those of the call before.
+        """
+        if not len(times_ns):
+            return None
+        is_ordered = places[0] >= self._furthest and (places[1:] >= places[:-1]).all()
+        furthest = places if is_ordered else np.maximum(np.maximum.accumulate(places), self._furthest)
+        self._latest.append((times_ns, furthest))
+        self._furthest = int(furthest[-1])
+        jump = None if is_ordered else self._search(times_ns, places)
+        while self._latest[0][0][-1] < times_ns[-1] - self._disorder_ns:
+            self._before = int(self._latest.popleft()[1][-1])
+        return jump
+
+    def _search(self, times_ns: Integers, places: Integers) -> int | None:
+        times = np.concatenate([times for times, _ in self._latest])
+        furthest = np.concatenate([[self._before], *(furthest for _, furthest in self._latest)])
+        earlier = np.searchsorted(times, times_ns - self._disorder_ns)
+        jumps = np.flatnonzero(places < furthest[earlier])
+        return int(jumps[0]) if len(jumps) else None
 
 
 class MessageReader(ABC):

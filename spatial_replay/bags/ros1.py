@@ -20,9 +20,8 @@ import lz4.frame
 import numpy as np
 from numpy.typing import NDArray
 
-from spatial_replay.bags.columns import Columns, MessageColumns, in_order, places_in, unnumbered
 from spatial_replay.bags.decoders import Topic, channel_of, full_type_name, topics_by_name
-from spatial_replay.bags.reader import MessageReader
+from spatial_replay.bags.reader import Columns, MessageColumns, MessageReader, in_order, places_in, unnumbered
 from spatial_replay.compiled import kernel, piece
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.mcap.index import LARGEST_CHUNK, DamageError

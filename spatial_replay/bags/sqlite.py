@@ -25,7 +25,6 @@ from urllib.parse import quote
 import numpy as np
 import zstandard
 
-from spatial_replay.bags.columns import Columns, MessageColumns, unnumbered
 from spatial_replay.bags.decoders import (
     LONGEST_TEXT,
     Topic,
@@ -34,7 +33,7 @@ from spatial_replay.bags.decoders import (
     is_latched,
     topics_by_name,
 )
-from spatial_replay.bags.reader import MessageReader
+from spatial_replay.bags.reader import Columns, MessageColumns, MessageReader, unnumbered
 from spatial_replay.errors import LogError, OutputError
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.mcap.index import LARGEST_CHUNK

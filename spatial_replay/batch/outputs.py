@@ -18,10 +18,10 @@ from xml.sax.saxutils import escape, quoteattr
 import numpy as np
 
 from spatial_replay import __version__
-from spatial_replay.batch.baseline import BASELINE_ROBUSTNESS
 from spatial_replay.batch.rows import Task, opened_task, parsed_specifications
 from spatial_replay.batch.run import BatchResult, Wanted
 from spatial_replay.batch.run_table import (
+    BASELINE_ROBUSTNESS,
     Total,
     Values,
     counts_of,

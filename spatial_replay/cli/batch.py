@@ -35,9 +35,8 @@ from spatial_replay.text import counted, json_number
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from spatial_replay.batch.baseline import Difference, Tolerance
     from spatial_replay.batch.run import BatchResult, PreparedCase
-    from spatial_replay.batch.run_table import By, Total
+    from spatial_replay.batch.run_table import By, Difference, Tolerance, Total
     from spatial_replay.batch.suite import Suite
     from spatial_replay.batch.workers import Workers
     from spatial_replay.logs.remote import LogFile
@@ -249,7 +248,6 @@ def batch(
       spatial-replay batch logs --spec safety.spatial --dask tcp://scheduler:8786
     """
     # imported here so that --help stays fast
-    from spatial_replay.batch.baseline import compare, edited_files, with_baseline
     from spatial_replay.batch.outputs import (
         is_github,
         worst_annotations,
@@ -258,6 +256,7 @@ def batch(
         write_summary,
     )
     from spatial_replay.batch.run import prepare, workers_of
+    from spatial_replay.batch.run_table import compare, edited_files, with_baseline
 
     if dask is not None and jobs is not None:
         raise UsageError("--jobs is for this machine, and a cluster has its own; remove --jobs or --dask")
@@ -381,7 +380,7 @@ def _check_outputs(outputs: BatchOutputs, suite: Suite) -> None:
 
 def _baseline(outputs: BatchOutputs) -> tuple[Tolerance, pa.Table | None]:
     """Return the tolerance, and the table of the baseline if there is one."""
-    from spatial_replay.batch.baseline import Tolerance
+    from spatial_replay.batch.run_table import Tolerance
     from spatial_replay.batch.store import ResultsFolder, result_files
 
     if outputs.baseline is None:

@@ -92,7 +92,7 @@ def falsify(
     from spatial_replay.batch.run import workers_of
     from spatial_replay.falsification.failure_search import search_failures
     from spatial_replay.falsification.simulations import scenario_simulation
-    from spatial_replay.simulation.worlds import default_specification
+    from spatial_replay.simulation.tabletop import default_specification
 
     files = load_spec_options(specs, profile, constants, lambda: default_specification(scenario))
     options = [word for spec in specs for word in ("--spec", str(spec))]

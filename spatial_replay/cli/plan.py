@@ -244,7 +244,7 @@ def planning_command(scenario: str) -> click.Command:
     ) -> int:
         # imported here so that --help stays fast
         from spatial_replay.runs.planned import record_plan
-        from spatial_replay.simulation.worlds import default_specification
+        from spatial_replay.simulation.tabletop import default_specification
 
         named = [*([] if spec is None else [spec]), *also]
         files = load_spec_options(named, profile, constants, lambda: default_specification(scenario))

@@ -381,7 +381,7 @@ def recording_command(scenario: str) -> click.Command:
     ) -> int:
         # imported here so that --help stays fast
         from spatial_replay.runs.scripted import record_script
-        from spatial_replay.simulation.worlds import default_specification
+        from spatial_replay.simulation.tabletop import default_specification
 
         files = load_spec_options(specs, profile, constants, lambda: default_specification(scenario))
         with progress("samples") as advance:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from spatial_replay.compare.alignment import file_of
+from spatial_replay.compare.runs import file_of
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Booleans, Floats, Integers
 from spatial_replay.logs.remote import RemoteFile
@@ -28,9 +28,15 @@ from spatial_replay.monitor.stream import NEVER
 from spatial_replay.monitor.verdict import Verdict, final_verdict, online_verdict
 from spatial_replay.monitor.witness.path import End, MissedResponse, deciding_path, missed_response
 from spatial_replay.monitor.witness.unfinished import UnfinishedNodes, evaluate_unfinished
-from spatial_replay.replay.clipped_source import clipped_source
 from spatial_replay.replay.engine import Replay, Replayed, run_replay
-from spatial_replay.replay.selection import DEFAULT_OPTIONS, KEEP_ALL, ReplayOptions, Selection, Window
+from spatial_replay.replay.selection import (
+    DEFAULT_OPTIONS,
+    KEEP_ALL,
+    ReplayOptions,
+    Selection,
+    Window,
+    clipped_source,
+)
 from spatial_replay.spec.diagnostics import nearest_hint
 from spatial_replay.spec.formula import Outline, Specification, iter_nodes
 from spatial_replay.trace.trace import ABSENT, Trace, window_of

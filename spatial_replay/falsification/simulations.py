@@ -21,12 +21,10 @@ from spatial_replay.geometry.footprint import Footprint
 from spatial_replay.logs.output_file import replacing
 from spatial_replay.recording.log import refuse_templates
 from spatial_replay.runs.planned import record_plan
-from spatial_replay.runs.run_log import run_log
-from spatial_replay.runs.scripted import about_run, refuse_unknown_names, simulate_script
+from spatial_replay.runs.scripted import about_run, refuse_unknown_names, run_log, simulate_script
 from spatial_replay.simulation.arm import least_distance, rectangle
-from spatial_replay.simulation.tabletop import Placement
+from spatial_replay.simulation.tabletop import Placement, default_specification, make_world, scenario_of
 from spatial_replay.simulation.world import Box, Injection, Kind, Start
-from spatial_replay.simulation.worlds import default_specification, make_world, scenario_of
 from spatial_replay.sources.open_log import read_trace
 from spatial_replay.spec.formula import Specification
 from spatial_replay.text import nearest_hint

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, ClassVar, Final
 
 import numpy as np
 
-from spatial_replay.bags.columns import DISORDER_NS, Message
 from spatial_replay.bags.decoders import decoder_of, topic_of, topics_by_name
+from spatial_replay.bags.reader import DISORDER_NS, Message
 from spatial_replay.errors import LogError, UsageError, importing
 from spatial_replay.live.client import (
     Client,

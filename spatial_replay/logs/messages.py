@@ -16,8 +16,7 @@ import numpy as np
 
 from spatial_replay.geometry.arrays import Integers, concatenated, select
 from spatial_replay.text import Sentence
-from spatial_replay.trace.pauses import Pauses
-from spatial_replay.trace.trace import Trace
+from spatial_replay.trace.trace import Pauses, Trace
 
 BLOCK_SAMPLES = 12_288
 """A block holds at most this many samples, so that memory stays bounded whatever the log's length."""

@@ -15,10 +15,9 @@ from types import MappingProxyType
 
 import numpy as np
 
-from spatial_replay.bags.columns import Columns, MessageColumns, in_pieces, without_jumps
 from spatial_replay.bags.decoders import Topic, full_type_name, why_unreadable
 from spatial_replay.bags.open import files_of_bag_around, open_messages
-from spatial_replay.bags.reader import MessageReader
+from spatial_replay.bags.reader import Columns, MessageColumns, MessageReader, in_pieces, without_jumps
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import concatenated, select
 from spatial_replay.geometry.footprint import Concave

@@ -16,8 +16,8 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from spatial_replay.bags.columns import DISORDER_NS
 from spatial_replay.bags.decoders import Decoder, Topic
+from spatial_replay.bags.reader import DISORDER_NS
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Booleans, Floats, Integers
 from spatial_replay.mapping.binding import Binding, Codes, Namer, TimeGetter, bind, bind_time, class_codes

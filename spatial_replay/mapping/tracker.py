@@ -24,8 +24,7 @@ from spatial_replay.mapping.topic_reader import ReadingPlan, ReportFault, TopicR
 from spatial_replay.mapping.transforms import FrameTree, Transforms
 from spatial_replay.text import Instant, Sentence
 from spatial_replay.trace.observations import Observations, check_observations
-from spatial_replay.trace.pauses import Pauses
-from spatial_replay.trace.trace import ABSENT, Trace, renumbered
+from spatial_replay.trace.trace import ABSENT, Pauses, Trace, renumbered
 from spatial_replay.trace.units import Axes
 
 LEFT = -1

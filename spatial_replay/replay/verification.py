@@ -21,8 +21,8 @@ import numpy as np
 
 from spatial_replay import __version__
 from spatial_replay.annotate.certificate import PLAN_SHA256, plan_sha256
-from spatial_replay.bags.columns import Message
 from spatial_replay.bags.mcap_log import McapLog
+from spatial_replay.bags.reader import Message
 from spatial_replay.errors import LogError, MissingFileError, UsageError
 from spatial_replay.logs.mcap.read import McapSource
 from spatial_replay.logs.messages import Messages
@@ -42,9 +42,8 @@ from spatial_replay.logs.topics import (
     SPECIFICATION,
 )
 from spatial_replay.monitor.semantics import Semantics
-from spatial_replay.replay.clipped_source import CLIP_METADATA, clipped_source
 from spatial_replay.replay.engine import Replay, load_files, run_replay
-from spatial_replay.replay.selection import KEEP_ALL, ReplayOptions, Window
+from spatial_replay.replay.selection import CLIP_METADATA, KEEP_ALL, ReplayOptions, Window, clipped_source
 from spatial_replay.spec.formula import Specification
 from spatial_replay.text import Instant, Sentence, counted_from, printable
 

@@ -33,13 +33,11 @@ from spatial_replay.planning.decisions import Kind, Outcome, Step, sentence_of
 from spatial_replay.planning.planner import Planner
 from spatial_replay.planning.settings import Grid, Settings, Skill, Workspace, changed_settings
 from spatial_replay.recording.plan_loop import run_plan
-from spatial_replay.runs.run_log import RunLog, run_log
-from spatial_replay.runs.scripted import about_run, refuse_unknown_names
+from spatial_replay.runs.scripted import RunLog, about_run, refuse_unknown_names, run_log
 from spatial_replay.runs.virtual_camera import open_film
 from spatial_replay.sanity import refuse_unsatisfiable
-from spatial_replay.simulation.tabletop import SAMPLES_PER_S
+from spatial_replay.simulation.tabletop import SAMPLES_PER_S, default_specification, make_world
 from spatial_replay.simulation.world import Injection, Start, TreeTick, World
-from spatial_replay.simulation.worlds import default_specification, make_world
 from spatial_replay.spec import parse_specification
 from spatial_replay.spec.formula import Atom, Formula, Misalignment, Specification
 from spatial_replay.spec.walks import base_of, iter_expressions, iter_formulas

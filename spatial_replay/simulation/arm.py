@@ -1,10 +1,11 @@
-"""A robot arm with a gripper, and the scene that it works on."""
+"""The arm: its motions, the scene around it, and the skills of picking, placing and pushing."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TypeAlias
 
 import numpy as np
@@ -13,7 +14,7 @@ from spatial_replay.geometry.arrays import Floats
 from spatial_replay.geometry.footprint import Footprint, FootprintBatch
 from spatial_replay.geometry.measure import MeasureRequest, Operand, measure
 from spatial_replay.simulation.bullet import REST, STEPS_PER_S, Engine, downwards, joints_for, tool_frame
-from spatial_replay.simulation.world import Body, Pose, TreeTick, footprint, height
+from spatial_replay.simulation.world import Body, Box, Execution, Pose, Stage, TreeTick, footprint, height
 
 TICKS_PER_S = 60
 """Commands of the arm per second."""
@@ -245,3 +246,436 @@ def rectangle(x: float, y: float, length: float, width: float, yaw: float) -> Fo
     turn = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
     corners: Floats = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)]) * np.array([length, width]) / 2
     return Footprint.polygon(corners @ turn + np.array([x, y]))
+
+
+# ----------------------------------------------------------------------------------------------------- grasps
+
+Point = tuple[float, float]
+
+_THICKEST = WIDEST - 0.008
+"""The maximum thickness of a body between the fingers, in metres."""
+_OPENING = 0.02
+"""How much wider than the body the fingers open, in metres."""
+_BELOW_TOP = 0.022
+"""The depth of a grasp below the top of a tall body, in metres."""
+_HAND_DEPTH, _HAND_WIDTH, _HAND_ABOVE = 0.064, 0.21, 0.035
+"""The hand: its size across and along its opening, and its height above the tool point, in metres."""
+_ROOM, _AMPLE = 0.0015, 0.01
+"""The clearance around the fingers, in metres, that is required, and beyond which more does not count."""
+_ANGLES = 12
+
+
+@dataclass(frozen=True, slots=True)
+class Grasp:
+    """A grasp of a body.
+
+    Attributes:
+        yaw: of the tool when it picks the body up, in radians.
+        turn: yaw of the tool when it sets the body down.
+        above_bottom: height of the tool point above the body's lowest point, in metres.
+        opening: distance of the fingers before and after, in metres.
+    """
+
+    yaw: float
+    turn: float
+    above_bottom: float
+    opening: float
+
+
+def best_grasp(
+    scene: Scene, name: str, goal: Point, yaw: float | None, *, is_lifted: bool = True
+) -> Grasp | Execution:
+    """Return the grasp with the most clearance, preferring thin sides; or the failure if there is none.
+
+    A body that is not lifted is turned the shorter way round.
+    """
+    start = scene.place_of(name)
+    if not in_reach(*start):
+        return Execution(False, f"{name} lies out of the robot's reach", "pick")
+    if not in_reach(*goal):
+        return Execution(False, f"({goal[0]:.2f}, {goal[1]:.2f}) is out of the robot's reach", "place")
+    angles = _angles(scene, name)
+    across = [(thickness, angle) for thickness, angle in angles if thickness <= _THICKEST]
+    if not across:
+        thinnest = f"{min(angles)[0] * 100:.1f} cm, and {_THICKEST * 100:.1f} cm fit between the fingers"
+        return Execution(False, f"{name} is too thick for the gripper as it lies: {thinnest}", "pick")
+    bottom, top = scene.height(name)
+    above_bottom = max(FINGERTIP + 0.003, top - bottom - _BELOW_TOP)
+    best, best_room, can_turn_hand, can_pick, can_place = None, _ROOM, False, False, False
+    for thickness, angle in sorted(across):
+        opening = min(WIDEST, thickness + _OPENING)
+        for grasp_yaw, turn in _turns(scene, name, angle, goal, yaw, is_lifted):
+            grasp = Grasp(grasp_yaw, turn, above_bottom, opening)
+            here = _room(scene, name, start, grasp.yaw, grasp, bottom)
+            there = _room(scene, name, goal, grasp.turn, grasp, surface(scene, name, goal))
+            can_turn_hand = True
+            can_pick, can_place = can_pick or here > _ROOM, can_place or there > _ROOM
+            room = min(here, there, _AMPLE)
+            if room > best_room:
+                best, best_room = grasp, room
+    if best is not None:
+        return best
+    if not can_turn_hand:
+        return Execution(False, f"the hand cannot turn as far as {name} has to be turned", "place")
+    if can_pick and can_place:
+        said = f"no grasp of {name} has room for the fingers both where it lies and where it should go"
+        return Execution(False, said, "place")
+    where = (
+        "where it lies" if can_place else "where it should go" if can_pick else "where it lies and should go"
+    )
+    return Execution(False, f"no room for the fingers around {name} {where}", "place" if can_pick else "pick")
+
+
+def surface(scene: Scene, name: str, goal: Point) -> float:
+    """Return the height of the support under a point: the table, or a body that supports others."""
+    spot = rectangle(*goal, 1e-3, 1e-3, 0.0)
+    under = [
+        scene.height(other)[1]
+        for other, body in scene.bodies.items()
+        if body.support and other != name and scene.distance(spot, other) <= 0
+    ]
+    return max(under, default=0.0)
+
+
+def _angles(scene: Scene, name: str) -> list[tuple[float, float]]:
+    """Return (thickness, yaw of the tool) of possible grasps: across flat sides if there are any."""
+    pose, covered = scene.pose(name), scene.footprint(name)
+    if isinstance(scene.bodies[name].shape, Box) and pose.is_level:
+        turns = [pose.yaw, pose.yaw + math.pi / 2]
+    else:
+        turns = [k * math.pi / _ANGLES for k in range(_ANGLES)]
+    spans = [(extent(covered, turn + math.pi / 2), turn) for turn in turns]
+    across = [(high - low, turn) for (low, high), turn in spans]
+    if len(across) == 2:
+        return across
+    thinnest = min(across)[0]
+    return [(thickness, turn) for thickness, turn in across if thickness < thinnest + 1e-3]
+
+
+def _turns(
+    scene: Scene, name: str, angle: float, goal: Point, yaw: float | None, is_lifted: bool
+) -> Iterator[tuple[float, float]]:
+    """Iterate over the yaws of the tool for picking up and setting down that the arm can reach."""
+    pose, start = scene.pose(name), scene.place_of(name)
+    # any yaw suits a round body: the arm keeps its own relative to the direction from the base
+    is_round = not isinstance(scene.bodies[name].shape, Box) and pose.stands
+    for picked in (angle, angle + math.pi):
+        grasp_yaw = turn_towards(picked, *start, 2 * math.pi)
+        further = 0.0 if yaw is None or not pose.is_level else yaw - pose.yaw
+        if is_round:
+            further = math.atan2(goal[1], goal[0]) - math.atan2(start[1], start[0])
+        turn = grasp_yaw + math.remainder(further, math.tau)
+        if is_lifted:
+            turn = turn_towards(grasp_yaw + further, *goal, 2 * math.pi)
+        if can_turn(grasp_yaw, *start) and can_turn(turn, *goal):
+            yield grasp_yaw, turn
+
+
+def _room(scene: Scene, name: str, place: Point, turn: float, grasp: Grasp, bottom: float) -> float:
+    """Return the clearance of fingers and hand to other bodies when a body is held at a place."""
+    tool = bottom + grasp.above_bottom
+    fingers = rectangle(*place, FINGER_DEPTH, grasp.opening + 2 * FINGER_WIDTH, turn)
+    hand = rectangle(*place, _HAND_DEPTH, _HAND_WIDTH, turn)
+    around_fingers = scene.clearance(fingers, name, above=tool - FINGERTIP)
+    return min(around_fingers, scene.clearance(hand, name, above=tool + _HAND_ABOVE))
+
+
+# ---------------------------------------------------------------------------------------------------- picking
+
+_SLOW = 0.15
+_SETTING_DOWN = 0.002
+"""The height above its support at which a body is released, in metres."""
+_LOST_TICKS = 6
+"""Ticks without contact after which a body is lost."""
+_STRAIGHT = 0.08
+"""The longest stretch, in metres, on which the tool's way counts as straight."""
+_NEAR = 0.02
+"""The tolerance of a body's position, in metres."""
+
+
+def picking(
+    scene: Scene, name: str, goal: Point, yaw: float | None, via: Sequence[Point] = ()
+) -> Generator[None, None, Execution]:
+    """Pick a body up and place its centre at a point, along others, with `yaw` unless that is None."""
+    grasp = best_grasp(scene, name, goal, yaw)
+    if isinstance(grasp, Execution):
+        return grasp
+    stood = scene.pose(name).stands
+    at: Stage = "pick"
+    trouble = yield from pick_up(scene, name, grasp)
+    if not trouble:
+        at, trouble = "way", (yield from carry(scene, name, grasp, goal, via))
+    if not trouble:
+        at, trouble = "place", (yield from set_down(scene, name, goal))
+    yield from let_go(scene, grasp.opening)
+    trouble = trouble or missed(scene, name, goal, stood=stood)
+    return Execution(False, trouble, at) if trouble else Execution(True, f"placed {name}")
+
+
+def pick_up(scene: Scene, name: str, grasp: Grasp) -> Generator[None, None, str]:
+    """Grasp a body and lift it; return the reason of a failure, or ""."""
+    (x, y), trouble = scene.place_of(name), (yield from take_hold(scene, name, grasp))
+    if trouble:
+        return trouble
+    lifted = yield from _holding(scene, name, scene.arm.move(x, y, ABOVE, speed=2 * _SLOW))
+    return "" if lifted else f"{name} slipped out of the fingers as it was lifted"
+
+
+def take_hold(scene: Scene, name: str, grasp: Grasp) -> Generator[None, None, str]:
+    """Close the fingers on a body where it stands; return the reason of a failure, or ""."""
+    arm, (x, y) = scene.arm, scene.place_of(name)
+    z = scene.height(name)[0] + grasp.above_bottom
+    yield from arm.travel(x, y, grasp.yaw)
+    yield from arm.grip(grasp.opening)
+    yield from arm.move(x, y, z + 0.05)
+    yield from arm.move(x, y, z, speed=_SLOW)
+    yield from arm.grip(0.0)
+    if scene.engine.fingers_touching(name) < 2:
+        return f"the fingers closed beside {name}"
+    return ""
+
+
+def carry(
+    scene: Scene, name: str, grasp: Grasp, goal: Point, via: Sequence[Point] = ()
+) -> Generator[None, None, str]:
+    """Move the held body above a point, along others; return the reason of a failure, or ""."""
+    for point in _fine(scene.place_of(name), (*via, goal)) if via else (goal,):
+        x, y = _tool_for(scene, name, point, grasp.turn)
+        carried = yield from _holding(scene, name, scene.arm.travel(x, y, grasp.turn))
+        if not carried:
+            return f"{name} slipped out of the fingers on the way"
+    return ""
+
+
+def turn_on_the_spot(scene: Scene, name: str, yaw: float) -> Generator[None, None, str]:
+    """Turn a body on its support between the fingers; return the reason of a failure, or ""."""
+    grasp = best_grasp(scene, name, scene.place_of(name), yaw, is_lifted=False)
+    if isinstance(grasp, Execution):
+        return grasp.reason
+    trouble = yield from take_hold(scene, name, grasp)
+    if not trouble:
+        turned = yield from _holding(scene, name, scene.arm.move(*scene.arm.commanded, grasp.turn))
+        trouble = "" if turned else f"{name} slipped out of the fingers as it was turned"
+    yield from let_go(scene, grasp.opening)
+    return trouble
+
+
+def put_back(scene: Scene, name: str) -> Motion:
+    """Put down what the fingers hold, where it is, and open them."""
+    if scene.engine.fingers_touching(name):
+        yield from set_down(scene, name, scene.place_of(name))
+    yield from let_go(scene, WIDEST)
+
+
+def _fine(start: Point, points: Sequence[Point]) -> list[Point]:
+    """Return points along straight lines, so close that the tool's way hardly leaves these."""
+    fine = []
+    for begin, end in pairwise((start, *points)):
+        count = max(1, math.ceil(math.dist(begin, end) / _STRAIGHT))
+        shares = (step / count for step in range(1, count + 1))
+        fine += [(begin[0] + s * (end[0] - begin[0]), begin[1] + s * (end[1] - begin[1])) for s in shares]
+    return fine
+
+
+def set_down(scene: Scene, name: str, goal: Point) -> Generator[None, None, str]:
+    """Lower the held body onto its support; return the reason of a failure, or ""."""
+    arm = scene.arm
+    x, y, above = arm.commanded
+    # measured now, because the body may hang in another pose than it stood in
+    z = surface(scene, name, goal) + above - scene.height(name)[0] + _SETTING_DOWN
+    lowered = yield from _holding(scene, name, arm.move(x, y, z + 0.03))
+    if lowered:
+        lowered = yield from _holding(scene, name, arm.move(x, y, z, speed=_SLOW / 2))
+    return "" if lowered else f"{name} slipped out of the fingers as it was set down"
+
+
+def let_go(scene: Scene, opening: float) -> Motion:
+    """Open the fingers, and lift them."""
+    x, y, _ = scene.arm.commanded
+    yield from scene.arm.grip(opening)
+    yield from scene.arm.move(x, y, ABOVE)
+
+
+def missed(scene: Scene, name: str, goal: Point, *, stood: bool = True) -> str:
+    """Return how a released body differs from its goal, or ""."""
+    if stood and not scene.pose(name).stands:
+        return f"{name} fell over"
+    away = math.dist(scene.place_of(name), goal)
+    return "" if away <= _NEAR else f"{name} lies {away * 100:.1f} cm from where it was put"
+
+
+def _tool_for(scene: Scene, name: str, goal: Point, turn: float) -> Point:
+    """Return the tool position for which the held body, usually off centre, is at a point."""
+    x, y = scene.place_of(name)
+    tool_x, tool_y, _ = scene.arm.commanded
+    dx, dy, turned = x - tool_x, y - tool_y, turn - scene.arm.yaw
+    cosine, sine = math.cos(turned), math.sin(turned)
+    return goal[0] - dx * cosine + dy * sine, goal[1] - dx * sine - dy * cosine
+
+
+def _holding(scene: Scene, name: str, motion: Motion) -> Generator[None, None, bool]:
+    """Move while the fingers hold a body; stop and return False when they lose it."""
+    lost = 0
+    for _ in motion:
+        yield
+        lost = lost + 1 if scene.engine.fingers_touching(name) == 0 else 0
+        if lost >= _LOST_TICKS:
+            return False
+    return True
+
+
+# ---------------------------------------------------------------------------------------------------- pushing
+
+
+_LOW = FINGERTIP + 0.006
+"""The height of the tool while it pushes, in metres: low enough not to tip a body."""
+_AWAY = 0.01
+"""The distance behind a body at which the fingers come down, in metres."""
+_MARGIN = 0.001
+_PUSH_FAST, _PUSH_SLOW = 0.1, 0.015
+_CLOSE = 0.004
+"""The distance to its goal, in metres, at which a body needs no further stroke."""
+_FAR = 0.015
+"""The tolerance of a body's position after all strokes, in metres."""
+_STRAIGHTENED = 0.0025
+_TURNED = 0.05
+"""The tolerance of a body's yaw that is given, in radians."""
+_TURNS = 2
+"""The maximum number of turns on the spot."""
+_STROKES = 4
+"""The maximum number of strokes to one goal."""
+
+
+def pushing(
+    scene: Scene, name: str, path: Sequence[Point], yaw: float | None = None
+) -> Generator[None, None, Execution]:
+    """Push a body along a path, one stroke for each straight stretch, with corrections at the end.
+
+    With `yaw`, turn it there: a stroke also turns a body a little, as its side comes to lie at the fingers.
+    """
+    corners = straightened([scene.place_of(name), *path])[1:]
+    for corner in corners[:-1]:
+        trouble = yield from _push_to(scene, name, corner, strokes=1, allowed=3 * _FAR)
+        if trouble is not None:
+            return trouble
+    trouble = yield from _push_to(scene, name, corners[-1], strokes=_STROKES, allowed=_FAR)
+    if trouble is not None:
+        return trouble
+    if turning := (yield from _turn_to(scene, name, corners[-1], yaw)):
+        return Execution(False, turning, "place")
+    is_straight = len(corners) == 1
+    way = "straight to its place" if is_straight else f"along {len(corners)} straight stretches"
+    turned = "" if yaw is None else ", and turned it there"
+    return Execution(True, f"pushed {name} {way}{turned}")
+
+
+def _push_to(
+    scene: Scene, name: str, goal: Point, *, strokes: int, allowed: float
+) -> Generator[None, None, Execution | None]:
+    """Push a body to a point in several strokes; return the failure, if it fails."""
+    missed = 0.0
+    for _ in range(strokes):
+        trouble = yield from _stroke(scene, name, goal)
+        if trouble is not None:
+            return trouble
+        missed = math.dist(scene.place_of(name), goal)
+        if missed <= _CLOSE:
+            break
+    if missed <= allowed:
+        return None
+    return Execution(False, f"{name} ended {missed * 100:.1f} cm from where it was pushed to", "place")
+
+
+def _turn_to(scene: Scene, name: str, goal: Point, yaw: float | None) -> Generator[None, None, str]:
+    """Turn a body to a yaw near its goal; return the reason of a failure, or ""."""
+    if yaw is None:
+        return ""
+    for _ in range(_TURNS):
+        if abs(scene.pose(name).turned_from(yaw)) <= _TURNED:
+            break
+        trouble = yield from turn_on_the_spot(scene, name, yaw)
+        if trouble:
+            return trouble
+    left = abs(scene.pose(name).turned_from(yaw))
+    if left > _TURNED:
+        return f"{name} is {math.degrees(left):.0f} degrees from how it was turned"
+    missed = math.dist(scene.place_of(name), goal)
+    return "" if missed <= _FAR else f"{name} ended {missed * 100:.1f} cm from where it was pushed to"
+
+
+def straightened(path: Sequence[Point]) -> list[Point]:
+    """Return the corners of a path, without points on the line between others (Douglas–Peucker)."""
+    if len(path) < 3:
+        return list(path)
+    points = np.array(path)
+    chord = points[-1] - points[0]
+    length = float(np.hypot(*chord))
+    offsets = points - points[0]
+    if length > 0:
+        away = np.abs(offsets[:, 0] * chord[1] - offsets[:, 1] * chord[0]) / length
+    else:
+        away = np.hypot(offsets[:, 0], offsets[:, 1])
+    farthest = int(np.argmax(away))
+    if away[farthest] <= _STRAIGHTENED:
+        return [path[0], path[-1]]
+    return straightened(path[: farthest + 1])[:-1] + straightened(path[farthest:])
+
+
+def _stroke(scene: Scene, name: str, goal: Point) -> Generator[None, None, Execution | None]:
+    """Push a body straight towards a point; return the failure, if it fails."""
+    x, y = scene.place_of(name)
+    length = math.dist((x, y), goal)
+    if length < _CLOSE:
+        return None
+    heading = math.atan2(goal[1] - y, goal[0] - x)
+    u, v = math.cos(heading), math.sin(heading)
+    back = u * x + v * y - extent(scene.footprint(name), heading)[0] + FINGER_DEPTH / 2
+    behind = (x - u * (back + _AWAY), y - v * (back + _AWAY))
+    if not in_reach(*goal):
+        said = f"the robot does not reach ({goal[0]:.2f}, {goal[1]:.2f}), where {name} should go"
+        return Execution(False, said, "place")
+    if not in_reach(*behind):
+        return Execution(False, f"the robot does not reach behind {name} where it lies", "pick")
+    gap = _gap(scene, name, behind, heading)
+    if gap is None:
+        return Execution(False, f"no room for the fingers behind {name}", "pick")
+    arm = scene.arm
+    yield from arm.travel(*behind, turn_towards(heading, *behind))
+    yield from arm.grip(gap)
+    yield from arm.move(*behind, 0.08)
+    yield from arm.move(*behind, _LOW, speed=0.2)
+    reached = yield from _advance(scene, name, behind, heading, length, back)
+    x, y, z = arm.commanded
+    yield from arm.move(x - 0.02 * u, y - 0.02 * v, z)
+    yield from arm.move(x - 0.02 * u, y - 0.02 * v, 0.1)
+    return None if reached else Execution(False, f"the fingers lost {name}", "way")
+
+
+def _advance(
+    scene: Scene, name: str, behind: Point, heading: float, length: float, back: float
+) -> Generator[None, None, bool]:
+    """Move the fingers forward until the body has moved by a length; return whether it did."""
+    u, v = math.cos(heading), math.sin(heading)
+    x, y = scene.place_of(name)
+    travelled = 0.0
+    while True:
+        now = scene.place_of(name)
+        remaining = length - (now[0] - x) * u - (now[1] - y) * v
+        if remaining <= _MARGIN:
+            return True
+        if travelled > length + back + _AWAY:
+            return False
+        travelled += min(_PUSH_FAST, _PUSH_SLOW + 2.0 * remaining) / TICKS_PER_S
+        scene.arm.aim(np.array([behind[0] + u * travelled, behind[1] + v * travelled, _LOW]), scene.arm.yaw)
+        yield
+
+
+def _gap(scene: Scene, name: str, behind: Point, heading: float) -> float | None:
+    """Return the widest gap of the fingers that fits behind a body; None if none does."""
+    low, high = extent(scene.footprint(name), heading + math.pi / 2)
+    widest = max(0.0, min(0.05, high - low - 2 * FINGER_WIDTH))
+    for gap in (widest, widest / 2, 0.0):
+        fingers = rectangle(*behind, FINGER_DEPTH, gap + 2 * FINGER_WIDTH, heading)
+        if scene.clearance(fingers, name) > _MARGIN:
+            return gap
+    return None

@@ -21,9 +21,15 @@ from typing import NamedTuple, Unpack
 from urllib.parse import quote
 
 from spatial_replay.errors import LogError, MissingFileError, RemoteError, UsageError
-from spatial_replay.logs.formats.csv_tracks import COLUMNS, iter_csv
-from spatial_replay.logs.formats.drone import FRAMES_A_SECOND, is_annotations, iter_annotations
-from spatial_replay.logs.formats.tracks import iter_jsonl, open_text
+from spatial_replay.logs.formats.tracks import (
+    CSV_COLUMNS,
+    FRAMES_A_SECOND,
+    is_annotations,
+    iter_annotations,
+    iter_csv,
+    iter_jsonl,
+    open_text,
+)
 from spatial_replay.logs.read_options import Reading, ReadOptions, count_of
 from spatial_replay.logs.remote import (
     BAG_METADATA,
@@ -240,7 +246,7 @@ def _is_scenario(head: bytes) -> bool:
 
 def _is_csv(head: bytes) -> bool:
     first = head.removeprefix(b"\xef\xbb\xbf").split(b"\n", 1)[0]
-    return any(name.encode() in first.split(b",") for name in COLUMNS)
+    return any(name.encode() in first.split(b",") for name in CSV_COLUMNS)
 
 
 class Format(NamedTuple):

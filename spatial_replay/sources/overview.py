@@ -12,11 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from spatial_replay.bags.columns import Message
 from spatial_replay.bags.decoders import Decoder, Topic
 from spatial_replay.bags.mcap_log import McapLog
 from spatial_replay.bags.open import open_messages
-from spatial_replay.bags.reader import MessageReader
+from spatial_replay.bags.reader import Message, MessageReader
 from spatial_replay.errors import LogError, MissingFileError, UsageError
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.mcap.read import LogSummary, McapSource, summarise_mcap

@@ -11,10 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from spatial_replay.bags.columns import MessageColumns
 from spatial_replay.bags.mcap_log import McapLog
 from spatial_replay.bags.open import open_messages
-from spatial_replay.bags.reader import MessageReader
+from spatial_replay.bags.reader import MessageColumns, MessageReader
 from spatial_replay.bags.ros1 import Ros1Bag
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Integers, select

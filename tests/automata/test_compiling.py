@@ -11,7 +11,7 @@ from automata.golden import FILE, FORMULAS, as_values
 from spatial_replay import NoAutomatonError, UsageError, automaton, parse_specification
 from spatial_replay.automata import dot_text, hoa_text, stored_text, words_text
 from spatial_replay.automata.automaton import Automaton
-from spatial_replay.simulation.worlds import default_specification
+from spatial_replay.simulation.tabletop import default_specification
 
 GOLDEN = json.loads(FILE.read_text())
 

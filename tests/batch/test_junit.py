@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 import spatial_replay as sr
 from batch.fleet import batch, write_fleet
 from examples import examples
-from spatial_replay.batch.baseline import Tolerance
 from spatial_replay.batch.outputs import write_junit
+from spatial_replay.batch.run_table import Tolerance
 from spatial_replay.batch.store import run_columns
 
 SCHEMA = xmlschema.XMLSchema(Path(__file__).with_name("xunit2.xsd"))

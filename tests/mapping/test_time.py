@@ -9,7 +9,7 @@ import pytest
 
 from mapping.feeding import SECOND, Feed, header, make, pose_stamped, ros
 from spatial_replay import LogError, Trace, UsageError
-from spatial_replay.bags.columns import MessageColumns
+from spatial_replay.bags.reader import MessageColumns
 from spatial_replay.mapping import Assembler, ReadingPlan, parse_mapping
 from spatial_replay.trace.sample import LATEST_NS
 

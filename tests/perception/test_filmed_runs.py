@@ -9,7 +9,7 @@ import pytest
 
 from spatial_replay import Trace, evaluate, read_trace
 from spatial_replay.cli import run
-from spatial_replay.simulation.worlds import default_specification
+from spatial_replay.simulation.tabletop import default_specification
 
 for each in ("av", "cv2", "pybullet", "py_trees"):
     pytest.importorskip(each)

@@ -13,7 +13,7 @@ from spatial_replay import Planner, Settings
 from spatial_replay.planning import BlackBox, Grid, Workspace
 from spatial_replay.recording.plan_loop import HOLDING_SAMPLES, MOST_WAITING_SAMPLES, run_plan
 from spatial_replay.runs.planned import PlanLoop
-from spatial_replay.runs.run_log import run_log
+from spatial_replay.runs.scripted import run_log
 
 TABLE = Settings(Workspace(Grid.over(0, 0, 10, 10, 0.5), supports=frozenset({"plate"})))
 THINGS = {"cup": block(1, 1, size=1), "fork": block(9, 9, size=1), "plate": block(5, 5, size=3)}

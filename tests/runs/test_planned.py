@@ -14,7 +14,7 @@ from spatial_replay.logs.schemas.BehaviourTree_pb2 import BehaviourTree
 from spatial_replay.planning import centre_of, read_decisions, recompute_decisions
 from spatial_replay.replay import load_files, run_replay, verify_certificate
 from spatial_replay.runs.planned import PlannedRun, record_plan, settings_for
-from spatial_replay.simulation.worlds import make_world
+from spatial_replay.simulation.tabletop import make_world
 from spatial_replay.sources import open_source
 
 RUNNING, SUCCESS = BehaviourTree.STATUS_RUNNING, BehaviourTree.STATUS_SUCCESS

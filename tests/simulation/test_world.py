@@ -12,9 +12,8 @@ import pytest
 from simulation.worlds import NO_SIMULATOR, centre, off, world
 from spatial_replay import Sample, TrackedObject, UsageError
 from spatial_replay.simulation.scenarios.push import SCENARIO as PUSH
-from spatial_replay.simulation.tabletop import Tabletop
+from spatial_replay.simulation.tabletop import SCENARIOS, Tabletop, default_specification, make_world
 from spatial_replay.simulation.world import Box, Start, footprint, height
-from spatial_replay.simulation.worlds import SCENARIOS, default_specification, make_world
 from spatial_replay.spec import object_names
 
 

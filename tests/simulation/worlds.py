@@ -9,9 +9,8 @@ from contextlib import contextmanager
 import pytest
 
 from spatial_replay import Sample
-from spatial_replay.simulation.tabletop import Tabletop
+from spatial_replay.simulation.tabletop import Tabletop, make_world
 from spatial_replay.simulation.world import Injection, Start
-from spatial_replay.simulation.worlds import make_world
 
 NO_SIMULATOR = "PyBullet is not installed; it has wheels for Python 3.11"
 

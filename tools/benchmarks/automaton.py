@@ -8,7 +8,7 @@ from typing import Any
 
 import spatial_replay as sr
 from spatial_replay.automata.automaton import Automaton
-from spatial_replay.simulation.worlds import default_specification
+from spatial_replay.simulation.tabletop import default_specification
 
 
 def _responses(count: int) -> str:

@@ -15,7 +15,7 @@ import spatial_replay as sr
 from spatial_replay.perception import Frame, TagObserver, load_tags, observe_cameras, open_frames, parse_tags
 from spatial_replay.perception.opencv import Camera, pose_looking_at
 from spatial_replay.runs.virtual_camera import Plate, render
-from spatial_replay.simulation.worlds import SCENARIOS, default_specification
+from spatial_replay.simulation.tabletop import SCENARIOS, default_specification
 
 TAGS = """
 size: 45mm

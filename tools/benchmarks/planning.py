@@ -165,7 +165,7 @@ def bench_planned_runs(bench: Any) -> None:
         bench.remark("the simulator is not installed: pip install '.[sim]'")
         return
     from spatial_replay.runs.planned import record_plan
-    from spatial_replay.simulation.worlds import SCENARIOS
+    from spatial_replay.simulation.tabletop import SCENARIOS
 
     with tempfile.TemporaryDirectory() as folder:
         for scenario in SCENARIOS:

@@ -14,7 +14,7 @@ def bench_simulated_run(measure: Any) -> None:
         measure.remark("worlds are not simulated: PyBullet is not installed (the extra `sim`)")
         return
     from spatial_replay.runs.scripted import record_script
-    from spatial_replay.simulation.worlds import SCENARIOS
+    from spatial_replay.simulation.tabletop import SCENARIOS
 
     with tempfile.TemporaryDirectory() as folder:
         for scenario in SCENARIOS:

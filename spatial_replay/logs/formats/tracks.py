@@ -1,4 +1,4 @@
-"""Track JSONL, one sample a line, and what every text format shares: lines, reported objects, columns.
+"""Track JSONL, track CSV and the Stanford Drone Dataset, and their shared lines, objects and columns.
 
 A text file may be plain or gzip, and damaged anywhere. A line that cannot be read costs its own sample only,
 so each is checked by itself.
@@ -6,22 +6,26 @@ so each is checked by itself.
 
 from __future__ import annotations
 
+import csv
 import gzip
 import json
 import zlib
+from array import array
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from math import inf, nan
+from math import cos, inf, isfinite, nan, sin
 from pathlib import Path
 from typing import Any, BinaryIO, TypeAlias, cast
 
 import numpy as np
+from numpy.typing import NDArray
 
-from spatial_replay.geometry.arrays import starts_from_counts
+from spatial_replay.errors import LogError
+from spatial_replay.geometry.arrays import Floats, Integers, starts_from_counts
 from spatial_replay.geometry.footprint import Concave, FootprintBatch
 from spatial_replay.logs.messages import BLOCK_SAMPLES
-from spatial_replay.logs.read_options import FaultList
-from spatial_replay.text import Sentence, is_encodable, text_number, times_apart
+from spatial_replay.logs.read_options import FaultList, Lost, frame_times
+from spatial_replay.text import Instant, Sentence, is_encodable, text_number, times_apart
 from spatial_replay.trace.observations import Observations, trace_from_observations
 from spatial_replay.trace.sample import LATEST_NS
 from spatial_replay.trace.trace import Trace, require_few
@@ -352,3 +356,297 @@ def _short(value: Any) -> str:
 
 def _shorten(text: str) -> str:
     return text if len(text) <= 60 else text[:59] + "…"
+
+
+CSV_COLUMNS = ("time_ns", "name", "class", "x", "y", "yaw", "length", "width")
+
+
+class _NoObjectError(Exception):
+    """A line that is not an object; the text says why and what to give instead."""
+
+
+def iter_csv(path: Path, faults: FaultList, *, concave: Concave = "decompose") -> Iterator[Trace]:
+    """Yield the samples of a track CSV in blocks.
+
+    A sample with a line that cannot be read is left out as a whole and goes to `faults`.
+
+    Raises:
+        LogError: the first line does not name the columns.
+    """
+    return iter_traces(_csv_samples(path, faults), faults, concave)
+
+
+def _csv_samples(path: Path, faults: FaultList) -> Iterator[ReportedSample]:
+    lines = iter_lines(path, faults)
+    order = _column_order(path, next(lines, (1, ""))[1])
+    time_ns, place, reports, broken = -1, "", dict[str, ObjectReport](), False
+    for number, line in lines:
+        here = f"{path.name}:{number}"
+        try:
+            row = _row(line, order)
+            at = _time(row["time_ns"])
+            if at < time_ns:
+                this, last = times_apart(at, time_ns)
+                what = Sentence("its time is ", this, ", before ", last, "; give times that do not go back")
+                raise _NoObjectError(what)
+        except _NoObjectError as error:
+            faults.add(Sentence(f"{here}: ", *error.args))
+            continue
+        if at > time_ns:
+            if reports and not broken:
+                yield time_ns, place, list(reports.values()), {}
+            time_ns, place, reports, broken = at, here, {}, False
+        try:
+            report = _row_report(row)
+            if report.name in reports:
+                raise _NoObjectError(f"object {report.name!r} is there twice; name each object once a sample")
+            reports[report.name] = report
+        except _NoObjectError as error:
+            faults.add(Sentence(f"{here}: {error}; the sample at ", Instant(at, 0), " is left out"))
+            broken = True
+    if reports and not broken:
+        yield time_ns, place, list(reports.values()), {}
+
+
+def _column_order(path: Path, header: str) -> list[str]:
+    order = [name.strip() for name in header.strip().split(",")]
+    if sorted(order) != sorted(CSV_COLUMNS):
+        raise LogError(
+            f"{path.name}:1: the columns are {', '.join(order)[:200]!r}; a track CSV has"
+            f" {','.join(CSV_COLUMNS)}"
+        )
+    return order
+
+
+def _row(line: str, order: list[str]) -> dict[str, str]:
+    try:
+        cells = next(csv.reader([line], strict=True))
+    except (csv.Error, StopIteration) as error:
+        raise _NoObjectError(f"the line is not CSV ({error}); a quoted cell ends on its own line") from None
+    if len(cells) != len(order):
+        raise _NoObjectError(f"the line has {len(cells)} cells; give {len(order)}")
+    return dict(zip(order, cells, strict=True))
+
+
+def _time(text: str) -> int:
+    try:
+        time_ns = int(text)
+    except ValueError:
+        time_ns = -1
+    if not 0 <= time_ns <= LATEST_NS:
+        raise _NoObjectError(f"time_ns is {text[:60]!r}; give integer nanoseconds from 0 to 2**63 - 1")
+    return time_ns
+
+
+def _row_report(row: dict[str, str]) -> ObjectReport:
+    if not row["name"]:
+        raise _NoObjectError("the name is empty; give each object a name")
+    x, y, length, width = (_cell(row, column) for column in ("x", "y", "length", "width"))
+    yaw = _cell(row, "yaw") if row["yaw"].strip() else nan
+    if length < 0 or width < 0:
+        raise _NoObjectError(f"length and width are {length:g} and {width:g}; give sizes of at least 0")
+    # the cosine and sine of an orientation that is not finite make the box unknown
+    c, s = (1.0, 0.0) if not row["yaw"].strip() else (cos(yaw), sin(yaw)) if isfinite(yaw) else (nan, nan)
+    vertices: list[float] = []
+    for a, b in ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)):
+        vertices += (x + a * length * c + b * width * -s, y + a * length * s + b * width * c)
+    return ObjectReport(row["name"], row["class"] or None, vertices, [4], [0.0], yaw=yaw)
+
+
+def _cell(row: dict[str, str], column: str) -> float:
+    """Return the number in a cell; an empty one stands for an unknown number."""
+    text = row[column].strip()
+    try:
+        return float(text) if text else nan
+    except ValueError:
+        wanted = "a number, or nothing where it is not known"
+        raise _NoObjectError(f"{column} is {text[:60]!r}; give {wanted}") from None
+
+
+FRAMES_A_SECOND = 30.0
+"""The rate of the dataset's videos."""
+
+DRONE_COLUMNS = ("id", "xmin", "ymin", "xmax", "ymax", "frame", "lost", "occluded", "generated", "label")
+
+_LARGEST = 10**18 - 1
+"""Any integer of so many digits fits 64 bits."""
+
+
+_BLOCK_BOXES = 2**16
+"""A block is closed when it holds this many, however few its frames are."""
+
+
+class _NoBoxError(Exception):
+    """A line that is not a box; the text says why and what to give instead."""
+
+
+def is_annotations(head: bytes) -> bool:
+    """Return whether some whole line at the beginning of a file is a row of annotations."""
+    lines = head.removeprefix(b"\xef\xbb\xbf").split(b"\n")
+    return any(map(_is_row, lines[:1] if len(lines) == 1 else lines[:-1]))
+
+
+def iter_annotations(
+    path: Path,
+    faults: FaultList,
+    *,
+    concave: Concave = "decompose",
+    rate: float = FRAMES_A_SECOND,
+    lost: Lost = "drop",
+) -> Iterator[Trace]:
+    """Yield the frames of an `annotations.txt` in blocks; a frame that the file names is a sample.
+
+    Files are ordered by object, so the first frame is complete only after the last line. All boxes are read
+    first, as plain columns of 57 bytes a line; samples are built block by block.
+
+    A frame with a line that cannot be read is left out as a whole and goes to `faults`.
+
+    Args:
+        concave: has no effect, since boxes are convex.
+        rate: frames a second; frame 0 is at time 0.
+        lost: whether rows marked as out of the picture are dropped or kept.
+    """
+    boxes, broken = _read_boxes(path, faults, _last_frame(rate))
+    frames, starts = np.unique(boxes.frame, return_index=True)
+    sound = ~np.isin(frames, np.fromiter(broken, np.int64))
+    frames, starts, ends = frames[sound], starts[sound], np.append(starts[1:], len(boxes.frame))[sound]
+    after = 0
+    while after < len(frames):
+        first = after
+        filled = int(np.searchsorted(ends, starts[first] + _BLOCK_BOXES, side="right"))
+        after = min(first + BLOCK_SAMPLES, max(filled, first + 1))
+        block = slice(first, after)
+        observations = _observations(boxes, frames[block], starts[block], ends[block], rate, lost)
+        trace, left_out = trace_from_observations(observations, concave=concave)
+        for index, what in sorted(left_out.items()):
+            faults.add(f"{path.name}: frame {frames[first + index]}: {what}")
+        yield trace
+
+
+class _Boxes:
+    """The lines of a file as columns, in the order of frames once `in_order` was called."""
+
+    def __init__(self) -> None:
+        self._numbers = {name: array("q") for name in ("id", "frame", "label")}
+        self._corners = array("d")
+        self._lost = array("b")
+        self.labels: dict[str, int] = {}
+        self.id = self.frame = self.label = np.zeros(0, np.int64)
+        self.corners = np.zeros((0, 4))
+        self.lost: NDArray[np.bool_] = np.zeros(0, np.bool_)
+
+    def add(self, number: int, corners: list[float], frame: int, lost: bool, label: str) -> None:
+        """Add one line."""
+        code = self.labels.setdefault(label, len(self.labels))
+        for name, value in (("id", number), ("frame", frame), ("label", code)):
+            self._numbers[name].append(value)
+        self._corners.extend(corners)
+        self._lost.append(lost)
+
+    def in_order(self) -> None:
+        """Sort by frame, keeping the file's order within each."""
+        frame = np.frombuffer(self._numbers["frame"], np.int64)
+        order = np.argsort(frame, kind="stable")
+        columns = (np.frombuffer(self._numbers[name], np.int64)[order] for name in ("id", "frame", "label"))
+        self.id, self.frame, self.label = columns
+        self.corners = np.frombuffer(self._corners, np.float64).reshape(-1, 4)[order]
+        self.lost = np.frombuffer(self._lost, np.int8)[order].astype(np.bool_)
+        self._numbers, self._corners, self._lost = {}, array("d"), array("b")
+
+
+def _read_boxes(path: Path, faults: FaultList, last_frame: int) -> tuple[_Boxes, set[int]]:
+    """Read every line that can be read; return the boxes, and the frames of the lines that cannot be read."""
+    boxes = _Boxes()
+    broken = set[int]()
+    for number, line in iter_lines(path, faults):
+        cells = line.split(None, len(DRONE_COLUMNS) - 1)
+        try:
+            if len(cells) != len(DRONE_COLUMNS):
+                raise _NoBoxError(f"the line has {len(cells)} columns; give {' '.join(DRONE_COLUMNS)}")
+            frame = _integer(cells[5], "frame", last_frame)
+        except _NoBoxError as error:
+            faults.add(f"{path.name}:{number}: {error}")
+            continue
+        try:
+            boxes.add(*_box(cells, frame))
+        except _NoBoxError as error:
+            faults.add(f"{path.name}:{number}: {error}; frame {frame} is left out")
+            broken.add(frame)
+    boxes.in_order()
+    return boxes, broken
+
+
+def _box(cells: list[str], frame: int) -> tuple[int, list[float], int, bool, str]:
+    number = _integer(cells[0], "id", _LARGEST)
+    try:
+        corners = [float(cell) for cell in cells[1:5]]
+    except ValueError:
+        raise _NoBoxError(f"the box is {' '.join(cells[1:5])[:60]!r}; give four numbers") from None
+    if corners[0] > corners[2] or corners[1] > corners[3]:
+        raise _NoBoxError(f"the box is {' '.join(cells[1:5])[:60]!r}; give xmin ymin xmax ymax")
+    if cells[6] not in ("0", "1"):
+        raise _NoBoxError(f"lost is {cells[6][:60]!r}; give 0 or 1")
+    label = cells[9].strip()
+    if len(label) >= 2 and label[0] == label[-1] == '"':
+        label = label[1:-1]
+    return number, corners, frame, cells[6] == "1", label
+
+
+def _integer(text: str, what: str, last: int) -> int:
+    is_number = len(text) <= len(str(_LARGEST)) and text.isascii() and text.isdecimal()
+    if not is_number or int(text) > last:
+        raise _NoBoxError(f"{what} is {text[:60]!r}; give an integer from 0 to {last}")
+    return int(text)
+
+
+def _last_frame(rate: float) -> int:
+    """Return the last frame whose time fits a sample."""
+    last = LATEST_NS // frame_times(rate) - 1
+    return min(max(last, 0), _LARGEST)
+
+
+def _observations(
+    boxes: _Boxes, frames: Integers, starts: Integers, ends: Integers, rate: float, lost: Lost
+) -> Observations:
+    """Return the boxes of some frames, those from `starts` up to `ends`."""
+    counts = ends - starts
+    sample = np.repeat(np.arange(len(frames), dtype=np.int64), counts)
+    rows = np.concatenate([np.zeros(0, np.int64), *map(np.arange, starts, ends)])
+    if lost == "drop":
+        visible = ~boxes.lost[rows]
+        sample, rows = sample[visible], rows[visible]
+    numbers, name = np.unique(boxes.id[rows], return_inverse=True)
+    period = frame_times(rate)
+    return Observations(
+        times_ns=np.array([round(frame * period) for frame in frames.tolist()], np.int64),
+        sample=sample,
+        name=name,
+        names=[str(number) for number in numbers.tolist()],
+        class_code=boxes.label[rows],
+        classes=tuple(label or None for label in boxes.labels),
+        yaw=np.full(len(rows), np.nan),
+        uncertainty=np.zeros(len(rows)),
+        shapes=_box_shapes(boxes.corners[rows]),
+        invalid=np.zeros(len(rows), np.bool_),
+        signals={},
+    )
+
+
+def _box_shapes(corners: Floats) -> FootprintBatch:
+    """Return boxes from (R, 4) xmin, ymin, xmax, ymax, counter-clockwise where y grows upwards."""
+    count = len(corners)
+    return FootprintBatch(
+        part_start=np.arange(count + 1, dtype=np.int64),
+        vertex_start=np.arange(count + 1, dtype=np.int64) * 4,
+        vertices=corners[:, [0, 1, 2, 1, 2, 3, 0, 3]].reshape(-1, 2),
+        radius=np.zeros(count),
+        bottom=np.full(count, np.nan),
+        top=np.full(count, np.nan),
+    )
+
+
+def _is_row(line: bytes) -> bool:
+    cells = line.split(None, len(DRONE_COLUMNS) - 1)
+    if len(cells) != len(DRONE_COLUMNS) or not (cells[0].isdigit() and cells[5].isdigit()):
+        return False
+    return all(flag in (b"0", b"1") for flag in cells[6:9])

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Generator
 
-from spatial_replay.simulation.arm import Scene
-from spatial_replay.simulation.motions import picking
+from spatial_replay.simulation.arm import Scene, picking
 from spatial_replay.simulation.tabletop import Placement, Scenario
 from spatial_replay.simulation.world import Body, Box, Cylinder, Execution, ReachableArea, Shape
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Generator
 
-from spatial_replay.simulation.arm import Scene
-from spatial_replay.simulation.motions import pushing
+from spatial_replay.simulation.arm import Scene, pushing
 from spatial_replay.simulation.tabletop import Placement, Scenario
 from spatial_replay.simulation.world import Body, Box, Execution, ReachableArea
 

@@ -14,10 +14,10 @@ from py_trees.behaviour import Behaviour
 from py_trees.common import Status
 from py_trees.decorators import Retry
 
-from spatial_replay.simulation.arm import Scene
-from spatial_replay.simulation.motions import (
+from spatial_replay.simulation.arm import (
     Grasp,
     Point,
+    Scene,
     best_grasp,
     carry,
     let_go,
