@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from operator import attrgetter
@@ -907,15 +906,10 @@ def _compare(
         traces: their samples.
     """
     a, b = traces
-    # all three measure for most of their time, which leaves the interpreter to the others
-    with ThreadPoolExecutor(2, "comparing") as threads:
-        waiting = [
-            threads.submit(_evaluated, trace, files, own) for trace, own in zip(traces, options, strict=True)
-        ]
-        aligned = _aligned(a, b, (), files, align) if align == "time" else None
-        evaluations = [each.result() for each in waiting]
+    evaluations = [_evaluated(trace, files, own) for trace, own in zip(traces, options, strict=True)]
     results = _paired(evaluations)
-    alignment, objects = aligned or _aligned(a, b, results, files, align)
+    alignment = align_runs((a.times_ns, b.times_ns), results, files, align)
+    objects = compare_objects(a, b, alignment)
     titles = [{result.title for evaluation in own for result in evaluation} for own in evaluations]
     return LogDiff(
         sources[0].name,
@@ -933,17 +927,6 @@ def _compare(
         (*_faults(a), *_faults(b)),
         traces,
     )
-
-
-def _aligned(
-    a: Trace,
-    b: Trace,
-    results: Sequence[tuple[SpecResult, SpecResult]],
-    files: Sequence[Specification],
-    align: str,
-) -> tuple[Alignment, tuple[ObjectDiff, ...]]:
-    alignment = align_runs((a.times_ns, b.times_ns), results, files, align)
-    return alignment, compare_objects(a, b, alignment)
 
 
 def _only_in(one: Trace, other: Trace, titles: set[str]) -> tuple[str, ...]:

@@ -154,7 +154,7 @@ class Assembler:
             if self._count == self._step or self._bytes >= _STEP_BYTES:
                 self._count = self._bytes = 0
                 self._step = min(2 * self._step, _LONGEST_STEP)
-                traces.append(self._settle(self._newest_ns - self._plan.margin_ns))
+                traces.append(self.settle(self._newest_ns - self._plan.margin_ns))
         return traces[0] if len(traces) == 1 else Trace.concatenate(traces)
 
     def know_static(self, messages: Iterable[Message]) -> None:
@@ -201,20 +201,12 @@ class Assembler:
         """The transforms so far."""
         return self._tree
 
-    def settle(self, upto_ns: int) -> Trace:
-        """Return the samples up to a time; messages before it that come later count from then on.
-
-        Raises:
-            LogError, UsageError: as `add`.
-        """
-        return self._settle(upto_ns)
-
     def lose(self, topics: Collection[str]) -> Trace:
         """Return the samples so far and one right after them, in which what some topics reported is unknown.
 
         It stays unknown until they report it again.
         """
-        so_far = self._settle(self._newest_ns)
+        so_far = self.settle(self._newest_ns)
         lost_ns = self._settled_ns + 1
         if not self._sample_times.note(lost_ns):
             return so_far
@@ -232,7 +224,7 @@ class Assembler:
         Raises:
             UsageError: the mapping fits no message of a topic, or the log has no such fixed frame.
         """
-        trace = self._settle(max(self._newest_ns, self._latest_ns))
+        trace = self.settle(max(self._newest_ns, self._latest_ns))
         if self._arrived is None:
             self._remarks.add_pauses()
         for text in self._tree.remarks():
@@ -402,8 +394,12 @@ class Assembler:
             sequences, recorded = arrived.sequence[stamped.places], arrived.place[stamped.places]
             reader.pending.add(times_ns, sequences, log_times_ns, recorded, stamped.contents)
 
-    def _settle(self, upto_ns: int) -> Trace:
-        """Return the samples up to a time before which no further message is expected."""
+    def settle(self, upto_ns: int) -> Trace:
+        """Return the samples up to a time; messages before it that come later count from then on.
+
+        Raises:
+            LogError, UsageError: as `add`.
+        """
         if upto_ns <= self._settled_ns:
             return Trace.empty()
         start_ns, end_ns = self._window_ns

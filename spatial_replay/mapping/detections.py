@@ -21,6 +21,7 @@ from spatial_replay.geometry.arrays import (
     Integers,
     counts_from_starts,
     flat_index,
+    select,
     starts_from_counts,
 )
 from spatial_replay.geometry.footprint import FootprintBatch
@@ -386,17 +387,17 @@ class Detections:
     message: Integers
     name: Integers
     class_code: Integers
-    frames: list[str] | None
-    stamp_ns: Integers | None
     poses: Poses
     solids: Solids
-    height: Floats | None
     uncertainty: Floats
-    covariance: Floats | None
-    lifetime_ns: Integers | None
-    is_locked: Booleans | None
-    deleted: list[tuple[int, int]]
-    skipped: int
+    frames: list[str] | None = None
+    stamp_ns: Integers | None = None
+    height: Floats | None = None
+    covariance: Floats | None = None
+    lifetime_ns: Integers | None = None
+    is_locked: Booleans | None = None
+    deleted: list[tuple[int, int]] = field(default_factory=list)
+    skipped: int = 0
 
     def repeated(self, index: int, count: int) -> Detections:
         """Return one of the objects `count` times, each in a message of its own, without frame and stamp."""
@@ -406,17 +407,11 @@ class Detections:
             message=np.arange(count, dtype=np.int64),
             name=self.name[same],
             class_code=self.class_code[same],
-            frames=None,
-            stamp_ns=None,
-            poses=Poses(poses.position[same], poses.rotation[same], poses.yaw[same]),
+            poses=select(poses, same),
             solids=self.solids.repeated(index, count),
             height=None if self.height is None else self.height[same],
             uncertainty=self.uncertainty[same],
             covariance=None if self.covariance is None else self.covariance[same],
-            lifetime_ns=None,
-            is_locked=None,
-            deleted=[],
-            skipped=0,
         )
 
 
@@ -504,22 +499,9 @@ def detections_from_chunks(
 def _no_detections(deleted: list[tuple[int, int]], skipped: int) -> Detections:
     none, numbers = np.empty(0, np.int64), np.empty(0)
     points, matrices = np.empty((0, 3)), np.empty((0, 3, 3))
-    return Detections(
-        message=none,
-        name=none,
-        class_code=none,
-        frames=None,
-        stamp_ns=None,
-        poses=Poses(points, matrices, numbers),
-        solids=Solids(none, np.empty(0, np.int8), points, matrices, points, np.zeros(1, np.int64), points),
-        height=None,
-        uncertainty=numbers,
-        covariance=None,
-        lifetime_ns=None,
-        is_locked=None,
-        deleted=deleted,
-        skipped=skipped,
-    )
+    solids = Solids(none, np.empty(0, np.int8), points, matrices, points, np.zeros(1, np.int64), points)
+    poses = Poses(points, matrices, numbers)
+    return Detections(none, none, none, poses, solids, numbers, deleted=deleted, skipped=skipped)
 
 
 def _joined(columns: Iterable[Sequence[int]]) -> Integers:
