@@ -287,10 +287,11 @@ class ChunkWalk:
             lost = len(is_usable) - np.count_nonzero(is_usable)
             self._fault(place, f"{lost} of the ", " have no channel, or a time beyond 2**63 - 1 ns")
         names = ("channel", "sequence", "log_time", "publish_time")
-        columns = [split.heads[name][is_usable].astype(np.int64) for name in names]
-        return Messages(
-            self.channels, *columns, [content[own] for own in compress(split.payloads, is_usable)]
+        channel, sequence, log_ns, publish_ns = (
+            split.heads[name][is_usable].astype(np.int64) for name in names
         )
+        payloads = [content[own] for own in compress(split.payloads, is_usable)]
+        return Messages(self.channels, channel, sequence, log_ns, publish_ns, payloads)
 
     def _find_channels(self) -> None:
         """Declare all channels of a log without a summary: chunks need not come in the order of time."""
