@@ -509,7 +509,8 @@ def centre_of(footprint: Footprint) -> tuple[float, float]:
 def centre_object(tracked: TrackedObject) -> TrackedObject:
     """Return an object as the point at its centre, halfway up."""
     point = centres_of(FootprintBatch.from_footprints([tracked.footprint], [tracked.height]))
-    return replace(tracked, footprint=Footprint.disc(*point.vertices[0], 0.0), height=point.height(0))
+    x, y = point.vertices[0]
+    return replace(tracked, footprint=Footprint.disc(x, y, 0.0), height=point.height(0))
 
 
 def centres_of(batch: FootprintBatch) -> FootprintBatch:
