@@ -37,6 +37,8 @@ def cache_folder() -> Path | None:
         try:
             is_new = not folder.exists()
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            # that of another user, where several may write, cannot be opened
+            os.close(_opened_lock(folder))
             with tempfile.TemporaryFile(dir=folder):
                 if shutil.disk_usage(folder).free < _ROOM_BYTES:
                     raise OSError(errno.ENOSPC, "no space left")
@@ -58,7 +60,7 @@ def remove_damaged(folder: Path) -> None:
 
     Code newer than its digest may be in the making while other processes run that use the folder. It stays.
     """
-    descriptor = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o600)
+    descriptor = _opened_lock(folder)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         is_alone = True
@@ -71,6 +73,10 @@ def remove_damaged(folder: Path) -> None:
                 path.unlink()
     # until this process ends
     fcntl.flock(descriptor, fcntl.LOCK_SH)
+
+
+def _opened_lock(folder: Path) -> int:
+    return os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o600)
 
 
 def seal(folder: Path) -> None:

@@ -6,8 +6,6 @@ import json
 import os
 import random
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
 from importlib.resources import files
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -21,6 +19,7 @@ from mcap.writer import CompressionType, Writer
 import spatial_replay as sr
 from batch.fleet import GATE, batch, command, write_fleet, write_log
 from logs.servers import s3_server
+from users import plain_user
 
 DISTANCES = [0.5, 0.4, 0.2, 0.1]
 
@@ -52,18 +51,6 @@ def test_a_row_says_what_a_replay_of_the_log_says(fleet: Path) -> None:
             )
     assert [row["failure"] for row in result.failures.to_pylist()] == ["violated, expected satisfied"] * 2
     assert sr.read_results("results").equals(result.table)
-
-
-@contextmanager
-def plain_user() -> Iterator[None]:
-    """Be a user who may not read everything, also in tests by root."""
-    before = os.geteuid()
-    if before == 0:
-        os.seteuid(65534)
-    try:
-        yield
-    finally:
-        os.seteuid(before)
 
 
 def test_a_folder_that_cannot_be_read_is_an_error_and_not_a_batch_without_its_logs() -> None:

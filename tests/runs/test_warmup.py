@@ -6,9 +6,12 @@ import os
 import shutil
 import subprocess
 import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from spatial_replay.code_cache import cache_folder
 from spatial_replay.logs.remote import user_cache_folder
+from users import plain_user
 
 _EVERY_KERNEL = """
 import importlib, pkgutil
@@ -66,3 +69,20 @@ def test_machine_code_is_kept_on_no_disk_that_is_full(monkeypatch, tmp_path):
     assert cache_folder().parent == roomy
     free[full] = 2**30
     assert cache_folder().parent == full
+
+
+def test_machine_code_of_another_user_is_left_alone(monkeypatch):
+    # where every user may look
+    with TemporaryDirectory(dir="/tmp") as name:
+        Path(name).chmod(0o755)
+        theirs, own = Path(name) / "theirs", Path(name) / "own"
+        monkeypatch.setenv("SPATIAL_REPLAY_CACHE", str(theirs))
+        monkeypatch.setenv("NUMBA_CACHE_DIR", str(own))
+        folder = cache_folder()
+        assert folder.parent == theirs
+        folder.chmod(0o777)
+        (folder / "lock").chmod(0o400)
+        own.mkdir()
+        own.chmod(0o777)
+        with plain_user():
+            assert cache_folder().parent == own
