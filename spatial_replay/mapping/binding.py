@@ -43,7 +43,7 @@ from spatial_replay.mapping.mapping_file import Measure, Stamp
 from spatial_replay.mapping.message_types import Alternatives, MessageLayout
 from spatial_replay.trace.sample import LATEST_NS
 
-BY_PLACE = "only the places in the list distinguish objects: objects swap where these change"
+BY_PLACE = "only the places in the list distinguish objects without an id: objects swap where these change"
 """Remark on objects that are named by their indices."""
 _LONGEST_NAME = 500
 _UUID_BYTES = 16
@@ -85,6 +85,7 @@ class Namer:
         self._is_by_index = False
         self.is_by_place = False
         """Whether nothing but their places in a list distinguished some objects."""
+        self._has_ids = False
         self._is_prepared = False
 
     @property
@@ -180,7 +181,8 @@ class Namer:
             if path.text in (INDEX, TOPIC) and path.text not in field_names(thing):
                 if path.text == TOPIC:
                     return self._topic
-                self.is_by_place = self.is_by_place or (isinstance(index, int) and index > 0)
+                is_one_of_several = self._has_ids or (isinstance(index, int) and index > 0)
+                self.is_by_place = self.is_by_place or is_one_of_several
                 return str(index)
             try:
                 root = message if path.from_message else thing
@@ -190,6 +192,7 @@ class Namer:
                     raise
                 continue
             if word:
+                self._has_ids = self._has_ids or alternatives[-1].text == INDEX
                 return word
         fields = "|".join(path.text for path in alternatives)
         raise ContentError(f"{{{fields}}} is empty; choose another name")

@@ -429,6 +429,16 @@ def test_objects_that_only_places_distinguish_are_remarked() -> None:
     assert make("topics: {/p: {}}", poses(1)).remarks == ()
 
 
+def test_objects_that_lose_their_id_are_remarked() -> None:
+    feed = Feed()
+    for second, own in enumerate(("7", "7", "")):
+        box = ros("vision_msgs/Detection3D", header=header("map"), id=own)
+        boxes = ros("vision_msgs/Detection3DArray", header=header("map"), detections=[box])
+        feed.add("/seen", second * SECOND, boxes)
+    assert "objects without an id: objects swap" in make("topics: {/seen: {}}", feed).remarks[0]
+    assert make("topics: {/seen: {}}", Feed(feed.messages[:2])).remarks == ()
+
+
 def test_the_class_of_a_detection_is_that_of_its_best_result() -> None:
     results = [
         ros(
