@@ -62,7 +62,7 @@ def parse(line: str) -> None:
             raise click.UsageError(f"{arguments[0]!r} is no command")
         arguments = arguments[1:]
     assert command is not None
-    command.make_context(command.name, arguments)
+    command.make_context(command.name, arguments).close()
 
 
 LINES = [(page.name, line) for page in PAGES for line in command_lines(page.read_text())]

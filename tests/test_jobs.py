@@ -8,6 +8,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -200,6 +201,16 @@ def test_the_jobs_of_both_services_run_the_gate(gate: list[Block]) -> None:
     assert Path(gitlab["gate"]["cache"]["paths"][0], "last_run.parquet").exists()
     Path("gate.spatial").write_text(Path("gate.spatial").read_text().replace("0.3", "0.5"))
     assert shell(steps[-1]).returncode == 1
+
+
+def test_the_image_installs_an_extra_that_exists_and_compiles_once(gate: list[Block]) -> None:
+    (image,) = (block.text for block in gate if block.language == "dockerfile")
+    base, copied, (install, compiling, _) = image.splitlines()[0], image.splitlines()[1], image.split(" && ")
+    assert (base, copied) == ("FROM python:3.11-slim", "COPY spatial-replay /src")
+    (extra,) = re.findall(r"RUN pip install '/src\[(\w+)\]'", install)
+    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
+    assert extra in project["optional-dependencies"]
+    assert typed(f"{compiling} --help").code == 0
 
 
 def test_a_missing_log_does_not_pass_the_gate(gate: list[Block]) -> None:

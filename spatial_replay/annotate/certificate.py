@@ -137,6 +137,8 @@ def specification_sha256(files: Sequence[Specification]) -> str:
     total = hashlib.sha256()
     for file in files:
         total.update(_text(format_specification(file)))
+        for name, digest in sorted(file.plugins.items()):
+            total.update(_text(name) + _text(digest))
     return total.hexdigest()
 
 
@@ -153,11 +155,17 @@ def plan_sha256(plan: Mapping[str, str]) -> str:
 
 
 def specifications_json(files: Sequence[Specification]) -> str:
-    """Return specifications as metadata lists them, in JSON: name and SHA-256 of the canonical text."""
+    """Return specifications as metadata lists them, in JSON: name, SHA-256 of their text, plug-ins."""
     texts = [format_specification(file).encode("utf-8", "surrogatepass") for file in files]
     hashes = [hashlib.sha256(text).hexdigest() for text in texts]
     listed = zip(files, hashes, strict=True)
-    return json.dumps([{"name": file.filename, "sha256": digest} for file, digest in listed])
+    plugins = [{"plugins": file.plugins} if file.plugins else {} for file in files]
+    return json.dumps(
+        [
+            {"name": file.filename, "sha256": digest, **more}
+            for (file, digest), more in zip(listed, plugins, strict=True)
+        ]
+    )
 
 
 class EvaluationHashes:

@@ -26,6 +26,7 @@ from spatial_replay.spec.formula import (
     Misalignment,
     Negative,
     Number,
+    Rate,
     Scaled,
     Signal,
     Specification,
@@ -33,8 +34,9 @@ from spatial_replay.spec.formula import (
     iter_nodes,
     operator_of,
 )
-from spatial_replay.spec.relations import RELATION_NAMES
+from spatial_replay.spec.relations import RELATION_NAMES, used_modules
 from spatial_replay.spec.tokens import written_name
+from spatial_replay.spec.walks import per_second
 from spatial_replay.text import names_of
 
 if TYPE_CHECKING:
@@ -269,6 +271,9 @@ def _units(expression: Expression, units: Mapping[str, str]) -> Iterator[str]:
                 stack.append(operand)
             case Minimum(operands) | Maximum(operands):
                 stack.extend(operands)
+            case Rate(signal=signal):
+                name = FOOTPRINT_UNITS if signal is None else signal.name
+                yield per_second(units.get(name) or f"units of {name or 'lengths'}")
             case Signal(name):
                 yield units.get(name) or f"units of {name}"
             case Misalignment():
@@ -325,6 +330,9 @@ def _self_contained(same: _Same) -> Specification:
     for text_of in (attrgetter("source"), format_specification):
         try:
             text = text_of(file)
+            if set(file.plugins) - set(used_modules(text)):
+                # one that the command line alone names has to be named in a log
+                continue
             read_back = parse_specification(text, filename=file.filename)
         except SpecificationError:
             continue

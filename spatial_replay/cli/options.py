@@ -246,11 +246,39 @@ allow_option = click.option(
     "recorder lost), or both with a comma between.",
 )
 
-profile_option = click.option(
-    "--profile",
-    type=click.Choice(["paper", "spatial_spec"]),
-    help="Relation profile of files without a `use` line.  [default: paper]",
+
+def _allow_plugins(context: click.Context, parameter: click.Parameter, names: tuple[str, ...]) -> None:
+    """Allow plug-ins until the command ends, also to the processes that it starts."""
+    if not names:
+        return
+    # imported here so that --help stays fast
+    from spatial_replay.spec.relations import PLUGINS_VARIABLE
+
+    before = os.environ.get(PLUGINS_VARIABLE, "")
+    places = [str(Path(name).absolute()) if name.endswith(".py") else name for name in names]
+    os.environ[PLUGINS_VARIABLE] = os.pathsep.join(filter(None, [before, *places]))
+    context.call_on_close(partial(os.environ.__setitem__, PLUGINS_VARIABLE, before))
+
+
+plugin_option = click.option(
+    "--plugin",
+    metavar="MODULE",
+    multiple=True,
+    is_eager=True,
+    expose_value=False,
+    callback=_allow_plugins,
+    help="Module or file with own relations and signals, which is run; repeat for several.",
 )
+
+
+def profile_option(command: _Command) -> _Command:
+    """Add the options for how specifications are read: `--profile` and `--plugin`."""
+    profile = click.option(
+        "--profile",
+        type=click.Choice(["paper", "spatial_spec"]),
+        help="Relation profile of files without a `use` line.  [default: paper]",
+    )
+    return profile(plugin_option(command))
 
 
 def gather(name: str, values: Callable[..., Any], command: Callable[..., Any]) -> Callable[..., Any]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from spatial_replay.cli.application import ExitCode
-from spatial_replay.cli.options import LogPath, reading_options
+from spatial_replay.cli.options import LogPath, plugin_option, reading_options
 from spatial_replay.cli.terminal import progress, show, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import LogFile, local_files
@@ -46,6 +46,7 @@ if TYPE_CHECKING:
     type=click.Path(path_type=Path),
     help="The signature to write or check.  [default: LOG.sig]",
 )
+@plugin_option
 @reading_options
 def verify(
     log: LogFile,

@@ -24,7 +24,6 @@ from spatial_replay.spec.formula import (
     Expression,
     Formula,
     Group,
-    Measurement,
     Outline,
     Quantified,
     RegionName,
@@ -42,7 +41,7 @@ from spatial_replay.spec.load import parse_specification
 from spatial_replay.spec.parser import split_statements
 from spatial_replay.spec.relations import RELATION_NAMES
 from spatial_replay.spec.tokens import span_of, tokenize
-from spatial_replay.spec.walks import base_of, iter_formulas, iter_terms, map_leaves, map_terms, substitute
+from spatial_replay.spec.walks import base_of, changed_leaf, iter_formulas, iter_terms, map_leaves, substitute
 
 
 def unify_regions(
@@ -85,7 +84,7 @@ class SharedNames:
 
     def expression(self, expression: Expression) -> Expression:
         """Return an expression whose groups are known by their members, and regions by their shapes."""
-        return map_leaves(expression, partial(_changed_leaf, change=self.term))
+        return map_leaves(expression, partial(changed_leaf, change=self.term))
 
     def term(self, term: Any) -> Any:
         """Return a term of the same kind."""
@@ -113,16 +112,12 @@ def _with_terms(formula: Formula, change: Callable[[Term], Term]) -> Formula:
         case Truth():
             return formula
         case Atom():
-            expression = map_leaves(formula.expression, partial(_changed_leaf, change=change))
+            expression = map_leaves(formula.expression, partial(changed_leaf, change=change))
             return replace(formula, expression=expression, terms=tuple(map(change, formula.terms)))
         case Quantified():
             return replace(formula, body=_with_terms(formula.body, change))
         case _:
             return replace(formula, operands=tuple([_with_terms(each, change) for each in formula.operands]))
-
-
-def _changed_leaf(leaf: Any, change: Callable[[Term], Term]) -> Any:
-    return map_terms(leaf, change) if isinstance(leaf, Measurement) else leaf
 
 
 def _with_region(term: Term, renamed: Mapping[str, str]) -> Term:

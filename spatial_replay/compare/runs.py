@@ -31,7 +31,7 @@ from spatial_replay.replay.selection import DEFAULT_OPTIONS, LogNames, ReplayOpt
 from spatial_replay.spec.diagnostics import Diagnostic, nearest_hint
 from spatial_replay.spec.formula import Atom, Specification, iter_nodes
 from spatial_replay.spec.walks import other_names
-from spatial_replay.text import Instant, Sentence, counted, counted_from, json_number, number_text, with_unit
+from spatial_replay.text import Instant, Sentence, counted, counted_from, json_number, with_unit
 from spatial_replay.trace.sample import FOREVER
 from spatial_replay.trace.trace import Trace
 from spatial_replay.trace.units import OTHER_UNITS, require_same_units
@@ -474,25 +474,25 @@ def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:8]) + (", …" if len(names) > 8 else "") or "none"
 
 
-def movement_sentence(each: ObjectDiff, start_ns: int) -> Sentence:
+def movement_sentence(each: ObjectDiff, start_ns: int, unit: str) -> Sentence:
     """Return since when an object moved differently, and how far the two are apart."""
     parts: list[str | Instant] = ["differs since ", Instant(each.first_ns, start_ns)]
     if each.shift:
-        parts.append(f", by up to {number_text(each.shift)}")
+        parts.append(f", by up to {with_unit(each.shift, unit)}")
     if each.apart_ns is not None:
         parts += ["; apart from itself since ", Instant(each.apart_ns, start_ns)]
-        parts += [f", farthest by {number_text(each.greatest)} at ", Instant(each.greatest_ns, start_ns)]
+        parts += [f", farthest by {with_unit(each.greatest, unit)} at ", Instant(each.greatest_ns, start_ns)]
     for which, count in (("A", each.only_a), ("B", each.only_b)):
         if count:
             parts.append(f"; only {which} has it in {counted(count, 'sample')}")
     return Sentence(*parts)
 
 
-def signal_sentence(each: SignalDiff, start_ns: int) -> Sentence:
+def signal_sentence(each: SignalDiff, start_ns: int, unit: str) -> Sentence:
     """Return since when a signal has other values, by how much, and whether its unit may be another."""
     parts: list[str | Instant] = ["differs since ", Instant(each.first_ns, start_ns)]
     if each.greatest > 0.0:
-        parts += [f", by up to {number_text(each.greatest)} at ", Instant(each.greatest_ns, start_ns)]
+        parts += [f", by up to {with_unit(each.greatest, unit)} at ", Instant(each.greatest_ns, start_ns)]
     if each.has_other_unit:
         times, which = (each.ratio, "B") if each.ratio > 1.0 else (1.0 / each.ratio, "A")
         parts.append(f"; {times:,.0f} times as large in {which}: it may be in another unit there")
@@ -782,13 +782,13 @@ class LogDiff(Displayed):
         paired = [len(set(rows.tolist())) for rows in (self.alignment.a, self.alignment.b)]
         counts = " | ".join(counted(count, "sample") for count in self.samples)
         yield f"  {counts}; {self.alignment}: {paired[0]:,} of A beside {paired[1]:,} of B"
-        start_ns = self.starts_ns[0]
+        start_ns, units = self.starts_ns[0], self.traces[0].units
         for each in self.objects[:_MOST_LISTED]:
-            yield f"  {each.name}: {movement_sentence(each, start_ns)}"
+            yield f"  {each.name}: {movement_sentence(each, start_ns, units.get('', ''))}"
         if len(self.objects) > _MOST_LISTED:
             yield f"  and {counted(len(self.objects) - _MOST_LISTED, 'other object')} moved differently"
         for signal in self.signals[:_MOST_LISTED]:
-            yield f"  {signal.name}: {signal_sentence(signal, start_ns)}"
+            yield f"  {signal.name}: {signal_sentence(signal, start_ns, units.get(signal.name, ''))}"
         if len(self.signals) > _MOST_LISTED:
             yield f"  and {counted(len(self.signals) - _MOST_LISTED, 'other signal')} with other values"
         for which, names in (("A", self.only_a), ("B", self.only_b)):

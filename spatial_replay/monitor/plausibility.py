@@ -305,7 +305,7 @@ def _doubts(atom: Atom, log: LogNumbers, taken: ThresholdRange | None) -> Iterat
         if _is_far(limit, taken, is_length=bool(lengths)):
             below = limit < taken.least
             end, side = (taken.least, "below") if below else (taken.greatest, "above")
-            what = "its signal is" if atom.relation == "signal" else "the distance is"
+            what = "the distance is" if lengths else "its signal is" if atom.relation == "signal" else "it is"
             message = f"`{taken.text}` {taken.holds} holds in this log: {what} never {side} {end:.4g}"
             yield message, f"no value comes near {format_number(limit)}; is it the threshold you mean?"
 

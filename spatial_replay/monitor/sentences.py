@@ -15,7 +15,7 @@ from spatial_replay.monitor.witness.threshold import Threshold
 from spatial_replay.monitor.witness.witness import Witness, WitnessStep
 from spatial_replay.spec.format import format_number
 from spatial_replay.spec.formula import Atom, Formula, Number, Scaled
-from spatial_replay.spec.walks import declared_unit, iter_expressions, iter_formulas
+from spatial_replay.spec.walks import declared_unit, iter_expressions, iter_formulas, per_second
 from spatial_replay.text import (
     Instant,
     Sentence,
@@ -303,6 +303,16 @@ def _measured(measured: Measured, units: Mapping[str, str]) -> str:
         case "misalignment":
             degrees = math.degrees(math.acos(max(-1.0, min(1.0, 1.0 - value))))
             return f"{names[0]} is turned by {number_text(degrees)}° from {names[1]}"
+        case "speed" | "rate":
+            of = names[0] if measured.quantity == "rate" else ""
+            size = with_unit(abs(value), per_second(units.get(of, "")))
+            if len(names) == 2:
+                return f"{names[0]} and {names[1]} {'approach' if value > 0.0 else 'part'} at {size}"
+            if value == 0.0:
+                return f"{names[0]} {'does not change' if of else 'stands still'}"
+            return f"{names[0]} " + (
+                f"{'rises' if value > 0.0 else 'falls'} by {size}" if of else f"moves at {size}"
+            )
         case "signal":
             return f"{names[0]} is {with_unit(value, units.get(names[0], ''))}"
     if math.isinf(value):

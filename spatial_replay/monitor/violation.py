@@ -30,7 +30,7 @@ from spatial_replay.monitor.witness.threshold import Threshold
 from spatial_replay.monitor.witness.witness import Witness, find_witness
 from spatial_replay.spec.checks import object_names, signal_names
 from spatial_replay.spec.format import format_formula
-from spatial_replay.spec.formula import NamedSpec, Number, Specification
+from spatial_replay.spec.formula import NamedSpec, Number, Signal, Specification
 from spatial_replay.spec.walks import declared_unit
 from spatial_replay.text import Instant, Sentence, with_unit
 from spatial_replay.trace.sample import FOREVER, Sample
@@ -123,7 +123,7 @@ def _short(atom: DecidingAtom, spec: str, amount: str) -> str:
     """Return what is wrong in a few words: in which direction a distance or a signal is off."""
     signed = [(sign, part) for sign, part in atom.branch if not isinstance(part, Number)]
     if len(signed) == 1 and len(atom.measured) == 1:
-        (sign, _), *_ = signed
+        (sign, part), *_ = signed
         (measured,) = atom.measured
         needs_more = (sign > 0) == (atom.end is End.HIGH)
         if measured.quantity == "signed_distance":
@@ -132,8 +132,8 @@ def _short(atom: DecidingAtom, spec: str, amount: str) -> str:
             return f"{first} is {amount} {where}"
         if measured.quantity == "signal" and not isfinite(_settling(atom)):
             return what_was_measured(atom, {})
-        if measured.quantity == "signal":
-            return f"{measured.names[0]} is {amount} too {'low' if needs_more else 'high'}"
+        if isinstance(part, Signal):
+            return f"{part.name} is {amount} too {'low' if needs_more else 'high'}"
     return f"`{spec}` is violated"
 
 

@@ -27,6 +27,7 @@ from spatial_replay.logs.source import (
     read_ahead,
     read_blocks,
     reading_only,
+    units_of,
 )
 from spatial_replay.logs.topics import ALL, MAPPED, OBJECTS, is_kept, protobuf_channel
 from spatial_replay.mapping.field_paths import get_field
@@ -280,7 +281,7 @@ class Selection:
         for trace in self.iter_traces():
             traces.append(trace)
             advance(len(trace))
-        return Trace.concatenate(traces)
+        return replace(Trace.concatenate(traces), units=units_of(self.source))
 
     def inside(self, trace: Trace) -> Trace:
         """Return those samples that are in the window."""

@@ -119,14 +119,18 @@ def _changes(diff: SpecificationDiff | LogDiff, first_ns: tuple[int, int]) -> It
         return
     for spec in diff.specs:
         yield _change(spec.a.title, spec.b.verdict, list(spec.sentences(diff.starts_ns)), first_ns)
+    units = diff.traces[0].units
     moved = [
-        Sentence(f"{each.name}: ", *movement_sentence(each, diff.starts_ns[0]).parts) for each in diff.objects
+        Sentence(f"{each.name}: ", *movement_sentence(each, diff.starts_ns[0], units.get("", "")).parts)
+        for each in diff.objects
     ]
     if moved:
         yield _change("who moved differently", None, moved, first_ns)
     if diff.signals:
         signals = [
-            Sentence(f"{each.name}: ", *signal_sentence(each, diff.starts_ns[0]).parts)
+            Sentence(
+                f"{each.name}: ", *signal_sentence(each, diff.starts_ns[0], units.get(each.name, "")).parts
+            )
             for each in diff.signals
         ]
         yield _change("signals with other values", None, signals, first_ns)

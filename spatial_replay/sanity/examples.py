@@ -34,6 +34,7 @@ from spatial_replay.spec.formula import (
     Outline,
     Projection,
     Protrusion,
+    Rate,
     RegionName,
     Signal,
     SignedDistance,
@@ -408,6 +409,8 @@ class _Attempt:
         return sides
 
     def _amount(self, quantity: Quantity, index: int) -> _Amount:
+        if isinstance(quantity, Rate):
+            raise CannotPlaceError("rates of change are not drawn")
         if isinstance(quantity, Signal):
             return _Amount({("signal", quantity.name, index): 1.0})
         assert isinstance(quantity, (Projection, CentroidProjection))

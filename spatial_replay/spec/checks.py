@@ -11,7 +11,7 @@ from lark import Token
 
 from spatial_replay.errors import UsageError
 from spatial_replay.spec.diagnostics import Diagnostic, Faults, SourceText, nearest_hint
-from spatial_replay.spec.format import format_number, format_term
+from spatial_replay.spec.format import format_relation
 from spatial_replay.spec.formula import (
     FUTURE_OPERATORS,
     PAST_OPERATORS,
@@ -19,7 +19,6 @@ from spatial_replay.spec.formula import (
     Formula,
     Group,
     NamedSpec,
-    Signal,
     Span,
     Specification,
     Temporal,
@@ -33,8 +32,8 @@ from spatial_replay.spec.tokens import BINARY_TYPES, STATEMENT_TYPES, quoted, sp
 from spatial_replay.spec.walks import (
     LENGTHS,
     base_of,
-    iter_expressions,
     iter_formulas,
+    logged_signals,
     substitute,
     terms_of,
     units_of,
@@ -146,17 +145,18 @@ def past_warnings(specs: Sequence[NamedSpec], source: SourceText) -> Iterator[Di
 
 
 def equality_warnings(specs: Sequence[NamedSpec], source: SourceText) -> Iterator[Diagnostic]:
-    """Yield a warning for each `a dist b == c`: measured lengths are hardly ever equal."""
+    """Yield a warning for each `a dist b == c`: what is measured is hardly ever equal to a number."""
     warned: set[Span] = set()
     for spec in specs:
         for atom in iter_formulas(spec.formula):
-            if isinstance(atom, Atom) and atom.parameters[:1] == ("==",) and atom.span not in warned:
+            is_exact = isinstance(atom, Atom) and atom.relation != "signal" and "==" in atom.parameters
+            if isinstance(atom, Atom) and is_exact and atom.span not in warned:
                 warned.add(atom.span)
                 message = f"`{atom.text}` hardly ever holds: its robustness is at most 0"
-                limit = float(atom.parameters[1])
-                ends = [format_number(float(f"{limit + by:.12g}")) for by in (-0.05, 0.05)]
-                a, b = (format_term(term) for term in atom.terms)
-                hint = f"write a band, such as {ends[0]} <= {a} dist {b} <= {ends[1]}"
+                *names, _, limit = atom.parameters
+                low, high = (float(f"{float(limit) + by:.12g}") for by in (-0.05, 0.05))
+                band = format_relation(atom.relation, atom.terms, (*names, low, "<=", "<=", high))
+                hint = f"write a band, such as {band}"
                 yield source.diagnostic("warning", atom.span, message, hint)
 
 
@@ -202,9 +202,7 @@ def signal_names(specification: Specification) -> tuple[str, ...]:
     """Return the numeric signals that the specs compare, in the order of the text."""
     found: dict[str, None] = {}
     for atom in _atoms(specification):
-        for part in iter_expressions(atom.expression):
-            if isinstance(part, Signal):
-                found[part.name] = None
+        found.update(dict.fromkeys(logged_signals(atom.expression)))
     return tuple(found)
 
 

@@ -98,13 +98,16 @@ def format_relation(
     """Return an atom as written, of its relation, terms and parameters (see `Atom`)."""
     names = [format_term(term, relations) for term in terms]
     values = [format_number(value) if isinstance(value, float) else value for value in parameters]
-    if not terms:
+    if relation == "signal":
         return f"{written_name(values[0], relations)} {values[1]} {values[2]}"
-    if relation == "dist":
-        distance = f"{names[0]} dist {names[1]}"
+    if relation in ("dist", "speed", "rate"):
+        measured = f"{names[0]} dist {names[1]}" if relation == "dist" else f"speed({', '.join(names)})"
+        if relation == "rate":
+            signal, *values = values
+            measured = f"rate({written_name(signal, relations)})"
         if len(values) == 2:
-            return f"{distance} {values[0]} {values[1]}"
-        return f"{values[0]} {values[1]} {distance} {values[2]} {values[3]}"
+            return f"{measured} {values[0]} {values[1]}"
+        return f"{values[0]} {values[1]} {measured} {values[2]} {values[3]}"
     if relation == "closer":
         return f"{names[0]} closer {names[1]} than {names[2]}"
     bracket = f"[{', '.join(values)}]" if values else ""
@@ -160,7 +163,7 @@ def format_formula(
 def format_specification(specification: Specification) -> str:
     """Return the canonical text of a specification, every `spec` on a line of its own."""
     relations = RELATION_NAMES | specification.relations
-    lines = [f"use {specification.profile}"]
+    lines = [f"use {each}" for each in (specification.profile, *specification.plugins)]
     for name, outline in specification.regions.items():
         lines.append(f"region {written_name(name, relations)} = {_format_outline(outline)}")
     for scale in specification.scales:

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal, NamedTuple, Self, TypeAlias
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Self, TypeAlias
 
 from spatial_replay.lazy import Displayed
 
@@ -215,6 +215,40 @@ class Signal(_Arithmetic):
     """A named numeric signal of the log."""
 
     name: str
+
+
+@dataclass(frozen=True, slots=True)
+class ComputedSignal(Signal):
+    """A signal that a plug-in computes of each sample; `plugin` is its module or file (see `relations`)."""
+
+    plugin: str
+
+
+@dataclass(frozen=True, slots=True)
+class PreviousSignal(Signal):
+    """A signal in the sample before."""
+
+    of: Signal
+
+
+@dataclass(frozen=True, slots=True)
+class Rate(Signal):
+    """A rate of change since the sample before, per second: `speed(a)`, `speed(a, b)`, `rate(signal)`.
+
+    To sentences and rules it is a signal; its numbers are computed (see `walks.change_of`).
+
+    Attributes:
+        name: as written.
+        terms: those of a speed.
+        signal: that of `rate`, else None.
+    """
+
+    terms: tuple[Term, ...]
+    signal: Signal | None = None
+
+
+STEP: Final = Rate("", ())
+"""The seconds since the sample before."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -564,7 +598,8 @@ class Specification(Displayed):
         profile: the relation profile, "paper" or "spatial_spec".
         regions: shapes by name.
         groups: declared groups by name.
-        relations: names of the relations that were given in Python.
+        relations: names of the relations that were given in Python, or by plug-ins.
+        plugins: the SHA-256 of the file of each plug-in that the text uses.
         constants: by name; formulas have their values already.
         scales: what the numbers of atoms are divided by; formulas have that already.
         source: the text it was parsed from, without a byte order mark; spans are offsets into it.
@@ -577,6 +612,7 @@ class Specification(Displayed):
     regions: dict[str, Outline] = field(default_factory=dict)
     groups: dict[str, Group] = field(default_factory=dict)
     relations: frozenset[str] = frozenset()
+    plugins: dict[str, str] = field(default_factory=dict)
     constants: dict[str, Constant] = field(default_factory=dict, compare=False)
     source: str = field(default="", compare=False)
     filename: str = field(default="<text>", compare=False)

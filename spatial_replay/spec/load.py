@@ -36,6 +36,7 @@ from spatial_replay.spec.formula import (
     Axis,
     Boolean,
     Bound,
+    ComputedSignal,
     Earlier,
     Enlarged,
     Equality,
@@ -64,8 +65,11 @@ from spatial_replay.spec.relations import (
     PROFILES,
     RELATION_NAMES,
     THREE_TERM_RELATIONS,
+    Plugin,
     Relation,
     compare,
+    plugins_of,
+    used_modules,
 )
 from spatial_replay.spec.resolve import MAX_SIZE, Anything, Namespace, Resolver, Scope, Value, kind_of
 from spatial_replay.spec.syntax import (
@@ -83,6 +87,7 @@ from spatial_replay.spec.syntax import (
     NumberSyntax,
     QuantifierSyntax,
     Quantity,
+    RateSyntax,
     RelationSyntax,
     SpecStatement,
     Statement,
@@ -94,11 +99,15 @@ from spatial_replay.spec.syntax import (
 from spatial_replay.spec.tokens import MAX_TOKENS, function_hint, is_reserved, quoted, tokenize
 from spatial_replay.spec.walks import (
     base_of,
+    has_rate,
     is_centre,
     iter_expressions,
     iter_formulas,
+    looks_back,
     other_names,
+    rate_of,
     scaled,
+    speed_of,
     substitute,
     terms_of,
 )
@@ -150,14 +159,56 @@ class AtomBuilder:
     def distance(self, written: DistanceSyntax, scope: Scope) -> Atom:
         """Return the atom of `a dist b <= c`, c - sd(a, b); of a chain, the lesser of both comparisons."""
         terms = (self.resolver.term(written.first, scope), self.resolver.term(written.second, scope))
+        return self._limited("dist", SignedDistance(*terms), terms, (), written, scope)
+
+    def rate(self, written: RateSyntax, scope: Scope) -> Formula:
+        """Return the atom of `speed(a) <= c` or `rate(signal) <= c`; `true` of anything else."""
+        given, function = written.arguments, written.function
+        if any(sign == "!=" for sign, _ in written.comparisons):
+            hint = f"write what is too slow or too fast: {function}(a) >= c, {function}(a) <= c"
+            self.resolver.fault(written.span, scope, "a rate is hardly ever exactly a number", hint)
+        if function == "rate" and len(given) == 1 and isinstance(given[0], Name):
+            signal = self._signal(given[0], scope)
+            return self._limited("rate", rate_of(signal), (), (signal.name,), written, scope)
+        if function == "rate" or not 1 <= len(given) <= 2:
+            message, hint = "'rate' takes one signal", "write rate(battery) <= c"
+            if function == "speed":
+                message, hint = "'speed' takes one or two objects", "write speed(a) <= c or speed(a, b) <= c"
+            self.resolver.fault(written.span, scope, message, hint)
+            return Truth(True)
+        terms = tuple([self._moving(each, scope, alone=len(given) == 1) for each in given])
+        return self._limited("speed", speed_of(*terms), terms, (), written, scope)
+
+    def _moving(self, written: TermSyntax | NumberSyntax | Arithmetic, scope: Scope, *, alone: bool) -> Term:
+        """Return a term that `speed` takes."""
+        if isinstance(written, (NumberSyntax, Arithmetic)):
+            self.resolver.fault(written.span, scope, "a number has no speed", "write speed(a) or speed(a, b)")
+            return TrackedName("")
+        term = self.resolver.term(written, scope)
+        if looks_back(term):
+            hint = "leave out the [-n]"
+            self.resolver.fault(written.span, scope, "a speed is from the sample before to this one", hint)
+        elif alone and isinstance(base_of(term), Group):
+            hint = "write forall p in GROUP: speed(p) <= c"
+            self.resolver.fault(written.span, scope, "a group has no speed of its own", hint)
+        return term
+
+    def _limited(
+        self,
+        relation: str,
+        quantity: Expression,
+        terms: tuple[Term, ...],
+        names: tuple[str, ...],
+        written: DistanceSyntax | RateSyntax,
+        scope: Scope,
+    ) -> Atom:
         limits = [(sign, self.resolver.number(limit, scope)) for sign, limit in written.comparisons]
-        quantity = SignedDistance(*terms)
         comparisons = [compare(quantity, sign, limit) for sign, limit in limits]
         (sign, limit), *upper = limits
         if not upper:
-            return self._atom("dist", comparisons[0], terms, (sign, limit), written, scope)
-        parameters = (limit, _MIRRORED[sign], *upper[0])
-        return self._atom("dist", minimum(*comparisons), terms, parameters, written, scope)
+            return self._atom(relation, comparisons[0], terms, (*names, sign, limit), written, scope)
+        parameters = (*names, limit, _MIRRORED[sign], *upper[0])
+        return self._atom(relation, minimum(*comparisons), terms, parameters, written, scope)
 
     def comparison(self, written: ComparisonSyntax, scope: Scope) -> Atom:
         """Return the atom of `signal >= c`, signal - c; `==` and `!=` are exact."""
@@ -176,6 +227,16 @@ class AtomBuilder:
                 self.resolver.fault(written.span, scope, "a text has no order", "compare it by == or !=")
         else:
             limit = self.resolver.number(written.limit, scope)
+        signal = self._signal(name, scope)
+        is_equal = Equality(signal, limit)
+        exact: Mapping[str, Expression] = {"==": is_equal, "!=": -is_equal}
+        expression = exact.get(written.operator) or compare(signal, written.operator, limit)
+        parameters = (name.text, written.operator, limit if shown is None else shown)
+        return self._atom("signal", expression, (), parameters, written, scope)
+
+    def _signal(self, name: Name, scope: Scope) -> Signal:
+        """Return a signal of the log or of a plug-in; a name of something else is a fault."""
+        plugin = self.resolver.names.signals.get(name.text)
         defined = self.resolver.names.definitions.get(name.text)
         if name.text in scope.values:
             message = f"{name.text!r} is a parameter or variable here; a signal of the log is expected"
@@ -183,11 +244,7 @@ class AtomBuilder:
         elif defined is not None and not isinstance(defined, BrokenStatement):
             message = f"{name.text!r} is {kind_of(defined)}; a signal of the log is expected"
             self.resolver.fault(name.span, scope, message)
-        signal, is_equal = Signal(name.text), Equality(Signal(name.text), limit)
-        exact: Mapping[str, Expression] = {"==": is_equal, "!=": -is_equal}
-        expression = exact.get(written.operator) or compare(signal, written.operator, limit)
-        parameters = (name.text, written.operator, limit if shown is None else shown)
-        return self._atom("signal", expression, (), parameters, written, scope)
+        return Signal(name.text) if plugin is None else ComputedSignal(name.text, plugin)
 
     def _atom(
         self,
@@ -195,7 +252,7 @@ class AtomBuilder:
         expression: Expression,
         terms: tuple[Term, ...],
         parameters: tuple[float | str, ...],
-        written: RelationSyntax | DistanceSyntax | ComparisonSyntax,
+        written: RelationSyntax | DistanceSyntax | RateSyntax | ComparisonSyntax,
         scope: Scope,
     ) -> Atom:
         text = format_relation(relation, terms, parameters, self.names)
@@ -260,6 +317,16 @@ class AtomBuilder:
             kind = "point" if is_centre(term) else "region" if isinstance(base, RegionName) else "group"
             message = f"{written.relation!r} needs an orientation, and a {kind} has none"
             self.resolver.fault(written.operator, scope, message, "compare single objects of the log")
+
+
+def _from_second(spec: NamedSpec) -> NamedSpec:
+    """Return a spec as written or, with a rate in it, from the second sample on: the first has no rates."""
+    formula = spec.formula
+    if (isinstance(formula, Temporal) and formula.operator in ("X", "WX")) or not has_rate(formula):
+        return spec
+    is_reference = isinstance(formula, Boolean) and formula.operator == "spec"
+    inner = formula.operands[0] if is_reference else replace(formula, name=None)
+    return replace(spec, formula=Temporal("WX", (inner,), name=spec.name, span=formula.span))
 
 
 @dataclass(frozen=True, slots=True)
@@ -449,7 +516,10 @@ class Elaborator:
         total = sum(known.size for name, known in self.known.items() if name not in self.referred)
         if total > MAX_SIZE:
             self._too_large(statements[-1].name.span)
-        return tuple(replace(spec, is_result=spec.name not in self.referred) for spec in done)
+        return tuple(
+            replace(spec, is_result=False) if spec.name in self.referred else _from_second(spec)
+            for spec in done
+        )
 
     def _spec(self, statement: SpecStatement, order: int) -> None:
         name = statement.name.text
@@ -518,6 +588,8 @@ class Elaborator:
                 return self.atoms.relation(written, scope) or Truth(True)
             case DistanceSyntax():
                 return self.atoms.distance(written, scope)
+            case RateSyntax():
+                return self.atoms.rate(written, scope)
             case ComparisonSyntax():
                 return self.atoms.comparison(written, scope)
             case BooleanSyntax():
@@ -702,7 +774,9 @@ def parse_specification(
         reverse.
     """
     _require_text(text)
-    given = dict(relations or {})
+    plugins = plugins_of(text)
+    given = {name: each for plugin in plugins.values() for name, each in plugin.relations.items()}
+    given |= relations or {}
     _check_relations(given)
     if profile is not None and profile not in PROFILES:
         raise UsageError(f"unknown profile {profile!r}; the profiles are {', '.join(PROFILES)}")
@@ -711,15 +785,20 @@ def parse_specification(
     if constants:
         text = _constant_writer(text, filename, names)(constants)
     faults = Faults(SourceText.of(text, filename))
+    for name, place in used_modules(text).items():
+        if name not in plugins and not nearest_hint(name, PROFILES):
+            message = f"{name!r} is neither a profile ({', '.join(PROFILES)}) nor an allowed plug-in"
+            hint = f'if you trust the module: --plugin {name}, or plugins = ["{name}"] in pyproject.toml'
+            faults.add(Span(*place), message, hint)
+    faults.raise_if_any()
     tokens = _tokens(text, names, faults)
     statements = parse_statements(tokens, names, faults)
-    used_profile = _profile(statements, faults) or profile or DEFAULT_PROFILE
-    namespace = Namespace(faults)
+    used_profile = _profile(statements, plugins, faults) or profile or DEFAULT_PROFILE
+    words = frozenset(token.value for token in tokens)
+    namespace = Namespace(faults, {name: each.place for each in plugins.values() for name in each.signals})
     namespace.declare(statements)
     listed = namespace.constant_ranges()
-    elaborator = Elaborator(
-        namespace, {**PROFILES[used_profile], **given}, frozenset(token.value for token in tokens), faults
-    )
+    elaborator = Elaborator(namespace, {**PROFILES[used_profile], **given}, words, faults)
     specs = [statement for statement in statements if isinstance(statement, SpecStatement)]
     if not specs and not any(isinstance(statement, BrokenStatement) for statement in statements):
         end = Span(len(text), len(text))
@@ -744,6 +823,11 @@ def parse_specification(
         namespace.regions,
         namespace.groups,
         frozenset(given),
+        {
+            name: each.sha256
+            for name, each in plugins.items()
+            if name in used_modules(text) or not words.isdisjoint({*each.relations, *each.signals})
+        },
         listed,
         scales=tuple(namespace.scales),
         source=text,
@@ -867,8 +951,9 @@ def _tokens(text: str, names: frozenset[str], faults: Faults) -> list[Token]:
     return tokens
 
 
-def _profile(statements: Sequence[Statement], faults: Faults) -> str | None:
+def _profile(statements: Sequence[Statement], plugins: Mapping[str, Plugin], faults: Faults) -> str | None:
     uses = [statement for statement in statements if isinstance(statement, UseStatement)]
+    uses = [each for each in uses if each.name.text not in plugins]
     for statement in uses[1:]:
         faults.add(statement.name.span, "a second use line", "a text has one relation profile")
     if not uses:

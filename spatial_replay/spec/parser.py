@@ -43,6 +43,7 @@ from spatial_replay.spec.syntax import (
     Point,
     QuantifierSyntax,
     Quantity,
+    RateSyntax,
     RegionStatement,
     RelationSyntax,
     ScaleStatement,
@@ -100,6 +101,15 @@ def _deeper(operands: tuple[FormulaSyntax, ...], span: Span) -> int:
         hint = "give parts of it names of their own, with spec"
         raise StatementError(span, f"more than {MAX_DEPTH} operators within one another", hint)
     return depth
+
+
+def _chain(lower: Any, below: Any, above: Any, upper: Any) -> tuple[tuple[str, Any], tuple[str, Any]]:
+    """Return both comparisons of `lower <= a dist b <= upper`, each as if the number stood on the right."""
+    for token, side in ((below, "left"), (above, "right")):
+        if token.value not in ("<=", "<"):
+            message = f"{token.value!r} cannot stand on the {side} of a chained comparison, only <= or <"
+            raise StatementError(span_of(token), message, _chain_hint(below.value, above.value))
+    return (MIRRORED[below.value], lower), (above.value, upper)
 
 
 def _chain_hint(below: str, above: str) -> str:
@@ -311,12 +321,16 @@ class TreeBuilder:
 
     def distance_within(self, children: list[Any]) -> DistanceSyntax:
         lower, below, first, _, second, above, upper = children
-        for token, side in ((below, "left"), (above, "right")):
-            if token.value not in ("<=", "<"):
-                message = f"{token.value!r} cannot stand on the {side} of a chained comparison, only <= or <"
-                raise StatementError(span_of(token), message, _chain_hint(below.value, above.value))
-        comparisons = ((MIRRORED[below.value], lower), (above.value, upper))
-        return DistanceSyntax(first, second, comparisons, _cover(children))
+        return DistanceSyntax(first, second, _chain(lower, below, above, upper), _cover(children))
+
+    def rate(self, children: list[Any]) -> RateSyntax:
+        function, _, arguments, _, token, limit = children
+        return RateSyntax(function.value, arguments or (), ((token.value, limit),), _cover(children))
+
+    def turned_rate(self, children: list[Any]) -> RateSyntax:
+        lower, below, function, _, arguments, _, above, upper = children
+        chain = ((MIRRORED[below.value], lower),) if above is None else _chain(lower, below, above, upper)
+        return RateSyntax(function.value, arguments or (), chain, _cover(children))
 
     def comparison(self, children: list[Any]) -> ComparisonSyntax:
         signal, token, limit = children
@@ -599,7 +613,7 @@ _SIGN_OF: Mapping[str, str] = MappingProxyType({
 })  # fmt: skip
 _COVERED: Mapping[str, frozenset[str]] = MappingProxyType(
     {
-        "a formula": frozenset({"NAME", "LPAR", "MINUS", "NUMBER", "ENLARGE", "ALL", "CLASS"}),
+        "a formula": frozenset({"NAME", "LPAR", "MINUS", "NUMBER", "ENLARGE", "ALL", "CLASS", "RATE"}),
         "an object, region or group": frozenset({"NAME", "LPAR", "CLASS", "NUMBER", "MINUS"}),
         "a number": frozenset({"NAME", "LPAR"}),
         "an arithmetic sign": frozenset({"MINUS", "SLASH"}),

@@ -15,13 +15,24 @@ and `between` have three terms, and a syntax of their own.
 
 from __future__ import annotations
 
+import hashlib
+import os
+import re
+import tomllib
 from collections.abc import Callable, Mapping
+from functools import cache
+from importlib import import_module
+from importlib.util import module_from_spec, spec_from_file_location
+from math import nan
+from pathlib import Path
 from types import MappingProxyType
-from typing import Literal, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
 
+from spatial_replay.errors import UsageError
 from spatial_replay.spec.formula import (
     Axis,
     CentroidProjection,
+    ComputedSignal,
     Enlarged,
     Expression,
     Misalignment,
@@ -237,3 +248,117 @@ PROFILES: Mapping[str, Mapping[str, Relation]] = MappingProxyType(
 """Relations by name, for each profile; both profiles have the same names."""
 
 RELATION_NAMES: frozenset[str] = frozenset(_PAPER)
+
+# ------------------------------------------------------------------------------------------- plug-ins
+
+PLUGINS_VARIABLE = "SPATIAL_REPLAY_PLUGINS"
+"""The plug-ins of `--plugin`, as PATH has its folders; other processes of a command inherit it."""
+_USED = re.compile(r'^[ \t]*use[ \t]+"?([A-Za-z_][\w.]*)"?[ \t]*(?:#.*)?$', re.MULTILINE | re.ASCII)
+
+
+class Plugin(NamedTuple):
+    """A module with own relations and signals.
+
+    Attributes:
+        place: its file, or the name to import it by.
+        sha256: of its file.
+        relations: functions from terms, and numbers, to an expression, by name (`RELATIONS`).
+        signals: functions from a `Sample` to a number, by name; None where it is unknown (`SIGNALS`).
+    """
+
+    name: str
+    place: str
+    sha256: str
+    relations: Mapping[str, Relation]
+    signals: Mapping[str, Callable[[Any], float | None]]
+
+
+def used_modules(text: str) -> dict[str, tuple[int, int]]:
+    """Return the names in the `use` lines of a text that are no relation profiles, with their places."""
+    return {found[1]: found.span(1) for found in _USED.finditer(text) if found[1] not in PROFILES}
+
+
+def plugins_of(text: str) -> dict[str, Plugin]:
+    """Load the plug-ins of the command line, and those that a text uses and the user allows.
+
+    No text loads a module by itself: it is allowed by `--plugin`, or by `[tool.spatial-replay] plugins` in
+    the pyproject.toml of the current folder.
+
+    Raises:
+        UsageError: a plug-in that cannot be loaded.
+    """
+    given = [each for each in os.environ.get(PLUGINS_VARIABLE, "").split(os.pathsep) if each]
+    used = set(used_modules(text))
+    allowed = {Path(each).stem if each.endswith(".py") else each: each for each in given}
+    if used - set(allowed):
+        allowed |= {each: each for each in _listed_plugins() if each in used}
+    return {name: load_plugin(_place(each)) for name, each in allowed.items()}
+
+
+def _listed_plugins() -> list[str]:
+    path = Path("pyproject.toml")
+    try:
+        listed = (
+            tomllib.loads(path.read_text("utf-8"))
+            .get("tool", {})
+            .get("spatial-replay", {})
+            .get("plugins", [])
+        )
+    except OSError:
+        return []
+    except (ValueError, AttributeError) as error:
+        raise UsageError(f"{path}: [tool.spatial-replay] plugins cannot be read: {error}") from error
+    if not isinstance(listed, list) or not all(isinstance(each, str) for each in listed):
+        raise UsageError(f'{path}: plugins is {listed!r}; give a list of modules, such as ["mymodule"]')
+    return listed
+
+
+def _place(module: str) -> str:
+    """Return the file of a module in the current folder, or the module's name."""
+    file = Path(module if module.endswith(".py") else f"{module.replace('.', '/')}.py").absolute()
+    return str(file) if file.exists() or module.endswith(".py") else module
+
+
+@cache
+def load_plugin(place: str) -> Plugin:
+    """Import a plug-in.
+
+    Args:
+        place: its file, or the name to import it by.
+
+    Raises:
+        UsageError: it cannot be imported, or holds no relations and signals.
+    """
+    try:
+        if place.endswith(".py"):
+            name = Path(place).stem
+            made = spec_from_file_location(name, place)
+            assert made is not None and made.loader is not None
+            module = module_from_spec(made)
+            made.loader.exec_module(module)
+        else:
+            name, module = place, import_module(place)
+        content = Path(module.__file__ or "").read_bytes()
+    except Exception as error:
+        raise UsageError(f"the plug-in {place} cannot be loaded: {type(error).__name__}: {error}") from error
+    relations, signals = getattr(module, "RELATIONS", {}), getattr(module, "SIGNALS", {})
+    for title, functions in (("RELATIONS", relations), ("SIGNALS", signals)):
+        if not isinstance(functions, Mapping) or not all(map(callable, functions.values())):
+            raise UsageError(f"the plug-in {place} has a {title} that is no dictionary of functions by name")
+    if not relations and not signals:
+        raise UsageError(f"the plug-in {place} has no relations and signals; define RELATIONS or SIGNALS")
+    return Plugin(name, place, hashlib.sha256(content).hexdigest(), dict(relations), dict(signals))
+
+
+def computed_signal(signal: ComputedSignal, sample: Any) -> float:
+    """Return the number of a plug-in's signal in a sample, NaN where it is unknown.
+
+    Raises:
+        UsageError: the plug-in fails, or returns no number.
+    """
+    try:
+        value = load_plugin(signal.plugin).signals[signal.name](sample)
+        return nan if value is None else float(value)
+    except Exception as error:
+        what = f"the plug-in {signal.plugin} fails for the signal {signal.name!r} at {sample.time_ns} ns"
+        raise UsageError(f"{what}: {type(error).__name__}: {error}") from error

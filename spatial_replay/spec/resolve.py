@@ -189,6 +189,7 @@ class Namespace:
     """The definitions of one text.
 
     Attributes:
+        signals: the plug-ins of the signals that these compute.
         definitions: statements by name; of a name given twice, the first.
         regions, groups: the values of those definitions.
         used: names that something refers to.
@@ -197,6 +198,7 @@ class Namespace:
     """
 
     faults: Faults
+    signals: Mapping[str, str] = field(default_factory=dict)
     definitions: dict[str, Statement] = field(default_factory=dict)
     regions: dict[str, Outline] = field(default_factory=dict)
     groups: dict[str, Group] = field(default_factory=dict)

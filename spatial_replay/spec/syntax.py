@@ -132,6 +132,20 @@ class DistanceSyntax(NamedTuple):
     span: Span
 
 
+class RateSyntax(NamedTuple):
+    """`speed(a) <= c`, `speed(a, b) <= c` or `rate(signal) <= c`, or a chain of two comparisons.
+
+    Attributes:
+        function: "speed" or "rate".
+        comparisons: in the order written, each as if the rate stood on the left.
+    """
+
+    function: str
+    arguments: tuple[TermSyntax | NumberSyntax | Arithmetic, ...]
+    comparisons: tuple[tuple[str, Quantity], ...]
+    span: Span
+
+
 class ComparisonSyntax(NamedTuple):
     """`signal >= 3.0`."""
 
@@ -187,6 +201,7 @@ FormulaSyntax: TypeAlias = (
     | Call
     | RelationSyntax
     | DistanceSyntax
+    | RateSyntax
     | ComparisonSyntax
     | BooleanSyntax
     | TemporalSyntax

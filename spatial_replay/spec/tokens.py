@@ -122,6 +122,8 @@ _AFTER_OPERAND = frozenset({"NAME", "RPAR", "RSQB", "NUMBER", "TRUTH"})
 STARTS_FORMULA = frozenset(
     {"LPAR", "NAME", "NOT", "PREFIX", "TRUTH", "QUANTIFIER", "NUMBER", "MINUS", "ENLARGE", "ALL", "CLASS"}
 )
+RATES = frozenset({"speed", "rate"})
+"""Words of rates of change where a bracket follows; elsewhere, names."""
 _RELATIONS = frozenset({"RELATION", "DIST", "CLOSER", "BETWEEN", "COMPARE"})
 
 
@@ -152,6 +154,8 @@ def read_spellings(tokens: list[Token], faults: Faults) -> list[Token]:
                 written = token
             if written.type == "ERROR":
                 _report(token, faults)
+            if token.value in RATES and following[0].type == "LPAR" and token.value not in macros:
+                written = _as(token, "RATE", token.value)
             result.append(written)
         else:
             result.append(token)
@@ -331,6 +335,9 @@ def _meant_call(tokens: Sequence[Token], comparison: str, limit: str) -> tuple[s
                 turned = comparison.translate(str.maketrans("<>", "><"))
                 both = "and" if comparison[0] == "<" else "or"
                 hint = f"write {signal} {turned} -{limit} {both} {signal} {comparison} {limit}"
+            elif name.lower() in ("velocity", "vel", "derivative", "der", "diff"):
+                word = "speed" if name.lower().startswith("vel") else "rate"
+                hint = f"it is written {word}({signal}) {comparison} {limit}"
         case _, ["NAME", "LPAR", "NAME", "COMMA", "NAME", "RPAR"]:
             name, first, second = tokens[-6].value, tokens[-4].value, tokens[-2].value
             hint = f"a distance is written between its objects: {first} dist {second} {comparison} {limit}"

@@ -7,12 +7,13 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal
 
-from spatial_replay.spec.format import format_number, format_relation
+from spatial_replay.spec.format import format_number, format_relation, format_term
 from spatial_replay.spec.formula import (
     Atom,
     Boolean,
     Centre,
     CentroidProjection,
+    ComputedSignal,
     DerivedTerm,
     Earlier,
     Enlarged,
@@ -26,9 +27,11 @@ from spatial_replay.spec.formula import (
     Misalignment,
     Negative,
     Number,
+    PreviousSignal,
     Projection,
     Protrusion,
     Quantified,
+    Rate,
     RegionName,
     Scale,
     Scaled,
@@ -44,6 +47,7 @@ from spatial_replay.spec.formula import (
     operator_of,
 )
 from spatial_replay.spec.relations import RELATION_NAMES
+from spatial_replay.spec.tokens import written_name
 
 
 def base_of(term: Term) -> TrackedName | Variable | RegionName | Group:
@@ -87,9 +91,11 @@ def iter_expressions(expression: Expression) -> Iterator[Expression]:
                 stack += reversed(current.operands)
 
 
-def measured_terms(measurement: Measurement) -> tuple[Term, ...]:
-    """Return the one or two terms that a measurement is of."""
+def measured_terms(measurement: Measurement | Rate) -> tuple[Term, ...]:
+    """Return the one or two terms that a measurement is of; of a rate, those of both samples."""
     match measurement:
+        case Rate():
+            return tuple(terms_of(change_of(measurement)))
         case SignedDistance() | Misalignment():
             return measurement.first, measurement.second
         case Protrusion():
@@ -101,8 +107,53 @@ def measured_terms(measurement: Measurement) -> tuple[Term, ...]:
 def terms_of(expression: Expression) -> Iterator[Term]:
     """Yield the terms that an expression measures."""
     for current in iter_expressions(expression):
-        if isinstance(current, Measurement):
+        if isinstance(current, Measurement | Rate):
             yield from measured_terms(current)
+
+
+def speed_of(*terms: Term) -> Rate:
+    """Return how fast an object moves or, of two terms, how fast their distance decreases."""
+    return Rate(f"speed({', '.join(map(format_term, terms))})", terms)
+
+
+def rate_of(signal: Signal) -> Rate:
+    """Return how fast a signal changes."""
+    return Rate(f"rate({written_name(signal.name, RELATION_NAMES)})", (), signal)
+
+
+def has_rate(formula: Formula) -> bool:
+    """Return whether a formula is about rates of change."""
+    atoms = (each for each in iter_formulas(formula) if isinstance(each, Atom))
+    return any(isinstance(part, Rate) for atom in atoms for part in iter_expressions(atom.expression))
+
+
+def change_of(rate: Rate) -> Sum | SignedDistance:
+    """Return what a rate is per second: the difference between this sample and the one before."""
+    match rate.terms:
+        case (one, other):
+            return SignedDistance(_before(one), _before(other)) - SignedDistance(one, other)
+        case (one,):
+            alone: Any = standing(one)
+            return SignedDistance(Centre(alone), Centre(Earlier(alone, samples=1)))
+    signal = rate.signal or Signal("")
+    return signal - PreviousSignal(signal.name, signal)
+
+
+def _before(term: Term) -> Term:
+    inner: Any = term
+    if isinstance(term, Enlarged | Centre):
+        inner = _before(term.term)
+        return replace(term, term=inner)
+    return Earlier(inner, samples=1)
+
+
+def logged_signals(expression: Expression) -> Iterator[str]:
+    """Yield the names of the signals that an expression needs in the log."""
+    for part in iter_expressions(expression):
+        signal = part.signal if isinstance(part, Rate) else part
+        signal = signal.of if isinstance(signal, PreviousSignal) else signal
+        if isinstance(signal, Signal) and not isinstance(signal, ComputedSignal):
+            yield signal.name
 
 
 def iter_formulas(formula: Formula) -> Iterator[Formula]:
@@ -179,7 +230,9 @@ def substitute(formula: Formula, names: Names, relations: frozenset[str] = RELAT
         case Truth():
             return formula
         case Atom():
-            expression = map_leaves(formula.expression, partial(_substituted, names=names))
+            expression = map_leaves(
+                formula.expression, partial(changed_leaf, change=partial(substitute_term, names=names))
+            )
             terms = tuple(substitute_term(term, names) for term in formula.terms)
             text = formula.text
             if terms:
@@ -248,10 +301,11 @@ def map_leaves(
             return change(expression)
 
 
-def _substituted(leaf: Number | Signal | Measurement, names: Names) -> Expression:
-    if isinstance(leaf, Number | Signal):
-        return leaf
-    return map_terms(leaf, lambda term: substitute_term(term, names))
+def changed_leaf(leaf: Number | Signal | Measurement, change: Callable[[Term], Term]) -> Expression:
+    """Return a number, a signal or a measurement with other terms in place of its own."""
+    if isinstance(leaf, Rate):
+        return speed_of(*map(change, leaf.terms)) if leaf.terms else leaf
+    return leaf if isinstance(leaf, Number | Signal) else map_terms(leaf, change)
 
 
 LENGTHS = "lengths"
@@ -263,17 +317,18 @@ class Unit:
     """The unit of an atom's number.
 
     Attributes:
-        kind: a length, in the units of the footprints; a signal's; or none, of orientations.
+        kind: a length, in the units of the footprints; a signal's; one of them per second ("rate"); or none.
         signal: the name of the signal, or None.
         divisor: what `scale` divides the number by, or None.
     """
 
-    kind: Literal["length", "signal", "orientation"]
+    kind: Literal["length", "signal", "rate", "orientation"]
     signal: str | None = None
     divisor: float | None = None
 
     def __str__(self) -> str:
-        name = {"length": LENGTHS, "orientation": "orientations"}.get(self.kind) or str(self.signal)
+        name = "orientations" if self.kind == "orientation" else self.signal or LENGTHS
+        name += " per second" if self.kind == "rate" else ""
         return name if self.divisor is None else f"{name} / {format_number(self.divisor)}"
 
 
@@ -302,10 +357,17 @@ def declared_unit(formula: Formula, declared: Mapping[str, str], *, is_scaled: b
     found = {
         ""
         if each.kind == "orientation" or (is_scaled and each.divisor is not None)
+        else per_second(declared.get(each.signal or "", ""))
+        if each.kind == "rate"
         else declared.get(each.signal or "", "")
         for each in units_of(formula)
     }
     return found.pop() if len(found) == 1 else ""
+
+
+def per_second(unit: str) -> str:
+    """Return the unit of a rate of change; "" where that of its numbers is not declared."""
+    return unit and ("1/s" if unit == "1" else f"{unit}/s")
 
 
 def is_mixed(units: Sequence[Unit]) -> bool:
@@ -339,7 +401,9 @@ def _units(expression: Expression) -> list[Unit]:
     if any(isinstance(part, Equality) for part in parts):
         return []
     for part in parts:
-        if isinstance(part, Signal):
+        if isinstance(part, Rate):
+            found[Unit("rate", part.signal and part.signal.name, divisor)] = None
+        elif isinstance(part, Signal):
             found[Unit("signal", part.name, divisor)] = None
         elif isinstance(part, Misalignment):
             found[Unit("orientation")] = None

@@ -256,6 +256,19 @@ def test_a_window_that_the_end_of_the_log_cut_is_said_where_it_decides(
     assert _document(folder, "hold.spatial", "--to", "5s", "--fail-on", "cut")[0] == 0
 
 
+def test_an_antecedent_that_held_for_no_member_tests_nothing(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    body = "forall x in (all except plate): (x ovlp plate -> x dist cup >= 1)"
+    (folder / "each.spatial").write_text(f"spec polite = G ({body})\n")
+    code, document = _document(folder, "each.spatial")
+    (polite,) = document["specifications"]
+    assert (code, polite["verdict"], polite["tested"]) == (4, "satisfied", "nothing")
+    assert [each["reason"] for each in polite["vacuous"]] == ["antecedent never held"]
+    assert "`x ovlp plate` never held" in capsys.readouterr().out
+    assert _document(folder, "each.spatial", "--fail-on", "vacuous")[0] == 1
+
+
 def test_an_antecedent_that_never_held_fails_a_gate_under_the_semantics_of_the_paper(folder: Path) -> None:
     (folder / "polite.spatial").write_text("spec polite = G (cup ovlp plate -> fork ovlp plate)\n")
     paper = ("--semantics", "paper")

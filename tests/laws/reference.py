@@ -37,6 +37,7 @@ from spatial_replay.spec.formula import (
     Projection,
     Protrusion,
     Quantified,
+    Rate,
     RegionName,
     Signal,
     SignedDistance,
@@ -300,6 +301,8 @@ class Observed:
         match expression:
             case Number():
                 return Interval(expression.value, expression.value)
+            case Rate():
+                return self._rate(expression, t, bindings, uncertain)
             case Signal():
                 number = self.signals[t].get(expression.name, math.nan)
                 return None if math.isnan(number) else Interval(number, number)
@@ -322,6 +325,32 @@ class Observed:
                     return None
                 return least(known) if isinstance(expression, Minimum) else greatest(known)
         return self._measurement(expression, t, bindings, uncertain)
+
+    def _rate(self, rate: Rate, t: int, bindings: Bindings, uncertain: bool) -> Interval | None:
+        """What changed since the sample before, per second."""
+        if t == 0:
+            return None
+        now, before = (self._changing(rate, at, bindings, uncertain) for at in (t, t - 1))
+        if now is None or before is None:
+            return None
+        step = (self.times_ns[t] - self.times_ns[t - 1]) / 1e9
+        if isinstance(now, Interval) and isinstance(before, Interval):
+            return Interval((now.low - before.high) / step, (now.high - before.low) / step)
+        moved = _measured(SignedDistance(*rate.terms, *rate.terms), [now], [before])
+        spread = now.uncertainty + before.uncertainty if uncertain else 0.0
+        return Interval((moved - spread) / step, (moved + spread) / step)
+
+    def _changing(
+        self, rate: Rate, t: int, bindings: Bindings, uncertain: bool
+    ) -> Interval | TrackedObject | None:
+        """A signal, minus a distance, or the centre of an object."""
+        match rate.terms:
+            case (one, other):
+                return self._expression(Negative(SignedDistance(one, other)), t, bindings, uncertain)
+            case (one,):
+                members = self.members(one, t, bindings)
+                return None if members is None else _centre(members[0])
+        return self._expression(rate.signal or Signal(""), t, bindings, uncertain)
 
     def _measurement(
         self, measurement: Expression, t: int, bindings: Bindings, uncertain: bool

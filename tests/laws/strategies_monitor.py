@@ -333,6 +333,7 @@ WORDS = Vocabulary(
     objects=NAMES,
     classes=CLASSES,
     signals=("battery",),
+    rates=True,
     regions=("goal", "table", "corner"),
     groups=("pair", "people", "everyone"),
     axes=("x", "y", "z"),

@@ -35,6 +35,7 @@ class Vocabulary:
         regions, groups: names that the text around defines.
         axes: for the relations along an axis.
         delays: whether terms may be those of an earlier sample.
+        rates: whether rates of change are compared.
         future, past: whether such operators are drawn.
         times: whether windows may be in seconds.
         quantifiers: whether open quantifiers are drawn (over `all` and `classes`).
@@ -48,6 +49,7 @@ class Vocabulary:
     groups: Sequence[str] = ()
     axes: Sequence[str] = ("x", "y")
     delays: bool = True
+    rates: bool = False
     oriented: bool = False
     future: bool = True
     past: bool = True
@@ -97,8 +99,10 @@ def atoms(draw: st.DrawFn, words: Vocabulary) -> str:
     """The text of a relation or comparison; parameters are always written."""
     kinds = ["plain", "parameter", "dist", "within", "closer", "prec", "between"]
     kinds += ["signal"] if words.signals else []
+    kinds += ["speed", "closing", *(["rate"] if words.signals else [])] if words.rates else []
     kinds += ["oriented"] if words.oriented else []
     first, second = draw(terms(words)), draw(terms(words))
+    tracked = draw(st.sampled_from(words.objects))
     match draw(st.sampled_from(kinds)):
         case "parameter":
             return f"{first} {draw(st.sampled_from(PARAMETER_RELATIONS))}[{draw(numbers)}] {second}"
@@ -117,6 +121,14 @@ def atoms(draw: st.DrawFn, words: Vocabulary) -> str:
         case "signal":
             comparison = draw(st.sampled_from((*COMPARISONS, "!=")))
             return f"{draw(st.sampled_from(words.signals))} {comparison} {draw(numbers)}"
+        case "rate":
+            signal, comparison = draw(st.sampled_from(words.signals)), draw(st.sampled_from(COMPARISONS))
+            return f"rate({signal}) {comparison} {draw(numbers)}"
+        case "speed":
+            return f"{draw(numbers)} <= speed({tracked}) < {draw(numbers)}"
+        case "closing":
+            first, second = (draw(terms(replace(words, delays=False))) for _ in range(2))
+            return f"speed({first}, {second}) {draw(st.sampled_from(COMPARISONS))} {draw(numbers)}"
         case "oriented":
             one, other = (draw(st.sampled_from(words.objects)) for _ in range(2))
             return f"{one} oriented[{draw(numbers)}] {other}"
@@ -204,6 +216,7 @@ _FULL = Vocabulary(
     regions=("goal", "table"),
     groups=("reds", "people", "everyone"),
     axes=("x", "y", "z"),
+    rates=True,
     oriented=True,
     quantifiers=True,
     max_depth=3,

@@ -23,6 +23,9 @@ spec alone = G forall x in people: x dist (everyone except x) >= 1
 spec apart = G forall x, y in people: x dist y >= 0.5
 spec going = F exists x in everyone: x dist x[-{samples}] >= 1
 spec parted = H[0, {samples}] forall x in people[-{duration}ms]: x dist a[-{duration}ms] >= 0.5
+spec slow = G (speed(a) <= 1 and forall x in people: speed(x) <= 1)
+spec nearing = F (0.5 <= speed(enlarge(a, 0.1), everyone except a))
+spec draining = O[0, {samples}] (rate(battery) <= 0.1)
 spec near = (everyone[-{samples}] dist b <= 3) S[0, {duration}ms] (a oriented[0.5] c)
 """
 
@@ -38,7 +41,9 @@ def crowds(draw, max_size=10):
         hidden = draw(ANYONE) if draw(st.booleans()) else ()
         unknown = {name: each.class_name for name, each in objects.items() if name in hidden}
         known = {name: each for name, each in objects.items() if name not in hidden}
-        samples.append(Sample(time_ns, known, {"battery": 1.5} if draw(st.booleans()) else {}, unknown))
+        samples.append(
+            Sample(time_ns, known, {"battery": draw(st.floats(0, 2))} if draw(st.booleans()) else {}, unknown)
+        )
         time_ns += draw(st.sampled_from([100, 250, 400])) * 10**6
     return samples
 

@@ -474,6 +474,8 @@ def test_a_result_that_decided_nothing_is_marked(tmp_path: Path) -> None:
     page = report_of_samples(tmp_path / "run.html", driving(3), "spec late = G[60s, 90s] robot ovlp vase")
     said = page.within("section#verdicts")
     assert "tested by nothing" in said
+    assert 'class="chip is-vacuous">satisfied' in page.text
+    assert 'class="chip is-satisfied"' not in page.text
     assert "no sample of the log lies in its window" in said
     assert [event["status"] for event in page.facts["events"]][-1] == "vacuous"
 

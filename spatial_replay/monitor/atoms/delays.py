@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from spatial_replay.spec.formula import Earlier, Formula
-from spatial_replay.spec.walks import iter_terms, standing
+from spatial_replay.spec.walks import has_rate, iter_terms, standing
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
 
@@ -26,13 +26,17 @@ class Delay(NamedTuple):
 
 
 NO_DELAY = Delay(0, None)
+PREVIOUS = Delay(1, None)
 
 
-def iter_delays(formulas: Iterable[Formula]) -> Iterator[Delay]:
+def iter_delays(formulas: Sequence[Formula]) -> Iterator[Delay]:
     """Iterate over the delays of the terms in some formulas that look back."""
     for term in map(standing, iter_terms(formulas)):
         if isinstance(term, Earlier):
             yield Delay.of(term)
+    # rates also look at the time of the sample before, and at its signals
+    if any(map(has_rate, formulas)):
+        yield PREVIOUS
 
 
 def look_back(formulas: Sequence[Formula]) -> tuple[int, int]:

@@ -20,6 +20,7 @@ from spatial_replay.geometry.arrays import Flags, Floats, Integers
 from spatial_replay.monitor.atoms.closest_pair import ClosestPair, number_of_closest
 from spatial_replay.monitor.atoms.terms import Bindings
 from spatial_replay.spec.formula import (
+    STEP,
     Atom,
     Boolean,
     Earlier,
@@ -33,6 +34,7 @@ from spatial_replay.spec.formula import (
     Negative,
     Number,
     Quantified,
+    Rate,
     Scaled,
     Signal,
     Sum,
@@ -42,7 +44,7 @@ from spatial_replay.spec.formula import (
     operands_of,
     operator_of,
 )
-from spatial_replay.spec.walks import map_terms, substitute_term
+from spatial_replay.spec.walks import change_of, map_terms, substitute_term
 from spatial_replay.text import TEXTS
 
 # instructions: operation, a, b, c
@@ -54,6 +56,7 @@ AND_MEMBER, OR_MEMBER = 10, 11  # a, and b where members c is 1, anything where 
 DIVIDE = 12  # a by constant b, which is positive
 CLOSEST = 13  # closest pair a, as an interval
 EQUAL = 14  # signal a and constant b: +inf or -inf; not a number where one of them is a text, or none
+QUOTIENT = 15  # a by b, which is positive and the same in every channel
 
 TILE = 128
 """Samples processed together: few, so that their columns stay in the processor's cache."""
@@ -147,6 +150,9 @@ def run_instructions(
                 elif op == DIVIDE:
                     for k in range(count):
                         target[k] = first[k] / constants[b]
+                elif op == QUOTIENT:
+                    for k in range(count):
+                        target[k] = first[k] / second[k]
                 elif op == OR:
                     for k in range(count):
                         target[k] = max(first[k], second[k])
@@ -210,7 +216,7 @@ class LeafCode:
         self.rows: dict[tuple[int, int, int, int], int] = {}
         self.constants: dict[float, int] = {}
         self.measurements: dict[Measurement, int] = {}
-        self.signals: dict[str, int] = {}
+        self.signals: dict[Signal, int] = {}
         self.closest: dict[ClosestPair, int] = {}
         self.members: dict[Membership, int] = {}
 
@@ -250,8 +256,12 @@ class LeafCode:
         match expression:
             case Number():
                 return self._constant(expression.value)
+            case Rate():
+                change = self._expression(change_of(expression), bindings)
+                step = self._row(SIGNAL, self.signals.setdefault(STEP, len(self.signals)))
+                return self._row(QUOTIENT, change, step)
             case Signal():
-                return self._row(SIGNAL, self.signals.setdefault(expression.name, len(self.signals)))
+                return self._row(SIGNAL, self.signals.setdefault(expression, len(self.signals)))
             case Sum():
                 first = self._expression(expression.first, bindings)
                 return self._row(ADD, first, self._expression(expression.second, bindings))
@@ -259,7 +269,7 @@ class LeafCode:
                 return self._row(NEGATE, self._expression(expression.operand, bindings))
             case Equality(signal, value):
                 constant = self.constants.setdefault(value, len(self.constants))
-                return self._row(EQUAL, self.signals.setdefault(signal.name, len(self.signals)), constant)
+                return self._row(EQUAL, self.signals.setdefault(signal, len(self.signals)), constant)
             case Scaled(operand, divisor):
                 constant = self.constants.setdefault(divisor, len(self.constants))
                 return self._row(DIVIDE, self._expression(operand, bindings), constant)

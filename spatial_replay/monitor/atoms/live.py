@@ -25,7 +25,7 @@ from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats, Integers, starts_from_counts
 from spatial_replay.geometry.footprint import FootprintBatch, TrackedObject, centre_object
 from spatial_replay.geometry.measure import QUANTITY_CODES
-from spatial_replay.monitor.atoms.delays import NO_DELAY, RecentSamples, iter_delays
+from spatial_replay.monitor.atoms.delays import NO_DELAY, PREVIOUS, RecentSamples, iter_delays
 from spatial_replay.monitor.atoms.instructions import LeafCode
 from spatial_replay.monitor.atoms.live_kernel import ABSENT, PackedPlan, PlanArrays, leaves_of_sample
 from spatial_replay.monitor.atoms.live_rows import (
@@ -38,15 +38,20 @@ from spatial_replay.monitor.atoms.measurements import quantity_of
 from spatial_replay.monitor.atoms.terms import footprint_from_outline
 from spatial_replay.spec.formula import (
     ANY_CLASS,
+    STEP,
     Centre,
+    ComputedSignal,
     Enlarged,
     Group,
     Misalignment,
     Outline,
+    PreviousSignal,
     RegionName,
+    Signal,
     Term,
     TrackedName,
 )
+from spatial_replay.spec.relations import computed_signal
 from spatial_replay.spec.walks import base_of, is_centre, iter_terms, measured_terms
 from spatial_replay.trace.sample import Sample
 
@@ -73,6 +78,7 @@ class LeafPlan:
         self.placeholders = placeholders
         self._places = tuple(rows.places)
         self._signals = tuple(code.signals)
+        self._previous = frame.delays.index(PREVIOUS) if PREVIOUS in frame.delays else 0
         self._has_classes = bool(frame.classes)
         count = len(frame.delays) + len(self._signals) + (len(self._places) if self._has_classes else 0)
         self._pack = Struct(f"={count}d").pack
@@ -96,8 +102,8 @@ class LeafPlan:
         numbers = [0.0]
         if len(samples) > 1:
             numbers = [0.0 if sample else ABSENT for sample in samples]
-        for name in self._signals:
-            numbers.append(newest.signals.get(name, nan))
+        for signal in self._signals:
+            numbers.append(_signal(signal, newest, samples[self._previous]))
         if not self._places:
             return self._pack(*numbers)
         packed = [b""]
@@ -118,6 +124,17 @@ class LeafPlan:
                 numbers.append(codes[unknown[name]] if name in unknown else 0.0)
         packed[0] = self._pack(*numbers)
         return b"".join(packed)
+
+
+def _signal(signal: Signal, sample: Sample, previous: Sample | None) -> float:
+    """Return what `TraceScene.signal` does of one sample."""
+    if signal == STEP:
+        return nan if previous is None else (sample.time_ns - previous.time_ns) / 1e9
+    if isinstance(signal, PreviousSignal):
+        return nan if previous is None else _signal(signal.of, previous, None)
+    if isinstance(signal, ComputedSignal):
+        return computed_signal(signal, sample)
+    return sample.signals.get(signal.name, nan)
 
 
 _NOTHING_THERE: Callable[[str], None] = MappingProxyType[str, None]({}).get

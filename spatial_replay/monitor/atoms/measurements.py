@@ -234,13 +234,8 @@ class _Code:
         code = LeafCode(scene)
         self._outputs = np.array(code.add_leaves(leaves, bindings), np.int64)
         self.measurements, self.closest = list(code.measurements), list(code.closest)
-        missing = np.full(len(scene), np.nan)
-        self._signals = np.array(
-            [
-                scene.trace.signals[name][scene.skip :] if name in scene.trace.signals else missing
-                for name in code.signals
-            ]
-        ).reshape(len(code.signals), len(scene))
+        self._signals = np.array([scene.signal(each) for each in code.signals])
+        self._signals = self._signals.reshape(len(code.signals), len(scene))
         members = np.array([_flags(scene, each) for each in code.members], np.int8)
         self._members = members.reshape(len(code.members), len(scene))
         self._rows = np.array(list(code.rows), np.int64).reshape(len(code.rows), 4)

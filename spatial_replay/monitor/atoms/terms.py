@@ -14,16 +14,21 @@ from spatial_replay.geometry.footprint import Footprint, FootprintBatch, centres
 from spatial_replay.geometry.measure import Operand
 from spatial_replay.spec.formula import (
     ANY_CLASS,
+    STEP,
     Centre,
+    ComputedSignal,
     Earlier,
     Enlarged,
     Group,
     Outline,
+    PreviousSignal,
     RegionName,
+    Signal,
     Term,
     TrackedName,
     Variable,
 )
+from spatial_replay.spec.relations import computed_signal
 from spatial_replay.trace.trace import ABSENT, Trace
 
 Bindings = Mapping[str, TrackedName]
@@ -100,6 +105,20 @@ class TraceScene:
         return FootprintBatch.concatenate(
             [self.trace.footprints, FootprintBatch.from_footprints(regions, heights)]
         )
+
+    def signal(self, signal: Signal) -> Floats:
+        """Return a signal, (T,), NaN where it is missing."""
+        return self._signal(signal)[self.skip :]
+
+    def _signal(self, signal: Signal) -> Floats:
+        times_ns = self.trace.times_ns
+        if signal == STEP:
+            return np.append(np.nan, np.diff(times_ns) / 1e9)[: len(times_ns)]
+        if isinstance(signal, PreviousSignal):
+            return np.append(np.nan, self._signal(signal.of))[:-1]
+        if isinstance(signal, ComputedSignal):
+            return np.array([computed_signal(signal, sample) for sample in self.trace.samples()], np.float64)
+        return self.trace.signals.get(signal.name, np.full(len(times_ns), np.nan))
 
     def resolve(self, term: Term) -> ResolvedTerm:
         """Resolve a term without variables (see `bind`)."""

@@ -34,9 +34,11 @@ from spatial_replay.spec.formula import (
     Misalignment,
     Negative,
     Number,
+    PreviousSignal,
     Projection,
     Protrusion,
     Quantified,
+    Rate,
     Scaled,
     Signal,
     SignedDistance,
@@ -46,7 +48,9 @@ from spatial_replay.spec.formula import (
 )
 from spatial_replay.spec.walks import (
     base_of,
+    change_of,
     iter_expressions,
+    logged_signals,
     measured_terms,
     standing,
     substitute,
@@ -66,14 +70,18 @@ def unknowns_of(scene: TraceScene, atom: Atom) -> tuple[str, ...]:
 
 def _reasons(scene: TraceScene, part: Expression) -> Iterator[str]:
     match part:
+        case Rate():
+            for inner in iter_expressions(change_of(part)):
+                yield from _reasons(scene, inner)
         case Signal() | Equality():
-            name, compared = (part.name, 0.0) if isinstance(part, Signal) else (part.signal.name, part.value)
-            values = scene.trace.signals.get(name)
-            if values is None:
+            signal, compared = (part, 0.0) if isinstance(part, Signal) else (part.signal, part.value)
+            name, value = signal.name, scene.signal(signal)[0]
+            if any(each not in scene.trace.signals for each in logged_signals(signal)):
                 yield f"there is no signal {name!r}"
-            elif not np.isfinite(values[scene.skip]):
-                yield f"signal {name!r} has no finite value in the sample"
-            elif is_text_number(compared) != is_text_number(values[scene.skip]):
+            elif not np.isfinite(value):
+                before = " before" if isinstance(part, PreviousSignal) else ""
+                yield f"signal {name!r} has no finite value in the sample{before}"
+            elif is_text_number(compared) != is_text_number(value):
                 kinds = "a text, not a number; `names` of its mapping give texts numbers"
                 if is_text_number(compared):
                     kinds = "a number, not a text; leave out `names` of its mapping to compare texts"
@@ -137,7 +145,7 @@ class Measured:
     """A number that decides an atom.
 
     Attributes:
-        quantity: "signed_distance", "protrusion", "max_x", …, "misalignment", "signal".
+        quantity: "signed_distance", "protrusion", "max_x", …, "misalignment", "signal", "speed", "rate".
         names: the objects or regions measured, each with its delay and enlargement; or the signal.
         value: the number.
         spread: its uncertainty, from that of the objects.
@@ -287,8 +295,12 @@ def _as_atom(expression: Expression) -> Atom:
 def _measured(scene: TraceScene, part: Expression) -> Measured:
     """Return a signal or a measurement of single objects: of groups, the members that attain it."""
     match part:
+        case Rate():
+            low, high = _intervals(scene, [_as_atom(part)])[0]
+            names = tuple(map(format_term, part.terms)) or ((part.signal or part).name,)
+            return Measured("speed" if part.terms else "rate", names, (low + high) / 2, (high - low) / 2)
         case Signal():
-            return Measured("signal", (part.name,), float(scene.trace.signals[part.name][scene.skip]))
+            return Measured("signal", (part.name,), float(scene.signal(part)[0]))
         case Misalignment():
             single: Measurement = part
         case SignedDistance():

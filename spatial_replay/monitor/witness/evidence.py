@@ -23,11 +23,10 @@ from spatial_replay.spec.formula import (
     Group,
     Outline,
     Quantified,
-    Signal,
     Term,
     TrackedName,
 )
-from spatial_replay.spec.walks import base_of, iter_expressions, iter_formulas, substitute
+from spatial_replay.spec.walks import base_of, iter_formulas, logged_signals, substitute
 from spatial_replay.trace.trace import Trace, window_of
 
 
@@ -173,8 +172,7 @@ class NamedPart(NamedTuple):
 def named_parts(formula: Formula) -> list[NamedPart]:
     """Return the signals and objects that a formula names, each once."""
     atoms = [each for each in iter_formulas(formula) if isinstance(each, Atom)]
-    expressions = [each for atom in atoms for each in iter_expressions(atom.expression)]
-    found = [NamedPart(each.name, True) for each in expressions if isinstance(each, Signal)]
+    found = [NamedPart(name, True) for atom in atoms for name in logged_signals(atom.expression)]
     terms = [term for atom in atoms for term in atom.terms]
     found += [NamedPart(name, False) for term in terms for name in _object_names(base_of(term))]
     return list(dict.fromkeys(found))
