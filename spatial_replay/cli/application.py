@@ -75,6 +75,9 @@ COMMANDS: dict[str, str] = {
 }
 """Name and summary, also of commands that the help leaves out; `cli/NAME.py` defines the command NAME."""
 
+FAMILIES = {"results": "batch", "doctor": "check", "learn": "tune"}
+"""Commands that share the module of another one."""
+
 
 class LazyCommands(click.Group):
     """A group of the commands in `COMMANDS`."""
@@ -93,9 +96,10 @@ class LazyCommands(click.Group):
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         if cmd_name not in COMMANDS:
             return None
-        command = getattr(import_module(f"spatial_replay.cli.{cmd_name}"), cmd_name)
+        module = import_module(f"spatial_replay.cli.{FAMILIES.get(cmd_name, cmd_name)}")
+        command = getattr(module, cmd_name)
         if not isinstance(command, click.Command):
-            raise TypeError(f"spatial_replay.cli.{cmd_name}.{cmd_name} is not a command: {command!r}")
+            raise TypeError(f"{module.__name__}.{cmd_name} is not a command: {command!r}")
         return command
 
     def resolve_command(

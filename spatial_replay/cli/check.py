@@ -1,17 +1,20 @@
-"""`spatial-replay check`: parse a specification; print its tree, or write its automaton."""
+"""`spatial-replay check` and `doctor`: faults of a specification, its tree, and its automaton."""
 
 from __future__ import annotations
 
+import re
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias
 from urllib.parse import quote
 
 import click
 
 from spatial_replay import __version__
+from spatial_replay.cli.application import ExitCode
 from spatial_replay.cli.options import (
     OTHER_READING,
     JsonCommand,
@@ -24,7 +27,7 @@ from spatial_replay.cli.options import (
     strict_names_option,
 )
 from spatial_replay.cli.terminal import PROGRAM, progress, show, show_diagnostics, show_json, warn
-from spatial_replay.errors import Diagnosis, NoAutomatonError, SpecificationError, UsageError
+from spatial_replay.errors import Diagnosis, NoAutomatonError, OutputError, SpecificationError, UsageError
 from spatial_replay.logs.remote import LogFile, local_files
 from spatial_replay.spec import format_formula
 from spatial_replay.spec.diagnostics import Diagnostic
@@ -36,6 +39,7 @@ from spatial_replay.text import counted, counted_from, json_number
 if TYPE_CHECKING:
     from spatial_replay.logs.read_options import Reading
     from spatial_replay.monitor.plausibility import ThresholdRange
+    from spatial_replay.sanity.examine import Examination
 
 
 Form: TypeAlias = Literal["text", "github", "sarif"]
@@ -424,3 +428,82 @@ def _print_automata(specification: Specification, names: Sequence[str], hz: floa
             faults.append(str(error))
     if faults:
         raise NoAutomatonError("\n".join(faults))
+
+
+_UNSAFE: Final = re.compile(r"[^\w-]+")
+
+
+@click.command(cls=JsonCommand)
+@click.argument("specification", metavar="SPEC", type=LogPath())
+@constants_option
+@profile_option
+@click.option(
+    "-o",
+    "--output",
+    metavar="DIR/",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Folder for the shortest runs, as tracks (JSONL).",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of text.")
+@finding_format_option
+def doctor(
+    specification: LogFile,
+    constants: Mapping[str, float | str],
+    profile: str | None,
+    output: Path | None,
+    as_json: bool,
+    form: Form,
+) -> int:
+    """Find what is wrong with a specification before any run.
+
+    Finds specs that no run can satisfy, that every run satisfies, that follow from another one or contradict
+    it. It also finds implications whose antecedent never holds. It uses the automaton and laws of geometry.
+    For each result prints the shortest run that satisfies it, and the shortest that violates it. Exits with 1
+    if it finds something, otherwise with 0.
+
+    \b
+    Examples:
+      spatial-replay doctor blocks.spatial
+      spatial-replay doctor blocks.spatial -o examples
+      spatial-replay doctor blocks.spatial --format github
+    """
+    # imported here so that --help stays fast
+    from spatial_replay.sanity import doctor as examine
+
+    if form != "text" and as_json:
+        raise UsageError(f"--format {form} writes to standard output; remove --json")
+    shown = str(specification)
+    with findings_of(shown, form):
+        (parsed,) = load_spec_options([specification], profile, constants)
+    found = examine(parsed, examples=form == "text" or output is not None)
+    files = {} if output is None else _write(found, output, local_files([specification]))
+    show_findings(form, shown, [each.diagnostic for each in found.findings])
+    if as_json:
+        show_json({"file": parsed.filename, **found.document})
+    elif form == "text":
+        show(*found.lines(files))
+    return ExitCode.VIOLATED if found.findings else ExitCode.SATISFIED
+
+
+def _write(found: Examination, output: Path, inputs: list[Path]) -> dict[tuple[str, str], Path]:
+    """Write the samples of all examples; return the files."""
+    from spatial_replay.logs.output_file import replacing
+
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(f"{output}: cannot be made: {error.strerror}; choose another folder") from error
+    files: dict[tuple[str, str], Path] = {}
+    stems: Counter[str] = Counter()
+    for spec in found.specs:
+        stem = _UNSAFE.sub("-", spec.name).strip("-") or "spec"
+        stems[stem] += 1
+        if stems[stem] > 1:
+            stem += f"-{stems[stem]}"
+        for example in (spec.satisfied, spec.violated):
+            if example is not None and example.samples is not None:
+                path = output / f"{stem}.{example.verdict}.jsonl"
+                with replacing(path, inputs) as stream:
+                    stream.write(example.jsonl.encode())
+                files[spec.name, example.verdict] = path
+    return files
