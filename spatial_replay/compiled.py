@@ -42,7 +42,7 @@ _CALL: Final = 32
 
 def kernel(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
     """Return a function of arrays and numbers that may run as machine code."""
-    return _Kernel(function, {})
+    return _Kernel(function, {"no_cfunc_wrapper": True})
 
 
 def long_kernel(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
@@ -50,7 +50,7 @@ def long_kernel(function: Callable[_Arguments, _Result]) -> Callable[_Arguments,
 
     Not for short calls: each would hand the interpreter to a busy thread, which keeps it for milliseconds.
     """
-    return _Kernel(function, {"nogil": True}, times=_LONG)
+    return _Kernel(function, {"nogil": True, "no_cfunc_wrapper": True}, times=_LONG)
 
 
 def elementwise(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:

@@ -38,9 +38,7 @@ NODE_CODE, NODE_A, NODE_B, NODE_WEAK, NODE_UNIT, NODE_LOW, NODE_HIGH = range(7)
 NODE_VARIABLE, NODE_TABLE, NODE_DEPENDS = 7, 8, 9  # the first two -1 for none
 NODE_TIMED = 10  # the number, in its part, of a window or shift in seconds, -1 for none
 NODE_CUTS = 11  # whether its windows cut a part's bound short (see `PART_IS_CUT`)
-# of a window ahead, a bit for each of `OPEN_END`, …: whether what it holds can only become better
-NODE_GROWS = 12
-NODE_WIDTH = 13
+NODE_WIDTH = 13  # a part's own row is longer than those of its nodes
 # codes of parts' nodes
 LITERAL = 0  # signal a
 PART_AND, PART_OR = 2, 3

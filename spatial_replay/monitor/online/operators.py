@@ -44,8 +44,9 @@ def window_of(bound: Bound | None) -> tuple[int, int, int | None]:
 
 
 def array_of_rows(rows: Sequence[Row], width: int) -> Integers:
-    """Return rows as an array (R, width), also for R = 0."""
-    return np.array(rows, np.int64).reshape(len(rows), width)
+    """Return rows as an array (R, width), also for R = 0; zeros follow a shorter row."""
+    padded = [(*row, *(0,) * (width - len(row))) for row in rows]
+    return np.array(padded, np.int64).reshape(len(rows), width)
 
 
 def _operands_of_row(row: Row) -> tuple[int, ...]:

@@ -32,7 +32,6 @@ from spatial_replay.monitor.online.rewriting import after_lasting, at_last, look
 from spatial_replay.monitor.online.root_bounds import (
     NEVER,
     cutting_windows,
-    growing_windows,
     is_monotone,
     known_bounds,
     root_end,
@@ -131,7 +130,7 @@ def _joined_rows(
     rows[reports_at:operands_at, : codes.REPORT_WIDTH] = reports
     rows[operands_at:first].reshape(-1)[: len(operands)] = operands
     for number, own in enumerate(parts):
-        rows[first : first + len(own) - 1] = own[:-1]
+        rows[first : first + len(own) - 1] = array_of_rows(own[:-1], width)
         rows[parts_at + number] = own[-1]
         rows[parts_at + number, [codes.PART_FIRST, codes.PART_END]] = first, first + len(own) - 1
         first += len(own) - 1
@@ -192,11 +191,11 @@ class _Parts:
 
 def _with_times(nodes: tuple[Row, ...]) -> Iterator[Row]:
     """Yield rows with the numbers of their windows in seconds, and what is known of these windows."""
-    timed, cutting, grows = 0, cutting_windows(nodes) or set(), growing_windows(nodes)
+    timed, cutting = 0, cutting_windows(nodes) or set()
     for number, row in enumerate(nodes):
         code, unit = row[codes.NODE_CODE], row[codes.NODE_UNIT]
         is_timed = unit != codes.SAMPLES and code in (*codes.AHEAD_OF, *codes.PAST_WINDOWS, codes.PAST_DELAY)
-        yield (*row, timed if is_timed else NOTHING, int(number in cutting), grows[number])
+        yield (*row, timed if is_timed else NOTHING, int(number in cutting))
         timed += is_timed
 
 

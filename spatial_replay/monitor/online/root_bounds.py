@@ -145,23 +145,6 @@ def directions(rows: tuple[Row, ...]) -> list[tuple[bool, bool]]:
     return found
 
 
-def growing_windows(rows: tuple[Row, ...]) -> list[int]:
-    """Return for each node, a bit for each of `OPEN_END`, …, whether it is a window of what can only improve.
-
-    With all that is still to come at its least, each sample can only raise a number, or lower it with all at
-    its greatest.
-    """
-    grows = list[int]()
-    for (code, *_), (rises, falls) in zip(rows, directions(rows), strict=True):
-        if code == codes.PART_WINDOW_MAX:
-            grows.append(rises << codes.OPEN_END | 1 << codes.OPEN_LOW)
-        else:
-            grows.append(
-                falls << codes.OPEN_END | 1 << codes.OPEN_HIGH if code == codes.PART_WINDOW_MIN else 0
-            )
-    return grows
-
-
 def is_monotone(rows: tuple[Row, ...]) -> bool:
     """Return whether what a root joins by the minimum never falls, or the other way round."""
     way = _direction_of(rows)

@@ -57,20 +57,9 @@ def run_samples(
             table = 2 * signals + rows[part, codes.PART_TABLE_START]
             for channel in range(channels if rows[part, codes.PART_KIND] == codes.TABLE else 0):
                 says = run_table(
-                    rows,
-                    part,
-                    history,
-                    channel,
-                    times,
-                    memory,
-                    table,
-                    work,
-                    top,
-                    position,
-                    begin,
-                    count,
+                    rows, part, history, channel, times, memory, table, work, top, position, begin, count,
                     start_ns,
-                )
+                )  # fmt: skip
                 for mode in range(3):
                     row = said_in(mode, channel, channels)
                     if row >= 0:
@@ -87,24 +76,15 @@ class _OpenPart:
     """State of `run_windows` between samples, for one part in one channel."""
 
     def __init__(self, rows: Integers, room: int) -> None:
-        nodes, part = len(rows) - 1, rows[-1]
+        nodes, part, timed = len(rows) - 1, rows[-1], int(rows[:-1, codes.NODE_TIMED].max()) + 1
         variables, count = int(part[codes.PART_VARIABLES]), int(part[codes.PART_TABLES])
-        self.rows = rows
+        self.rows, self._nodes = rows, nodes
         self.tables = np.zeros((2 * count + 2, max(1 << variables, count)))
-        self._timed = int(rows[:-1, codes.NODE_TIMED].max()) + 1
-        self._nodes = nodes
-        self.state = self._state(room)
+        self.columns = np.empty((windows.EXTRA * nodes + windows.EXTRA_ROWS, room))
+        width = max(room, nodes, windows.NEXT + 2 * timed)
+        self.state = np.zeros((windows.STARTS + 2 * timed, width), np.int64)
+        self.state[windows.HEAD, windows.KNOWN : windows.KNOWN + windows.SETS] = _UNKNOWN
         self.state[windows.STATE, :nodes] = -1
-        self.columns = self._columns(room)
-
-    def _state(self, room: int) -> Integers:
-        width = max(room, self._nodes, windows.NEXT + 2 * self._timed)
-        state = np.zeros((windows.STARTS + 2 * self._timed, width), np.int64)
-        state[windows.HEAD, windows.KNOWN : windows.KNOWN + windows.SETS] = _UNKNOWN
-        return state
-
-    def _columns(self, room: int) -> Floats:
-        return np.empty(((windows.SETS + 1) * self._nodes + windows.EXTRA_ROWS, room))
 
     def copy(self, room: int) -> _OpenPart:
         """Return a part of the same state, with columns that are not known yet."""
@@ -131,15 +111,12 @@ class _OpenPart:
     @property
     def kept_from(self) -> int | None:
         """The first position that it may still look at; None if there is none."""
-        is_begun, corners = (
+        is_begun, last = (
             self.state[windows.HEAD, windows.IS_BEGUN],
-            1 << self.rows[-1, codes.PART_VARIABLES],
+            (1 << self.rows[-1, codes.PART_VARIABLES]) - 1,
         )
-        if (
-            is_begun
-            and self.tables[0, 0] == self.tables[0, corners - 1]
-            and not self.rows[-1, codes.PART_HAS_NOW]
-        ):
+        is_constant = is_begun and self.tables[0, 0] == self.tables[0, last]
+        if is_constant and not self.rows[-1, codes.PART_HAS_NOW]:
             return None
         return int(self.state[windows.LOWS, : self._nodes].min())
 
@@ -218,7 +195,8 @@ class OnlineRun:
         series, done = empty((len(self._program.reports), SERIES, len(times_ns))), 0
         while done < len(times_ns):
             count = self._make_room(min(self._tile, len(times_ns) - done))
-            series[:, :, done : done + count] = self._add(leaves, 0, times_ns[done : done + count], done)
+            self._add(leaves, 0, times_ns[done : done + count], done, count)
+            series[:, :, done : done + count] = self._series[:, :, :count]
             done += count
         return series
 
@@ -241,35 +219,31 @@ class OnlineRun:
         Args:
             leaves: (C, A, 1), of which those of the program begin at `first_leaf`.
         """
-        if len(leaves) > self._channels:
+        if len(leaves) != self._channels:
             self.widen(len(leaves))
-        elif len(leaves) < self._channels:
             leaves = np.ascontiguousarray(in_channels(leaves, self._channels))
         self._make_room(1)
-        numbers = self._add(leaves, first_leaf, np.array([time_ns]), 0)[:, :, 0].copy()
+        self._add(leaves, first_leaf, time_ns, 0, 1)
+        numbers = self._series[:, :, 0].copy()
         numbers.flags.writeable = False
         return numbers
 
-    def _add(self, leaves: Floats, first_leaf: int, times_ns: Integers, t: int) -> Floats:
+    def _add(self, leaves: Floats, first_leaf: int, times_ns: Integers | int, t: int, count: int) -> None:
         """Add samples for which there is room, of leaves in as many channels as the run has.
 
         Args:
             first_leaf: where the leaves of the program begin.
             times_ns: of the samples; their leaves stand from `t` on.
-
-        Returns:
-            (N, 4, T): value, now, lower and upper of each node, until more samples are added.
         """
-        count = len(times_ns)
-        if self._position == 0:
-            self._start_ns = int(times_ns[0])
-            for _, parts in self._open:
-                for part in parts:
-                    part.state[windows.HEAD, windows.START_NS] = self._start_ns
         if not self._program.keeps_history:
             self._offset = self._position
         begin = self._position - self._offset
         self._stamps[begin : begin + count] = times_ns
+        if self._position == 0:
+            self._start_ns = int(self._stamps[begin])
+            for _, parts in self._open:
+                for part in parts:
+                    part.state[windows.HEAD, windows.START_NS] = self._start_ns
         arrays = self._program.rows, leaves, self._history, self._times, self._memory, self._work
         numbers = first_leaf, t, count, self._position, begin, self._start_ns
         if not self._open:
@@ -282,7 +256,6 @@ class OnlineRun:
             run_samples(*arrays, *numbers, FINISH)
         self._position += count
         self._newest = count - 1, [0, 0] if self._channels == 1 else [6, 7]
-        return self._series[:, :, :count]
 
     def _run_open(self, number: int, channel: int, part: _OpenPart, begin: int, count: int) -> None:
         """Run a part in one channel, and enter what it says."""
@@ -292,14 +265,15 @@ class OnlineRun:
             part.rows, self._channel_history[channel], self._stamps, part.columns, part.state, part.tables,
             begin, count, bounds,
         )  # fmt: skip
-        says, rows = part.columns[-4:, :count], self._work[NUMBERS * number : NUMBERS * (number + 1), :count]
+        says = part.columns[-SERIES:, :count]
+        rows = self._work[NUMBERS * number : NUMBERS * (number + 1), :count]
         if channels == 1:
-            rows[[0, 2, 3, 1]] = says
+            rows[:SERIES] = says
             return
         if channel < 2:
-            rows[is_high], rows[2 + is_high] = says[0], says[3]
+            rows[is_high], rows[2 + is_high] = says[0], says[windows.SAID_NOW]
         if bounds:
-            rows[4 + is_high], rows[6 + is_high] = says[1 + is_high], says[0]
+            rows[4 + is_high], rows[6 + is_high] = says[2 + is_high], says[0]
 
     def _see_history(self) -> None:
         """Take views of what the recent samples are."""

@@ -21,7 +21,7 @@ VALUES, FRESH, POINT, SAYS = range(4)
 EXTRA_ROWS = 6
 
 
-@piece
+@inlined
 def read_table(tables: Floats, row: int, first: int, variables: int, points: Floats, point: int) -> float:
     """Read a table at a point: walk its corners in descending order of the coordinates.
 
@@ -29,8 +29,6 @@ def read_table(tables: Floats, row: int, first: int, variables: int, points: Flo
         tables, row, first: where the table begins.
         points, point: the row of the point.
     """
-    if variables == 1:
-        return float(max(tables[row, first], min(points[point, 0], tables[row, first + 1])))
     # a monotone lattice polynomial is the maximum over the chain of corners of min(coordinate, entry)
     result, corner = tables[row, first], 0
     for _ in range(variables):

@@ -2,7 +2,8 @@
 
 A part runs in one channel at a time. Each of its nodes is a row of numbers, its *column*, one number for each
 recent sample. A sample changes a column only where a window opens or closes with it, or where an operand has
-changed. Columns are updated operands first, and each says from where on it has changed.
+changed. Columns are updated operands first, and each says between which positions it
+has changed.
 
 Positions of the root whose windows have all closed are absorbed into a table (see `tables`). It belongs to
 the *base*, the first position of the root that is not absorbed. It gives the root's value at the first sample
@@ -33,22 +34,25 @@ _NEVER = 1 << 62
 
 SETS = 3
 """`OPEN_END`, `OPEN_LOW` and `OPEN_HIGH`; the columns of a corner of the table come after those."""
+SEEN = SETS + 1
+"""Sets of columns before the copies that windows keep of their operands' columns."""
+EXTRA = SEEN + SETS
+"""Sets of columns before the extra rows."""
 # rows of columns after those of the nodes: what blocks are joined to, room for `_slide`, and what a part says
 JOINED, BEFORE, SAYS = 0, SETS, SETS + 1
-SAID_NOW = 3
-"""The row of what a part is at the newest sample; those before it are what it is at the first one, by set."""
+SAID_NOW = 1
+"""The row of a part's value at the newest sample, after its value at the first one and before its bounds."""
 EXTRA_ROWS = SETS + 5
 
-# rows of the state: the first holds single numbers, the others a number for each node
-HEAD, LOWS, LOW, HIGH, PLAIN, CHANGED, BOUNDARY, STATE = range(8)
-STARTS = 8  # and then, of each window in seconds: where it starts at each position, and what comes after it
+# rows of the state: the first holds single numbers, the others a number for each node, which has changed from
+# CHANGED to before CHANGED_END, and at the newest sample
+HEAD, LOWS, LOW, HIGH, PLAIN, CHANGED, CHANGED_END, BOUNDARY, STATE = range(9)
+STARTS = 9  # and then, of each window in seconds: where it starts at each position, and what comes after it
 # columns of the first row: how many samples are forgotten, the time of the first one, the base, whether
 # anything is absorbed, how many samples windows in seconds know
 OFFSET, START_NS, BASE, IS_BEGUN, ENTERED = range(5)
 KNOWN = 5  # for each set, up to where its columns are known
-UNJOINED = KNOWN + SETS  # for each set, the first position that its blocks do not know
-NEXT = UNJOINED + SETS  # of each window in seconds, the next positions to begin and to close
-PERSISTENT = ENTERED
+NEXT = KNOWN + SETS  # of each window in seconds, the next positions to begin and to close
 
 
 @inlined
@@ -72,33 +76,26 @@ def beyond(mode: int, weak: int) -> float:
     return np.inf if mode == codes.OPEN_HIGH else -np.inf
 
 
-@piece
+@inlined
 def extremum(is_greatest: bool, columns: Floats, row: int, begin: int, end: int, start: float) -> float:
     """Return the greatest or least of some numbers of a row and `start`.
 
     Eight are joined side by side: one after the other, each would wait for the one before.
     """
-    v0 = v1 = v2 = v3 = v4 = v5 = v6 = v7 = start
-    k = begin
-    if is_greatest:
-        while k + 8 <= end:
-            v0, v1 = max(v0, columns[row, k]), max(v1, columns[row, k + 1])
-            v2, v3 = max(v2, columns[row, k + 2]), max(v3, columns[row, k + 3])
-            v4, v5 = max(v4, columns[row, k + 4]), max(v5, columns[row, k + 5])
-            v6, v7 = max(v6, columns[row, k + 6]), max(v7, columns[row, k + 7])
-            k += 8
-        value = max(max(max(v0, v1), max(v2, v3)), max(max(v4, v5), max(v6, v7)))
-    else:
-        while k + 8 <= end:
-            v0, v1 = min(v0, columns[row, k]), min(v1, columns[row, k + 1])
-            v2, v3 = min(v2, columns[row, k + 2]), min(v3, columns[row, k + 3])
-            v4, v5 = min(v4, columns[row, k + 4]), min(v5, columns[row, k + 5])
-            v6, v7 = min(v6, columns[row, k + 6]), min(v7, columns[row, k + 7])
-            k += 8
-        value = min(min(min(v0, v1), min(v2, v3)), min(min(v4, v5), min(v6, v7)))
+    sign = 1.0 if is_greatest else -1.0
+    v0 = v1 = v2 = v3 = v4 = v5 = v6 = v7 = sign * start
+    # a compiler that knows that no position is negative joins several numbers at once
+    k = max(begin, 0)
+    while k + 8 <= end:
+        v0, v1 = max(v0, sign * columns[row, k]), max(v1, sign * columns[row, k + 1])
+        v2, v3 = max(v2, sign * columns[row, k + 2]), max(v3, sign * columns[row, k + 3])
+        v4, v5 = max(v4, sign * columns[row, k + 4]), max(v5, sign * columns[row, k + 5])
+        v6, v7 = max(v6, sign * columns[row, k + 6]), max(v7, sign * columns[row, k + 7])
+        k += 8
+    value = max(max(max(v0, v1), max(v2, v3)), max(max(v4, v5), max(v6, v7)))
     for i in range(k, end):
-        value = better(is_greatest, value, columns[row, i])
-    return value
+        value = max(value, sign * columns[row, i])
+    return sign * value
 
 
 # ------------------------------------------------------------------------------- where windows begin and end
@@ -207,7 +204,7 @@ def _enter(rows: Integers, stamps: Integers, state: Integers, last: int) -> None
 # -------------------------------------------------------------------------------------- columns of the nodes
 
 
-@piece
+@inlined
 def _slide(
     is_greatest: bool, window: tuple[bool, int, int, int, int], state: Integers, columns: Floats,
     child: int, own: int, before: int, begin: int, end: int, last: int,
@@ -248,25 +245,6 @@ def _slide(
 
 
 @inlined
-def _join_changes(
-    is_greatest: bool, window: tuple[bool, int, int, int, int], state: Integers, columns: Floats,
-    child: int, own: int, begin: int, end: int, changed: int, last: int,
-) -> int:  # fmt: skip
-    """Join what has changed, and can only have become better, with windows that hold all of it up to their
-    end; return the first that changes, last + 1 for none."""
-    value, first, at = -np.inf if is_greatest else np.inf, last + 1, changed
-    for position in range(begin, end):
-        after = _after(state, window, position, last)
-        while at < after:
-            value = better(is_greatest, value, columns[child, at])
-            at += 1
-        number = better(is_greatest, columns[own, position], value)
-        if number != columns[own, position]:
-            columns[own, position], first = number, min(first, position)
-    return first
-
-
-@inlined
 def _run_open(
     is_greatest: bool, window: tuple[bool, int, int, int, int], state: Integers, columns: Floats,
     child: int, own: int, begin: int, changed: int, last: int, is_fresh: bool,
@@ -275,75 +253,111 @@ def _run_open(
 
     The later one of these begins, the less it holds.
     """
-    value = -np.inf if is_greatest else np.inf
+    value, is_same = -np.inf if is_greatest else np.inf, False
     for position in range(begin if is_fresh else last, last + 1):
         columns[own, position] = value
     # after those that have begun
-    position = min(_first_starting(state, window, last + 1, last), last + 1)
-    if changed == last and not is_fresh:
-        value = columns[child, last]
-        for stride in (STRIDE, 1):
-            while position - stride >= begin and _outdoes(
-                is_greatest, value, columns[own, position - stride]
-            ):
-                for k in range(position - stride, position):
-                    columns[own, k] = value
-                position -= stride
-        return position
-    at = last + 1
-    while position > begin:
-        start = _start(state, window, position - 1, last)
-        while at > start:
-            at -= 1
-            value = better(is_greatest, value, columns[child, at])
-        if not is_fresh and start <= changed and columns[own, position - 1] == value:
-            break
-        position -= 1
-        columns[own, position] = value
+    position, at = min(_first_starting(state, window, last + 1, last), last + 1), last + 1
+    while position > begin and not is_same:
+        stop = max(position - STRIDE, begin)
+        first = _start(state, window, stop, last)
+        if at <= last and extremum(is_greatest, columns, child, first, at, value) == value:
+            # as much as the one after them
+            start = _start(state, window, position - 1, last)
+            is_same = not is_fresh and start <= changed and columns[own, position - 1] == value
+            for k in range(position if is_same else stop, position):
+                columns[own, k] = value
+            position, at = position if is_same else stop, first
+        while position > stop and not is_same:
+            start = _start(state, window, position - 1, last)
+            while at > start:
+                at -= 1
+                value = better(is_greatest, value, columns[child, at])
+            is_same = not is_fresh and start <= changed and columns[own, position - 1] == value
+            if not is_same:
+                position -= 1
+                columns[own, position] = value
     return position
 
 
 @inlined
+def _unchanged(
+    is_greatest: bool, columns: Floats, child: int, own: int, seen: int, changed: int, changed_end: int,
+    begin: int, end: int,
+) -> tuple[int, int]:  # fmt: skip
+    """Leave windows out that hold something better than all that has changed, before and after it did.
+
+    Returns:
+        The first of the windows at begin … end - 1 that may change, and what comes after the last one.
+    """
+    nothing = -np.inf if is_greatest else np.inf
+    if changed == changed_end:
+        begin = end
+    if begin < end:
+        before = extremum(is_greatest, columns, seen, changed, changed_end, nothing)
+        after = extremum(is_greatest, columns, child, changed, changed_end, nothing)
+        worst = extremum(not is_greatest, columns, own, begin, end, -nothing)
+        if _outdoes(is_greatest, worst, before) and not _outdoes(is_greatest, after, worst):
+            begin = end
+        while begin < end and (
+            _outdoes(is_greatest, columns[own, begin], before)
+            and not _outdoes(is_greatest, after, columns[own, begin])
+        ):
+            begin += 1
+        while begin < end and (
+            _outdoes(is_greatest, columns[own, end - 1], before)
+            and not _outdoes(is_greatest, after, columns[own, end - 1])
+        ):
+            end -= 1
+    return begin, end
+
+
+@inlined
 def _run_window(
-    rows: Integers, d: int, stamps: Integers, state: Integers, columns: Floats, child: int, own: int,
-    before: int,
-    mode: int, changed: int, last: int, is_fresh: bool,
-) -> int:  # fmt: skip
-    """Bring the column of a bounded operator up; return the first position that changes."""
-    code, window, lowest = rows[d, codes.NODE_CODE], window_of(rows, d), state[LOWS, d]
+    rows: Integers, d: int, stamps: Integers, state: Integers, columns: Floats, mode: int, last: int,
+    is_fresh: bool,
+) -> tuple[int, int]:  # fmt: skip
+    """Bring the column of a bounded operator up; return between which positions it changes."""
+    code, window, lowest, nodes = rows[d, codes.NODE_CODE], window_of(rows, d), state[LOWS, d], len(rows) - 1
+    child, own = mode * nodes + rows[d, codes.NODE_A], mode * nodes + d
+    changed, changed_end = state[CHANGED, rows[d, codes.NODE_A]], state[CHANGED_END, rows[d, codes.NODE_A]]
+    seen, is_ahead = SEEN * nodes + own, window[0]
     is_greatest = code in (codes.PART_WINDOW_MAX, codes.PAST_WINDOW_MAX)
-    begin = lowest if is_fresh else max(min(_first_holding(state, window, changed, last), last), lowest)
-    if not window[0]:
-        first = _slide(is_greatest, window, state, columns, child, own, before, begin, last + 1, last)
-        return lowest if is_fresh else min(first, last)
     # whether what may come outdoes all that an open window holds
-    is_decided = mode != codes.OPEN_END and (mode == codes.OPEN_HIGH) == is_greatest
+    is_decided = is_ahead and mode != codes.OPEN_END and (mode == codes.OPEN_HIGH) == is_greatest
+    tail = last + 1
     if is_decided:
-        tail = max(_first_unclosed(state, stamps, window, last), lowest)
-        if not is_fresh and last > 0:  # those that have closed with the last sample have changed, too
-            begin = min(begin, max(_first_holding(state, window, last - 1, last), lowest))
-    else:
-        tail = max(_first_holding(state, window, last, last), lowest)
-    tail, first = min(tail, last + 1), last
-    grown = begin
-    if not is_fresh and not is_decided and rows[d, codes.NODE_GROWS] >> mode & 1:
-        grown = min(max(_first_starting(state, window, changed + 1, last), begin), tail)
-        first = min(
-            first, _join_changes(is_greatest, window, state, columns, child, own, begin, grown, changed, last)
-        )
-    if grown < tail:
-        first = min(first, _slide(is_greatest, window, state, columns, child, own, before, grown, tail, last))
+        tail = _first_unclosed(state, stamps, window, last)
+    elif is_ahead:
+        tail = _first_holding(state, window, last, last)
+    begin, tail = lowest, min(max(tail, lowest), last + 1)
+    end = tail
+    if not is_fresh:
+        begin = min(max(min(_first_holding(state, window, changed, last), last), lowest), tail)
+    if is_ahead and not is_fresh:
+        closing = tail  # with the last sample, or not before it
+        if is_decided and last > 0:
+            closing = min(max(_first_holding(state, window, last - 1, last), lowest), tail)
+        end = min(_first_starting(state, window, changed_end, last), closing)
+        begin, end = _unchanged(is_greatest, columns, child, own, seen, changed, changed_end, begin, end)
+        if closing < tail:
+            begin, end = closing if begin >= end else begin, tail
+    if is_ahead:
+        for k in range(changed, changed_end):
+            columns[seen, k] = columns[child, k]
+        columns[seen, last] = columns[child, last]
+    first = _slide(is_greatest, window, state, columns, child, own, EXTRA * nodes + BEFORE, begin, end, last)
     if is_decided:
         for position in range(tail if is_fresh else max(tail, last), last + 1):
             columns[own, position] = beyond(mode, 0)
     elif tail <= last:
-        first = min(
-            first, _run_open(is_greatest, window, state, columns, child, own, tail, changed, last, is_fresh)
-        )
-    return lowest if is_fresh else first
+        opened = _run_open(is_greatest, window, state, columns, child, own, tail, changed, last, is_fresh)
+        if opened < last:
+            first, end = min(first, opened), last
+    return (lowest, last) if is_fresh else (first, min(end, last))
 
 
-@piece
+@inlined
 def _run_since(
     strong: bool, has_left: bool, columns: Floats, left: int, right: int, own: int, value: float, begin: int,
     last: int,
@@ -363,11 +377,11 @@ def _run_since(
 @inlined
 def _start_of_past(rows: Integers, d: int, state: Integers, tables: Floats) -> float:
     """Return the value that a since or trigger starts from, by its table, which ends at its state."""
-    if state[STATE, d] < 0:
-        return np.inf if rows[d, codes.NODE_WEAK] else -np.inf
-    part = len(rows) - 1
-    variables, point = rows[part, codes.PART_VARIABLES], 2 * rows[part, codes.PART_TABLES]
-    return read_table(tables, rows[d, codes.NODE_TABLE], 0, variables, tables, point)
+    value, part = beyond(codes.OPEN_END, rows[d, codes.NODE_WEAK]), len(rows) - 1
+    if state[STATE, d] >= 0:
+        variables, point = rows[part, codes.PART_VARIABLES], 2 * rows[part, codes.PART_TABLES]
+        value = read_table(tables, rows[d, codes.NODE_TABLE], 0, variables, tables, point)
+    return value
 
 
 @inlined
@@ -387,63 +401,52 @@ def has_column(rows: Integers) -> bool:
     return bool(rows[root, codes.NODE_A] >= 0 or rows[root, codes.NODE_VARIABLE] < 0)
 
 
-@piece
+@inlined
 def _bring_up(
     rows: Integers, history: Floats, stamps: Integers, columns: Floats, state: Integers, tables: Floats,
-    mode: int, last: int,
+    mode: int, last: int, is_fresh: bool,
 ) -> None:  # fmt: skip
     """Bring the columns of one set up to the last sample: by that one alone, or all of them."""
-    nodes = len(rows) - 1
-    is_fresh, first = state[HEAD, KNOWN + mode] != last - 1 or last == 0, mode * nodes
-    if state[HEAD, KNOWN + mode] == last:
-        return
-    state[HEAD, KNOWN + mode] = last
-    if is_fresh:
-        find_lows(rows, state, stamps, last)
-        state[HEAD, UNJOINED + mode] = 0
-    before = (SETS + 1) * nodes + BEFORE
+    nodes, first = len(rows) - 1, mode * (len(rows) - 1)
     for d in range(nodes if has_column(rows) else nodes - 1):
         code, a, b = rows[d, codes.NODE_CODE], rows[d, codes.NODE_A], rows[d, codes.NODE_B]
-        own, begin, lowest = first + d, last, state[LOWS, d]
+        own, begin, end, lowest = first + d, last, last, state[LOWS, d]
         if code == codes.LITERAL:
             begin = lowest if is_fresh else last
             for k in range(begin, last + 1):
                 columns[own, k] = history[a, k]
         elif code in (codes.PART_AND, codes.PART_OR):
-            left, right = first + a, first + b
+            is_or, left, right = code == codes.PART_OR, first + a, first + b
             begin = max(min(state[CHANGED, a], state[CHANGED, b]), lowest)
-            if code == codes.PART_OR:
-                while (
-                    begin < last
-                    and not is_fresh
-                    and max(columns[left, begin], columns[right, begin]) == columns[own, begin]
-                ):
-                    begin += 1
-                for k in range(begin, last + 1):
-                    columns[own, k] = max(columns[left, k], columns[right, k])
+            end = max(state[CHANGED_END, a], state[CHANGED_END, b])
+            while (
+                begin < end
+                and not is_fresh
+                and better(is_or, columns[left, begin], columns[right, begin]) == columns[own, begin]
+            ):
+                begin += 1
+            one, two, target = columns[left, begin:end], columns[right, begin:end], columns[own, begin:end]
+            if is_or:
+                for k in range(len(target)):
+                    target[k] = max(one[k], two[k])
             else:
-                while (
-                    begin < last
-                    and not is_fresh
-                    and min(columns[left, begin], columns[right, begin]) == columns[own, begin]
-                ):
-                    begin += 1
-                for k in range(begin, last + 1):
-                    columns[own, k] = min(columns[left, k], columns[right, k])
+                for k in range(len(target)):
+                    target[k] = min(one[k], two[k])
+            columns[own, last] = better(is_or, columns[left, last], columns[right, last])
         elif code in (codes.UNTIL, codes.RELEASE):
             left, right, strong = first + max(a, 0), first + b, code == codes.UNTIL
             changed, begin = state[CHANGED, b], last + 1
             if a >= 0:
                 changed = min(changed, state[CHANGED, a])
-            value = beyond(mode, rows[d, codes.NODE_WEAK])
-            while begin > lowest:
+            value, is_same = beyond(mode, rows[d, codes.NODE_WEAK]), False
+            while begin > lowest and not is_same:
                 if a >= 0:
                     value = better(not strong, columns[left, begin - 1], value)
                 value = better(strong, columns[right, begin - 1], value)
-                if not is_fresh and begin <= min(changed, last) and columns[own, begin - 1] == value:
-                    break
-                begin -= 1
-                columns[own, begin] = value
+                is_same = not is_fresh and begin <= min(changed, last) and columns[own, begin - 1] == value
+                if not is_same:
+                    begin -= 1
+                    columns[own, begin] = value
             if rows[d, codes.NODE_VARIABLE] >= 0:
                 _set_point(rows, d, state, columns, own, mode, last, tables)
         elif code in (codes.PAST_SINCE, codes.PAST_TRIGGER):
@@ -474,24 +477,17 @@ def _bring_up(
                 at = _start(state, window, k, last) if window[0] else _after(state, window, k, last) - 1
                 columns[own, k] = columns[child, at] if 0 <= at <= last else missing
         else:
-            begin = _run_window(
-                rows,
-                d,
-                stamps,
-                state,
-                columns,
-                first + a,
-                own,
-                before,
-                mode,
-                state[CHANGED, a],
-                last,
-                is_fresh,
-            )
-        state[CHANGED, d] = begin
+            begin, end = _run_window(rows, d, stamps, state, columns, mode, last, is_fresh)
+        state[CHANGED, d], state[CHANGED_END, d] = (begin, end) if begin < end else (last, last)
     if not has_column(rows):
-        changed = state[CHANGED, rows[nodes - 1, codes.NODE_B]]
-        state[HEAD, UNJOINED + mode] = min(state[HEAD, UNJOINED + mode], changed)
+        body = rows[nodes - 1, codes.NODE_B]
+        is_until, joined = rows[nodes - 1, codes.NODE_CODE] == codes.UNTIL, EXTRA * nodes + JOINED + mode
+        nothing, complete = -np.inf if is_until else np.inf, (last + 1) // BLOCK
+        for k in range(state[CHANGED, body] // BLOCK, complete):
+            if k == complete - 1 or k * BLOCK < state[CHANGED_END, body]:
+                columns[joined, k] = extremum(
+                    is_until, columns, first + body, k * BLOCK, (k + 1) * BLOCK, nothing
+                )
 
 
 # --------------------------------------------------------------------------------------- what a part says
@@ -499,22 +495,20 @@ def _bring_up(
 
 @inlined
 def _joined(
-    is_until: bool, columns: Floats, body: int, joined: int, unjoined: int, value: float, begin: int, end: int
+    is_until: bool, columns: Floats, body: int, joined: int, value: float, begin: int, end: int
 ) -> float:
-    """Join a number with those at begin … end - 1, block by block; blocks are known before `unjoined`."""
+    """Join a number with those at begin … end - 1, most of which are joined in blocks."""
     whole, after = begin // BLOCK + 1, end // BLOCK
-    nothing = -np.inf if is_until else np.inf
-    for k in range(max(unjoined // BLOCK, whole), after):
-        columns[joined, k] = extremum(is_until, columns, body, k * BLOCK, (k + 1) * BLOCK, nothing)
-    value = extremum(is_until, columns, body, begin, whole * BLOCK, value)
+    begun = min(whole * BLOCK, end)
+    value = extremum(is_until, columns, body, begin, begun, value)
     value = extremum(is_until, columns, joined, whole, after, value)
-    return extremum(is_until, columns, body, after * BLOCK, end, value)
+    return extremum(is_until, columns, body, max(begun, after * BLOCK), end, value)
 
 
-@piece
+@inlined
 def _at_first(
-    rows: Integers, stamps: Integers, columns: Floats, state: Integers, tables: Floats, mode: int, end: int,
-    last: int, own_set: int,
+    rows: Integers, columns: Floats, state: Integers, tables: Floats, mode: int, own_set: int, end: int,
+    last: int,
 ) -> float:  # fmt: skip
     """Return what the root is at the first sample, by the columns of a set.
 
@@ -525,64 +519,46 @@ def _at_first(
     nodes, base = len(rows) - 1, state[HEAD, BASE]
     first, root = own_set * nodes, nodes - 1
     value = beyond(mode, rows[root, codes.NODE_WEAK])
-    if has_column(rows):
-        if base <= last:
-            value = columns[first + root, base]
-    else:
+    if not has_column(rows):
         is_until, body = rows[root, codes.NODE_CODE] == codes.UNTIL, first + rows[root, codes.NODE_B]
-        if end - base < 4 * BLOCK:
-            value = extremum(is_until, columns, body, base, end, value)
-        else:
-            unjoined, joined = state[HEAD, UNJOINED + own_set], (SETS + 1) * nodes + JOINED + own_set
-            value = _joined(is_until, columns, body, joined, unjoined, value, base, end)
-            state[HEAD, UNJOINED + own_set] = max(unjoined, end // BLOCK * BLOCK)
-    if not state[HEAD, IS_BEGUN]:
-        return value
-    variables, point = rows[nodes, codes.PART_VARIABLES], 2 * rows[nodes, codes.PART_TABLES]
-    for d in range(root):
-        if rows[d, codes.NODE_VARIABLE] >= 0:
-            _set_point(rows, d, state, columns, first + d, mode, last, tables)
-    if rows[root, codes.NODE_VARIABLE] >= 0:
-        tables[point, rows[root, codes.NODE_VARIABLE]] = value
-    return read_table(tables, 0, 0, variables, tables, point)
+        value = _joined(is_until, columns, body, EXTRA * nodes + JOINED + own_set, value, base, end)
+    elif base <= last:
+        value = columns[first + root, base]
+    if state[HEAD, IS_BEGUN]:
+        variables, point = rows[nodes, codes.PART_VARIABLES], 2 * rows[nodes, codes.PART_TABLES]
+        if rows[root, codes.NODE_VARIABLE] >= 0:
+            tables[point, rows[root, codes.NODE_VARIABLE]] = value
+        value = read_table(tables, 0, 0, variables, tables, point)
+    return value
 
 
 @inlined
-def _bound(
-    rows: Integers, history: Floats, stamps: Integers, columns: Floats, state: Integers, tables: Floats,
-    mode: int, last: int,
-) -> float:  # fmt: skip
-    """Return the lower or the upper bound of the root at the first sample (see `root_bounds`)."""
-    nodes = len(rows) - 1
-    variables, known = rows[nodes, codes.PART_VARIABLES], rows[nodes, codes.PART_KNOWN] >> mode
-    corner = 0 if mode == codes.OPEN_LOW else (1 << variables) - 1
-    is_until = rows[nodes - 1, codes.NODE_CODE] == codes.UNTIL
-    is_begun = state[HEAD, IS_BEGUN] > 0
-    if (known & 1 and (known & codes.EVEN_IF_OVER or not _is_over(rows, stamps, state, last))) or (
-        is_begun and variables == 0
-    ):
-        return tables[0, corner] if is_begun else beyond(mode, 0)
-    if rows[nodes, codes.PART_IS_CUT] and (mode == codes.OPEN_LOW) == is_until:
-        end = last + 1
-        for d in range(nodes):
-            if rows[d, codes.NODE_CUTS]:
-                end = min(end, _first_unclosed(state, stamps, window_of(rows, d), last))
-        end = max(end, state[HEAD, BASE])
-        return _at_first(rows, stamps, columns, state, tables, mode, end, last, codes.OPEN_END)
-    _bring_up(rows, history, stamps, columns, state, tables, mode, last)
-    return _at_first(rows, stamps, columns, state, tables, mode, last + 1, last, mode)
+def _is_known(rows: Integers, stamps: Integers, state: Integers, mode: int, last: int) -> bool:
+    """Return whether a bound follows from the table alone (see `root_bounds`)."""
+    part = len(rows) - 1
+    known = rows[part, codes.PART_KNOWN] >> mode
+    is_free = known & codes.EVEN_IF_OVER > 0 or not _is_over(rows, stamps, state, last)
+    is_constant = state[HEAD, IS_BEGUN] > 0 and rows[part, codes.PART_VARIABLES] == 0
+    return bool(is_constant or (known & 1 > 0 and is_free))
+
+
+@inlined
+def _end_of_uncut(rows: Integers, stamps: Integers, state: Integers, last: int) -> int:
+    """Return the first position where a window is open that cuts a bound short."""
+    end = last + 1
+    for d in range(len(rows) - 1):
+        if rows[d, codes.NODE_CUTS]:
+            end = min(end, _first_unclosed(state, stamps, window_of(rows, d), last))
+    return max(end, state[HEAD, BASE])
 
 
 @inlined
 def _is_over(rows: Integers, stamps: Integers, state: Integers, last: int) -> bool:
     """Return whether no later sample can fall into the window of a root that counts from the first one."""
-    part = len(rows) - 1
-    far = rows[part, codes.PART_ENDS_AT]
-    if far < 0:
-        return False
-    if rows[part, codes.PART_END_UNIT] == codes.SAMPLES:
-        return bool(state[HEAD, OFFSET] + last >= far)
-    return bool(stamps[last] - state[HEAD, START_NS] >= far)
+    part, elapsed = len(rows) - 1, state[HEAD, OFFSET] + last
+    if rows[part, codes.PART_END_UNIT] != codes.SAMPLES:
+        elapsed = stamps[last] - state[HEAD, START_NS]
+    return bool(0 <= rows[part, codes.PART_ENDS_AT] <= elapsed)
 
 
 @kernel
@@ -596,39 +572,50 @@ def run_windows(
         rows: (D + 1, NODE_WIDTH), the part's nodes, and the part itself.
         history: (S, room), the signals in the channel.
         stamps: (room,), the times of the recent samples.
-        columns: (4 D + EXTRA_ROWS, room); the last four rows receive what the part says.
+        columns: (EXTRA * D + EXTRA_ROWS, room); the last four rows receive what the part says.
         state: see `HEAD`.
         tables: (2 T + 2, …): the part's table and those of its past operators, room for the next ones, a
             point at which tables are read, and what past operators start from.
         bounds: 1 to compute the lower bound, 2 for the upper one, 3 for both.
     """
     nodes = len(rows) - 1
-    root, says = nodes - 1, (SETS + 1) * nodes + SAYS
+    root, says = nodes - 1, EXTRA * nodes + SAYS
+    is_until = rows[root, codes.NODE_CODE] == codes.UNTIL
     corners, has_now = 1 << rows[nodes, codes.PART_VARIABLES], rows[nodes, codes.PART_HAS_NOW] > 0
     for k in range(count):
         last = begin + k
         if state[HEAD, IS_BEGUN] and not has_now and tables[0, 0] == tables[0, corners - 1]:
             # it is the same whatever is still to come
-            for each in range(SETS):
-                columns[says + each, k] = tables[0, 0]
+            columns[says, k] = columns[says + 2, k] = columns[says + 3, k] = tables[0, 0]
             continue
         if state.shape[0] > STARTS:
             _enter(rows, stamps, state, last)
-        _bring_up(rows, history, stamps, columns, state, tables, codes.OPEN_END, last)
-        columns[says, k] = _at_first(
-            rows, stamps, columns, state, tables, codes.OPEN_END, last + 1, last, codes.OPEN_END
-        )
+        for mode in range(SETS):
+            into = says + mode + (mode != codes.OPEN_END)
+            if mode != codes.OPEN_END and not bounds >> (mode - 1) & 1:
+                continue
+            if mode != codes.OPEN_END and _is_known(rows, stamps, state, mode, last):
+                corner = 0 if mode == codes.OPEN_LOW else corners - 1
+                columns[into, k] = tables[0, corner] if state[HEAD, IS_BEGUN] else beyond(mode, 0)
+                continue
+            own_set, end = mode, last + 1
+            if rows[nodes, codes.PART_IS_CUT] and mode == (codes.OPEN_LOW if is_until else codes.OPEN_HIGH):
+                own_set, end = codes.OPEN_END, _end_of_uncut(rows, stamps, state, last)
+            else:
+                is_fresh = state[HEAD, KNOWN + mode] != last - 1 or last == 0
+                state[HEAD, KNOWN + mode] = last
+                if is_fresh:
+                    find_lows(rows, state, stamps, last)
+                _bring_up(rows, history, stamps, columns, state, tables, mode, last, is_fresh)
+            columns[into, k] = _at_first(rows, columns, state, tables, mode, own_set, end, last)
         if has_now and has_column(rows):
             columns[says + SAID_NOW, k] = columns[root, last]
         elif has_now:
             columns[says + SAID_NOW, k] = better(
-                rows[root, codes.NODE_CODE] == codes.UNTIL,
+                is_until,
                 columns[rows[root, codes.NODE_B], last],
                 beyond(codes.OPEN_END, rows[root, codes.NODE_WEAK]),
             )
-        for mode in range(codes.OPEN_LOW, codes.OPEN_HIGH + 1):
-            if bounds >> (mode - 1) & 1:
-                columns[says + mode, k] = _bound(rows, history, stamps, columns, state, tables, mode, last)
         if (state[HEAD, OFFSET] + last) % CLOSING == CLOSING - 1:
             _absorb(rows, stamps, columns, state, tables, last)
 
@@ -734,7 +721,7 @@ def _run_corner(
                 columns[own, k] = columns[left, at] if 0 <= at <= last else missing
         else:
             is_greatest = code in (codes.PART_WINDOW_MAX, codes.PAST_WINDOW_MAX)
-            before = (SETS + 1) * nodes + BEFORE
+            before = EXTRA * nodes + BEFORE
             _slide(is_greatest, window_of(rows, d), state, columns, left, own, before, low, high + 1, last)
 
 
