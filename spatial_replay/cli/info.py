@@ -394,8 +394,7 @@ def _lines(
         start_ns, end_ns = survey.start_ns, survey.end_ns
     if start_ns is not None and end_ns is not None:
         yield f"time     {_clock(start_ns)} to {_clock(end_ns)} ({(end_ns - start_ns) / 1e9:.3f} s)"
-    if overview.samples > 1 and overview.start_ns is not None and overview.end_ns is not None:
-        period = (overview.end_ns - overview.start_ns) / (overview.samples - 1) / 1e9
+    if period := overview.period_ns / 1e9:
         ahead = max(round(1.0 / period), 1)
         looks = f"F[0, {ahead}] looks {ahead * period:.3g} s ahead"
         yield f"rate     {1.0 / period:.4g} samples a second: {looks}"

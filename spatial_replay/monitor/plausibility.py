@@ -38,7 +38,7 @@ from spatial_replay.spec.formula import (
 )
 from spatial_replay.spec.walks import base_of, iter_expressions, iter_formulas, terms_of
 from spatial_replay.text import counted, time_text
-from spatial_replay.trace.trace import Trace
+from spatial_replay.trace.trace import Pauses, Trace
 
 _LENGTH_RELATIONS = frozenset({"closeto", "farfrom", "touch", "moved", "dist"})
 _FAR = 10.0
@@ -120,6 +120,7 @@ class LogNumbers:
         """Start before the first sample."""
         self.box: tuple[float, float, float, float] = (inf, inf, -inf, -inf)
         self.samples = 0
+        self._pauses = Pauses()
         self.times_ns = (0, 0)
         self._regions = specification.regions
         # by part: how many samples lack it, and the first of them
@@ -148,6 +149,7 @@ class LogNumbers:
             int(trace.times_ns[-1]),
         )
         self.samples += len(trace)
+        self._pauses.add(trace.times_ns)
         for part in self._parts:
             lacking = np.flatnonzero(is_missing(trace, part))
             if len(lacking):
@@ -202,8 +204,9 @@ class LogNumbers:
 
     @property
     def rate(self) -> float | None:
-        """Samples a second, on average; None of fewer than two samples."""
-        return (self.samples - 1) / self.seconds if self.seconds > 0.0 else None
+        """Samples a second, as they usually come; None of fewer than two samples."""
+        usual_ns = self._pauses.usual_ns
+        return 1e9 / usual_ns if usual_ns else None
 
 
 def window_lines(specification: Specification, log: LogNumbers) -> list[str]:

@@ -26,7 +26,7 @@ from spatial_replay.logs.topics import OBJECTS
 from spatial_replay.mapping.suggest import EXAMPLES, suggest_mapping, suggest_topics
 from spatial_replay.sources.open_log import is_bag_folder, readable_file
 from spatial_replay.text import Instant, Sentence
-from spatial_replay.trace.trace import Trace
+from spatial_replay.trace.trace import Pauses, Trace
 from spatial_replay.trace.units import OUR_AXES, Axes
 
 _STEP = 10_000
@@ -312,6 +312,7 @@ class Overview:
 
     Attributes:
         start_ns, end_ns: times of the first and the last sample; None without samples.
+        period_ns: how often samples usually come; 0 without two of them.
         faults: what was lost or left out.
         container: channels, metadata and attachments of an MCAP log; None for other formats.
         remarks: what is worth knowing although nothing was lost.
@@ -323,6 +324,7 @@ class Overview:
     samples: int
     start_ns: int | None
     end_ns: int | None
+    period_ns: int
     objects: tuple[ObjectOverview, ...]
     signals: tuple[str, ...]
     faults: tuple[str, ...]
@@ -364,6 +366,7 @@ def overview_of(source: Source, advance: Callable[[int], object] = lambda sample
         samples=tally.samples,
         start_ns=tally.start_ns,
         end_ns=tally.end_ns,
+        period_ns=tally.pauses.usual_ns,
         objects=tally.objects(),
         signals=tuple(sorted(tally.signals)),
         # reading the samples and listing the container report the same damage
@@ -378,7 +381,7 @@ def overview_of_survey(path: str | PathLike[str], survey: Survey) -> Overview:
     """Return what an external log holds, of which nothing says yet what its samples are."""
     container = summarise_mcap(McapSource(readable_file(path))) if survey.kind == McapSource.kind else None
     faults = container.faults if container is not None else ()
-    return Overview(survey.name, survey.kind, 0, None, None, (), (), faults, container)
+    return Overview(survey.name, survey.kind, 0, None, None, 0, (), (), faults, container)
 
 
 @dataclass(slots=True)
@@ -393,12 +396,14 @@ class _Tally:
     classes: dict[str, set[str]] = field(default_factory=lambda: defaultdict(set))
     signals: set[str] = field(default_factory=set)
     faults: list[str] = field(default_factory=list)
+    pauses: Pauses = field(default_factory=Pauses)
 
     def add(self, trace: Trace) -> None:
         self.faults.extend(trace.faults)
         if not len(trace):
             return
         self.samples += len(trace)
+        self.pauses.add(trace.times_ns)
         self.start_ns = int(trace.times_ns[0]) if self.start_ns is None else self.start_ns
         self.end_ns = int(trace.times_ns[-1])
         self.signals.update(trace.signals)

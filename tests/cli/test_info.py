@@ -358,3 +358,13 @@ def test_faults_of_track_files_count_seconds_from_the_start(
     assert "the sample at 0.300 s is left out" in said
     assert run(["info", str(tmp_path / "run.jsonl")]) == 3
     assert "run.jsonl:3: its time is 0.100 s, not after 0.200 s" in capsys.readouterr().err
+
+
+def test_the_rate_is_the_usual_one_where_samples_pause(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = tmp_path / "paused.jsonl"
+    times = [step * 10**8 for step in (*range(6), *range(60, 66))]
+    log.write_text("".join(f'{{"time_ns": {each}, "objects": [{HAND}]}}\n' for each in times))
+    assert run(["info", str(log)]) == 0
+    assert "10 samples a second: F[0, 10] looks 1 s ahead" in capsys.readouterr().out
