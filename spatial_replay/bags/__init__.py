@@ -18,9 +18,5 @@ __all__ = ["Decoder", "Message", "MessageReader", "Topic", "open_messages"]
 
 __getattr__, __dir__ = loaded_when_used(
     globals(),
-    {
-        "decoders": ("Decoder", "Topic"),
-        "open": ("open_messages",),
-        "reader": ("Message", "MessageReader"),
-    },
+    {"decoders": ("Decoder", "Topic"), "open": ("open_messages",), "reader": ("Message", "MessageReader")},
 )

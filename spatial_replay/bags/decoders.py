@@ -570,15 +570,7 @@ def standard_schema(type_name: str, encoding: RosEncoding, distribution: str | N
 _MOST_FILES = 1_000
 """Files that one descriptor set may hold."""
 
-_WELL_KNOWN = (
-    any_pb2,
-    duration_pb2,
-    empty_pb2,
-    field_mask_pb2,
-    struct_pb2,
-    timestamp_pb2,
-    wrappers_pb2,
-)
+_WELL_KNOWN = (any_pb2, duration_pb2, empty_pb2, field_mask_pb2, struct_pb2, timestamp_pb2, wrappers_pb2)
 """None of these imports another."""
 
 ENCODINGS = ("ros1", "cdr", "protobuf", "json")

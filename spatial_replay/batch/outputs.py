@@ -146,11 +146,7 @@ def markdown(table: pa.Table) -> str:
         f"|---|---|---|{'--:|' * (len(columns) + 1)}",
     ]
     for place, each in enumerate(rows):
-        names = [
-            each.group["case"],
-            each.group["spec"] or each.group["file"],
-            each.about,
-        ]
+        names = [each.group["case"], each.group["spec"] or each.group["file"], each.about]
         numbers = [f"{own[place]:,}" for own in columns.values()]
         least = "" if each.least is None else f"{each.least:.6g}"
         lines.append(_line([*names, *numbers, least]))
@@ -564,12 +560,7 @@ class _Page:
 
 
 def write_pages(
-    result: BatchResult,
-    folder: Path,
-    name: str,
-    workers: Workers,
-    *,
-    progress: Progress = no_progress,
+    result: BatchResult, folder: Path, name: str, workers: Workers, *, progress: Progress = no_progress
 ) -> dict[tuple[str, str], Path]:
     """Write the page over all logs, and one about each log with a verdict that fails.
 

@@ -127,11 +127,7 @@ _AUTOMATON_FILES = (".dot", ".hoa", ".svg")
 
 @click.command(cls=JsonCommand)
 @click.argument("specification", metavar="SPEC", type=LogPath())
-@click.option(
-    "--log",
-    type=LogPath(),
-    help="Log to compare names, thresholds and windows with.",
-)
+@click.option("--log", type=LogPath(), help="Log to compare names, thresholds and windows with.")
 @constants_option
 @strict_names_option
 @profile_option
@@ -139,9 +135,7 @@ _AUTOMATON_FILES = (".dot", ".hoa", ".svg")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of text.")
 @finding_format_option
 @click.option(
-    "--dfa",
-    metavar="FILE|-",
-    help="Automaton to write, as .dot, .hoa or .svg; - prints it as text.",
+    "--dfa", metavar="FILE|-", help="Automaton to write, as .dot, .hoa or .svg; - prints it as text."
 )
 @click.option("--result", "of", metavar="NAME", help="With --dfa: which result, if SPEC has several.")
 @click.option("--hz", metavar="N", type=float, help="With --dfa: samples per second, for bounds in seconds.")

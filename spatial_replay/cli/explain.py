@@ -66,13 +66,7 @@ def explain(request: EvaluationArguments, result: str, at: str | None, as_json: 
     """
     # imported here so that --help stays fast
     from spatial_replay.logs.topics import MAPPED
-    from spatial_replay.replay import (
-        explain_results,
-        has_samples_from,
-        idle_document,
-        run_replay,
-        verdict_of,
-    )
+    from spatial_replay.replay import explain_results, has_samples_from, idle_document, run_replay, verdict_of
 
     name, _, object_of = result.partition("@")
     node, object_name = name or None, object_of or None

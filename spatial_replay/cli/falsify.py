@@ -100,13 +100,7 @@ def falsify(
     options += [] if profile is None else ["--profile", profile]
     simulation, parameters = scenario_simulation(scenario, files, vary, options, is_planned=planned)
     found = search_failures(
-        simulation,
-        parameters,
-        folder,
-        workers_of(jobs),
-        budget=budget,
-        seed=seed,
-        progress=progress,
+        simulation, parameters, folder, workers_of(jobs), budget=budget, seed=seed, progress=progress
     )
     if as_json:
         show_json(found.document)

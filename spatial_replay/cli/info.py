@@ -14,13 +14,7 @@ from typing import TYPE_CHECKING
 import click
 
 from spatial_replay.cli.application import ExitCode
-from spatial_replay.cli.options import (
-    JsonCommand,
-    LogPath,
-    input_files,
-    output_option,
-    reading_options,
-)
+from spatial_replay.cli.options import JsonCommand, LogPath, input_files, output_option, reading_options
 from spatial_replay.cli.output import MANY, WORST_FIRST, counts_text
 from spatial_replay.cli.terminal import (
     fitted,
@@ -58,9 +52,7 @@ _OF_MESSAGES = frozenset({"mapping", "on_time_jump", "max_lateness", "max_gap"})
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of text.")
 @click.option("--suggest-mapping", is_flag=True, help="Print a first mapping file (YAML) instead.")
 @click.option(
-    "--fit",
-    is_flag=True,
-    help="Print rates, gaps and known objects instead, as `requires` of a suite.",
+    "--fit", is_flag=True, help="Print rates, gaps and known objects instead, as `requires` of a suite."
 )
 @click.option("--decisions", is_flag=True, help="Print the decisions of a planned run instead.")
 @click.option(

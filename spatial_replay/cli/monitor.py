@@ -339,11 +339,7 @@ class _Run:
     """A session on a terminal, from its start to its end."""
 
     def __init__(
-        self,
-        session: LiveSession,
-        recorders: Sequence[Recorder],
-        length_s: float | None,
-        until: str | None,
+        self, session: LiveSession, recorders: Sequence[Recorder], length_s: float | None, until: str | None
     ) -> None:
         self._session, self._recorders = session, recorders
         self._length_s, self._until = length_s, until

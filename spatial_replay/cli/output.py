@@ -11,14 +11,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
 from spatial_replay.cli.terminal import Coloured, Line, show, show_json
-from spatial_replay.text import (
-    counted,
-    counted_from,
-    escaped,
-    requirement_text,
-    time_text,
-    with_unit,
-)
+from spatial_replay.text import counted, counted_from, escaped, requirement_text, time_text, with_unit
 
 if TYPE_CHECKING:
     from spatial_replay.monitor.monitor import Ending

@@ -154,11 +154,7 @@ def _redo(
 @setting_options
 @click.pass_context
 def plan(
-    context: click.Context,
-    /,
-    log: LogFile | None,
-    changes: Mapping[str, Any],
-    **options: Any,
+    context: click.Context, /, log: LogFile | None, changes: Mapping[str, Any], **options: Any
 ) -> int | None:
     """Plan a run in a simulated world, and record it with every decision.
 

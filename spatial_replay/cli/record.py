@@ -247,10 +247,7 @@ SCENARIOS: Mapping[str, str] = MappingProxyType(
 
 _SIMULATION = (
     click.option(
-        "--seed",
-        type=click.IntRange(0),
-        default=0,
-        help="Seed of initial poses and noise.  [default: 0]",
+        "--seed", type=click.IntRange(0), default=0, help="Seed of initial poses and noise.  [default: 0]"
     ),
     click.option(
         "--noise",
@@ -273,9 +270,7 @@ _SIMULATION = (
         "  [default: as the seed has it]",
     ),
     click.option(
-        "--gui",
-        is_flag=True,
-        help="Show the world in a window, no faster than real time. Needs a display.",
+        "--gui", is_flag=True, help="Show the world in a window, no faster than real time. Needs a display."
     ),
     click.option(
         "--camera",
@@ -365,9 +360,7 @@ def recording_command(scenario: str) -> click.Command:
     @constants_option
     @profile_option
     @click.option(
-        "--duration",
-        metavar="T",
-        help="Simulated time, such as 10s.  [default: to the end of the script]",
+        "--duration", metavar="T", help="Simulated time, such as 10s.  [default: to the end of the script]"
     )
     @simulation_options
     def command(

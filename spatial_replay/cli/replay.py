@@ -45,12 +45,7 @@ if TYPE_CHECKING:
     default="",
     help="With -o: the result whose violation the scene points at.  [default: the first violated one]",
 )
-@click.option(
-    "--json",
-    "json_file",
-    metavar="FILE|-",
-    help="Results to write, as one JSON object.",
-)
+@click.option("--json", "json_file", metavar="FILE|-", help="Results to write, as one JSON object.")
 @click.option("--series", is_flag=True, help="With --json: add the numbers of every node at every sample.")
 @click.option(
     "--to-end",

@@ -77,10 +77,7 @@ def serve(
 
 
 def _serve(
-    evaluated: Evaluated,
-    files: SpecificationFiles | None,
-    serving: ServingArguments,
-    play: bool,
+    evaluated: Evaluated, files: SpecificationFiles | None, serving: ServingArguments, play: bool
 ) -> ExitCode | None:
     # imported here so that --help stays fast
     from spatial_replay.serve import open_server

@@ -80,28 +80,9 @@ def _read_ranges(
 
 
 @click.command(cls=ManyLogs)
-@click.option(
-    "--spec",
-    "spec",
-    metavar="SPEC",
-    type=LogPath(),
-    required=True,
-    help="Specification file.",
-)
-@click.option(
-    "--good",
-    metavar="LOG...",
-    multiple=True,
-    type=LogPath(),
-    help="Runs that have to satisfy it.",
-)
-@click.option(
-    "--bad",
-    metavar="LOG...",
-    multiple=True,
-    type=LogPath(),
-    help="Runs that have to violate it.",
-)
+@click.option("--spec", "spec", metavar="SPEC", type=LogPath(), required=True, help="Specification file.")
+@click.option("--good", metavar="LOG...", multiple=True, type=LogPath(), help="Runs that have to satisfy it.")
+@click.option("--bad", metavar="LOG...", multiple=True, type=LogPath(), help="Runs that have to violate it.")
 @click.option(
     "--vary",
     "ranges",

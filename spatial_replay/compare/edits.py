@@ -102,8 +102,7 @@ def without_variables(formula: Quantified) -> Formula:
     inner = sum(isinstance(each, Quantified) for each in iter_formulas(formula.body))
     # no name of a text begins with a blank and a number
     return substitute(
-        formula.body,
-        {name: Variable(f" {inner}.{index}") for index, name in enumerate(formula.variables)},
+        formula.body, {name: Variable(f" {inner}.{index}") for index, name in enumerate(formula.variables)}
     )
 
 

@@ -676,12 +676,7 @@ class _Writer:
         return parse_specification("\n".join([*texts, ""]))
 
     def text(
-        self,
-        written: _Written,
-        head: Sequence[str],
-        evidence: Sequence[LearnedLine],
-        good: int,
-        bad: int,
+        self, written: _Written, head: Sequence[str], evidence: Sequence[LearnedLine], good: int, bad: int
     ) -> str:
         """Return the file: each spec in its canonical form, below a comment with its evidence."""
         lines = [*map(_comment, head), f"use {self.profile}"]

@@ -18,8 +18,5 @@ if TYPE_CHECKING:
 __all__ = ["LiveSession", "LiveUpdate", "SessionStatus", "monitor", "open_recorders"]
 
 __getattr__, __dir__ = loaded_when_used(
-    globals(),
-    {
-        "session": ("LiveSession", "LiveUpdate", "SessionStatus", "monitor", "open_recorders"),
-    },
+    globals(), {"session": ("LiveSession", "LiveUpdate", "SessionStatus", "monitor", "open_recorders")}
 )

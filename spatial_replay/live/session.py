@@ -20,15 +20,7 @@ import numpy as np
 from spatial_replay.bags.decoders import decoder_of, topic_of, topics_by_name
 from spatial_replay.bags.reader import DISORDER_NS, Message
 from spatial_replay.errors import LogError, UsageError, importing
-from spatial_replay.live.client import (
-    Client,
-    Connected,
-    Disconnected,
-    Inbox,
-    Offered,
-    Received,
-    Warned,
-)
+from spatial_replay.live.client import Client, Connected, Disconnected, Inbox, Offered, Received, Warned
 from spatial_replay.logs.messages import Channel, MemorySink, Messages
 from spatial_replay.logs.objects import decode_objects
 from spatial_replay.logs.read_options import FaultKinds

@@ -746,12 +746,7 @@ def _of_transforms(topic: Topic, examples: Sequence[object]) -> TopicSuggestion:
     )
     frames = frozenset(parent for message in examples for parent, _ in _edges(message))
     return TopicSuggestion(
-        topic,
-        {**left_out, **_POINT},
-        "{child_frame_id}",
-        _SIZELESS,
-        is_transforms=True,
-        frames=frames,
+        topic, {**left_out, **_POINT}, "{child_frame_id}", _SIZELESS, is_transforms=True, frames=frames
     )
 
 

@@ -56,10 +56,7 @@ _CONVERTED: Final[Mapping[str, tuple[int, str]]] = MappingProxyType(
 _ENCODINGS: Final = (*_CHANNELS, "mono16", *_CONVERTED)
 
 _DETECTIONS: Final[Mapping[str, str]] = MappingProxyType(
-    {
-        "apriltag_msgs/AprilTagDetectionArray": "detections",
-        "apriltag_msgs/ApriltagArrayStamped": "apriltags",
-    }
+    {"apriltag_msgs/AprilTagDetectionArray": "detections", "apriltag_msgs/ApriltagArrayStamped": "apriltags"}
 )
 """Types of messages with the tags of an image, and the field that lists them."""
 

@@ -88,10 +88,7 @@ def poses_on_plane(
     yaw = np.arctan2(along[..., 1], along[..., 0]) - turn[:, None]
     cosine, sine = np.cos(yaw), np.sin(yaw)
     shift = np.stack(
-        [
-            cosine * offset[:, :1] - sine * offset[:, 1:],
-            sine * offset[:, :1] + cosine * offset[:, 1:],
-        ],
+        [cosine * offset[:, :1] - sine * offset[:, 1:], sine * offset[:, :1] + cosine * offset[:, 1:]],
         axis=-1,
     )
     position = centre - shift

@@ -336,11 +336,7 @@ class ClipLog:
     backlog = 0
 
     def __init__(
-        self,
-        folder: Path,
-        files: Sequence[Specification],
-        about: Mapping[str, str] | None,
-        trigger: Trigger,
+        self, folder: Path, files: Sequence[Specification], about: Mapping[str, str] | None, trigger: Trigger
     ) -> None:
         """Compile everything, and make the folder."""
         self._folder, self._files, self._about = folder, files, dict(about or {})

@@ -85,11 +85,7 @@ _OURS: Final = frozenset({PLAN_DECISION, GRADIENT_MAP, PLAN_PATH})
 
 
 def message_channel(
-    topic: str,
-    encoding: str | None,
-    schema: SchemaLike,
-    schema_name: str | None,
-    schema_encoding: str | None,
+    topic: str, encoding: str | None, schema: SchemaLike, schema_name: str | None, schema_encoding: str | None
 ) -> Channel:
     """Return the channel of a topic for a caller's own messages.
 
@@ -275,13 +271,7 @@ class MessageQueue:
     """
 
     def __init__(
-        self,
-        name: str,
-        limit: int,
-        *,
-        blocks: bool,
-        ring: Callable[[], None],
-        missed: Callable[[int], None],
+        self, name: str, limit: int, *, blocks: bool, ring: Callable[[], None], missed: Callable[[int], None]
     ) -> None:
         """Begin without channels.
 

@@ -74,13 +74,7 @@ __all__ = [
 __getattr__, __dir__ = loaded_when_used(
     globals(),
     {
-        "document": (
-            "Explanation",
-            "document_from_replay",
-            "explain_results",
-            "idle_document",
-            "verdict_of",
-        ),
+        "document": ("Explanation", "document_from_replay", "explain_results", "idle_document", "verdict_of"),
         "engine": ("Replay", "Replayed", "load_files", "recorded_texts", "run_replay"),
         "selection": (
             "LogNames",

@@ -242,12 +242,7 @@ class Tabletop:
         return self._move(name, pushing(self._scene, name, path, yaw))
 
     def place(
-        self,
-        name: str,
-        x: float,
-        y: float,
-        yaw: float | None = None,
-        via: Sequence[tuple[float, float]] = (),
+        self, name: str, x: float, y: float, yaw: float | None = None, via: Sequence[tuple[float, float]] = ()
     ) -> Execution:
         self._refuse_unless("place", name, [x, y, 0.0 if yaw is None else yaw])
         return self._move(name, self._scenario.placing(self._scene, name, (x, y), yaw, via))

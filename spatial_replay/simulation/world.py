@@ -274,12 +274,7 @@ class World(Protocol):
         """
 
     def place(
-        self,
-        name: str,
-        x: float,
-        y: float,
-        yaw: float | None = None,
-        via: Sequence[tuple[float, float]] = (),
+        self, name: str, x: float, y: float, yaw: float | None = None, via: Sequence[tuple[float, float]] = ()
     ) -> Execution:
         """Pick an object up, carry it along points and place its centre at (x, y); None keeps its yaw.
 
