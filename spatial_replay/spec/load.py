@@ -207,7 +207,7 @@ class AtomBuilder:
         (sign, limit), *upper = limits
         if not upper:
             return self._atom(relation, comparisons[0], terms, (*names, sign, limit), written, scope)
-        parameters = (*names, limit, _MIRRORED[sign], *upper[0])
+        parameters: tuple[float | str, ...] = (*names, limit, _MIRRORED[sign], *upper[0])
         return self._atom(relation, minimum(*comparisons), terms, parameters, written, scope)
 
     def comparison(self, written: ComparisonSyntax, scope: Scope) -> Atom:
@@ -324,8 +324,10 @@ def _from_second(spec: NamedSpec) -> NamedSpec:
     formula = spec.formula
     if (isinstance(formula, Temporal) and formula.operator in ("X", "WX")) or not has_rate(formula):
         return spec
-    is_reference = isinstance(formula, Boolean) and formula.operator == "spec"
-    inner = formula.operands[0] if is_reference else replace(formula, name=None)
+    if isinstance(formula, Boolean) and formula.operator == "spec":
+        inner = formula.operands[0]
+    else:
+        inner = replace(formula, name=None)
     return replace(spec, formula=Temporal("WX", (inner,), name=spec.name, span=formula.span))
 
 

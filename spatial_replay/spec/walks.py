@@ -402,7 +402,7 @@ def _units(expression: Expression) -> list[Unit]:
         return []
     for part in parts:
         if isinstance(part, Rate):
-            found[Unit("rate", part.signal and part.signal.name, divisor)] = None
+            found[Unit("rate", part.signal.name if part.signal else None, divisor)] = None
         elif isinstance(part, Signal):
             found[Unit("signal", part.name, divisor)] = None
         elif isinstance(part, Misalignment):

@@ -549,7 +549,8 @@ def _end_of_uncut(rows: Integers, stamps: Integers, state: Integers, last: int) 
     for d in range(len(rows) - 1):
         if rows[d, codes.NODE_CUTS]:
             end = min(end, _first_unclosed(state, stamps, window_of(rows, d), last))
-    return max(end, state[HEAD, BASE])
+    first: int = max(end, state[HEAD, BASE])
+    return first
 
 
 @inlined
