@@ -193,9 +193,7 @@ def evaluate(
     if strict_names:
         _require_names(specification, trace, each or {})
     stream = EvaluationStream(
-        find_instances(specification, each or {}, [trace], *window),
-        specification.regions,
-        semantics,
+        find_instances(specification, each or {}, [trace], *window), specification.regions, semantics
     )
     results = tuple(
         SpecResult.from_stream(

@@ -15,12 +15,7 @@ from spatial_replay.lazy import Displayed, data_frame
 from spatial_replay.monitor.causes import Cause, Conjunct, LeastPart, conjuncts_of, find_causes, find_least
 from spatial_replay.monitor.offline import evaluate_offline, full_signal, window_signal
 from spatial_replay.monitor.semantics import Semantics, require_ltlf
-from spatial_replay.monitor.sentences import (
-    cause_sentences,
-    reason_sentence,
-    sentences_of,
-    verdict_sentence,
-)
+from spatial_replay.monitor.sentences import cause_sentences, reason_sentence, sentences_of, verdict_sentence
 from spatial_replay.monitor.stream import NEVER, InstanceStream, SeriesBlock
 from spatial_replay.monitor.vacuity import (
     Tested,

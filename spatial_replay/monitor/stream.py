@@ -148,10 +148,7 @@ class EvaluationStream:
     """The instances of a specification, and the recent samples that they may still look back at."""
 
     def __init__(
-        self,
-        instances: Iterable[Instance],
-        regions: Mapping[str, Outline],
-        semantics: Semantics = "ltlf",
+        self, instances: Iterable[Instance], regions: Mapping[str, Outline], semantics: Semantics = "ltlf"
     ) -> None:
         """Start before the first sample."""
         self.streams = tuple(InstanceStream(instance, semantics) for instance in instances)

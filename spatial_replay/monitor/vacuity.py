@@ -38,13 +38,7 @@ from spatial_replay.spec.formula import (
     iter_nodes,
     operands_of,
 )
-from spatial_replay.spec.walks import (
-    is_spatial,
-    iter_expressions,
-    iter_formulas,
-    iter_terms,
-    standing,
-)
+from spatial_replay.spec.walks import is_spatial, iter_expressions, iter_formulas, iter_terms, standing
 from spatial_replay.text import (
     Instant,
     Sentence,

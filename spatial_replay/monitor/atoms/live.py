@@ -28,12 +28,7 @@ from spatial_replay.geometry.measure import QUANTITY_CODES
 from spatial_replay.monitor.atoms.delays import NO_DELAY, PREVIOUS, RecentSamples, iter_delays
 from spatial_replay.monitor.atoms.instructions import LeafCode
 from spatial_replay.monitor.atoms.live_kernel import ABSENT, PackedPlan, PlanArrays, leaves_of_sample
-from spatial_replay.monitor.atoms.live_rows import (
-    Leaves,
-    Member,
-    PlanContext,
-    PlanRows,
-)
+from spatial_replay.monitor.atoms.live_rows import Leaves, Member, PlanContext, PlanRows
 from spatial_replay.monitor.atoms.measurements import quantity_of
 from spatial_replay.monitor.atoms.terms import footprint_from_outline
 from spatial_replay.spec.formula import (
@@ -179,8 +174,7 @@ def _arrays(frame: PlanContext, rows: PlanRows, code: LeafCode, outputs: Sequenc
     closest = [rows.of_term(each.group) for each in code.closest]
     members = [rows.of_membership(each) for each in code.members]
     regions = FootprintBatch.from_footprints(
-        [each.footprint for each in frame.regions.values()],
-        [each.height for each in frame.regions.values()],
+        [each.footprint for each in frame.regions.values()], [each.height for each in frame.regions.values()]
     )
     return PlanArrays(
         extent=_whole(

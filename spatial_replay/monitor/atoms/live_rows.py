@@ -11,16 +11,7 @@ from spatial_replay.monitor.atoms.delays import NO_DELAY, Delay
 from spatial_replay.monitor.atoms.instructions import Membership
 from spatial_replay.monitor.atoms.live_kernel import ANY
 from spatial_replay.monitor.atoms.terms import left_out_of, open_group
-from spatial_replay.spec.formula import (
-    ANY_CLASS,
-    Atom,
-    Centre,
-    Earlier,
-    Group,
-    Quantified,
-    RegionName,
-    Term,
-)
+from spatial_replay.spec.formula import ANY_CLASS, Atom, Centre, Earlier, Group, Quantified, RegionName, Term
 from spatial_replay.spec.walks import base_of, is_centre, standing
 
 Leaves: TypeAlias = Sequence[Atom | Quantified]

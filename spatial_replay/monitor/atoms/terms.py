@@ -204,10 +204,7 @@ class TraceScene:
         row = len(self.trace.footprints) + list(self.regions).index(region.name)
         count = len(self)
         return ResolvedTerm(
-            Operand(np.full((count, 1), row, np.int64)),
-            unknown,
-            np.zeros(count),
-            np.full(count, np.nan),
+            Operand(np.full((count, 1), row, np.int64)), unknown, np.zeros(count), np.full(count, np.nan)
         )
 
     def _rows_of(self, name: str) -> Integers:

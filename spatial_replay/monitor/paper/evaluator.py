@@ -17,14 +17,7 @@ from spatial_replay.monitor.online.codes import low_and_high
 from spatial_replay.monitor.paper.kernel import PaperMemory, step_paper
 from spatial_replay.monitor.paper.scans import OPERATORS, PaperTable, paper_table
 from spatial_replay.spec.diagnostics import SourceText
-from spatial_replay.spec.formula import (
-    Atom,
-    Formula,
-    Quantified,
-    Specification,
-    Temporal,
-    iter_nodes,
-)
+from spatial_replay.spec.formula import Atom, Formula, Quantified, Specification, Temporal, iter_nodes
 
 _TILE = 256
 _FIRST_ROOM = 1024

@@ -16,15 +16,7 @@ import numpy as np
 
 from spatial_replay.compiled import inlined, piece
 from spatial_replay.geometry.arrays import Flags, Floats, Integers
-from spatial_replay.spec.formula import (
-    Atom,
-    Boolean,
-    Formula,
-    Quantified,
-    Temporal,
-    Truth,
-    iter_nodes,
-)
+from spatial_replay.spec.formula import Atom, Boolean, Formula, Quantified, Temporal, Truth, iter_nodes
 from spatial_replay.spec.walks import is_spatial
 
 # columns of the table

@@ -16,16 +16,7 @@ from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.online.codes import in_channels
-from spatial_replay.spec.formula import (
-    Atom,
-    Earlier,
-    Formula,
-    Group,
-    Outline,
-    Quantified,
-    Term,
-    TrackedName,
-)
+from spatial_replay.spec.formula import Atom, Earlier, Formula, Group, Outline, Quantified, Term, TrackedName
 from spatial_replay.spec.walks import base_of, iter_formulas, logged_signals, substitute
 from spatial_replay.trace.trace import Trace, window_of
 
@@ -208,15 +199,7 @@ def _gap(name: str, missing: NDArray[np.bool_], times_ns: Integers) -> Gap:
     # leading and trailing samples, without another one between
     begin, end = int(np.argmin(missing)), len(missing) - int(np.argmin(missing[::-1]))
     is_at_ends = 0 < begin + len(missing) - end == len(at) < len(missing)
-    window = (
-        int(times_ns[begin]) if begin else None,
-        int(times_ns[end]) if end < len(missing) else None,
-    )
+    window = (int(times_ns[begin]) if begin else None, int(times_ns[end]) if end < len(missing) else None)
     return Gap(
-        name,
-        len(at),
-        len(missing),
-        int(times_ns[first]),
-        int(times_ns[last]),
-        window if is_at_ends else None,
+        name, len(at), len(missing), int(times_ns[first]), int(times_ns[last]), window if is_at_ends else None
     )

@@ -364,10 +364,7 @@ class MissedResponse:
 
 
 def missed_response(
-    path: DecidingPath,
-    nodes: Sequence[Formula],
-    done: OfflineNodes | UnfinishedNodes,
-    times_ns: Integers,
+    path: DecidingPath, nodes: Sequence[Formula], done: OfflineNodes | UnfinishedNodes, times_ns: Integers
 ) -> MissedResponse | None:
     """Return the outermost implication on the path to what violates a formula that failed, if there is one.
 
