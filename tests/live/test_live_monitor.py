@@ -42,7 +42,8 @@ from spatial_replay import LogError, Sample, Trace, Trigger, UsageError
 from spatial_replay.bags import open_messages
 from spatial_replay.cli import run
 from spatial_replay.live import LiveSession, LiveUpdate, monitor
-from spatial_replay.live.client import LARGEST_FRAME
+from spatial_replay.live.client import LARGEST_FRAME, Inbox, Received
+from spatial_replay.logs.messages import Channel
 from spatial_replay.logs.topics import OBJECTS, ROBUSTNESS, SCENE
 
 TURTLES = """
@@ -337,6 +338,15 @@ def test_what_a_server_floods_with_is_bounded_and_ctrl_c_ends_the_run(tmp_path: 
             process.send_signal(signal.SIGINT)
             rest, _ = process.communicate(timeout=PATIENCE_S)
     assert "look out" not in said + rest
+
+
+def test_large_messages_that_wait_are_bounded_by_their_bytes() -> None:
+    inbox = Inbox()
+    for tick in range(100):
+        inbox.put(Received(Channel("/camera", "json", None), tick, bytes(2**20), 0.0))
+    waiting = [item.time_ns for item in inbox.take() if isinstance(item, Received)]
+    assert waiting == list(range(36, 100))
+    assert inbox.dropped == 36
 
 
 def test_definitions_without_end_end_the_connection(tmp_path: Path) -> None:
