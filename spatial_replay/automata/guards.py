@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from typing import NamedTuple, TypeAlias, overload
 
 from spatial_replay.errors import NoAutomatonError
@@ -11,14 +12,17 @@ from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import (
     Atom,
     Boolean,
+    Expression,
     Formula,
+    Negative,
     Quantified,
+    Sum,
     Temporal,
     Truth,
     expand,
     operands_of,
 )
-from spatial_replay.spec.walks import is_spatial
+from spatial_replay.spec.walks import is_spatial, without_variables
 
 LEAF = 1 << 60
 """The variable of a leaf: it orders after all others."""
@@ -176,12 +180,12 @@ def _bracketed(formula: Formula) -> str:
 class Propositions:
     """The propositions of a formula, numbered in the order of the text.
 
-    Equal ones, however they are written (`a and b`, `b and a`; `a -> b`, `not a or b`), are one. So are a
-    proposition and its negation where a formula holds both: the second is the first, negated.
+    Equal ones, however they are written (`a and b`, `b and a`; `a leftof b`, `not (a rightof b)`), are one.
+    So are a proposition and its negation where a formula holds both: the second is the first, negated.
     """
 
     def __init__(self, formula: Formula) -> None:
-        self._shapes = _Shapes()
+        self._shapes = Shapes()
         self._numbers: dict[int, int] = {}
         self._literals: dict[int, tuple[int, bool]] = {}
         self.all: list[Proposition] = []
@@ -196,17 +200,15 @@ class Propositions:
         return self._literals.get(id(formula))
 
     def _add(self, formula: Formula) -> None:
-        number = self._numbers.get(self._shapes.of(formula, True))
-        if number is not None:
-            self._literals[id(formula)] = number, True
-            return
-        negated = self._shapes.of(formula, False)
+        shape = self._shapes.of(formula)
+        negated = self._shapes.negated(shape)
         if negated in self._numbers:
             self._literals[id(formula)] = self._numbers[negated], False
             return
-        number = self._numbers[self._shapes.of(formula, True)] = len(self.all)
-        self._literals[id(formula)] = number, True
-        self.all.append(Proposition(formula, format_formula(formula), formula.name))
+        if shape not in self._numbers:
+            self._numbers[shape] = len(self.all)
+            self.all.append(Proposition(formula, format_formula(formula), formula.name))
+        self._literals[id(formula)] = self._numbers[shape], True
 
 
 def _maximal(formula: Formula) -> Iterator[Formula]:
@@ -220,52 +222,81 @@ def _maximal(formula: Formula) -> Iterator[Formula]:
         yield from _maximal(operand)
 
 
-class _Shapes:
-    """Numbers of spatial formulas: one for all that are equal up to the way they are written."""
+class Shapes:
+    """Spatial formulas as diagrams over their relations: equal ones, however written, are one node."""
 
     def __init__(self) -> None:
-        self._interned: dict[tuple[object, ...], int] = {}
-        self._known: dict[tuple[int, bool], int] = {}
-        self._joined: dict[tuple[bool, int], frozenset[int]] = {}
+        self._diagrams = Diagrams(MAX_SHAPES)
+        self._variables: dict[object, int] = {}
+        self._known: dict[int, tuple[Formula, int]] = {}
 
-    def of(self, formula: Formula, positive: bool) -> int:
-        """Return the number of a formula, or of its negation, in negation normal form."""
-        formula = expand(formula)
-        key = (id(formula), positive)
-        if key not in self._known:
-            self._known[key] = self._shape(formula, positive)
-        return self._known[key]
+    def of(self, formula: Formula) -> int:
+        """Return the node of a formula about one sample."""
+        if id(formula) not in self._known:
+            try:
+                node = self._of(expand(formula))
+            except (NoAutomatonError, RecursionError):
+                # too large to be compared with others by what it means
+                node = self._variable(format_formula(formula))
+            # the formula is kept, so that its id stays its own
+            self._known[id(formula)] = formula, node
+        return self._known[id(formula)][1]
 
-    def _shape(self, formula: Formula, positive: bool) -> int:
+    def negated(self, node: int) -> int:
+        """Return the node of the negation."""
+        try:
+            return self._diagrams.complement(node)
+        except (NoAutomatonError, RecursionError):
+            return self._variable(("not", node))
+
+    def _of(self, formula: Formula) -> int:
         match formula:
             case Truth():
-                return self._intern("truth", formula.value == positive)
+                return YES if formula.value else NO
             case Atom():
-                return self._intern("atom", formula.expression, positive)
+                expression, is_positive = _signed(formula)
+                variable = self._variable(expression)
+                return variable if is_positive else self._diagrams.complement(variable)
             case Boolean(operator="not"):
-                return self.of(formula.operands[0], not positive)
+                return self._diagrams.complement(self.of(formula.operands[0]))
             case Boolean():
-                is_both = (formula.operator == "and") == positive
-                return self._join(is_both, *(self.of(each, positive) for each in formula.operands))
+                join = self._diagrams.both if formula.operator == "and" else self._diagrams.either
+                nodes = [self.of(each) for each in formula.operands]
+                # the last ones first: their variables are below those of the others
+                return reduce(lambda below, each: join(each, below), reversed(nodes))
             case Quantified():
-                body = self.of(formula.body, positive)
-                is_every = (formula.quantifier == "forall") == positive
-                return self._intern("members", is_every, formula.variables, formula.group, body)
+                # "exists" is not "forall" of the negation
+                body, is_every = self.of(without_variables(formula)), formula.quantifier == "forall"
+                key = len(formula.variables), formula.group, body if is_every else self.negated(body)
+                every = self._variable(key)
+                return every if is_every else self.negated(every)
             case Temporal():
                 raise ValueError(f"{formula.operator} is not an operator about one sample")
 
-    def _join(self, is_both: bool, *operands: int) -> int:
-        """Return the number of a conjunction or disjunction; order, repetition and brackets do not count."""
-        parts = (self._joined.get((is_both, each), frozenset({each})) for each in operands)
-        chosen = frozenset[int]().union(*parts)
-        if len(chosen) == 1:
-            return next(iter(chosen))
-        number = self._intern(is_both, chosen)
-        self._joined[is_both, number] = chosen
-        return number
+    def _variable(self, key: object) -> int:
+        return self._diagrams.variable(self._variables.setdefault(key, len(self._variables)))
 
-    def _intern(self, *key: object) -> int:
-        return self._interned.setdefault(key, len(self._interned))
+
+MAX_SHAPES = 200_000
+"""How many nodes the diagrams have by which propositions are compared."""
+
+
+def _signed(atom: Atom) -> tuple[Expression, bool]:
+    """Return an expression that says the same as a relation, or the opposite, and whether it is the same.
+
+    Signals are left as they are: they are often equal to their limits, where both hold.
+    """
+    expression, is_positive = atom.expression, True
+    while atom.relation != "signal":
+        match expression:
+            case Negative(operand=operand):
+                expression = operand
+            case Sum(first=first, second=Negative(operand=operand)) if repr(operand) < repr(first):
+                expression = Sum(operand, Negative(first))
+            case _:
+                break
+        is_positive = not is_positive
+    return expression, is_positive
 
 
 Literal: TypeAlias = tuple[int, bool]

@@ -32,7 +32,6 @@ from spatial_replay.spec.formula import (
     Temporal,
     Term,
     Truth,
-    Variable,
     iter_nodes,
     operands_of,
     operator_of,
@@ -41,7 +40,7 @@ from spatial_replay.spec.load import parse_specification
 from spatial_replay.spec.parser import split_statements
 from spatial_replay.spec.relations import RELATION_NAMES
 from spatial_replay.spec.tokens import span_of, tokenize
-from spatial_replay.spec.walks import base_of, changed_leaf, iter_formulas, iter_terms, map_leaves, substitute
+from spatial_replay.spec.walks import base_of, changed_leaf, iter_terms, map_leaves, without_variables
 
 
 def unify_regions(
@@ -95,15 +94,6 @@ class SharedNames:
         if not isinstance(term, DerivedTerm):
             return term
         return replace(term, term=self.term(term.term))
-
-
-def without_variables(formula: Quantified) -> Formula:
-    """Return the body of a quantifier with variables that are known by their place alone."""
-    inner = sum(isinstance(each, Quantified) for each in iter_formulas(formula.body))
-    # no name of a text begins with a blank and a number
-    return substitute(
-        formula.body, {name: Variable(f" {inner}.{index}") for index, name in enumerate(formula.variables)}
-    )
 
 
 def _with_terms(formula: Formula, change: Callable[[Term], Term]) -> Formula:

@@ -7,13 +7,13 @@ inequalities between sums. Two relations about one quantity share it, whatever t
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from fractions import Fraction
-from itertools import product
-from math import isfinite
+from itertools import combinations, permutations, product
+from math import dist, isfinite
 from typing import Final, Literal, NamedTuple, TypeAlias
 
-from spatial_replay.automata.guards import NO, YES, Diagrams
+from spatial_replay.automata.guards import NO, YES, Diagrams, Shapes
 from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.sanity.linear import Inequality
@@ -52,7 +52,14 @@ from spatial_replay.spec.formula import (
     expand,
 )
 from spatial_replay.spec.relations import compare
-from spatial_replay.spec.walks import base_of, iter_formulas, measured_terms, standing
+from spatial_replay.spec.walks import (
+    base_of,
+    iter_expressions,
+    iter_formulas,
+    measured_terms,
+    standing,
+    terms_of,
+)
 from spatial_replay.text import is_text_number
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
@@ -187,10 +194,42 @@ def _measured(measurement: Measurement, regions: Mapping[str, Outline]) -> Tree:
 
 def _of_regions(measurement: Measurement, regions: Mapping[str, Outline]) -> Linear:
     """Return what is measured of regions alone: a number, as they are where they are, or else unknown."""
+    (value,) = _numbers_of([measurement], regions)
+    return Linear(((measurement, Fraction(1)),)) if value is None else Linear((), value)
+
+
+def _numbers_of(measurements: Sequence[Measurement], regions: Mapping[str, Outline]) -> list[Fraction | None]:
+    """Return what is measured of regions alone; None where that is unknown."""
     nothing = TraceScene(Trace.from_samples([Sample(0, {})]), regions)
-    values = leaf_values(nothing, [Atom("", "", measurement)], {})[:, 0, 0]
-    is_known = len(set(values.tolist())) == 1 and isfinite(values[0])
-    return Linear((), exact(float(values[0]))) if is_known else Linear(((measurement, Fraction(1)),))
+    values = leaf_values(nothing, [Atom("", "", each) for each in measurements], {})[:, :, 0].T.tolist()
+    return [exact(each[0]) if len(set(each)) == 1 and isfinite(each[0]) else None for each in values]
+
+
+def _between(atoms: Sequence[Atom], regions: Mapping[str, Outline]) -> dict[Measurement, Fraction]:
+    """Return the distances of regions that are apart, and protrusions of regions from those around them."""
+    terms = (term for each in atoms for term in terms_of(each.expression))
+    names = dict.fromkeys(each for each in map(without_radius, terms) if isinstance(each, RegionName))
+    pairs = list(permutations(names, 2))
+    measured: list[Measurement] = [SignedDistance(*pair) for pair in pairs if repr(pair[0]) < repr(pair[1])]
+    measured += [Protrusion(*pair) for pair in pairs]
+    numbers = zip(measured, _numbers_of(measured, regions), strict=True) if measured else ()
+    return {
+        each: value
+        for each, value in numbers
+        if value is not None and isinstance(each, SignedDistance) == (value > 0)
+    }
+
+
+def _diameter(outline: Outline) -> Fraction:
+    """Return the greatest distance of two points of a region in the plane."""
+    widest = max((dist(*pair) for pair in combinations(outline.vertices, 2)), default=0.0)
+    return exact(widest + 2.0 * outline.radius)
+
+
+def is_about_heights(atoms: Iterable[Atom]) -> bool:
+    """Return whether a relation is along z."""
+    parts = (part for each in atoms for part in iter_expressions(each.expression))
+    return any(isinstance(part, Projection) and part.axis == "z" for part in parts)
 
 
 def _shifted(measurement: Measurement, regions: Mapping[str, Outline]) -> Linear:
@@ -317,6 +356,8 @@ class FactDiagrams:
     Attributes:
         diagrams: of all conditions; variables are the numbers of facts.
         facts: by number.
+        diameters: of the regions, unless a formula or a region is about heights.
+        between: distances of regions that are apart, and protrusions of regions from those around them.
     """
 
     def __init__(self, formulas: Iterable[Formula], regions: Mapping[str, Outline]) -> None:
@@ -327,11 +368,16 @@ class FactDiagrams:
         self._trees: dict[Expression, Tree | None] = {}
         self._known: dict[int, tuple[Formula, int]] = {}
         self._written: dict[int, dict[str, None]] = {}
+        self._shapes = Shapes()
+        self._opaque_nodes: dict[int, int] = {}
         # quantities that are compared with "==": modes and counts as a rule
         self._compared: set[Weights] = set()
         atoms = [each for one in formulas for each in iter_formulas(one) if isinstance(each, Atom)]
         for each in atoms:
             self._tree_of(each.expression)
+        is_upright = is_about_heights(atoms) or any(each.height is not None for each in regions.values())
+        self.diameters = {} if is_upright else {name: _diameter(each) for name, each in regions.items()}
+        self.between = _between(atoms, regions)
         # what is measured comes first: a run that only it decides can be placed
         for each in atoms:
             self.of(each)
@@ -401,6 +447,14 @@ class FactDiagrams:
                     yield strict, other
 
     def _opaque(self, formula: Formula) -> int:
+        shape = self._shapes.of(formula)
+        if shape not in self._opaque_nodes:
+            node = self._opaque_nodes[shape] = self._new_opaque(formula)
+            # "exists" of something is not "forall" of its negation
+            self._opaque_nodes[self._shapes.negated(shape)] = self.diagrams.complement(node)
+        return self._opaque_nodes[shape]
+
+    def _new_opaque(self, formula: Formula) -> int:
         text = format_formula(formula)
         alone = None
         if isinstance(formula, Quantified) and isinstance(formula.group, Group):

@@ -332,17 +332,31 @@ class _Examiner:
             reading = self._reading(part)
             runs = reading.satisfying if satisfied else reading.violating
             what = "whether a run satisfies it" if satisfied else "whether a run violates it"
-            self._answers[key] = self._asked(part.name, what, *([] if runs is None else [runs]))
+            given = [] if runs is None else [runs]
+            self._answers[key] = self._asked(part.name, what, *given, whole=(part, satisfied))
         return self._answers[key]
 
-    def _asked(self, name: str, what: str, *runs: Runs) -> Answer | None:
+    def _asked(
+        self, name: str, what: str, *runs: Runs, whole: tuple[_Part, bool] | None = None
+    ) -> Answer | None:
         try:
             if runs:
                 return self._search.shortest(*runs)
         except UndecidedError:
-            pass
+            if whole is not None and (answer := self._of_whole(*whole)) is not None:
+                return answer
         self._undecided.setdefault(name, []).append(what)
         return None
+
+    def _of_whole(self, part: _Part, satisfied: bool) -> Answer | None:
+        """Return what the automaton of a whole part says; None if that is not decided either."""
+        try:
+            side = Side(automaton_of(self._specification, part.name, part.formula), satisfied)
+            if not side.may_agree(side.automaton.initial):
+                return Answer(None, by_logic=True)
+            return self._search.shortest(((side,),))
+        except (NoAutomatonError, UndecidedError):
+            return None
 
     def _is_empty(self, part: _Part, satisfied: bool) -> bool:
         answer = self._answer(part, satisfied)
@@ -364,6 +378,8 @@ class _Examiner:
         implications = {
             node.span: node for node in nodes if isinstance(node, Boolean) and node.operator == "->"
         }
+        if (count := len(implications)) > MAX_ANTECEDENTS:
+            self._notes.append(f"of {count} implications of {part.name}, {MAX_ANTECEDENTS} were examined")
         possible: dict[Boolean, Runs] = {}
         for node in list(implications.values())[:MAX_ANTECEDENTS]:
             if (ever := self._sometime(part, node.operands[0])) is None:

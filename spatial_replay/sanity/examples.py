@@ -16,9 +16,17 @@ from typing import Any, Final, Literal, NamedTuple, TypeAlias
 import numpy as np
 
 from spatial_replay.errors import SpatialReplayError
-from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
+from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject, centre_of
+from spatial_replay.monitor.atoms.terms import footprint_from_outline
 from spatial_replay.monitor.evaluate import Evaluation, evaluate
-from spatial_replay.sanity.conditions import Fact, Quantity, plain, radius_of, without_radius
+from spatial_replay.sanity.conditions import (
+    Fact,
+    Quantity,
+    is_about_heights,
+    plain,
+    radius_of,
+    without_radius,
+)
 from spatial_replay.sanity.linear import Inequality, solve
 from spatial_replay.sanity.relaxations import conjuncts
 from spatial_replay.sanity.shortest_words import Word, WordSearch
@@ -49,14 +57,6 @@ from spatial_replay.trace.trace import Trace
 # ------------------------------------------------------------------------------------------- regions as boxes
 
 
-def footprint_of(outline: Outline) -> Footprint:
-    """Return the area of a region."""
-    if outline.is_disc:
-        (x, y), *_ = outline.vertices
-        return Footprint.disc(x, y, outline.radius)
-    return Footprint.polygon(np.array(outline.vertices, np.float64))
-
-
 def around(outline: Outline) -> tuple[tuple[float, float], ...]:
     vertices, radius = np.array(outline.vertices, np.float64), outline.radius
     limits = zip(vertices.min(axis=0) - radius, vertices.max(axis=0) + radius, strict=True)
@@ -71,7 +71,7 @@ def inside(footprint: Footprint) -> tuple[tuple[float, float], ...]:
 
 def _box_in(part: ConvexPart) -> tuple[tuple[float, float], ...]:
     """Return a box around a part's centroid, of the proportions of the box around the part."""
-    x, y = centroid(part)
+    x, y = centre_of(Footprint((part,)))
     if len(part.vertices) < 3:
         half = part.radius / math.sqrt(2.0)
         return (x - half, x + half), (y - half, y + half)
@@ -85,18 +85,6 @@ def _box_in(part: ConvexPart) -> tuple[tuple[float, float], ...]:
         y - share * height / 2.0,
         y + share * height / 2.0,
     )
-
-
-def centroid(part: ConvexPart) -> tuple[float, float]:
-    """Return the centroid of a part's polygon; of a point or segment, the mean."""
-    vertices = part.vertices - part.vertices[0]
-    after = np.roll(vertices, -1, axis=0)
-    cross = vertices[:, 0] * after[:, 1] - after[:, 0] * vertices[:, 1]
-    if len(vertices) < 3:
-        x, y = vertices.mean(axis=0).tolist()
-    else:
-        x, y = (((vertices + after) * cross[:, None]).sum(axis=0) / (3.0 * cross.sum())).tolist()
-    return x + float(part.vertices[0, 0]), y + float(part.vertices[0, 1])
 
 
 # -------------------------------------------------------------------------------------------------- placement
@@ -174,7 +162,7 @@ class Setting:
         key = (name, outer)
         if key not in self._boxes:
             outline = self.regions[name]
-            limits = around(outline) if outer else inside(footprint_of(outline))
+            limits = around(outline) if outer else inside(footprint_from_outline(outline))
             self._boxes[key] = limits if outline.height is None else (*limits, outline.height)
         return self._boxes[key]
 
@@ -416,8 +404,8 @@ class _Attempt:
         assert isinstance(quantity, (Projection, CentroidProjection))
         axis = "xyz".index(quantity.axis)
         if isinstance(quantity, CentroidProjection) and isinstance(quantity.term, RegionName):
-            footprint = footprint_of(self._setting.regions[quantity.term.name])
-            centres = [centroid(part)[axis] for part in footprint.parts]
+            footprint = footprint_from_outline(self._setting.regions[quantity.term.name])
+            centres = [centre_of(Footprint((part,)))[axis] for part in footprint.parts]
             return _Amount({}, min(centres) if quantity.side == "min" else max(centres))
         sides = self._sides(quantity.term, index, outer=True)
         if axis >= len(sides):
@@ -649,11 +637,7 @@ def _setting(specification: Specification, spec: NamedSpec) -> Setting:
     """Return what there is to place: what the other specs are about, too, so that they can be evaluated."""
     own = _atoms(spec)
     every = [*own, *(atom for each in specification.results for atom in _atoms(each))]
-    upright = any(
-        isinstance(part, Projection) and part.axis == "z"
-        for atom in every
-        for part in iter_expressions(atom.expression)
-    )
+    upright = is_about_heights(every)
     turned = dict.fromkeys(_turned(own))
     if len({*turned, *_turned(every)}) <= MAX_TURNED:
         turned.update(dict.fromkeys(_turned(every)))

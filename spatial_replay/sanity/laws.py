@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from fractions import Fraction
-from itertools import combinations
-from typing import TypeVar
+from itertools import combinations, product
+from typing import Final, TypeVar
 
 from spatial_replay.sanity.conditions import (
     Quantity,
@@ -23,6 +23,7 @@ from spatial_replay.sanity.linear import Inequality
 from spatial_replay.spec.formula import (
     Axis,
     CentroidProjection,
+    Measurement,
     Misalignment,
     Outline,
     Projection,
@@ -31,19 +32,32 @@ from spatial_replay.spec.formula import (
     SignedDistance,
     Term,
 )
+from spatial_replay.spec.walks import measured_terms
+
+LEVEL: Final = -1
+"""The label of laws about objects without a gap in height; labels of facts are at least 0."""
 
 
 def laws(
-    quantities: Iterable[Quantity], inside: Iterable[Protrusion], regions: Mapping[str, Outline]
+    quantities: Iterable[Quantity],
+    inside: Iterable[Protrusion],
+    regions: Mapping[str, Outline],
+    between: Mapping[Measurement, Fraction],
+    diameters: Mapping[str, Fraction],
 ) -> list[Inequality]:
     """Return the laws between quantities, and between these and others that are about the same terms.
 
     Args:
         inside: the protrusions that are at most 0.
+        between: distances of regions that are apart, and protrusions of regions from those around them.
+        diameters: of regions, for objects without a gap in height; none where heights count.
     """
     used = list(dict.fromkeys(quantities))
+    present = set(terms_in(used))
+    between = {each: value for each, value in between.items() if present.issuperset(measured_terms(each))}
+    used += [each for each in between if each not in used]
     terms = [term for term in terms_in(used) if is_solid(term)]
-    found = list(_single(used))
+    found = [*_single(used), *_fixed(between)]
     extents = _Extents(used, terms, regions)
     distances = [each for each in used if isinstance(each, SignedDistance)]
     protrusions = [each for each in used if isinstance(each, Protrusion)]
@@ -53,11 +67,14 @@ def laws(
         _distance(without_radius(each.first), without_radius(each.second)) for each in distances
     )
     outside = dict.fromkeys(_bare(each) for each in protrusions)
-    within = dict.fromkeys(each for each in inside if each in outside)
+    inside = {*inside, *between}
+    within = dict.fromkeys(each for each in outside if each in inside)
     found += _transitive(outside, within, regions)
     found += _nested(bare, within, regions)
+    found += _across(bare, outside, diameters)
     if extents.matter:
-        found += extents.laws(bare, outside)
+        # those of regions are measured, and rounded: extents, which are exact, add nothing to them
+        found += extents.laws(bare, [each for each in outside if each not in between])
     return found
 
 
@@ -85,6 +102,25 @@ def _single(used: Iterable[Quantity]) -> Iterator[Inequality]:
                 yield _law((each, 1))
             case Protrusion() if each.inner == each.outer:
                 yield _law((each, 1))
+
+
+def _fixed(between: Mapping[Measurement, Fraction]) -> Iterator[Inequality]:
+    """Yield how far regions are apart at least, and how far they stick out of one another at most."""
+    for each, value in between.items():
+        sign = -1 if isinstance(each, SignedDistance) else 1
+        yield _law((each, sign), bound=sign * value)
+
+
+def _across(
+    distances: Iterable[SignedDistance], outside: Mapping[Protrusion, None], diameters: Mapping[str, Fraction]
+) -> Iterator[Inequality]:
+    """Yield that two objects are at most the diameter of a region apart, plus how far they stick out."""
+    for pair, (name, diameter) in product(distances, diameters.items()):
+        region = RegionName(name)
+        rooms = [Protrusion(pair.first, region), Protrusion(pair.second, region)]
+        if pair.first != pair.second and all(each in outside for each in rooms):
+            law = _law((pair, 1), *((each, -1) for each in rooms), bound=diameter)
+            yield law._replace(label=LEVEL)
 
 
 def _enlarged(distances: list[SignedDistance], protrusions: list[Protrusion]) -> Iterator[Inequality]:
@@ -140,10 +176,14 @@ def _transitive(
     for first in waiting:
         a, b = first.inner, first.outer
         for c, second in outers.get(b, {}).items():
+            if a == c:
+                # a lies within b by no more than b sticks out of a
+                yield _law((first, -1), (second, -1))
             # heights count between a and c, but not on the way over a region without any
             is_gap = is_flat(b, regions) and not is_flat(a, regions) and not is_flat(c, regions)
             # steps over what no measurement begins or ends with say the same one by one
-            leads = c in outers[a] or not beyond.get(c, frozenset()).isdisjoint(outers[a])
+            is_nested = isinstance(b, RegionName) and isinstance(c, RegionName)
+            leads = is_nested or c in outers[a] or not beyond.get(c, frozenset()).isdisjoint(outers[a])
             if a == c or is_gap or not (leads or is_flat(a, regions)):
                 continue
             whole = Protrusion(a, c)

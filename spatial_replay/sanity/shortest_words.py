@@ -16,7 +16,7 @@ from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.guards import LEAF, NO, YES, Diagrams
 from spatial_replay.errors import NoAutomatonError
 from spatial_replay.sanity.conditions import Fact, FactDiagrams, is_negated, terms_in
-from spatial_replay.sanity.laws import laws
+from spatial_replay.sanity.laws import LEVEL, laws
 from spatial_replay.sanity.linear import solve
 from spatial_replay.spec.formula import Protrusion, Signal
 
@@ -258,6 +258,9 @@ MAX_LENGTHS: Final = 4
 
 MAX_SHORT: Final = 12
 """The longest run that is looked for so."""
+
+_ON_ONE_LEVEL: Final = "no gap in height"
+"""What an exclusion names that does not hold for objects above each other."""
 
 MAX_PAIRS: Final = 200
 """How many pairs of automata are looked at for two that exclude each other."""
@@ -561,7 +564,7 @@ class WordSearch:
         numbers = self._impossible(cube)
         if numbers is None:
             return None
-        core = {number: cube[number] for number in sorted(numbers)}
+        core = {number: cube[number] for number in sorted(numbers - {LEVEL})}
         for number in tuple(core):
             less = {each: value for each, value in core.items() if each != number}
             if less and self._impossible(less) is not None:
@@ -612,15 +615,16 @@ class WordSearch:
         weights = [facts[number].weights for number in cube]
         quantities = dict.fromkeys(quantity for each in weights for quantity, _ in each)
         geometry = [each for each in quantities if not isinstance(each, Signal)]
-        known = laws(geometry, inside, self._conditions.regions) if geometry else []
+        conditions = self._conditions
+        known = laws(geometry, inside, conditions.regions, conditions.between, conditions.diameters)
         return solve(own, known).conflict
 
-    def _about(self, sides: Sequence[Side]) -> Iterator[frozenset[tuple[int, bool]]]:
-        """Yield the exclusions between facts that automata read."""
+    def _about(self, sides: Sequence[Side]) -> list[frozenset[tuple[int, bool]]]:
+        """Return the exclusions between facts that automata read; without any, those with other facts."""
         facts = self._read(sides)
-        for each in self._exclusions:
-            if facts.issuperset(fact for fact, _ in each):
-                yield each
+        about = [(each, {fact for fact, _ in each}) for each in self._exclusions]
+        own = [each for each, read in about if facts >= read]
+        return own or [each for each, read in about if facts & read]
 
     def _read(self, sides: Sequence[Side]) -> set[int]:
         """Return the facts that automata read."""
@@ -638,7 +642,9 @@ class WordSearch:
         return facts
 
     def _texts_of(self, exclusion: frozenset[tuple[int, bool]]) -> tuple[str, ...]:
-        texts = (self.fact(number).texts[0 if value else 1] for number, value in sorted(exclusion))
+        texts = [self.fact(number).texts[0 if value else 1] for number, value in sorted(exclusion)]
+        if LEVEL in (self._impossible(dict(exclusion)) or ()):
+            texts.append(_ON_ONE_LEVEL)
         return tuple(dict.fromkeys(texts))
 
     def fact(self, number: int) -> Fact:

@@ -247,6 +247,16 @@ def substitute(formula: Formula, names: Names, relations: frozenset[str] = RELAT
             return replace(formula, operands=operands)
 
 
+def without_variables(formula: Quantified) -> Formula:
+    """Return the body of a quantifier with variables that are known by their place alone."""
+    inner = sum(isinstance(each, Quantified) for each in iter_formulas(formula.body))
+    # no name of a text begins with a blank and a number
+    return substitute(
+        formula.body,
+        {name: Variable(f" {inner}.{index}") for index, name in enumerate(formula.variables)},
+    )
+
+
 def substitute_term(term: Term, names: Names) -> Term:
     """Return a term with other objects in place of some of its variables."""
     match term:

@@ -65,6 +65,10 @@ def test_a_named_proposition_is_labelled_by_its_name() -> None:
         ("a ovlp b xor c ovlp d", "not (a ovlp b <-> c ovlp d)"),
         ("a ovlp b", "not not (a ovlp b)"),
         ("forall x in all: x ovlp a", "not (exists x in all: not (x ovlp a))"),
+        ("forall x in all: x ovlp a", "forall y in all: y ovlp a"),
+        ("a ovlp b and (c ovlp d or e ovlp f)", "(a ovlp b and c ovlp d) or (a ovlp b and e ovlp f)"),
+        ("a leftof b", "not (a rightof b)"),
+        ("a closer b than c", "not (a closer c than b)"),
     ],
 )
 def test_equivalent_texts_are_one_proposition(first: str, second: str) -> None:
@@ -84,6 +88,28 @@ def test_a_proposition_and_its_negation_are_one() -> None:
     }
     assert machine.accepts([[True], [False]])
     assert not machine.accepts([[True], [True]])
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        ("a leftof b", "a rightof b"),
+        ("a dist b <= 1", "a dist b > 1"),
+        ("exists x in all: x ovlp a", "forall y in all: not (y ovlp a)"),
+        ("a ovlp b and (c ovlp d or e ovlp f)", "not (a ovlp b) or (not (c ovlp d) and not (e ovlp f))"),
+    ],
+)
+def test_relations_that_are_opposites_are_one_proposition(first: str, second: str) -> None:
+    machine = machine_of(f"(F ({first})) and (F ({second}))")
+    (proposition,) = machine.propositions
+    assert proposition == machine_of(f"F ({first})").propositions[0]
+    assert machine.accepts([[True], [False]]) and not machine.accepts([[True], [True]])
+
+
+def test_signals_may_be_at_most_and_at_least_a_limit_at_once() -> None:
+    machine = machine_of("(G mode <= 2) and (F mode >= 2)")
+    assert [each.text for each in machine.propositions] == ["mode <= 2", "mode >= 2"]
+    assert machine.accepts([[True, True]])
 
 
 def test_a_template_has_one_automaton_for_all_objects() -> None:

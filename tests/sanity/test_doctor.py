@@ -14,6 +14,9 @@ from spatial_replay.sanity.examples import Example
 REGIONS = """
 region left_bin = box(0, 0, 1, 1)
 region right_bin = circle((3, 0.5), 0.5)
+region corner = box(0, 0, 0.4, 0.4)
+region left_disc = circle((5, 5), 0.5)
+region right_disc = circle((5.8, 5.8), 0.5)
 group cups = cup, mug
 """
 
@@ -61,6 +64,24 @@ def exclusions(formula: str, profile: str = "paper") -> tuple[tuple[str, ...], .
         ),
         ("cups leftof b and b leftof mug", ("mug prec[x] b", "b leftof mug")),
         ("mode == 2 and mode >= 3", ("mode <= 2", "mode >= 3")),
+        ("a enclosedin b and b enclosedin a", ("a enclosedin b", "b enclosedin a")),
+        (
+            "a enclosedin b and b enclosedin c and c enclosedin a",
+            ("a enclosedin b", "b enclosedin c", "c enclosedin a"),
+        ),
+        (
+            "cup enclosedin corner and not (cup enclosedin left_bin)",
+            ("cup enclosedin corner", "not (cup enclosedin left_bin)"),
+        ),
+        # their extents along both axes overlap
+        (
+            "cup enclosedin left_disc and cup enclosedin right_disc",
+            ("cup enclosedin left_disc", "cup enclosedin right_disc"),
+        ),
+        (
+            "cup enclosedin corner and mug enclosedin left_bin and cup dist mug >= 2",
+            ("cup enclosedin corner", "mug enclosedin left_bin", "cup dist mug >= 2", "no gap in height"),
+        ),
     ],
 )
 def test_what_geometry_excludes_is_named(formula: str, excluded: tuple[str, ...]) -> None:
@@ -97,6 +118,30 @@ def test_what_can_hold_is_not_excluded() -> None:
     )
     # marginal by its nature, and meant
     assert findings("spec s = F (mode == 2 and mode >= 2)\nspec t = F (a touch[0] b)\n") == []
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "spec s = F (cup enclosedin corner and mug enclosedin corner and cup dist mug >= 0.5)",
+        "spec s = F (a moved[0.2] corner and b enclosedin corner and a dist b >= 0.7)",
+        # things of which one stands on the other may be further apart than their region is wide
+        "spec s = F (a enclosedin corner and b enclosedin corner and a dist b >= 1 and b prec[z] a)",
+        "region shelf = box(9, 9, 10, 10) height (1, 2)\n"
+        "spec s = F (cup enclosedin corner and mug enclosedin corner and cup dist mug >= 1)",
+    ],
+    ids=("diagonal", "outside", "above", "shelf"),
+)
+def test_things_in_a_region_may_be_as_far_apart_as_it_is_wide(text: str) -> None:
+    assert findings(text) == []
+
+
+def test_none_and_some_are_opposites_whatever_their_variables_are_called() -> None:
+    none = "spec none = G (forall p in all: not (p ovlp robot))\n"
+    assert findings(f"{none}spec some = F (exists q in all: q ovlp robot)") == [
+        ("contradiction", ("none", "some"))
+    ]
+    assert findings(f"{none}spec other = F (exists q in all: q ovlp person)") == []
 
 
 def test_contradictions_of_logic_alone_are_said_to_be() -> None:
