@@ -125,7 +125,7 @@ def test_the_specification_in_the_readme_has_the_numbers_that_the_readme_shows()
     assert f"satisfied by {in_time.robustness:.3f} metres, violated by {-late.robustness:.3f}" in README
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/command-line.md"])
+@pytest.mark.parametrize("page", ["README.md", "docs/why-did-it-fail.md"])
 def test_the_explanation_on_a_page_is_what_the_command_prints(
     page: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

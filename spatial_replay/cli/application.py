@@ -271,7 +271,10 @@ def message_from_error(error: BaseException) -> str:
             notes = getattr(error.__cause__ or error, "__notes__", ())
             return "\n  ".join(["interrupted", *notes])
         case click.UsageError(ctx=click.Context() as context):
-            return f"{error.format_message()}\n  see '{context.command_path} --help'"
+            path, what = context.command_path, error.format_message()
+            if "unexpected extra" in what and any("--spec" in each.opts for each in context.command.params):
+                what += f"; specifications come after --spec: {path} LOG --spec FILE"
+            return f"{what}\n  see '{path} --help'"
         case click.ClickException():
             return error.format_message()
         case SpecificationError(diagnoses=[_, *_] as diagnoses):

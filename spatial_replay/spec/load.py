@@ -727,7 +727,8 @@ class Elaborator:
             self.resolver.fault(written.name.span, scope, f"{name!r} is a template, not a macro", hint)
             return
         macros = (each for each, what in self.names.definitions.items() if isinstance(what, DefStatement))
-        inner = self.faults.source.text[written.name.span.end : written.span.end].strip()
+        given = written.arguments
+        inner = f"({self.faults.source.text[given[0].span.start : given[-1].span.end] if given else 'p'})"
         hint = self.faults.nearest(name, macros) or function_hint(name, inner) or "define it with def"
         self.resolver.fault(written.name.span, scope, f"no macro is named {name!r}", hint)
 
@@ -968,8 +969,8 @@ def _profile(statements: Sequence[Statement], plugins: Mapping[str, Plugin], fau
     return None
 
 
-_FORMULA = re.compile(r"[(<>=]")
-"""Characters of a formula that file names hardly ever have."""
+_FORMULA = re.compile(r"[(<>=]|\S [a-z]+(\[.*\])? \S")
+"""What formulas have and file names hardly ever do: some characters, and a word between two others."""
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?", re.ASCII)
 
 

@@ -186,6 +186,10 @@ TEN_FAULTS = "\n".join(
     [
         (("replay", "none.mcap", "--spec", "blocks.spatial"), "none.mcap: no such file; check the path"),
         (("replay", "run.jsonl", "--spec", "none.spatial"), "none.spatial: no such file; check the path"),
+        (
+            ("replay", "run.jsonl", "blocks.spatial"),
+            "specifications come after --spec: spatial-replay replay",
+        ),
         (("replay", "run.jsonl"), "run.jsonl holds no specification of its own; give one with --spec"),
         ((*REPLAY, "-o", "run.jsonl"), "run.jsonl is an input too"),
         ((*REPLAY, "-o", "./blocks.spatial"), "blocks.spatial is an input too"),
