@@ -40,7 +40,7 @@ from spatial_replay.replay.selection import (
 from spatial_replay.spec.diagnostics import nearest_hint
 from spatial_replay.spec.formula import Outline, Specification, iter_nodes
 from spatial_replay.trace.trace import ABSENT, Trace, window_of
-from spatial_replay.tuning.search import last_that_holds
+from spatial_replay.tuning.tuned import last_that_holds
 
 
 class KeptNode(NamedTuple):

@@ -1,15 +1,21 @@
-"""Result of tuning: values with their ranges, the margin of every run, runs that conflict, and surfaces."""
+"""The search for constants (by numbers, exactly along directions, by evolution) and its result.
+
+The result holds values with their ranges, the margin of every run, runs that conflict, and surfaces.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+import itertools
+import math
+import random
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from spatial_replay.errors import UsageError
+from spatial_replay.errors import UsageError, importing
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.lazy import Displayed
 from spatial_replay.monitor.verdict import Verdict, final_verdict
@@ -28,7 +34,630 @@ from spatial_replay.tuning.margins import (
     text_of_constant,
     varied_constants,
 )
-from spatial_replay.tuning.search import Found, Search
+
+_GENERATIONS, _CANDIDATES = 15, 6
+"""Bounds of an evolution: its generations, and candidates of each for every number."""
+
+
+def last_that_holds(inside: int, end: int, holds: Callable[[int], bool]) -> int:
+    """Return the last number up to which a condition holds: looked for at doubling steps, then by halves.
+
+    It costs few evaluations, all of them near to where it starts, if it does not hold far.
+
+    Args:
+        inside: holds, and is not evaluated.
+        end: the last number to look at, on either side.
+        holds: once it fails, it is taken to fail from there to the end.
+    """
+    step = 1
+    while inside != end:
+        ahead = min(inside + step, end) if end > inside else max(inside - step, end)
+        if not holds(ahead):
+            return last_before(inside, ahead, holds)
+        inside, step = ahead, 2 * step
+    return inside
+
+
+def last_before(inside: int, outside: int, holds: Callable[[int], bool]) -> int:
+    """Return the last number that holds between one that does and another, on either side, that does not."""
+    while abs(outside - inside) > 1:
+        middle = (inside + outside) // 2
+        if holds(middle):
+            inside = middle
+        else:
+            outside = middle
+    return inside
+
+
+def evolve(
+    cost: Callable[[Sequence[int]], float], sizes: Sequence[int], start: Sequence[int], seed: int
+) -> None:
+    """Let SciPy look for numbers, from 0 to some sizes, of the least cost: the best that it asked for.
+
+    Raises:
+        UsageError: SciPy is not installed.
+    """
+    with importing("tuning several constants needs SciPy", extra="tune"):
+        from scipy.optimize import differential_evolution
+    differential_evolution(
+        lambda shares: cost([round(share * size) for share, size in zip(shares, sizes, strict=True)]),
+        [(0.0, 1.0)] * len(sizes),
+        rng=np.random.default_rng(seed),
+        x0=[number / size for number, size in zip(start, sizes, strict=True)],
+        init="sobol",
+        popsize=_CANDIDATES,
+        maxiter=_GENERATIONS,
+        polish=False,
+    )
+
+
+_MOST_EVALUATIONS: Final = 8_000
+"""Evaluations of runs for one decision, or for one widest margin; past them it counts as undecided."""
+_MOST_BOXES: Final = 2_000
+"""Boxes that are looked at for one margin, which need no evaluation if they lie near to others."""
+_LEVELS, _PRECISION = 40, 1e-3
+"""Margins tried for the widest, and how near to it, as a part of it, the search comes."""
+_CONTRACTION: Final = 4
+"""Halvings by which a side of a box is cut in one turn."""
+
+
+class Feasibility(NamedTuple):
+    """Whether some runs all have a margin at some point.
+
+    Attributes:
+        looseness: of each constant there, or None if no such point was found.
+        is_proven: whether there is none, if none was found.
+    """
+
+    looseness: tuple[int, ...] | None
+    is_proven: bool = True
+
+
+class _Part(NamedTuple):
+    """Constants that share results, and these results."""
+
+    axes: tuple[int, ...]
+    results: tuple[str, ...]
+
+
+class ExactSearch:
+    """The search for points, by their looseness, at which runs have a margin."""
+
+    def __init__(self, margins: Margins, point_of: Callable[[Sequence[int]], Point]) -> None:
+        """Prepare the search.
+
+        Args:
+            point_of: returns the point with a looseness of each constant, from 0 to the number of its steps.
+        """
+        self._margins, self._point_of = margins, point_of
+        self._steps = [constant.steps for constant in margins.varied]
+        parts = _parts(margins)
+        self._single = [part for part in parts if len(part.axes) < 2]
+        several = [part for part in parts if len(part.axes) > 1]
+        self._joint = _Part(
+            tuple(axis for part in several for axis in part.axes),
+            tuple(name for part in several for name in part.results),
+        )
+
+    def widest(self, good: Sequence[int], bad: Sequence[int]) -> Feasibility:
+        """Return the point of the widest margin of some runs, if at any point all have the right verdict."""
+        found = self.decide(good, bad, 0.0)
+        if found.looseness is None:
+            return found
+        best, low = found.looseness, self._least((*good, *bad), found.looseness)
+        ends = self._steps, [0] * len(self._steps)
+        high = min(self._least(good, ends[0]), self._least(bad, ends[1]))
+        if any(self._is_invalid((*good, *bad), end) for end in ends):
+            high = math.inf
+        is_proven = True
+        most = self._margins.evaluations + _MOST_EVALUATIONS
+        for _ in range(_LEVELS):
+            if self._margins.evaluations > most:
+                is_proven = False
+                break
+            if high - low <= _PRECISION * abs(low) or low == high:
+                break
+            level = (low + high) / 2 if math.isfinite(high) else max(1.0, 2 * low)
+            tried = self.decide(good, bad, level)
+            if tried.looseness is None:
+                high = level
+                is_proven &= tried.is_proven
+            else:
+                best, low = tried.looseness, max(level, self._least((*good, *bad), tried.looseness))
+        return Feasibility(best, is_proven)
+
+    def decide(self, good: Sequence[int], bad: Sequence[int], level: float) -> Feasibility:
+        """Return a point at which some runs have at least a margin, or whether there is none."""
+        numbers = list(self._steps)
+        uncovered = list(bad)
+        for part in self._single:
+            for axis in part.axes:
+                numbers[axis] = self._tightest(good, numbers, axis, level, part)
+            if not all(self._holds(run, numbers, level, part.results) for run in good):
+                return Feasibility(None)
+            uncovered = [run for run in uncovered if not self._holds(run, numbers, level, part.results)]
+        if not self._joint.axes:
+            return Feasibility(None if uncovered else tuple(numbers))
+        return self._in_boxes(good, uncovered, numbers, level)
+
+    def _tightest(
+        self, good: Sequence[int], numbers: Sequence[int], axis: int, level: float, part: _Part
+    ) -> int:
+        """Return the least number of an axis from which on good runs hold; all steps if one never does."""
+        number = 0
+        for run in good:
+            holds = partial(self._holds_at, run, numbers, axis, level, part.results)
+            if not holds(number):
+                number = last_before(self._steps[axis], number, holds)
+        return number
+
+    def _in_boxes(
+        self, good: Sequence[int], bad: Sequence[int], numbers: Sequence[int], level: float
+    ) -> Feasibility:
+        low = _with(numbers, self._joint.axes, 0)
+        boxes = [(low, list(numbers))]
+        most = self._margins.evaluations + _MOST_EVALUATIONS
+        for _ in range(_MOST_BOXES):
+            if not boxes:
+                return Feasibility(None)
+            if self._margins.evaluations > most:
+                break
+            low, high = boxes.pop()
+            if not (self._may_fit(good, high, level) and self._may_fit(bad, low, level)):
+                continue
+            self._contract(good, low, high, level)
+            if not self._may_fit(bad, low, level):
+                continue
+            self._contract(bad, high, low, level)
+            for corner in (low, high):
+                if all(self._holds(run, corner, level, self._joint.results) for run in (*good, *bad)):
+                    return Feasibility(tuple(corner))
+            axis = max(self._joint.axes, key=lambda axis: self._share(axis, low, high))
+            if high[axis] > low[axis]:
+                middle = (low[axis] + high[axis]) // 2
+                boxes.append((_with(low, [axis], middle + 1), list(high)))
+                boxes.append((list(low), _with(high, [axis], middle)))
+        return Feasibility(None, is_proven=not boxes)
+
+    def _share(self, axis: int, low: Sequence[int], high: Sequence[int]) -> float:
+        return (high[axis] - low[axis]) / self._steps[axis]
+
+    def _contract(
+        self, runs: Sequence[int], corner: list[int], opposite: Sequence[int], level: float
+    ) -> None:
+        """Move a corner of a box past numbers with which some runs fail even if all else is as opposite."""
+        for axis in self._joint.axes:
+            end, other = corner[axis], opposite[axis]
+            if end == other or self._may_fit(runs, _with(opposite, [axis], end), level):
+                continue
+            least = max(abs(other - end) >> _CONTRACTION, 1)
+            while abs(other - end) > least:
+                middle = (end + other) // 2
+                if self._may_fit(runs, _with(opposite, [axis], middle), level):
+                    other = middle
+                else:
+                    end = middle
+            corner[axis] = end + (1 if other > end else -1)
+
+    def _may_fit(self, runs: Sequence[int], numbers: Sequence[int], level: float) -> bool:
+        return all(self._holds(run, numbers, level, self._joint.results) for run in runs) or (
+            bool(runs) and self._is_invalid(runs, numbers)
+        )
+
+    def _holds(self, run: int, numbers: Sequence[int], level: float, results: Sequence[str]) -> bool:
+        return self._margins.holds(run, self._point_of(numbers), level, results)
+
+    def _holds_at(
+        self, run: int, numbers: Sequence[int], axis: int, level: float, results: Sequence[str], number: int
+    ) -> bool:
+        return self._holds(run, _with(numbers, [axis], number), level, results)
+
+    def _is_invalid(self, runs: Sequence[int], numbers: Sequence[int]) -> bool:
+        # such as a window whose ends are reversed; beyond, the verdict may be right again
+        return self._margins.robustness(runs[0], self._point_of(numbers)) is None
+
+    def _least(self, runs: Sequence[int], numbers: Sequence[int]) -> float:
+        point = self._point_of(numbers)
+        return min((self._margins.margin(run, point) for run in runs), default=math.inf)
+
+
+def _parts(margins: Margins) -> list[_Part]:
+    """Return the constants that share results, directly or through others."""
+    parts: list[tuple[set[int], list[str]]] = []
+    for name, axes in margins.axes.items():
+        shared = [part for part in parts if part[0] & set(axes)]
+        parts = [part for part in parts if part not in shared]
+        parts.append(
+            (set(axes).union(*(part[0] for part in shared)), [name, *(n for p in shared for n in p[1])])
+        )
+    return [_Part(tuple(sorted(axes)), tuple(names)) for axes, names in parts]
+
+
+def _with(numbers: Sequence[int], axes: Sequence[int], number: int) -> list[int]:
+    return [number if axis in axes else old for axis, old in enumerate(numbers)]
+
+
+_PARTS: Final = 1 << 20
+"""Steps by which all constants together are tightened."""
+_ROUNDS: Final = 6
+"""The most rounds of adding runs to those that decide."""
+_MOST_LINES, _SECANTS = 64, 24
+"""The most lines of the grid that are all looked at, and the most steps on one of them."""
+_FAR: Final = 1e12
+"""In place of an infinite margin."""
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """The end of a search.
+
+    Attributes:
+        point: where it ended.
+        is_held: whether every run has the right verdict there.
+        conflict: runs that have not all the right verdict at any point, as far as was searched; () if held.
+        is_proven: whether they have it at no point at all; if held, whether no other point is better.
+        alone: those of the conflict that have the right verdict at no point, whatever the others need.
+    """
+
+    point: Point
+    is_held: bool
+    conflict: tuple[int, ...] = ()
+    is_proven: bool = True
+    alone: tuple[int, ...] = ()
+
+
+class Search:
+    """A search for the best point, for given runs; the same seed gives the same point."""
+
+    def __init__(self, margins: Margins, seed: int = 0) -> None:
+        self._margins, self._seed = margins, seed
+        numbers = list(range(len(margins.runs)))
+        random.Random(seed).shuffle(numbers)
+        self._good = [number for number in numbers if margins.runs[number].is_good]
+        self._bad = [number for number in numbers if not margins.runs[number].is_good]
+        self._steps = tuple(constant.steps for constant in margins.varied)
+
+    def best(self) -> Found:
+        """Return the tightest point if all runs are good, else the one with the widest margin.
+
+        Raises:
+            UsageError: the tightest is asked for of a constant without a direction; the library for several
+                constants is not installed.
+        """
+        if not self._bad:
+            return self._tightest()
+        if len(self._steps) == 1 and self._margins.directions[0] is not None:
+            return self._widest_of_one()
+        if None not in self._margins.directions:
+            return self._widest_by_boxes()
+        return self._widest_of_several()
+
+    def holds(self, point: Point) -> bool:
+        """Return whether every run has the right verdict."""
+        return self._all_hold([*self._bad, *self._good], point)
+
+    def limit(self, run: int) -> int | None:
+        """Return the number at which a run holds by the narrowest, for one constant with a direction.
+
+        Returns:
+            None if it holds nowhere.
+        """
+        steps = self._steps[0]
+        is_good = self._margins.runs[run].is_good
+
+        def at(easiness: int) -> Point:
+            return (self._numbered(0, easiness if is_good else steps - easiness),)
+
+        return at(self._least([run], steps, at))[0] if self._margins.holds(run, at(steps)) else None
+
+    def interval(self, point: Point, axis: int, least: float = 0.0) -> tuple[int, int]:
+        """Return the numbers around a point's, on one axis, at which all margins are at least so large."""
+        return self._edge(point, axis, -1, least), self._edge(point, axis, 1, least)
+
+    # ---------------------------------------------------------------------------------------- one constant
+
+    def _tightest(self) -> Found:
+        """Tighten all constants together, then one after the other, while every run stays satisfied."""
+        for constant, direction in zip(self._margins.varied, self._margins.directions, strict=True):
+            if direction is None:
+                raise UsageError(
+                    f"greater values of {constant.name} are looser in one place and tighter in another, so "
+                    "none is the tightest; give bad runs, too"
+                )
+        loosest = self._at([_PARTS] * len(self._steps), _PARTS)
+        failing = tuple(run for run in self._good if not self._margins.holds(run, loosest))
+        if failing:
+            return Found(loosest, is_held=False, conflict=failing, alone=failing)
+        together = self._least(self._good, _PARTS, lambda part: self._at([part] * len(self._steps), _PARTS))
+        point = self._at([together] * len(self._steps), _PARTS)
+        for axis, steps in enumerate(self._steps):
+
+            def along(looseness: int, axis: int = axis, point: Point = point) -> Point:
+                return self._with(point, axis, self._numbered(axis, looseness))
+
+            point = along(self._least(self._good, steps, along))
+        return Found(point, is_held=True)
+
+    def _widest_of_one(self) -> Found:
+        steps = self._steps[0]
+
+        def at(looseness: int) -> Point:
+            return (self._numbered(0, looseness),)
+
+        alone = self._alone(at(steps), at(0))
+        good, bad = ([run for run in runs if run not in alone] for runs in (self._good, self._bad))
+        first = self._least(good, steps, at)
+        last = steps - self._least(bad, steps, lambda tightness: at(steps - tightness))
+        failing: list[int] = []
+        if first > last:
+            failing = [run for run in good if not self._margins.holds(run, at(last))]
+            failing += [run for run in bad if not self._margins.holds(run, at(first))]
+        if alone or failing:
+            return Found(at(first), is_held=False, conflict=(*alone, *failing), alone=alone)
+        number = self._crossing(first, last, at)
+        widest = max(number, max(number - 1, first), key=lambda each: self._least_margin(at(each)))
+        least = self._least_margin(at(widest))
+        interval = self.interval(at(widest), 0, least)
+        return Found((self._margins.varied[0].roundest(*interval),), is_held=True)
+
+    def _alone(self, loosest: Point, tightest: Point) -> tuple[int, ...]:
+        """Return the runs that have the right verdict at no point, given the two at which that is easiest."""
+        good = [run for run in self._good if not self._margins.holds(run, loosest)]
+        return (*good, *(run for run in self._bad if not self._margins.holds(run, tightest)))
+
+    def _crossing(self, first: int, last: int, at: Callable[[int], Point]) -> int:
+        """Return the least looseness at which the good have the wider margin; the last if there is none.
+
+        Runs that have the least margin nowhere between the ends are left out as these move together.
+        """
+        margin = self._margins.margin
+        good, bad = self._good, self._bad
+        while first < last:
+            middle = (first + last) // 2
+            least_good = min(margin(run, at(last)) for run in good) if good else np.inf
+            least_bad = min(margin(run, at(first)) for run in bad)
+            good = [run for run in good if margin(run, at(first)) <= least_good]
+            bad = [run for run in bad if margin(run, at(last)) <= least_bad]
+            goods = min((margin(run, at(middle)) for run in good), default=np.inf)
+            if goods >= min(margin(run, at(middle)) for run in bad):
+                last = middle
+            else:
+                first = middle + 1
+        return first
+
+    def _least(self, runs: Iterable[int], most: int, at: Callable[[int], Point]) -> int:
+        """Return the least number from which on every run holds; all hold at `most`."""
+        number = 0
+        for run in runs:
+            if not self._margins.holds(run, at(number)):
+                number = last_before(most, number, partial(self._holds_at, run, at))
+        return number
+
+    def _holds_at(self, run: int, at: Callable[[int], Point], number: int, least: float = 0.0) -> bool:
+        return self._margins.holds(run, at(number), least)
+
+    # ------------------------------------------------------------------------------------ several constants
+
+    def _widest_by_boxes(self) -> Found:
+        """Decide exactly over the runs that decide, and add those that turn out to, until none is missing."""
+        alone = self._alone(
+            self._at([_PARTS] * len(self._steps), _PARTS), self._loosened([0] * len(self._steps))
+        )
+        if alone:
+            return Found(self._margins.start, is_held=False, conflict=alone, alone=alone)
+        exact = ExactSearch(self._margins, self._loosened)
+        deciding = self._worst(self._margins.start, [])
+        while True:
+            good, bad = self._sorted(deciding)
+            found = exact.widest(good, bad)
+            if found.looseness is None:
+                break
+            point = self._climbed(deciding, self._loosened(found.looseness))
+            missing = self._worst(point, deciding) or self._failing(point)[:1]
+            if not missing:
+                return Found(self._centred(point), is_held=True, is_proven=found.is_proven)
+            deciding += missing
+        if found.is_proven:
+            # each run that is left is needed for the contradiction
+            for run in list(deciding):
+                rest = self._sorted([each for each in deciding if each != run])
+                fewer = exact.decide(*rest, 0.0)
+                if fewer.looseness is None and fewer.is_proven:
+                    deciding.remove(run)
+        return Found(self._margins.start, False, tuple(deciding), found.is_proven)
+
+    def _sorted(self, runs: Sequence[int]) -> tuple[list[int], list[int]]:
+        """Return the good ones among runs, and the bad ones."""
+        return [run for run in runs if run in self._good], [run for run in runs if run in self._bad]
+
+    def _failing(self, point: Point) -> list[int]:
+        return [run for run in (*self._good, *self._bad) if not self._margins.holds(run, point)]
+
+    def _loosened(self, looseness: Sequence[int]) -> Point:
+        return tuple(self._numbered(axis, number) for axis, number in enumerate(looseness))
+
+    def _widest_of_several(self) -> Found:
+        """Optimise over the runs that decide, and add those that turn out to, until none is missing."""
+        start = self._margins.start
+        deciding = self._worst(start, [])
+        point = start
+        for _ in range(_ROUNDS):
+            point = self._optimised(deciding, point)
+            missing = self._worst(point, deciding)
+            if not missing:
+                break
+            deciding += missing
+        if not self.holds(point):
+            return Found(point, is_held=False, conflict=self._conflict(point), is_proven=False)
+        return Found(self._centred(point), is_held=True, is_proven=False)
+
+    def _worst(self, point: Point, known: Sequence[int]) -> list[int]:
+        """Return the good and the bad run of the least margin, if it is less than that of the known runs."""
+        margin = self._margins.margin
+        least = min((margin(run, point) for run in known), default=np.inf)
+        worst = [min(runs, key=lambda run: margin(run, point)) for runs in (self._good, self._bad) if runs]
+        return [run for run in worst if run not in known and (not known or margin(run, point) < least)]
+
+    def _optimised(self, runs: Sequence[int], start: Point) -> Point:
+        """Return the best point for some runs: of all on few grid lines, or else the best that is found.
+
+        The lines go along an axis with a direction, on which the best number is narrowed down.
+        """
+        axis = self._line_axis
+        others = [each for each in range(len(self._steps)) if each != axis]
+        best: tuple[float, Point] = (-np.inf, start)
+
+        def look(numbers: Sequence[int]) -> float:
+            nonlocal best
+            point = list(start)
+            for other, number in zip(others, numbers, strict=True):
+                point[other] = number
+            found = self._best_on_line(runs, tuple(point), axis)
+            best = max(best, found)
+            return -found[0]
+
+        sizes = [self._steps[other] for other in others]
+        if axis is not None and math.prod(size + 1 for size in sizes) <= _MOST_LINES:
+            for numbers in itertools.product(*(range(size + 1) for size in sizes)):
+                look(numbers)
+        else:
+            evolve(look, sizes, [start[other] for other in others], self._seed)
+        return self._climbed(runs, best[1])
+
+    @property
+    def _line_axis(self) -> int | None:
+        """The axis with a direction that has the most numbers, or None."""
+        axes = [axis for axis, each in enumerate(self._margins.directions) if each is not None]
+        return max(axes, key=lambda axis: self._steps[axis], default=None)
+
+    def _best_on_line(self, runs: Sequence[int], point: Point, axis: int | None) -> tuple[float, Point]:
+        """Return the best point that is found along an axis, with its margin.
+
+        Margins of good runs rise towards looser values, those of bad ones fall: the best is where they meet.
+        They are often linear in a threshold, so that a few secants find it.
+        """
+        if axis is None:
+            return self._sides(runs, point)[0], point
+        best: tuple[float, Point] = (-np.inf, point)
+
+        def excess(looseness: int) -> float:
+            nonlocal best
+            moved = self._with(point, axis, self._numbered(axis, looseness))
+            least, good, bad = self._sides(runs, moved)
+            best = max(best, (least, moved))
+            return good - bad
+
+        low, high = 0, self._steps[axis]
+        below, above = excess(low), excess(high)
+        if below >= 0.0 or above < 0.0:
+            return best
+        for turn in range(_SECANTS):
+            if high - low <= 1:
+                break
+            share = 0.5 if turn % 3 == 2 else below / (below - above)
+            middle = min(max(low + round(share * (high - low)), low + 1), high - 1)
+            if (found := excess(middle)) >= 0.0:
+                high, above = middle, found
+            else:
+                low, below = middle, found
+        return best
+
+    def _sides(self, runs: Sequence[int], point: Point) -> tuple[float, float, float]:
+        """Return the least margin of some runs, and those of the good and of the bad among them, bounded."""
+        least = [_FAR, _FAR]
+        for run in runs:
+            side = int(not self._margins.runs[run].is_good)
+            least[side] = max(min(self._margins.margin(run, point), least[side]), -_FAR)
+        return min(least), least[0], least[1]
+
+    def _climbed(self, runs: Sequence[int], point: Point) -> Point:
+        """Move a point along single axes while the least margin grows, by steps that halve."""
+
+        def value(each: Point) -> float:
+            return min(self._margins.margin(run, each) for run in runs)
+
+        best = value(point)
+        sizes = [max(steps >> 4, 1) for steps in self._steps]
+        for _ in range(12):
+            for axis, size in enumerate(sizes):
+                for step in (-size, size):
+                    moved = self._with(point, axis, min(max(point[axis] + step, 0), self._steps[axis]))
+                    if (margin := value(moved)) > best:
+                        point, best = moved, margin
+            sizes = [max(size >> 1, 1) for size in sizes]
+        return point
+
+    def _centred(self, point: Point) -> Point:
+        """Move each number to the middle of those that give no lesser margin."""
+        least = self._least_margin(point)
+        for axis, constant in enumerate(self._margins.varied):
+            number = constant.roundest(*self.interval(point, axis, least))
+            moved = self._with(point, axis, number)
+            # between the ends a constant without a direction may have a lesser margin
+            point = moved if self._all_hold(self._good + self._bad, moved, least) else point
+        return point
+
+    def _conflict(self, point: Point) -> tuple[int, ...]:
+        """Return the runs that conflict: one or two for which no point is found, else all that fail."""
+        margin = self._margins.margin
+        worst = [min(runs, key=lambda run: margin(run, point)) for runs in (self._good, self._bad) if runs]
+        for few in (*[[run] for run in worst], worst):
+            if not self._all_hold(few, self._optimised(few, point)):
+                return tuple(few)
+        return tuple(self._failing(point))
+
+    # ---------------------------------------------------------------------------------------------- points
+
+    def _numbered(self, axis: int, looseness: int) -> int:
+        """Return the number on an axis of a value that is so many steps looser than the tightest."""
+        return self._steps[axis] - looseness if self._margins.directions[axis] == -1 else looseness
+
+    def _at(self, parts: Sequence[int], whole: int) -> Point:
+        """Return the point whose looseness is this part of the whole, on each axis."""
+        return tuple(
+            self._numbered(axis, part * self._steps[axis] // whole) for axis, part in enumerate(parts)
+        )
+
+    def _with(self, point: Point, axis: int, number: int) -> Point:
+        return (*point[:axis], number, *point[axis + 1 :])
+
+    def _all_hold(self, runs: Sequence[int], point: Point, least: float = 0.0) -> bool:
+        return all(self._margins.holds(run, point, least) for run in runs)
+
+    def _least_margin(self, point: Point) -> float:
+        return min(self._margins.margin(run, point) for run in (*self._good, *self._bad))
+
+    def _edge_of_each(self, point: Point, axis: int, end: int, least: float) -> int:
+        """Return the last number from a point's to an end up to which all runs hold, run by run.
+
+        For an axis with a direction: only good runs fail at tighter values, only bad ones at looser ones.
+        """
+        is_looser = (end > point[axis]) == (self._margins.directions[axis] == 1)
+        # where the specification is invalid, one good run shows it as well as all
+        for run in [*self._bad, *self._good[:1]] if is_looser else self._good:
+            holds = partial(self._holds_at, run, partial(self._with, point, axis), least=least)
+            if not holds(end):
+                end = last_before(point[axis], end, holds)
+        return end
+
+    def _edge(self, point: Point, axis: int, towards: int, least: float) -> int:
+        """Return the last number in one direction up to which all margins are at least so large."""
+        runs, end = [*self._bad, *self._good], self._steps[axis] if towards > 0 else 0
+        if self._margins.directions[axis] is not None:
+            return self._edge_of_each(point, axis, end, least)
+
+        def holds(number: int) -> bool:
+            nonlocal runs
+            moved = self._with(point, axis, number)
+            for index, run in enumerate(runs):
+                if not self._margins.holds(run, moved, least):
+                    # it is the likeliest to fail again
+                    runs = [run, *runs[:index], *runs[index + 1 :]]
+                    return False
+            return True
+
+        return last_that_holds(point[axis], end, holds)
+
 
 MOST_RUNS: Final = 10_000
 MOST_SAMPLES: Final = 1 << 25

@@ -359,7 +359,9 @@ def test_messages_may_be_as_late_as_is_said(tmp_path: Path, mapping: Path) -> No
         read_trace(log, mapping=mapping)
     assert read_trace(log, mapping=mapping, max_lateness="5s") == expected
     assert read_trace(log, mapping=mapping, max_lateness="all") == expected
-    with pytest.raises(UsageError, match="max_lateness is 'soon'; give a duration such as 2s or 500ms, or all"):
+    with pytest.raises(
+        UsageError, match="max_lateness is 'soon'; give a duration such as 2s or 500ms, or all"
+    ):
         read_trace(log, mapping=mapping, max_lateness="soon")
 
 
