@@ -11,13 +11,15 @@ POSITIVE: Final = (0.0, 0.447, 0.698)
 NEGATIVE: Final = (0.835, 0.369, 0.0)
 NEUTRAL: Final = (0.55, 0.55, 0.55)
 HOLDING: Final = (0.337, 0.706, 0.914)
-FAILING: Final = (0.902, 0.624, 0.0)
-"""Colours of results that hold or fail so far: light blue and amber."""
+"""Colour of results that hold so far: light blue. Pending ones are grey."""
 LABEL: Final = (0.95, 0.95, 0.95)
 """Red, green and blue from 0 to 1."""
 
 CURVES: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c8c8c")
 """Colours of curves in one plot, distinguishable with every common colour blindness (Okabe and Ito)."""
+
+MAP: Final = ("#00204d", "#414d6b", "#7c7b78", "#bcae6c", "#ffea46")
+"""Colours of a gradient map, from what fails most to what holds most (five of cividis)."""
 
 _LIGHTER: Final = 0.4
 

@@ -108,7 +108,7 @@ declare module "report-drawing" {
   export function mark(status: Status): HTMLElement;
   export function indexAt(times: Float64Array, time: number): number;
   export function statusOf(run: DrawnRun, result: DrawnResult, node: DrawnNode, place: number | null): Status;
-  export function branch(node: DrawnNode, rows: TreeRow[], hasIntervals: boolean): HTMLElement;
+  export function branch(node: DrawnNode, rows: TreeRow[]): HTMLElement;
   export function showRow(row: TreeRow, run: DrawnRun, result: DrawnResult, place: number | null, isLast: boolean): void;
   export function eventRow(event: DrawnEvent, choose: () => void): HTMLElement;
   export function markedEvent(

@@ -94,7 +94,7 @@ export class Tree {
       settles: true, results: [this.result], numbers: (values) => values,
       palette: { positive: "", negative: "", neutral: "", curves: [] },
     };
-    this.made = element("ul", {}, ...(nodes[0] ? [branch(nodes[0], this.rows, true)] : []));
+    this.made = element("ul", {}, ...(nodes[0] ? [branch(nodes[0], this.rows)] : []));
     this.lines = this.rows.map((row) => row.parts[0]!.closest<HTMLElement>(".row")!);
     this.folds = this.lines.map((line) => line.tagName === "SUMMARY" ? line.parentElement as HTMLDetailsElement : null);
     this.lines.forEach((line, place) => this.listen(line, place, choose));

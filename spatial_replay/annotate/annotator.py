@@ -123,8 +123,7 @@ class Annotator:
             )
             for tree, instance, kept in zip(trees, instances, automata, strict=True)
         ]
-        written = [tree.written(files[tree.file].source) for tree in trees]
-        self._standing = StandingEncoder(trees, self._runs, written, units)
+        self._standing = StandingEncoder(trees, self._runs, units)
         self._encoder = SceneEncoder(shown_regions(files), units.get("", ""))
         self._latest: tuple[Trace, list[SeriesBlock]] | None = None
         self._scene = scene or SceneState()
@@ -139,10 +138,7 @@ class Annotator:
     @property
     def outcomes(self) -> Sequence[FinalStanding]:
         """Outcome of each result at the end of the log."""
-        return [
-            outcome._replace(over_by=each.over_by)
-            for outcome, each in zip(self._standing.outcomes, self._reporters, strict=False)
-        ]
+        return self._standing.outcomes
 
     @property
     def _over(self) -> list[str]:

@@ -394,7 +394,7 @@ class LeafHistory:
         if verdict is Verdict.VIOLATED:
             pending = np.full((len(final) - node, 2), NEVER, np.int64)
             conjuncts = conjuncts_of(self._nodes[node], "")
-            first, *_ = find_causes(conjuncts, values[node:], final[node:], pending, lambda *_: None)
+            first, *_ = find_causes(conjuncts, values[node:], final[node:], pending)
             node += first.node
         done = evaluate_offline(self._formula, self._order, samples.leaves, samples.times_ns)
         path = deciding_path(self._formula, done, samples.times_ns, node, _END_OF[verdict])

@@ -152,8 +152,15 @@ class AnnotatedEvaluation:
             axes: those of the source.
             images: those of the topics that have images.
         """
+        from spatial_replay.annotate.annotator import shown_regions
         from spatial_replay.annotate.foxglove_layout import LayoutContents
+        from spatial_replay.annotate.scene.scene_template import outlines_of
+        from spatial_replay.monitor.atoms.terms import footprint_from_outline
 
+        if extent is not None:
+            for outline in shown_regions(self._files).values():
+                for ring in outlines_of(footprint_from_outline(outline)):
+                    extent = extent.with_points(ring)
         has_states = [each.automaton is not None for each in self.automata]
         # every result has events: a verdict is reported when it is reached, or else when the log ends
         derived = {SCENE, *(DERIVED if self.trees else ())} - set(() if any(has_states) else (AUTOMATON,))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import isfinite
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
@@ -365,8 +364,6 @@ class EventReporter:
         violated_ns: since when the root is violated for certain, or `LATEST_NS`.
         over: what decided the root's verdict, an atom or a missing response, once there is one; "" if that
             is not known.
-        over_by: the number of that atom, or of the one that came nearest to the response, with its unit and
-            without its sign; "" if that is not known.
     """
 
     def __init__(
@@ -403,7 +400,7 @@ class EventReporter:
         self._unknown_ns = np.full(len(self._reported), LATEST_NS)
         self.settled: SettledViolation | None = None
         self.violated_ns = LATEST_NS
-        self.over = self.over_by = ""
+        self.over = ""
 
     def extend(self, block: SeriesBlock) -> list[EncodedEvent]:
         """Take in the next samples; return the changes that they confirm, by node, then by time."""
@@ -577,13 +574,10 @@ class EventReporter:
         if self._reported[node].node or found is None or not self._settles:
             return
         missed = found.missed if isinstance(found, DecidingLeaf) else None
-        leaf, number = self._leaf(found.shown.value if isinstance(found, DecidingLeaf) else found, now_ns)
-        amount = amount_text(abs(number), leaf, self._units) if isfinite(number) else ""
-        self.over, self.over_by = self._leaf_text(leaf), amount
+        leaf, _ = self._leaf(found.shown.value if isinstance(found, DecidingLeaf) else found, now_ns)
+        self.over = self._leaf_text(leaf)
         if missed and missed.is_condition:
             self.over = f"missed {missed.response}"
-            if isinstance(found, DecidingLeaf) and found.response is None:
-                self.over_by = ""
 
     def _leaf(self, found: LeafValue, now_ns: int) -> tuple[Formula, float]:
         """Return a leaf with its number, in place of a quantifier that of the objects that decide it."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from itertools import zip_longest
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
@@ -14,8 +15,8 @@ from spatial_replay.annotate.specification import MIXED, ReportedTree, unit_of, 
 from spatial_replay.annotate.standing import FinalStanding, named_parts, part_title, worst_first
 from spatial_replay.logs.messages import Attachment
 from spatial_replay.logs.schemas.Robustness_pb2 import (
-    FAILS_SO_FAR,
     HOLDS_SO_FAR,
+    PENDING,
     SATISFIED,
     UNKNOWN,
     VIOLATED,
@@ -39,17 +40,19 @@ from spatial_replay.logs.topics import (
     topic_of_camera,
 )
 from spatial_replay.monitor.online.rewriting import looks_ahead
-from spatial_replay.palette import CURVES, FAILING, HOLDING, NEGATIVE, NEUTRAL, POSITIVE, hexadecimal, lighter
+from spatial_replay.palette import CURVES, HOLDING, NEGATIVE, NEUTRAL, POSITIVE, hexadecimal, lighter
 from spatial_replay.spec.formula import Formula
-from spatial_replay.text import number_text, shortened_formula
+from spatial_replay.text import number_text
 from spatial_replay.trace.units import OUR_AXES, Axes
 
 _MOST_CURVES: Final = 12
 _MOST_STRIPS: Final = 8
-"""More curves, or strips of states, cannot be distinguished."""
+"""More curves, or strips of named specs, cannot be distinguished."""
 
 _MOST_PLOTS: Final = 3
-_MOST_INDICATORS: Final = 24
+_MOST_INDICATORS: Final = 6
+"""Lights in one row."""
+
 _LEGEND_PIXELS: Final = 190
 """The width of a legend, beside the curves so that it hides none."""
 
@@ -63,7 +66,7 @@ STANDING_COLOURS: Final[Mapping[int, tuple[str, str]]] = MappingProxyType(
     {
         SATISFIED: ("satisfied", hexadecimal(POSITIVE)),
         HOLDS_SO_FAR: ("holds so far", hexadecimal(HOLDING)),
-        FAILS_SO_FAR: ("fails so far", hexadecimal(FAILING)),
+        PENDING: ("pending", hexadecimal(NEUTRAL)),
         VIOLATED: ("violated", hexadecimal(NEGATIVE)),
         UNKNOWN: ("unknown", hexadecimal(NEUTRAL)),
     }
@@ -95,24 +98,24 @@ def scene_panel(
         "followMode": "follow-none",
         "followTf": FRAMES[0],
         "topics": {topic: {"visible": True, **how} for topic, how in shown.items() if topic in topics},
-        "scene": {"labelScaleFactor": 1},
-        # its axes are a metre long, whatever the scene's size
+        # axes are a metre long, whatever the scene's size
+        "scene": {"labelScaleFactor": 1, "transforms": {"showLabel": False, "axisScale": 0}},
         "transforms": {f"frame:{frame}": {"visible": False} for frame in FRAMES},
     }
     title = "Scene, redone" if redone else "Scene"
+    if grid in topics:
+        title += " (map: dark blue fails, grey is 0, yellow holds)"
     shown_title = title if axes == OUR_AXES else f"{title}, {axes}"
     return _titled("3D!redone" if redone else "3D!scene", shown_title, config)
 
 
 def indicators(trees: Sequence[ReportedTree], outcomes: Sequence[FinalStanding] = ()) -> list[Panel]:
-    """Return a light for each result, in the colour of how it stands at the cursor.
+    """Return a light for each of the first results, in the colour of how it stands at the cursor.
 
     Args:
-        outcomes: of the finished log; titles say since when, by how much and over what results are violated.
+        outcomes: of the finished log; titles say by how much and when results are violated.
     """
-    titles = [tree.title for tree in trees]
-    for index, outcome in enumerate(outcomes):
-        titles[index] += _violation_text(outcome)
+    titles = [_light_title(tree, outcome) for tree, outcome in zip_longest(trees, outcomes)]
     rules = [
         {"operator": "=", "rawValue": str(number), "color": colour, "label": words}
         for number, (words, colour) in STANDING_COLOURS.items()
@@ -180,16 +183,11 @@ def whole_curves(trees: Sequence[ReportedTree], units: Mapping[str, str]) -> lis
     ]
 
 
-def state_strips(trees: Sequence[ReportedTree], has_states: Sequence[bool]) -> Panel:
-    """Return a strip for how each result stands, then for its automaton's state and its named specs."""
-    strips = [(tree.title, _standing_path(tree.title, "standing"), True) for tree in trees]
+def state_strips(trees: Sequence[ReportedTree]) -> Panel:
+    """Return a strip for how each result stands, then for its named specs."""
+    strips = [(tree.title, _standing_path(tree.title, "standing")) for tree in trees]
     more = [
-        (f"{_short(tree.title)}: automaton", _standing_path(tree.title, "automaton"), False)
-        for tree, has_state in zip(trees, has_states, strict=True)
-        if has_state
-    ]
-    more += [
-        (part_title(name, tree), _standing_path(part_title(name, tree), "standing"), True)
+        (part_title(name, tree), _standing_path(part_title(name, tree), "standing"))
         for tree, name, node, _ in _parts(trees)
         if looks_ahead(node)
     ]
@@ -204,16 +202,11 @@ def state_strips(trees: Sequence[ReportedTree], has_states: Sequence[bool]) -> P
             "label": label,
             "timestampMethod": "receiveTime",
             "value": path,
-            **({"customStates": {"type": "discrete", "states": states}} if is_standing else {}),
+            "customStates": {"type": "discrete", "states": states},
         }
-        for label, path, is_standing in [*strips, *more[:_MOST_STRIPS]]
+        for label, path in [*strips, *more[:_MOST_STRIPS]]
     ]
     return _titled("StateTransitions!verdicts", "How results stand", {"isSynced": True, "paths": paths})
-
-
-def node_table() -> Panel:
-    """Return the table of the worst result's nodes at the cursor: whether they hold now, and by how much."""
-    return _titled("Table!nodes", "Nodes of the worst result, now", {"topicPath": f"{STANDING}.present"})
 
 
 def violation_table() -> Panel:
@@ -228,8 +221,16 @@ def event_list() -> Panel:
 
 
 def specification_text() -> Panel:
-    """Return the text of the specification, with its nodes."""
-    return _titled("RawMessages!specification", "Specification", {"topicPath": SPECIFICATION})
+    """Return the text of the specification as it is written."""
+    return _titled(
+        "RawMessages!specification", "Specification", {"topicPath": f"{SPECIFICATION}.files[:].source"}
+    )
+
+
+def automaton_text(tree: ReportedTree) -> Panel:
+    """Return the state of a result's automaton in words."""
+    config = {"topicPath": _standing_path(tree.title, "automaton")}
+    return _titled("RawMessages!automaton", f"Automaton of {tree.title}", config)
 
 
 def decision_reason() -> Panel:
@@ -277,17 +278,13 @@ def summary() -> Panel:
     return _titled("RawMessages!summary", "The whole log", {"topicPath": f"{CURVES_TOPIC}.summary"})
 
 
-def _violation_text(outcome: FinalStanding) -> str:
-    if outcome.standing != VIOLATED:
-        return ""
-    since = f", violated since {outcome.since_s:.3f} s"
-    if outcome.over:
-        # the number of what is named: that of the result may be another atom's, in another unit
-        by = f" by {outcome.over_by}" if outcome.over_by else ""
-        return f"{since}: {shortened_formula(outcome.over)}{by}"
+def _light_title(tree: ReportedTree, outcome: FinalStanding | None) -> str:
+    """Return the name of a result, by how much it is violated and when, then words: viewers cut the end."""
+    title, words = tree.title, f": {tree.sentence}" if tree.sentence else ""
+    if outcome is None or outcome.standing != VIOLATED or not math.isfinite(outcome.by):
+        return f"{title}{words}"
     unit = f" {outcome.unit}" if outcome.unit and outcome.unit != MIXED else ""
-    by = f" by {number_text(outcome.by)}{unit}" if math.isfinite(outcome.by) else ""
-    return f"{since}{by}"
+    return f"{title}, by {number_text(outcome.by)}{unit} at {outcome.at_s:.3f} s{words}"
 
 
 def _titled(identifier: str, title: str, config: Config) -> Panel:
@@ -378,8 +375,6 @@ def _quoted(text: str) -> str:
     return json.dumps(text, ensure_ascii=False)
 
 
-_PER_ROW: Final = 6
-
 _MARGIN = 1.5
 """The height of the picture by the size of what is in it; a panel may be narrower than it is high."""
 
@@ -431,87 +426,138 @@ def live_layout_attachment(contents: LayoutContents) -> Attachment:
 
 
 def viewer_layout(contents: LayoutContents) -> dict[str, Any]:
-    """Return the layout of a log: the scene on the left, its evaluation on the right.
+    """Return the layout of a log: whether, where and when; all else is in tabs.
 
-    If the log has a planner's decisions, its map lies under the scene, and the reasons are listed below it.
+    The lights of the worst results are at the top, the scene on the left; on the right are the curves of one
+    unit at a time, the states of results, and a panel of tabs.
     """
     contents = contents.worst_first()
-    return _layout(contents, _scene_panels(contents), _evaluation_panels(contents))
+    trees = contents.trees
+    curves = [*result_curves(trees, contents.units), *part_curves(trees, contents.units)] if trees else []
+    return _layout(contents, curves, _details(contents))
 
 
 def layout_for_live(contents: LayoutContents) -> dict[str, Any]:
     """Return the layout for a server that replays a log: with the curves of the whole log at any time, and
     the constants that a viewer may edit."""
     contents = contents.worst_first()
-    left = [*_scene_panels(contents), (constants(), 1.5)]
-    panels = _evaluation_panels(contents)
-    if panels:
-        # the curves of the whole log include those played so far
-        played = len(result_curves(contents.trees, contents.units))
-        panels[:played] = [(panel, 3.0) for panel in whole_curves(contents.trees, contents.units)]
-        panels.insert(0, (violation_table(), 1.5))
-        left.append((summary(), 0.7))
-    return _layout(contents, left, panels)
+    details = _details(contents)
+    if contents.trees:
+        details.insert(0, ("whole log", summary()))
+    curves = whole_curves(contents.trees, contents.units) if contents.trees else []
+    return _layout(contents, curves, details, below=constants())
 
 
-_Weighted = tuple[Panel, float]
-"""A panel, and its share of the space beside its neighbours."""
+_PANELS: Final = "spatial-replay.spatial-replay {}!{}"
+"""The identifier of a panel of the extension, by its name."""
 
 
-def _scene_panels(contents: LayoutContents) -> list[_Weighted]:
-    """Return the pictures of cameras, the scene and, of a planner, its reasons."""
-    about = _camera(contents.extent), contents.topics, contents.axes
-    scenes = [(scene_panel(*about), 4.0)]
-    if REDONE_MAP in contents.topics:
-        scenes.append((scene_panel(*about, redone=True), 4.0))
-    cameras = [(each, 4.0) for each in image_panels(contents.images, contents.topics)]
-    return [*cameras, *scenes, *([(decision_reason(), 1.0)] if PLAN_DECISION in contents.topics else [])]
+def with_panels(layout: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the layout of a log for viewers that have the extension: scene, tree, curves and decisions.
+
+    Args:
+        layout: that of the log without them (see `viewer_layout`).
+    """
+    configs = {
+        identifier: config for identifier, config in layout["configById"].items() if "3D!" in identifier
+    }
+    curves = [(name, layout["configById"][name]) for name in layout["configById"] if name.startswith("Plot!")]
+    names = ["automaton", *(["decisions"] if "RawMessages!decision" in layout["configById"] else [])]
+    own = [(each, Panel(_PANELS.format(each, each), {})) for each in names]
+    own += [(_tab_title(each), each) for each in (Panel(name, config) for name, config in curves)]
+    tabs, panels = _tabs("Tab!panels", own)
+    tree = Panel(_PANELS.format("specification", "tree"), {})
+    configs |= {panel.identifier: panel.config for panel in (tree, *panels)}
+    right = _split("column", [(tree.identifier, 6.0), (tabs, 4.0)])
+    whole = {"direction": "row", "first": "3D!scene", "second": right, "splitPercentage": 45}
+    return {**layout, "configById": configs, "layout": whole}
 
 
-def _evaluation_panels(contents: LayoutContents) -> list[_Weighted]:
-    """Return the panels of the evaluation, from top to bottom."""
+_Details = list[tuple[str, Panel]]
+"""Panels of one place, by the titles of their tabs."""
+
+
+def _details(contents: LayoutContents) -> _Details:
+    """Return the panels that are in tabs, those of violations first."""
     trees = contents.trees
-    if not trees:
-        return []
-    panels = [(panel, 3.0) for panel in result_curves(trees, contents.units)]
-    if any(outcome.standing == VIOLATED for outcome in contents.outcomes):
-        panels.insert(0, (violation_table(), 1.5))
-    panels += [(panel, 2.0) for panel in part_curves(trees, contents.units)]
-    panels.append((state_strips(trees, contents.has_states), 3.0))
-    if EVENT_LOG in contents.topics:
-        panels.append((event_list(), 2.0))
-    return [*panels, (node_table(), 2.0), (specification_text(), 1.0)]
+    details = [("violated", violation_table())] if trees else []
+    if trees and EVENT_LOG in contents.topics:
+        details.append(("events", event_list()))
+    if trees:
+        details.append(("specification", specification_text()))
+    if any(contents.has_states):
+        details.append(("automaton", automaton_text(trees[contents.has_states.index(True)])))
+    if PLAN_DECISION in contents.topics:
+        details.append(("decision", decision_reason()))
+    if REDONE_MAP in contents.topics:
+        about = _camera(contents.extent), contents.topics, contents.axes
+        details.append(("redone", scene_panel(*about, redone=True)))
+    cameras = image_panels(contents.images, contents.topics)
+    return details + [(each.config["foxglovePanelTitle"].lower(), each) for each in cameras]
 
 
-def _attachment(layout: dict[str, Any]) -> Attachment:
-    text = json.dumps(layout, indent=1, sort_keys=True, ensure_ascii=False)
-    return Attachment(LAYOUT, "application/json", text.encode())
+def layout_text(layout: Mapping[str, Any]) -> str:
+    """Return a layout as a file has it."""
+    return json.dumps(layout, indent=1, sort_keys=True, ensure_ascii=False)
+
+
+def _attachment(layout: Mapping[str, Any]) -> Attachment:
+    return Attachment(LAYOUT, "application/json", layout_text(layout).encode())
 
 
 def _layout(
-    contents: LayoutContents, left: Sequence[_Weighted], right: Sequence[_Weighted]
+    contents: LayoutContents, curves: Sequence[Panel], details: _Details, below: Panel | None = None
 ) -> dict[str, Any]:
-    """Return a layout: the lights of the results at the top, and two columns below them."""
+    """Return a layout: lights at the top, the scene on the left, curves, states and details on the right.
+
+    Args:
+        below: what is under the scene.
+    """
     lights = indicators(contents.trees, contents.outcomes)
-    rows = [lights[begin : begin + _PER_ROW] for begin in range(0, len(lights), _PER_ROW)]
-    tree = _split("column", [(panel.identifier, share) for panel, share in left])
+    scene = scene_panel(_camera(contents.extent), contents.topics, contents.axes)
+    panels = [*lights, scene]
+    left: list[tuple[_Tree, float]] = [(scene.identifier, 7.0)]
+    if below is not None:
+        panels.append(below)
+        left.append((below.identifier, 3.0))
+    right: list[tuple[_Tree, float]] = []
+    if curves:
+        plots, own = _tabs("Tab!curves", [(_tab_title(each), each) for each in curves])
+        states = state_strips(contents.trees)
+        panels += [*own, states]
+        right += [(plots, 3.0), (states.identifier, 2.5)]
+    if details:
+        tabs, own = _tabs("Tab!details", details)
+        panels += own
+        right.append((tabs, 5.0))
+    tree = _split("column", left)
     if right:
-        second = _split("column", [(panel.identifier, share) for panel, share in right])
-        tree = {"direction": "row", "first": tree, "second": second, "splitPercentage": 45}
-    if rows:
-        lit: list[tuple[_Tree, float]] = [
-            (_split("row", [(panel.identifier, 1.0) for panel in row]), 1.0) for row in rows
-        ]
-        tree = _split("column", [*lit, (tree, _LIT_SHARE)])
+        second = _split("column", right)
+        tree = {"direction": "row", "first": tree, "second": second, "splitPercentage": 50}
+    if lights:
+        row = _split("row", [(panel.identifier, 1.0) for panel in lights])
+        tree = _split("column", [(row, 1.0), (tree, _LIT_SHARE)])
     return {
-        "configById": {
-            panel.identifier: panel.config for panel in (*lights, *(panel for panel, _ in (*left, *right)))
-        },
+        "configById": {panel.identifier: panel.config for panel in panels},
         "globalVariables": {},
         "layout": tree,
         "playbackConfig": {"speed": 1},
         "userNodes": {},
     }
+
+
+def _tab_title(plot: Panel) -> str:
+    """Return the title of a plot in short: "results [m]"."""
+    return str(plot.config["foxglovePanelTitle"]).removeprefix("Robustness of ")
+
+
+def _tabs(identifier: str, titled: Sequence[tuple[str, Panel]]) -> tuple[str, list[Panel]]:
+    """Return the identifier of a panel with tabs, or of the only panel, and all panels."""
+    panels = [panel for _, panel in titled]
+    if len(panels) == 1:
+        return panels[0].identifier, panels
+    tabs = [{"title": title, "layout": panel.identifier} for title, panel in titled]
+    return identifier, [*panels, Panel(identifier, {"activeTabIdx": 0, "tabs": tabs})]
 
 
 _Tree = str | dict[str, Any]

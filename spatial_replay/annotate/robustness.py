@@ -16,8 +16,8 @@ from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.messages import Channel
 from spatial_replay.logs.schemas.Curves_pb2 import Curves, NodeCurves, SpecificationCurves
 from spatial_replay.logs.schemas.Robustness_pb2 import (
-    FAILS_SO_FAR,
     HOLDS_SO_FAR,
+    PENDING,
     SATISFIED,
     UNKNOWN,
     VIOLATED,
@@ -111,7 +111,7 @@ def standing_codes(series: Floats, *, final: bool = False) -> Codes:
     codes = np.full(value.shape, UNKNOWN, np.uint8)
     if not final:
         codes[value >= 0.0] = HOLDS_SO_FAR
-        codes[value < 0.0] = FAILS_SO_FAR
+        codes[value < 0.0] = PENDING
     codes[upper < 0.0] = VIOLATED
     codes[lower >= 0.0] = SATISFIED
     return codes

@@ -1,6 +1,6 @@
 """How all results stand, in one message → /spatial/standing.
 
-Viewers need no other topic of numbers: one message has every result, and of the worst one every node now.
+Viewers need no other topic of numbers: one message has every result.
 """
 
 from __future__ import annotations
@@ -17,13 +17,10 @@ from spatial_replay.annotate.scene.scene_update import spaced
 from spatial_replay.annotate.specification import ReportedTree, unit_of
 from spatial_replay.geometry.arrays import Floats, Integers, combined, equal_places
 from spatial_replay.logs.schemas.Robustness_pb2 import (
-    FAILS_NOW,
-    FAILS_SO_FAR,
-    HOLDS_NOW,
     HOLDS_SO_FAR,
+    PENDING,
     SATISFIED,
     UNKNOWN,
-    UNKNOWN_NOW,
     VIOLATED,
     StandingUpdate,
 )
@@ -33,13 +30,10 @@ from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.spec.formula import Formula, iter_nodes
 from spatial_replay.trace.sample import LATEST_NS
 
-_MOST_ROWS: Final = 60
-"""The most nodes of the worst result: a table of more is no longer looked at."""
-
 _MOST_TEMPLATES: Final = 1024
 
 _RANKS: Final = np.full(256, 2, np.uint8)
-for _rank, _code in enumerate((VIOLATED, FAILS_SO_FAR, UNKNOWN, HOLDS_SO_FAR, SATISFIED)):
+for _rank, _code in enumerate((VIOLATED, PENDING, UNKNOWN, HOLDS_SO_FAR, SATISFIED)):
     _RANKS[_code] = _rank
 _RANKS.flags.writeable = False
 """How bad each number of `Standing` is; 0 is the worst."""
@@ -77,19 +71,19 @@ class FinalStanding(NamedTuple):
         standing: satisfied, violated or unknown, a number of `Standing`.
         since_s: of a violation, since when it is certain, in seconds after the first sample.
         by: its robustness without its sign: the end of its interval that decides; NaN where it is unknown.
+        at_s: since when it is that, in seconds after the first sample.
         unit: of the robustness.
         over: what decided it; "" if that is not known.
-        over_by: the number of that, with its unit and without its sign; "" if that is not known.
         is_late: whether only the end of the log decided it.
     """
 
     standing: int
     since_s: float
     by: float
+    at_s: float
     unit: str
     over: str
     is_late: bool = False
-    over_by: str = ""
 
 
 def worst_first(outcomes: Sequence[FinalStanding]) -> list[int]:
@@ -118,23 +112,21 @@ class StandingEncoder:
         self,
         trees: Sequence[ReportedTree],
         runs: Sequence[AutomatonRun | None],
-        written: Sequence[Sequence[str]],
         units: Mapping[str, str],
     ) -> None:
         """Start before the first sample.
 
         Args:
             runs: of each tree, the run of its automaton, which takes in the same samples.
-            written: of each tree, its nodes as the file writes them.
             units: those that are declared, see `unit_of`.
         """
-        self._written, self._units = written, units
+        self._units = units
         self._trees, self._runs = trees, runs
         self._parts = [named_parts(tree) for tree in trees]
-        self._nodes = [[node for _, _, node in iter_nodes(tree.formula)] for tree in trees]
-        self._last = [np.full((len(nodes), 4, 1), np.nan) for nodes in self._nodes]
+        self._last = [np.full((len(list(iter_nodes(tree.formula))), 4, 1), np.nan) for tree in trees]
         self._words = [""] * len(trees)
         self._violated_ns = [LATEST_NS] * len(trees)
+        self._least, self._least_ns = [math.inf] * len(trees), [0] * len(trees)
         self._first_ns: int | None = None
         self._written_ns: int | None = None
         self._templates: dict[_Layout, WireTemplate] = {}
@@ -152,7 +144,7 @@ class StandingEncoder:
         """
         chosen = spaced(times_ns, self._written_ns)
         shown_ns = times_ns[chosen]
-        series, words, since = [], [], []
+        series, words, since, least = [], [], [], []
         for index, block in enumerate(blocks):
             at = np.searchsorted(block.times_ns, shown_ns, side="right")
             is_whole = len(at) == block.series.shape[2] and bool((at == np.arange(1, len(at) + 1)).all())
@@ -160,11 +152,12 @@ class StandingEncoder:
             series.append(np.concatenate(with_last, axis=2)[:, :, at] if with_last else block.series)
             words.append(self._described(index, block, at))
             since.append(np.append(self._violated_ns[index], self._violated(index, block))[at])
+            least.append(np.append(self._least_ns[index], self._became_least(index, block))[at])
         self.pass_over(blocks)
         if not len(chosen):
             return shown_ns, []
         self._written_ns = int(shown_ns[-1])
-        return shown_ns, self._messages(shown_ns, series, words, np.array(since), over)
+        return shown_ns, self._messages(shown_ns, series, words, np.array([since, least]), over)
 
     def pass_over(self, blocks: Sequence[SeriesBlock]) -> None:
         """Take in the next samples without a message."""
@@ -174,6 +167,8 @@ class StandingEncoder:
             if self._first_ns is None:
                 self._first_ns = min(int(each.times_ns[0]) for each in blocks if len(each.times_ns))
             self._violated_ns[index] = int(self._violated(index, block)[-1])
+            self._least_ns[index] = int(self._became_least(index, block)[-1])
+            self._least[index] = float(np.fmin.reduce(block.series[0, 3], initial=self._least[index]))
             self._last[index] = block.series[:, :, -1:].copy()
             run = self._runs[index]
             if run is not None:
@@ -187,6 +182,12 @@ class StandingEncoder:
         since_ns = np.where(begun < 0, self._violated_ns[index], block.times_ns[begun])
         return np.where(is_violated, since_ns, LATEST_NS)
 
+    def _became_least(self, index: int, block: SeriesBlock) -> Integers:
+        """Return (T,) since when the upper end of a result is as low as it is, at each sample of a block."""
+        upper = np.append(self._least[index], block.series[0, 3])
+        is_less = upper[1:] < np.fmin.accumulate(upper)[:-1]
+        return np.maximum.accumulate(np.where(is_less, block.times_ns, self._least_ns[index]))
+
     def end(self, time_ns: int, finals: Sequence[Floats], over: Sequence[str]) -> bytes:
         """Return the message about the finished log.
 
@@ -197,21 +198,26 @@ class StandingEncoder:
         """
         first_ns = time_ns if self._first_ns is None else self._first_ns
         since_ns = self._violated_ns
+        for place, final in enumerate(finals):
+            if final[0, 1] < self._least[place]:
+                self._least_ns[place] = time_ns
         outcomes, series = [], []
         for last, final in zip(self._last, finals, strict=True):
             ended = last.copy()
             ended[:, 2:, 0] = final
             series.append(ended)
-        for tree, ended, violated_ns, said in zip(self._trees, series, since_ns, over, strict=True):
+        each_of = zip(self._trees, series, since_ns, self._least_ns, over, strict=True)
+        for tree, ended, violated_ns, least_ns, said in each_of:
             code = int(standing_codes(ended[:1], final=True)[0, 0])
             low, high = ended[0, 2:, 0].tolist()
             by = -high if code == VIOLATED else low if code == SATISFIED else math.nan
-            since_s = (min(violated_ns, time_ns) - first_ns) / 1e9
+            since_s, at_s = ((min(each, time_ns) - first_ns) / 1e9 for each in (violated_ns, least_ns))
             unit = unit_of(tree.formula, self._units)
-            outcomes.append(FinalStanding(code, since_s, by, unit, said, violated_ns == LATEST_NS))
+            outcomes.append(FinalStanding(code, since_s, by, at_s, unit, said, violated_ns == LATEST_NS))
         self.outcomes = tuple(outcomes)
         words, times_ns = [([each], np.zeros(1, np.int64)) for each in self._words], np.array([time_ns])
-        [payload] = self._messages(times_ns, series, words, np.array(since_ns)[:, None], over, final=True)
+        instants = np.array([since_ns, self._least_ns])[:, :, None]
+        [payload] = self._messages(times_ns, series, words, instants, over, final=True)
         return payload
 
     def _described(self, index: int, block: SeriesBlock, at: Integers) -> tuple[list[str], Integers]:
@@ -227,11 +233,13 @@ class StandingEncoder:
         times_ns: Integers,
         series: Sequence[Floats],
         words: Sequence[tuple[list[str], Integers]],
-        since_ns: Integers,
+        instants_ns: Integers,
         over: Sequence[str],
         *,
         final: bool = False,
     ) -> Sequence[bytes]:
+        """Encode messages; `instants_ns` (2, R, S) are since when each result is violated, and so bad."""
+        since_ns = instants_ns[0]
         codes = [standing_codes(each, final=final) for each in series]
         of_results = np.array([each[0] for each in codes])
         worst = worst_results(of_results, since_ns)
@@ -243,7 +251,7 @@ class StandingEncoder:
         )
         counts = (of_results == VIOLATED).sum(axis=0)
         marks, numbers = self._columns(series, codes)
-        encoded, of_violated = [], dict[int, tuple[Floats, Floats]]()
+        encoded, of_violated = [], dict[int, tuple[Floats, Floats, Floats]]()
         is_listed = np.arange(len(order))[:, None] < counts
         keys = [worst, *(which for _, which in words), *np.where(is_listed, order, -1)]
         for members in equal_places(combined(keys, len(times_ns))):
@@ -251,16 +259,14 @@ class StandingEncoder:
             violated = tuple((each, over[each]) for each in order[: counts[first], first].tolist())
             said = tuple(texts[which[first]] for texts, which in words)
             layout = _Layout(int(worst[first]), said, violated, final)
-            now = series[layout.worst][:_MOST_ROWS, 1]
             own = [each[members] for each in (times_ns[:, None], *numbers)]
             for each, _ in layout.violated:
                 if each not in of_violated:
-                    seconds = (np.minimum(since_ns[each], times_ns) - (self._first_ns or 0)) / 1e9
-                    of_violated[each] = np.round(seconds, 3)[:, None], -series[each][0, 3, :, None]
-                since, by = of_violated[each]
-                own += [since[members], rounded(by[members])]
-            own.append(rounded(now.T[members]))
-            own_marks = np.concatenate([each[members] for each in (*marks, _present(now).T)], axis=1)
+                    seconds = (np.minimum(instants_ns[:, each], times_ns) - (self._first_ns or 0)) / 1e9
+                    since, at = np.round(seconds, 3)[:, :, None]
+                    of_violated[each] = since, rounded(_finite(-series[each][0, 3, :, None])), at
+                own += [column[members] for column in of_violated[each]]
+            own_marks = np.concatenate([each[members] for each in marks], axis=1)
             encoded.append((members, self._template(layout).encode(words_of(own), own_marks)))
         return placed(len(times_ns), encoded)
 
@@ -272,7 +278,7 @@ class StandingEncoder:
             for identifier, node in parts.values():
                 marks.append(own[identifier, :, None])
                 numbers.append(numbered[identifier, 0 if looks_ahead(node) else 1, :, None])
-        return marks, numbers
+        return marks, [_finite(each) for each in numbers]
 
     def _template(self, layout: _Layout) -> WireTemplate:
         if layout not in self._templates:
@@ -292,14 +298,12 @@ class StandingEncoder:
             for name, (_, node) in parts.items():
                 unit = unit_of(node, self._units)
                 message.results.add(name=part_title(name, tree), standing=UNKNOWN, robustness=1.0, unit=unit)
-        for node, said in zip(self._nodes[worst][:_MOST_ROWS], self._written[worst], strict=False):
-            unit = unit_of(node, self._units)
-            text = said if node.name is None else node.name
-            message.present.add(text=text, state=UNKNOWN_NOW, now=1.0, unit=unit)
         for index, over in violated:
             tree = self._trees[index]
             unit = unit_of(tree.formula, self._units)
-            message.violated.add(name=tree.title, since=1.0, by=1.0, unit=unit, over=over)
+            message.violated.add(name=tree.title, since=1.0, by=1.0, unit=unit, over=over, at=1.0)
+        if not violated:
+            message.violated.add(name="nothing is violated")
         return message
 
 
@@ -312,12 +316,9 @@ def named_parts(tree: ReportedTree) -> dict[str, tuple[int, Formula]]:
     }
 
 
-def _present(now: Floats) -> Codes:
-    """Return the number of `Present` for each robustness in one sample."""
-    codes = np.full(now.shape, UNKNOWN_NOW, np.uint8)
-    codes[now >= 0.0] = HOLDS_NOW
-    codes[now < 0.0] = FAILS_NOW
-    return codes
+def _finite(numbers: Floats) -> Floats:
+    """Return numbers without those that are infinite, which no curve and no table can show."""
+    return np.where(np.isinf(numbers), np.nan, numbers)
 
 
 def part_title(name: str, tree: ReportedTree) -> str:

@@ -368,7 +368,9 @@ def _panels(table: pa.Table, reports: Mapping[tuple[str, str], str]) -> Iterator
 
 
 def _panel(title: str, *content: Html) -> Html:
-    return element("section", element("h2", title), *content, **{"class": "panel"})
+    # what may be wider than the page can be scrolled with keys
+    attributes = {"class": "panel", "aria-label": title, "tabindex": "0"}
+    return element("section", element("h2", title), *content, **attributes)
 
 
 def _totals(by_spec: Sequence[Total]) -> Html:

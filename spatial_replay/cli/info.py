@@ -63,6 +63,7 @@ _OF_MESSAGES = frozenset({"mapping", "on_time_jump", "max_lateness", "max_gap"})
     help="Print the recorded specification as it was written instead; NAME: of which file or spec.",
 )
 @click.option("--layout", is_flag=True, help="Print the layout to import in a viewer instead.")
+@click.option("--panels", is_flag=True, help="With --layout: the one for viewers that have the extension.")
 @click.option(
     "--panel", is_flag=True, help="Print the extension with panels for viewers instead; it is for every log."
 )
@@ -76,6 +77,7 @@ def info(
     decisions: bool,
     specification: str | None,
     layout: bool,
+    panels: bool,
     panel: bool,
     output: Path | None,
     reading: Reading,
@@ -96,6 +98,7 @@ def info(
       spatial-replay info push.mcap --decisions
       spatial-replay info annotated.mcap --specification -o used.spatial
       spatial-replay info annotated.mcap --layout -o layout.json
+      spatial-replay info annotated.mcap --layout --panels -o layout.json
       spatial-replay info --panel -o spatial-replay.foxe
     """
     wanted = [
@@ -114,6 +117,8 @@ def info(
         raise UsageError(f"{' and '.join(wanted)} print different things; give one of them")
     if as_json and wanted and not decisions:
         raise UsageError(f"{wanted[0]} prints no JSON; remove --json")
+    if panels and not layout:
+        raise UsageError("--panels chooses a layout; add --layout")
     if panel and log is not None:
         raise UsageError("--panel prints the extension, which is the same for every log; remove the log")
     if log is None and not panel:
@@ -122,7 +127,7 @@ def info(
         if log is None:
             return _print_panel()
         if layout:
-            return _print_layout(log)
+            return _print_layout(log, panels=panels)
         if specification is not None:
             return _print_specification(log, specification)
         if decisions:
@@ -202,15 +207,17 @@ def _print_fitness(log: LogFile, reading: Reading) -> int:
     return ExitCode.SATISFIED
 
 
-def _print_layout(log: LogFile) -> int:
-    """Print the layout stored in a log."""
+def _print_layout(log: LogFile, *, panels: bool) -> int:
+    """Print the layout stored in a log, or the one for viewers that have the extension."""
+    from spatial_replay.annotate.foxglove_layout import layout_text, with_panels
     from spatial_replay.logs.topics import LAYOUT
     from spatial_replay.sources.open_log import open_source
 
     source = open_source(log)
     for attachment in source.attachments():
         if attachment.name == LAYOUT:
-            show_file(attachment.data.decode("utf-8", "replace"))
+            text = attachment.data.decode("utf-8", "replace")
+            show_file(layout_text(with_panels(json.loads(text))) if panels else text)
             return ExitCode.SATISFIED
     raise UsageError(
         f"{source.name} has no layout; logs written by spatial-replay record or replay -o have one"

@@ -163,16 +163,18 @@ def _numbers(result: SpecResult, first_ns: int) -> str:
 def _below(result: SpecResult, first_ns: int) -> Iterator[str]:
     """Yield a line for each cause of the verdict, and for each part that decided nothing."""
     # imported here so that --help stays fast
-    from spatial_replay.monitor.sentences import gap_sentence, reason_sentence
+    from spatial_replay.monitor.sentences import cause_reason, gap_sentence
 
     for cause in result.causes:
         is_own = cause.spec == result.name
-        when = "" if cause.settled_ns is None else f" at {time_text(cause.settled_ns, first_ns)}"
+        when = (
+            "" if cause.settled_ns is None or cause.least else f" at {time_text(cause.settled_ns, first_ns)}"
+        )
         about = "" if is_own else requirement_text(cause.requirement, cause.title)
         about = f" [{about}]" if about else ""
         label = f"{cause.spec}{about}{when}: " if len(result.causes) > 1 or not is_own else ""
         if cause.witness is not None:
-            yield f"{label}{reason_sentence(cause.witness, first_ns=first_ns)}"
+            yield f"{label}{cause_reason(cause, first_ns)}"
         elif label:
             yield f"{label}{cause.verdict}, robustness {_shown(cause.robustness)}"
     witness = result.worst

@@ -230,7 +230,7 @@ class _Part:
             # no part was settled earlier than the whole, and one that is later does not come first
             if prefix is not None and prefix.ends(node)[1][0] < 0.0:
                 settled_ns[node, 1] = certain_ns
-        causes = find_causes(conjuncts, values, final, settled_ns, lambda node, settled_ns: None)
+        causes = find_causes(conjuncts, values, final, settled_ns)
         return causes[0].node if causes else None
 
 

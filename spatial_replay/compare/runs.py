@@ -24,7 +24,7 @@ from spatial_replay.logs.source import Source
 from spatial_replay.monitor.evaluate import Evaluation, evaluate
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.semantics import require_ltlf
-from spatial_replay.monitor.sentences import reason_sentence
+from spatial_replay.monitor.sentences import cause_reason
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.planning.read import read_decisions
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, LogNames, ReplayOptions, Selection
@@ -547,7 +547,7 @@ class RunSpecDiff:
             yield Sentence(f"brought about by `{self.a.nodes[node].text}`")
         for which, result, start_ns in zip("AB", (self.a, self.b), starts_ns, strict=True):
             if self.is_flipped and result.causes and result.causes[0].witness is not None:
-                reason = reason_sentence(result.causes[0].witness, first_ns=start_ns)
+                reason = cause_reason(result.causes[0], start_ns)
                 yield Sentence(f"{which}: ", *reason.parts)
         if self.moved:
             names = ", ".join(each.name for each in self.moved)

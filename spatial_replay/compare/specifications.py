@@ -31,7 +31,7 @@ from spatial_replay.monitor.online.codes import in_channels
 from spatial_replay.monitor.paper.evaluator import PaperRun
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.semantics import Semantics
-from spatial_replay.monitor.sentences import reason_sentence
+from spatial_replay.monitor.sentences import cause_reason
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, LogNames, ReplayOptions, Selection
 from spatial_replay.spec.diagnostics import Diagnostic, nearest_hint
@@ -257,7 +257,7 @@ class SpecDiff(Displayed):
         if len(self.cause) > 1:
             yield Sentence(self._together())
         if self.is_flipped and self.new.causes and self.new.causes[0].witness is not None:
-            yield reason_sentence(self.new.causes[0].witness, first_ns=first_ns)
+            yield cause_reason(self.new.causes[0], first_ns)
         others = [edit for edit in self.edits if edit not in self.cause]
         for edit in others[:_MOST_LISTED]:
             what = "edited, too: " if self.cause else "edited, without effect on the result: "

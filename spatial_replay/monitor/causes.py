@@ -30,6 +30,8 @@ class Cause:
             decided.
         witness: the atom that decides it: at `settled_ns`, on the samples up to there, or else on the
             whole log. None if the leaves were not stored, and under the paper's semantics.
+        least: the atom that gives it the robustness of the whole log, where that is less than at
+            `settled_ns`; else None.
         requirement, title: of the spec ("REQ-12" and its words), or None.
     """
 
@@ -42,6 +44,12 @@ class Cause:
     witness: Witness | None
     requirement: str | None = None
     title: str | None = None
+    least: Witness | None = None
+
+    @property
+    def shown(self) -> Witness | None:
+        """The atom that its robustness is of."""
+        return self.least or self.witness
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +107,7 @@ def find_causes(
     values: Floats,
     final: Floats,
     settled_ns: Integers,
-    witness: Callable[[int, int | None], Witness | None],
+    witnesses: Callable[[int, int | None], tuple[Witness | None, Witness | None]] = lambda *_: (None, None),
     named: Mapping[str, NamedSpec] = MappingProxyType({}),
 ) -> tuple[Cause, ...]:
     """Return one cause for each named spec with a conjunct that is not satisfied.
@@ -111,7 +119,8 @@ def find_causes(
         values: (N,), each node's value on the whole log.
         final: (N, 2), the ends of each node's interval for the finished log.
         settled_ns: (N, 2), see `InstanceStream`.
-        witness: returns the witness of a node: what settled it at a time, or on the whole log.
+        witnesses: returns those of a node: what settled it at a time, or decides it on the whole log, and
+            what gave it its robustness later.
         named: specs by name.
     """
     failing = [each for each in conjuncts if _verdict(final, each.node) is not Verdict.SATISFIED]
@@ -122,6 +131,7 @@ def find_causes(
     for each in first.values():
         at = settled_time(settled_ns, each.node)
         about = named.get(each.spec)
+        witness, least = witnesses(each.node, at)
         causes.append(
             Cause(
                 each.spec,
@@ -130,9 +140,10 @@ def find_causes(
                 _verdict(final, each.node),
                 float(values[each.node]),
                 at,
-                witness(each.node, at),
+                witness,
                 None if about is None else about.id,
                 None if about is None else about.title,
+                least,
             )
         )
     return tuple(causes)

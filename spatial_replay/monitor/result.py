@@ -15,7 +15,13 @@ from spatial_replay.lazy import Displayed, data_frame
 from spatial_replay.monitor.causes import Cause, Conjunct, LeastPart, conjuncts_of, find_causes, find_least
 from spatial_replay.monitor.offline import evaluate_offline, full_signal, window_signal
 from spatial_replay.monitor.semantics import Semantics, require_ltlf
-from spatial_replay.monitor.sentences import cause_sentences, reason_sentence, sentences_of, verdict_sentence
+from spatial_replay.monitor.sentences import (
+    cause_reason,
+    cause_sentences,
+    reason_sentence,
+    sentences_of,
+    verdict_sentence,
+)
 from spatial_replay.monitor.stream import NEVER, InstanceStream, SeriesBlock
 from spatial_replay.monitor.vacuity import (
     Tested,
@@ -33,7 +39,7 @@ from spatial_replay.spec.diagnostics import nearest_hint
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Formula, NamedSpec, iter_nodes, operator_of
 from spatial_replay.spec.walks import declared_unit
-from spatial_replay.text import Instant, Sentence, counted_from, shortened_formula, with_unit
+from spatial_replay.text import Instant, Sentence, counted_from, shortened_formula
 from spatial_replay.trace.sample import LATEST_NS
 
 _UNTESTED: Final = Sentence("Nothing tested the verdict.")
@@ -240,7 +246,7 @@ class SpecResult(Displayed):
 
     def causes_of(self, node: int) -> tuple[Cause, ...]:
         """Return why a node is violated or unknown, as `causes` does for the root."""
-        return self._causes(node, self._settled_witness)
+        return self._causes(node, self._witnesses)
 
     def _conjuncts_of(self, node: int) -> list[Conjunct]:
         """Return the parts of a node that have to hold for it to hold."""
@@ -250,13 +256,17 @@ class SpecResult(Displayed):
 
     def first_cause(self, node: int) -> Cause | None:
         """Return the first of `causes_of` a node, without its witness: no sample is read for it."""
-        return next(iter(self._causes(node, lambda node, settled_ns: None)), None)
+        return next(iter(self._causes(node, lambda *_: (None, None))), None)
 
-    def _causes(self, node: int, witness: Callable[[int, int | None], Witness | None]) -> tuple[Cause, ...]:
+    def _causes(
+        self, node: int, witnesses: Callable[[int, int | None], tuple[Witness | None, Witness | None]]
+    ) -> tuple[Cause, ...]:
         if final_verdict(*self.final[node].tolist()) is Verdict.SATISFIED:
             return ()
         named = {**self.evidence.instance.named, self.name: self.spec}
-        return find_causes(self._conjuncts_of(node), self.values, self.final, self.settled_ns, witness, named)
+        return find_causes(
+            self._conjuncts_of(node), self.values, self.final, self.settled_ns, witnesses, named
+        )
 
     def to_pandas(self) -> Any:
         """Return the numbers of each sample as a pandas DataFrame, indexed by `time_ns`.
@@ -406,26 +416,16 @@ class SpecResult(Displayed):
         return deciding_path(self.formula, done, self.times_ns, 0, end).steps[-1].node
 
     def reason(self, first_ns: int) -> Sentence:
-        """Return what decided the verdict and, where that has another robustness, what gave it that.
+        """Return what gave the verdict its robustness, and how a violation began where that was earlier.
 
-        The verdict may have been settled before the log ended, and what came later be worse or better. ""
-        without a witness (see `worst`).
+        "" without a witness (see `worst`).
         """
-        decided = self.worst
-        if decided is None:
+        if self.causes:
+            return cause_reason(self.causes[0], first_ns)
+        if self.worst is None or self.leaves is None:
             return Sentence("")
-        reason = reason_sentence(decided, first_ns=first_ns)
-        is_violated = self.verdict is Verdict.VIOLATED
-        number, own = (self.upper, decided.upper) if is_violated else (self.lower, decided.lower)
-        if decided.settled_ns is None or number == own or self.leaves is None:
-            return reason
-        since = Instant(decided.settled_ns, first_ns)
         whole = find_witness(self.evidence, self.leaves, self.times_ns, flips=False)
-        least = "Least robustness" if is_violated else "Robustness"
-        return Sentence(
-            *(f"{str(self.verdict).capitalize()} since ", since, ": ", reason),
-            *(f" {least} {with_unit(number, self.unit)}: ", reason_sentence(whole, first_ns=first_ns)),
-        )
+        return reason_sentence(whole, first_ns=first_ns)
 
     def explain(self, *, first_ns: int | None = None) -> str:
         """Explain the verdict in sentences, one a line, as the command `explain` prints them.
@@ -503,6 +503,21 @@ class SpecResult(Displayed):
         leaves, times_ns = self.leaves[:, :, :count], self.times_ns[:count]
         whole = (self.leaves, self.times_ns)
         return find_witness(self.evidence, leaves, times_ns, node, goes_on=True, whole=whole)
+
+    def _witnesses(self, node: int, settled_ns: int | None) -> tuple[Witness | None, Witness | None]:
+        """Return what settled the verdict of a node and, of a violation that grew later, what it grew by."""
+        first = self._settled_witness(node, settled_ns)
+        if (
+            self.leaves is None
+            or first is None
+            or settled_ns is None
+            or not self.final[node, 1] < first.upper
+        ):
+            return first, None
+        least = find_witness(self.evidence, self.leaves, self.times_ns, node, flips=False)
+        # the first response that was missed says more than a later one
+        is_atom = least.deciding is not None and not least.deciding.unknown
+        return first, least if is_atom and first.missed is None and least.missed is None else None
 
     def _leaves(self, what: str) -> Floats:
         require_ltlf(self.semantics, what)

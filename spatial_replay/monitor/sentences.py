@@ -34,7 +34,13 @@ _EDGES = {"min_x": "left", "max_x": "right", "min_y": "lower", "max_y": "upper"}
 
 
 def sentences_of(
-    witness: Witness, *, first_ns: int, requirement: str = "", is_open: bool = False, has_ended: bool = False
+    witness: Witness,
+    *,
+    first_ns: int,
+    requirement: str = "",
+    is_open: bool = False,
+    has_ended: bool = False,
+    least: Witness | None = None,
 ) -> tuple[Sentence, ...]:
     """Return sentences on why a node has its verdict: what decided it, and what would flip it.
 
@@ -43,6 +49,7 @@ def sentences_of(
         requirement: what its spec stands for, see `requirement_text`.
         is_open: whether it is pending: samples after those evaluated decide it.
         has_ended: whether it was pending until the log ended, and is violated for that.
+        least: the atom by which a violation grew after it was settled.
     """
     title = f"`{witness.path[0].name or shortened_formula(witness.path[0].text)}`"
     title += f" for {witness.object}" if witness.object is not None else ""
@@ -54,6 +61,7 @@ def sentences_of(
         sentences = [Sentence(f"{title} is pending: {numbers} so far, and later samples decide.")]
     else:
         sentences = [Sentence(f"{title} is {witness.verdict}{_ENDED if has_ended else ''}: {numbers}.")]
+    flipping, witness = witness, least or witness
     is_decided = not (witness.deciding is None or witness.deciding.unknown) and not is_open
     is_decided = is_decided and witness.verdict is not Verdict.UNKNOWN
     if witness.missed is not None and not is_open:
@@ -79,8 +87,11 @@ def sentences_of(
         how = _how_it_decides(witness, witness.deciding, first_ns, is_open=is_open)
         if witness.missed is None or not witness.missed.is_condition or is_open:
             sentences.append(Sentence(f"{what} is `{witness.deciding.text}`, which ", how))
-        if witness.obstacle != "infinity":
-            sentences.append(Sentence(_flip(witness, witness.deciding, witness.threshold, is_open=is_open)))
+        if least is not None:
+            sentences.append(_first_failure(flipping, first_ns))
+        if flipping.deciding is not None and flipping.obstacle != "infinity":
+            flip = _flip(flipping, flipping.deciding, flipping.threshold, is_open=is_open)
+            sentences.append(Sentence(flip))
     if witness.open_end is not None:
         sentences.append(_open_end(*witness.open_end, first_ns, witness.units))
     return tuple(sentences)
@@ -91,7 +102,8 @@ def cause_sentences(cause: Cause, *, first_ns: int, object: str | None = None) -
     requirement = requirement_text(cause.requirement, cause.title)
     if cause.witness is not None:
         has_ended = cause.settled_ns is None and cause.verdict is Verdict.VIOLATED
-        return sentences_of(cause.witness, first_ns=first_ns, requirement=requirement, has_ended=has_ended)
+        about = {"requirement": requirement, "has_ended": has_ended, "least": cause.least}
+        return sentences_of(cause.witness, first_ns=first_ns, **about)
     instance = f" for {object}" if object is not None else ""
     instance += f" ({requirement})" if requirement else ""
     if cause.settled_ns is not None:
@@ -199,6 +211,26 @@ def reason_sentence(witness: Witness, *, first_ns: int) -> Sentence:
         return Sentence(said, " ", _closest(*witness.closest, first_ns, witness.units))
     how = Sentence(f"`{deciding.text}` ", _how_it_decides(witness, deciding, first_ns))
     return Sentence(missed, ": ", how) if missed else how
+
+
+def cause_reason(cause: Cause, first_ns: int) -> Sentence:
+    """Return what gave a cause its robustness, and how it began if that was earlier; "" without a witness."""
+    if cause.shown is None:
+        return Sentence("")
+    reason = reason_sentence(cause.shown, first_ns=first_ns)
+    if cause.least is None or cause.witness is None:
+        return reason
+    return Sentence(reason, " ", _first_failure(cause.witness, first_ns))
+
+
+def _first_failure(settled: Witness, first_ns: int) -> Sentence:
+    """Return a sentence on the sample that settled a violation, which grew later."""
+    amount, deciding = with_unit(abs(settled.upper), settled.unit), settled.deciding
+    if deciding is not None and math.isfinite(deciding.value):
+        amount = amount_text(abs(deciding.value), deciding.atom, settled.units)
+    return Sentence(
+        "It was violated first at ", Instant(settled.settled_ns or 0, first_ns), f", by {amount}."
+    )
 
 
 def missed_text(missed: MissedResponse, first_ns: int) -> Sentence:

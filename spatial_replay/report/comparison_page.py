@@ -184,7 +184,7 @@ def _pairs(
     if isinstance(diff, SpecificationDiff):
         knots = [[0.0, (a.first_ns - b.first_ns) / 1e9]]
         for spec in diff.specs:
-            if first_ns is None and spec.first is not None and spec.cause:
+            if first_ns is None and spec.first is not None:
                 first_ns = spec.first.time_ns
             titles = spec.old.title, spec.new.title
             nodes += _node_pairs(spec.title, titles, (spec.old, spec.new), places)
@@ -198,8 +198,14 @@ def _pairs(
                 [(knot.a_ns - a.first_ns) / 1e9, (knot.b_ns - b.first_ns) / 1e9]
                 for knot in diff.alignment.knots
             ]
-        apart = [each.apart_ns for each in diff.objects if each.apart_ns is not None]
-        first_ns = min(apart, default=None if diff.decision is None else diff.decision.a_ns)
+        found = (
+            [each.apart_ns for each in diff.objects],
+            [] if diff.decision is None else [diff.decision.a_ns],
+            [spec.first_ns for spec in diff.specs],
+            [each.first_ns for each in (*diff.objects, *diff.signals)],
+        )
+        known = ([at for at in times_ns if at is not None] for times_ns in found)
+        first_ns = next((min(times_ns) for times_ns in known if times_ns), None)
         for run_spec in diff.specs:
             titles = run_spec.a.title, run_spec.b.title
             nodes += _node_pairs(run_spec.a.title, titles, (run_spec.a, run_spec.b), places)

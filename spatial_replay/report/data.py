@@ -402,8 +402,8 @@ def _pointer_value(each: ReportedResult, first_ns: int, lengths: str) -> Mapping
     """Return the arrow at what decided a result that is not satisfied, and when it is shown."""
     if each.pointer is None or each.fault_ns is None:
         return None
-    # as the arrow of the log's scene says it of an atom that holds and should not
-    holds = "holds by " if each.pointer.number >= 0 else ""
+    # as the arrow of the log's scene says it
+    holds = "must not hold, holds by " if each.pointer.number >= 0 else ""
     return {
         "time": (each.fault_ns - first_ns) / 1e9,
         "ends": each.pointer.ends.reshape(-1).tolist(),

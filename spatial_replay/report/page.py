@@ -169,6 +169,8 @@ def _summary(each: ReportedResult, first_ns: int) -> Html:
     result = each.result
     numbers = [f"robustness {each.robustness_text or 'not determined'}"]
     if result.violated_at_ns is not None:
+        if result.least is None and result.least_at_ns is not None:
+            numbers.append(f"least at {Instant(result.least_at_ns, first_ns)}")
         numbers.append(f"violated since {Instant(result.violated_at_ns, first_ns)}")
     elif result.satisfied_at_ns is not None:
         numbers.append(f"satisfied since {Instant(result.satisfied_at_ns, first_ns)}")

@@ -192,7 +192,7 @@ def _results(
         tree, compiled = replay.trees[index], replay.automata[index]
         file, unit = replay.files[tree.file], unit_of(result.formula, declared)
         is_explained = index in explained
-        witness = result.worst if is_explained else None
+        witness = (result.causes[0].shown if result.causes else result.worst) if is_explained else None
         yield ReportedResult(
             result=result,
             tree=tree,

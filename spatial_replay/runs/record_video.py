@@ -36,7 +36,7 @@ from spatial_replay.logs.topics import (
     topic_of_camera,
 )
 from spatial_replay.monitor.monitor import Ending, Monitor, Update
-from spatial_replay.palette import FAILING, NEGATIVE, NEUTRAL, POSITIVE
+from spatial_replay.palette import NEGATIVE, NEUTRAL, POSITIVE
 from spatial_replay.perception.frame import Frame
 from spatial_replay.perception.observer import Observation, TagObserver, View, camera_names, simultaneous
 from spatial_replay.perception.opencv import Camera
@@ -105,7 +105,7 @@ _RANKS: Final = {
     Standing.PENDING: 2,
     Standing.VIOLATED: 3,
 }
-_COLOURS: Final = (NEUTRAL, POSITIVE, FAILING, NEGATIVE)
+_COLOURS: Final = (NEUTRAL, POSITIVE, NEUTRAL, NEGATIVE)
 
 
 def _members(requirement: Requirement, sample: Sample) -> set[str]:

@@ -34,6 +34,8 @@ from spatial_replay.serve.player import (
 )
 from spatial_replay.serve.relay import Gate, Relay
 from spatial_replay.serve.services import PLAYBACK_STATE, SERVICES, STEERING, answer, asset, steered
+from spatial_replay.spec.format import format_duration
+from spatial_replay.trace.trace import duration_ns_from_text
 
 # viewers get their errors in replies; the SDK would print them on standard error, too
 logging.getLogger("foxglove").addHandler(logging.NullHandler())
@@ -41,6 +43,12 @@ logging.getLogger("foxglove").addHandler(logging.NullHandler())
 _LONGEST_TEXT: Final = 64
 _LONGEST_NOTE: Final = 2_000
 """The most characters of a duration, and of a note."""
+
+_REJECTED: Final = "rejected"
+"""The parameter that says which value was rejected, and why; "" once another one is accepted."""
+
+_MOST_S: Final = 9e9
+"""Seconds of a duration, at most."""
 
 _STOP_S: Final = 1.0
 """How long the SDK, which waits for every viewer, may take to stop."""
@@ -209,7 +217,24 @@ class LiveServer(PublishingServer):
             UsageError: nothing can listen there.
         """
         self._session, self._questions = session, questions
+        self._rejected = ""
         super().__init__(f"spatial-replay: {session.name}", channels, host, port, origins)
+
+    def send_note(self, note: Note) -> None:
+        """See `Viewers.send_note`. Some viewers keep notes permanently: rejected values are in a parameter."""
+        if note.about not in (CONSTANTS, ARROW):
+            super().send_note(note)
+        elif note.text != self._rejected:
+            self._rejected = note.text[:_LONGEST_NOTE]
+            self.send_playback()
+
+    def remove_note(self, about: str) -> None:
+        """See `Viewers.remove_note`."""
+        if about not in (CONSTANTS, ARROW):
+            super().remove_note(about)
+        elif self._rejected:
+            self._rejected = ""
+            self.send_playback()
 
     def send_state(self, state: PlaybackState) -> None:
         """See `Viewers.send_state`."""
@@ -217,7 +242,7 @@ class LiveServer(PublishingServer):
 
     def send_values(self, values: Values) -> None:
         """See `Viewers.send_values`."""
-        self._server.publish_parameter_values(_parameters(values))
+        self._server.publish_parameter_values(_constants(values))
 
     def send_playback(self) -> None:
         """See `Viewers.send_playback`."""
@@ -226,7 +251,7 @@ class LiveServer(PublishingServer):
     @property
     def steering(self) -> Mapping[str, float | str | bool]:
         """The parameters that are no constants."""
-        return {**self._session.playback, ARROW: self._session.arrow}
+        return {**self._session.playback, ARROW: self._session.arrow, _REJECTED: self._rejected}
 
     def _start(self) -> protocol.WebSocketServer:
         return foxglove.start_server(
@@ -375,7 +400,7 @@ class _Listener(protocol.ServerListener):
     def on_get_parameters(
         self, client: protocol.Client, param_names: list[str], request_id: str | None = None
     ) -> list[Parameter]:
-        chosen = _parameters({**self._server.steering, **self._session.values})
+        chosen = [*_parameters(self._server.steering), *_constants(self._session.values)]
         return [each for each in chosen if each.name in param_names] if param_names else chosen
 
     def on_set_parameters(
@@ -384,7 +409,7 @@ class _Listener(protocol.ServerListener):
         self._server.remove_note(CONSTANTS)
         self._server.remove_note(ARROW)
         try:
-            values = {each.name: _value(each) for each in parameters}
+            values = {each.name: _value(each) for each in parameters if each.name != _REJECTED}
             playback = {name: value for name, value in values.items() if name in PLAYBACK}
             constants = {
                 name: value for name, value in values.items() if name not in PLAYBACK and name != ARROW
@@ -392,12 +417,12 @@ class _Listener(protocol.ServerListener):
             if ARROW in values:
                 self._session.point_at(values[ARROW])
             if constants:
-                self._session.set_constants(_without_flags(constants))
+                self._session.set_constants(_as_written(constants, self._session.values))
             if playback:
                 self._server.send_state(self._session.steer(playback))
         except SpatialReplayError as error:
             self._server.send_note(Note(CONSTANTS, Level.ERROR, str(error)))
-        return _parameters({**self._server.steering, **self._session.values})
+        return [*_parameters(self._server.steering), *_constants(self._session.values)]
 
     def on_playback_control_request(
         self, playback_control_request: protocol.PlaybackControlRequest
@@ -419,6 +444,14 @@ def _parameters(values: Mapping[str, float | str | bool]) -> list[Parameter]:
     return [Parameter(name, value=value) for name, value in values.items()]
 
 
+def _constants(values: Values) -> list[Parameter]:
+    """Return constants as viewers have them, who type no quotes: durations are seconds."""
+    seconds = {
+        name: duration_ns_from_text(each) / 1e9 for name, each in values.items() if isinstance(each, str)
+    }
+    return _parameters({**values, **seconds})
+
+
 def _value(parameter: Parameter) -> float | str | bool:
     """Return the value that a viewer sets.
 
@@ -433,20 +466,23 @@ def _value(parameter: Parameter) -> float | str | bool:
     raise _misfit(parameter.name, value)
 
 
-def _without_flags(values: Mapping[str, float | str | bool]) -> Values:
-    """Return values of constants.
+def _as_written(values: Mapping[str, float | str | bool], present: Values) -> Values:
+    """Return values of constants as a specification has them: seconds of a duration as a text.
 
     Raises:
         UsageError: one is true or false.
     """
+    written: dict[str, float | str] = {}
     for name, value in values.items():
         if isinstance(value, bool):
             raise _misfit(name, value)
-    return values
+        is_seconds = isinstance(present.get(name), str) and isinstance(value, float) and 0 <= value < _MOST_S
+        written[name] = format_duration(round(float(value) * 1e9)) if is_seconds else value
+    return written
 
 
 def _misfit(name: str, value: object) -> UsageError:
-    remedy = "give a number or, for a duration, a text such as '2s'"
+    remedy = "give a number, for a duration in seconds"
     return UsageError(f"{shortened(name)} cannot be {shortened(value)}: {remedy}")
 
 

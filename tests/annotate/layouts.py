@@ -18,9 +18,13 @@ def layout_of(log: Path) -> dict[str, Any]:
     return layout
 
 
-def panels(tree: Any) -> set[str]:
-    """The identifiers of the panels that a tree of splits places."""
-    return {tree} if isinstance(tree, str) else panels(tree["first"]) | panels(tree["second"])
+def panels(layout: dict[str, Any], tree: Any = None) -> set[str]:
+    """The identifiers of the panels that a layout places, in splits and in tabs."""
+    tree = layout["layout"] if tree is None else tree
+    if isinstance(tree, dict):
+        return panels(layout, tree["first"]) | panels(layout, tree["second"])
+    tabs = layout["configById"][tree].get("tabs", [])
+    return {tree}.union(*(panels(layout, tab["layout"]) for tab in tabs))
 
 
 def paths_of(config: Any) -> Iterator[str]:

@@ -49,25 +49,33 @@ NEARING = [5.0 - step / 4 for step in range(20)]
         # only the first sample is asked: the number stays that which decided
         (
             "(a dist b <= 6) -> F[0s, 0.4s] (a dist b <= 1.5)",
-            {3: "", 4: "a dist b <= 1.5: -2.5", **dict.fromkeys((5, 18), "a dist b <= 1.5 at 0.400 s: -2.5")},
+            {
+                3: "",
+                4: "a dist b <= 1.5 now: -2.5",
+                **dict.fromkeys((5, 18), "a dist b <= 1.5 at 0.400 s: -2.5"),
+            },
         ),
         (
             "(a dist b >= 6) and F (a dist b <= 0.5)",
-            {0: "a dist b >= 6: -1", **dict.fromkeys((1, 10, 19), "a dist b >= 6 at 0.000 s: -1")},
+            {0: "a dist b >= 6 now: -1", **dict.fromkeys((1, 10, 19), "a dist b >= 6 at 0.000 s: -1")},
         ),
         # what had to follow was missed then, even where the condition is false by now (from sample 13 on)
         (
             "G ((a dist b >= 2) -> F[0s, 0.4s] (a dist b <= 0.5))",
             {
                 3: "",
-                4: "a dist b <= 0.5: -3.5",
+                4: "a dist b <= 0.5 now: -3.5",
                 **dict.fromkeys((5, 13, 18), "a dist b <= 0.5 at 0.400 s: -3.5"),
             },
         ),
         # an atom that should not hold is not written as if it failed
         (
             "G not (a dist b <= 4)",
-            {4: "", 5: "a dist b <= 4: holds by 0.25", 10: "a dist b <= 4: holds by 1.5"},
+            {
+                4: "",
+                5: "a dist b <= 4 now: must not hold, holds by 0.25",
+                10: "a dist b <= 4 now: must not hold, holds by 1.5",
+            },
         ),
     ],
     ids=["deadline", "first sample", "response", "negation"],
@@ -84,7 +92,7 @@ def test_what_the_arrow_says_is_true_in_every_sample(
     [
         (
             "forall p, q in boxes: p dist q >= 2.5",
-            {10: "", 11: "a dist b >= 2.5: -0.25", 19: "a dist b >= 2.5: -2.25"},
+            {10: "", 11: "a dist b >= 2.5 now: -0.25", 19: "a dist b >= 2.5 now: -2.25"},
         ),
         (
             "not (exists p in boxes: p dist b <= 2.5 and not (p ovlp b))",
@@ -92,11 +100,15 @@ def test_what_the_arrow_says_is_true_in_every_sample(
         ),
         (
             "not (exists p in (boxes except b): p dist b <= 2.5)",
-            {9: "", 11: "a dist b <= 2.5: holds by 0.25", 19: "a dist b <= 2.5: holds by 2.25"},
+            {
+                9: "",
+                11: "a dist b <= 2.5 now: must not hold, holds by 0.25",
+                19: "a dist b <= 2.5 now: must not hold, holds by 2.25",
+            },
         ),
         (
             "(forall p in (boxes except b): p dist b >= 2.5) and a dist b >= 1",
-            {11: "a dist b >= 2.5: -0.25", 19: "a dist b >= 2.5: -2.25"},
+            {11: "a dist b >= 2.5 now: -0.25", 19: "a dist b >= 2.5 now: -2.25"},
         ),
     ],
     ids=["two objects", "no single atom", "exists", "conjunction"],
@@ -111,11 +123,11 @@ def test_the_arrow_of_a_quantifier_names_the_objects_that_decide_it(
 def test_every_label_of_an_arrow_has_its_unit_and_three_digits(tmp_path: Path) -> None:
     sizes = [2.5534e-05, 0.00141421, 0.0517, 0.132, 12.3456, 987654.0]
     found = labels(tmp_path, "spec s = G (a dist b >= 987655)", [987655 - 1.5, 987000.0], unit="mm")
-    assert found[0] == "a dist b >= 987655: -1.5 mm"
+    assert found[0] == "a dist b >= 987655 now: -1.5 mm"
     for index, size in enumerate(sizes):
         folder = tmp_path / str(index)
         folder.mkdir()
         [label, *_] = labels(folder, "spec s = G (a dist b <= 0)", [size], unit="µm")
         prefix, _, number = label.partition(": ")
-        assert (prefix, number.endswith(" µm")) == ("a dist b <= 0", True)
+        assert (prefix, number.endswith(" µm")) == ("a dist b <= 0 now", True)
         assert np.isclose(float(number.removesuffix(" µm")), -size, rtol=5e-3)

@@ -14,6 +14,7 @@ import spatial_replay as sr
 from annotate.layouts import layout_of, panels, paths_of
 from annotate.message_paths import split, values
 from spatial_replay.annotate.foxglove_layout import LayoutContents, layout_for_live
+from spatial_replay.cli import run as run_command
 from spatial_replay.logs import MemorySource
 from spatial_replay.logs.schemas.Robustness_pb2 import Standing
 from spatial_replay.replay import ReplayOptions, run_replay
@@ -36,7 +37,7 @@ def run(tmp_path: Path, text: str, **options: object) -> Path:
 def check_layout(log: Path) -> dict:
     """That every panel is placed once and finds what it shows; the layout."""
     layout = layout_of(log)
-    assert panels(layout["layout"]) == set(layout["configById"])
+    assert panels(layout) == set(layout["configById"])
     for path in paths_of(layout["configById"]):
         assert values(log, path), path
     return layout
@@ -72,7 +73,7 @@ def test_every_path_of_a_layout_finds_something_in_its_log(tmp_path, specificati
     run_replay(open_source(RECORDINGS / "table.jsonl"), files, output=output)
     layout = check_layout(output)
     kinds = {panel.partition("!")[0] for panel in layout["configById"]}
-    assert kinds == {"3D", "Indicator", "Plot", "RawMessages", "RosOut", "StateTransitions", "Table"}
+    assert kinds == {"3D", "Indicator", "Plot", "RawMessages", "RosOut", "StateTransitions", "Tab", "Table"}
 
 
 def test_a_layout_shows_nothing_that_its_log_has_not(tmp_path):
@@ -84,6 +85,29 @@ def test_a_layout_shows_nothing_that_its_log_has_not(tmp_path):
     layout = check_layout(log)
     assert curves(layout).keys() == {"settled"}
     assert layout["configById"]["Plot!robustness"]["yAxisLabel"] == "units of battery"
+
+
+def test_the_scene_has_half_of_the_window_and_details_are_in_tabs(tmp_path):
+    layout = layout_of(run(tmp_path, TEXT + "\nspec turned = G a oriented[1] b"))
+    below = layout["layout"]["second"]
+    assert (below["first"], below["splitPercentage"]) == ("3D!scene", 50)
+    tabs = {name: layout["configById"][name]["tabs"] for name in ("Tab!curves", "Tab!details")}
+    assert [tab["title"] for tab in tabs["Tab!curves"]] == ["results [footprint units]", "results [no unit]"]
+    assert [tab["title"] for tab in tabs["Tab!details"]] == [
+        "violated",
+        "events",
+        "specification",
+        "automaton",
+    ]
+
+
+def test_viewers_with_the_extension_have_a_layout_of_its_panels(tmp_path, capsys):
+    log = run(tmp_path, TEXT)
+    assert run_command(["info", str(log), "--layout", "--panels"]) == 0
+    layout = json.loads(capsys.readouterr().out)
+    assert panels(layout) == set(layout["configById"])
+    assert {"3D!scene", "spatial-replay.spatial-replay specification!tree"} < panels(layout)
+    assert run_command(["info", str(log), "--panels"]) == 2
 
 
 def test_any_node_is_found_by_name_and_by_id(tmp_path):
@@ -141,13 +165,13 @@ def test_a_planned_run_has_its_map_path_and_decision(tmp_path):
     assert set(shown) == {"/spatial/scene", "/plan/gradient_map", "/plan/path"}
     assert shown["/plan/gradient_map"]["colorMode"] == "rgba-fields"
     assert layout["configById"]["RawMessages!decision"]["topicPath"] == "/plan/decision.reason"
-    assert panels(layout["layout"]) == set(layout["configById"])
+    assert panels(layout) == set(layout["configById"])
     assert "/plan/" not in json.dumps(layout_of(layer))
 
 
 def test_the_layout_for_a_live_server_has_its_constants():
     layout = layout_for_live(LayoutContents((), (), None, ()))
-    assert panels(layout["layout"]) == set(layout["configById"]) == {"3D!scene", "Parameters!constants"}
+    assert panels(layout) == set(layout["configById"]) == {"3D!scene", "Parameters!constants"}
 
 
 @pytest.mark.parametrize("path", ["spatial/a", "/a.", "/a{b=1}", "/a[x]", '/a{b=="c}'])
@@ -163,21 +187,16 @@ def curves(layout: dict, panel: str = "Plot!robustness") -> dict[str, str]:
     return {path["label"]: path["value"] for path in own}
 
 
-def test_the_title_of_a_light_has_the_number_of_what_it_names(tmp_path):
-    """The number of the result is that of the condition here, and would be in another unit."""
-    samples = [
-        sr.Sample(
-            t * 10**8,
-            {"a": sr.Footprint.disc(0, 0, 1), "b": sr.Footprint.disc(3 - t / 4, 0, 1)},
-            {"speed": 9.0 - t},
-        )
-        for t in range(5)
-    ]
-    output = tmp_path / "annotated.mcap"
-    files = [sr.parse_specification("spec stops = G (a dist b <= 0.5 -> F[0s, 0.1s] (speed <= 1))")]
-    run_replay(MemorySource.from_samples(samples), files, output=output)
-    title = layout_of(output)["configById"]["Indicator!result0"]["foxglovePanelTitle"]
-    assert title == "stops, violated since 0.400 s: missed F[0s, 0.1s] (speed <= 1) by 4"
+def test_the_title_of_a_light_has_the_verdicts_number_and_when_it_was_least(tmp_path):
+    text = 'spec apart "REQ-2: they keep their distance" = G (a dist b >= 8)\nspec near = F a closeto[2] b'
+    output = run(tmp_path, text)
+    result = sr.evaluate(sr.parse_specification(text), sr.read_trace(output)).results[0]
+    assert (result.violated_at_ns, result.least_at_ns) == (10**8, 4 * 10**8)
+    lights = layout_of(output)["configById"]
+    titles = [lights[f"Indicator!result{place}"]["foxglovePanelTitle"] for place in (0, 1)]
+    number = f"{-result.robustness:.4g}"
+    assert titles[0] == f"REQ-2 apart, by {number} at 0.400 s: they keep their distance"
+    assert titles[1].startswith("near, by ")
 
 
 def test_every_result_has_its_curve_its_light_and_its_strip_under_its_name(tmp_path):
@@ -189,7 +208,7 @@ def test_every_result_has_its_curve_its_light_and_its_strip_under_its_name(tmp_p
     lights = [panel for name, panel in panels.items() if name.startswith("Indicator!")]
     for key in ("lichtblickPanelTitle", "foxglovePanelTitle"):
         first, second = (light[key] for light in lights)
-        assert first == "near, violated since 0.400 s: a closeto[2] b by 2.099"
+        assert first == "near, by 2.099 at 0.400 s"
         assert second == "apart"
     assert panels["Table!violated"]["topicPath"] == "/spatial/standing.violated"
     strips = panels["StateTransitions!verdicts"]["paths"]
@@ -213,9 +232,8 @@ def test_the_worst_of_many_results_have_lights_and_curves(tmp_path):
     text = "\n".join(f"spec s{index} = G a farfrom[{0 if index < 44 else 4.5}] b" for index in range(45))
     layout = check_layout(run(tmp_path, text))
     lights = [panel for name, panel in layout["configById"].items() if name.startswith("Indicator!")]
-    titles = {light["foxglovePanelTitle"].partition(",")[0] for light in lights}
-    assert titles == {"s44", *(f"s{index}" for index in range(23))}
-    assert layout["configById"]["Indicator!result0"]["foxglovePanelTitle"].startswith("s44, violated since")
+    titles = [light["foxglovePanelTitle"].partition(",")[0] for light in lights]
+    assert titles == ["s44", *(f"s{index}" for index in range(5))]
     assert next(iter(curves(layout))) == "s44"
 
 

@@ -11,8 +11,8 @@ from hypothesis.extra.numpy import arrays
 from spatial_replay import LogError, Verdict
 from spatial_replay.annotate.robustness import decode_robustness, encode_robustness
 from spatial_replay.logs.schemas.Robustness_pb2 import (
-    FAILS_SO_FAR,
     HOLDS_SO_FAR,
+    PENDING,
     SATISFIED,
     UNKNOWN,
     VIOLATED,
@@ -35,7 +35,7 @@ def numbered(draw: st.DrawFn):
 
 
 def open_standing(value: float) -> int:
-    return UNKNOWN if np.isnan(value) else HOLDS_SO_FAR if value >= 0.0 else FAILS_SO_FAR
+    return UNKNOWN if np.isnan(value) else HOLDS_SO_FAR if value >= 0.0 else PENDING
 
 
 @given(numbered(), st.none() | st.text(min_size=1, max_size=5))

@@ -405,33 +405,33 @@ def test_an_arrow_with_its_number_points_at_the_worst_violation():
     assert ["witness" in each for each in identifiers] == [True, False, False, True]
     assert [each.id for each in shown[1].deletions] == ["witness"]
     assert not shown[2].deletions
-    assert arrow(shown[0])[2] == "a closeto[1] b: -1"
+    assert arrow(shown[0])[2] == "a closeto[1] b now: -1"
     begin, end, label = arrow(shown[3])
-    assert (begin[0], end[0], label) == (1.0, 9.0, "a closeto[1] b: -7")
+    assert (begin[0], end[0], label) == (1.0, 9.0, "a closeto[1] b now: -7")
     assert begin[1] == end[1]
 
 
 def test_the_number_of_an_arrow_is_in_the_unit_of_the_log():
     [message] = pointed("scale lengths = 4\nspec s = G a closeto[1] b", {"a": box_at(0.0), "b": box_at(9.0)})
-    assert arrow(message)[2] == "a closeto[1] b: -7"
+    assert arrow(message)[2] == "a closeto[1] b now: -7"
 
 
 def test_the_arrow_of_an_enclosure_shows_what_sticks_out():
     text = "region goal = box(0, 0, 2, 2)\nspec s = G a enclosedin goal"
     [message] = pointed(text, {"a": Footprint.box(1.0, 0.5, 3.5, 1.0)})
     begin, end, label = arrow(message)
-    assert (begin[0], end[0], label) == (3.5, 2.0, "a enclosedin goal: -1.5")
+    assert (begin[0], end[0], label) == (3.5, 2.0, "a enclosedin goal now: -1.5")
 
 
 def test_the_arrow_of_a_direction_joins_what_is_nearest():
     [message] = pointed("spec s = G a leftof b", {"a": box_at(4.0), "b": box_at(0.0)})
     begin, end, label = arrow(message)
-    assert (begin[0], end[0], label) == (4.0, 1.0, "a leftof b: -5")
+    assert (begin[0], end[0], label) == (4.0, 1.0, "a leftof b now: -5")
 
 
 def test_a_requirement_not_to_hold_is_pointed_at_too():
     [message] = pointed("spec s = G not a closeto[3] b", {"a": box_at(0.0), "b": box_at(2.0)})
-    assert arrow(message)[2] == "a closeto[3] b: holds by 2"
+    assert arrow(message)[2] == "a closeto[3] b now: must not hold, holds by 2"
 
 
 def test_a_constant_has_no_arrow():
@@ -457,7 +457,7 @@ def test_a_fulfilled_obligation_has_no_requirements(text):
 def test_an_empty_group_hides_no_arrow():
     drink = 'group drinks = class "drink"\nspec s = F (exists o in drinks: o closeto[1] a)\n'
     [message] = pointed(drink + "spec t = G a closeto[1] b", {"a": box_at(0.0), "b": box_at(3.0)})
-    assert arrow(message)[2] == "a closeto[1] b: -1"
+    assert arrow(message)[2] == "a closeto[1] b now: -1"
 
 
 def test_cutting_a_run_moves_no_arrow():

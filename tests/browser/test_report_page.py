@@ -584,7 +584,7 @@ CanvasRenderingContext2D.prototype.fillText = function (text, ...at) {
 
 
 @pytest.mark.parametrize(
-    ("name", "label"), [("touched", "a ovlp b: holds by "), ("violated", f": {MINUS}0.155")]
+    ("name", "label"), [("touched", "a ovlp b: must not hold, holds by "), ("violated", f": {MINUS}0.155")]
 )
 def test_the_arrow_of_an_atom_that_holds_and_should_not_says_that_it_holds(
     open_page: Open, name: str, label: str

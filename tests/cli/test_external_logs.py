@@ -217,13 +217,13 @@ def test_a_declared_unit_of_lengths_is_at_axes_in_tables_in_sentences_and_in_wha
                 (channel.topic, message.data) for _, channel, message in make_reader(stream).iter_messages()
             ]
         standing = [StandingUpdate.FromString(data) for topic, data in messages if topic == STANDING]
-        assert {each.unit for message in standing for each in (*message.results, *message.present)} == {"m"}
+        assert {each.unit for message in standing for each in message.results} == {"m"}
         events = [Event.FromString(data) for topic, data in messages if topic == EVENTS]
         [end] = [each.metadata for each in events if "`meet` is violated" in each.metadata[-1].value]
         assert "`turtle1 ovlp turtle2` failed by 1.514 m" in end[-1].value
         drawn = [SceneUpdate.FromString(data) for topic, data in messages if topic == SCENE]
         [arrow] = [each for each in drawn[-1].entities if each.id == "witness"]
-        assert arrow.texts[0].text.strip() == "turtle1 ovlp turtle2: -1.53 m"
+        assert arrow.texts[0].text.strip() == "turtle1 ovlp turtle2 now: -1.53 m"
         [found] = [Specification.FromString(data) for topic, data in messages if topic == described]
         assert {node.unit for result in found.results for node in result.nodes} == {"m"}
     capsys.readouterr()

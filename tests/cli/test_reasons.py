@@ -62,7 +62,8 @@ def test_the_text_says_when_a_violation_became_certain_and_why(
     assert "mission [REQ-7]  violated" in first
     assert "certain since 5.533 s" in first
     assert title.strip() == "done and safe"
-    assert safe.strip().startswith("safe at 5.533 s: `cup dist plate >= 0.2` fails by ")
+    assert safe.strip().startswith("safe: `cup dist plate >= 0.2` fails by 0.1449 at 9.767 s ")
+    assert safe.endswith(" It was violated first at 5.533 s, by 0.001284.")
     assert goal.strip().startswith("goal: `fork ovlp plate` fails by ")
     assert "first satisfied" not in printed
 
@@ -78,7 +79,7 @@ def test_the_requirements_of_a_result_its_parts_and_causes_are_in_every_output(
     about = ("REQ-3", "keeps its distance")
     assert named == {"mission": ("REQ-7", "done and safe"), "safe": about, "goal": (None, None)}
     assert (mission["causes"][0]["requirement"], mission["causes"][0]["title"]) == about
-    assert "safe [REQ-3: keeps its distance] at 5.533 s: " in capsys.readouterr().out
+    assert "safe [REQ-3: keeps its distance]: " in capsys.readouterr().out
     run(["explain", str(LOG), "--spec", "mission.spatial"])
     said = capsys.readouterr().out
     assert "`safe` (REQ-3: keeps its distance) is violated since 5.533 s" in said
@@ -165,7 +166,7 @@ def test_amounts_are_said_in_the_unit_of_the_log_where_scale_divides_them(
     (folder / "scaled.spatial").write_text("scale lengths = 0.5\nspec safe = G (cup dist plate >= 0.2)\n")
     run(["replay", str(LOG), "--spec", "scaled.spatial"])
     said = capsys.readouterr().out
-    assert "`cup dist plate >= 0.2` fails by 0.001284 (0.002568 on its scale of 0.5) at 5.533 s" in said
+    assert "It was violated first at 5.533 s, by 0.001284 (0.002568 on its scale of 0.5)." in said
 
 
 def test_explain_lists_every_failing_spec_the_settled_one_first(

@@ -37,6 +37,14 @@ def evaluated(text: str = TASK) -> sr.Evaluation:
     return sr.evaluate(sr.parse_specification(text), sr.Trace.from_samples(stopped_robot()))
 
 
+def test_what_is_said_of_a_violation_that_grew_has_its_robustness_and_then_how_it_began() -> None:
+    result = evaluated("spec safe = G (red dist vase >= 0.1)").result()
+    said = result.reason(0)
+    assert said.startswith(f"`red dist vase >= 0.1` fails by {-result.robustness:.4g} at 4.000 s")
+    assert said.endswith("It was violated first at 3.000 s, by 0.03.")
+    assert "first" not in evaluated("spec charged = G (battery >= 0.2)").result().reason(0)
+
+
 def test_what_settled_the_verdict_comes_before_a_goal_that_was_never_reached() -> None:
     result = evaluated().result()
     assert [cause.spec for cause in result.causes] == ["safe", "charged", "deliver"]
@@ -102,8 +110,9 @@ def test_explanations_name_every_cause_and_what_would_have_prevented_it() -> Non
         "`task` is violated: robustness -7.76, certain since 3.000 s (the least robustness is that of "
         "`deliver`).",
         "`safe` is violated since 3.000 s, whatever came after.",
-        "What decides is `red dist vase >= 0.1`, which fails by 0.03 at 3.000 s (within `safe`): "
-        "red and vase are 0.07 apart.",
+        "What decides is `red dist vase >= 0.1`, which fails by 0.34 at 4.000 s (its least within `safe`): "
+        "red and vase overlap by 0.24.",
+        "It was violated first at 3.000 s, by 0.03.",
         "It would be satisfied with -0.2401 or less instead of 0.1 in `red dist vase >= 0.1`.",
         "`charged` is violated since 4.000 s, whatever came after.",
         "What decides is `battery >= 0.2`, which fails by 0.06 at 4.000 s (within `charged`): "

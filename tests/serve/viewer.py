@@ -118,6 +118,13 @@ class Viewer:
         text: str = found["message"]
         return text
 
+    async def rejected(self) -> str:
+        """Why the last value was rejected, once that is known."""
+        async with asyncio.timeout(PATIENCE_S):
+            while not (text := str((await self.parameters())["rejected"])):
+                await asyncio.sleep(0)
+        return text
+
     async def summary(self, says: str = "") -> str:
         """What the next message about the whole log says that it comes to."""
         if "/spatial/curves" not in self._subscribed:
@@ -223,7 +230,11 @@ class Viewer:
 
 def constants_of(parameters: dict[str, Any]) -> dict[str, Any]:
     """The parameters that do not steer the playback."""
-    return {name: value for name, value in parameters.items() if not name.startswith(("playback.", "scene."))}
+    return {
+        name: value
+        for name, value in parameters.items()
+        if not name.startswith(("playback.", "scene.", "rejected"))
+    }
 
 
 @asynccontextmanager

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from textwrap import wrap
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
@@ -25,13 +26,13 @@ from spatial_replay.annotate.violations import EvaluatedResult, Violations
 from spatial_replay.geometry.arrays import Floats, Integers, combined, equal_places
 from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.logs.schemas.Robustness_pb2 import (
-    FAILS_SO_FAR,
     HOLDS_SO_FAR,
+    PENDING,
     SATISFIED,
     UNKNOWN,
     VIOLATED,
 )
-from spatial_replay.palette import FAILING, HOLDING, NEGATIVE, NEUTRAL, POSITIVE
+from spatial_replay.palette import HOLDING, MAP, NEGATIVE, NEUTRAL, POSITIVE
 from spatial_replay.text import Instant
 
 
@@ -62,13 +63,14 @@ _CROWD: Final = 40
 _MOST_LABELS: Final = 20
 """From so many objects on, not all have labels; the most that then have."""
 
-_MOST_TITLES: Final = 3
+_MOST_TITLES: Final = 6
+_BANNER_WIDTH: Final = 30
 _STANDING_WORDS: Final = MappingProxyType(
     {
         VIOLATED: ("violated", NEGATIVE),
-        FAILS_SO_FAR: ("failing so far", FAILING),
+        PENDING: ("pending", NEUTRAL),
         UNKNOWN: ("unknown", NEUTRAL),
-        HOLDS_SO_FAR: ("holding so far", HOLDING),
+        HOLDS_SO_FAR: ("holds so far", HOLDING),
         SATISFIED: ("satisfied", POSITIVE),
     }
 )
@@ -105,17 +107,26 @@ def banners_of(
 def _banner(
     results: Sequence[EvaluatedResult], codes: NDArray[np.uint8], place: tuple[float, float]
 ) -> Banner | None:
-    parts, colour, titles = [], None, [each.title for each in results]
+    worst, others, colour = "", list[str](), None
     for code, (words, hue) in _STANDING_WORDS.items():
         of_code = [result for result, each in zip(results, codes.tolist(), strict=True) if each == code]
         if code == VIOLATED:  # the one that was so first comes first
             of_code.sort(key=lambda each: each.violated_ns)
         own = [each.title for each in of_code]
-        if own:
-            few = own if len(own) <= _MOST_TITLES else [*own[:_MOST_TITLES], "…"]
-            parts.append(f"{len(own)} {words}: {', '.join(few)}" if len(titles) > 1 else f"{own[0]} {words}")
-            colour = colour or hue
-    return None if colour is None else Banner("; ".join(parts), colour, place)
+        if not own:
+            continue
+        if colour is not None:
+            others.append(f"{len(own)} {words}")
+            continue
+        few = (
+            own
+            if len(own) <= _MOST_TITLES
+            else [*own[: _MOST_TITLES - 1], f"{len(own) - _MOST_TITLES + 1} more"]
+        )
+        worst = f"{own[0]} {words}" if len(results) == 1 else f"{len(own)} {words}: {', '.join(few)}"
+        colour = hue
+    lines = [line for text in (worst, ", ".join(others)) for line in wrap(text, _BANNER_WIDTH)]
+    return None if colour is None else Banner("\n".join(lines), colour, place)
 
 
 class ArrowTexts(NamedTuple):
@@ -158,8 +169,10 @@ def arrow_texts(
         known = results[result].leaf_pairs if result >= 0 and leaf >= 0 else None
         text = found.atoms[atom] if atom >= 0 else "" if known is None else known.texts[leaf]
         text = text if len(text) <= _LONGEST_CAUSE else f"{text[: _LONGEST_CAUSE - 1]}…"
-        at = "" if moment_ns < 0 else f" at {Instant(moment_ns, first_ns)}"
-        causes.append(CauseText(f"{text}{at}: {'holds by ' if holds else ''}", int(words[places[0]])))
+        at = " now" if moment_ns < 0 else f" at {Instant(moment_ns, first_ns)}"
+        causes.append(
+            CauseText(f"{text}{at}: {'must not hold, holds by ' if holds else ''}", int(words[places[0]]))
+        )
     numbers = [b""] * len(found.result)
     for index, number in zip(shown.tolist(), texts, strict=True):
         numbers[index] = number
@@ -185,6 +198,11 @@ _OPACITY: Final = 0.6
 """Opacity of a map's cells, so that the scene above them stays visible."""
 
 
+_MAP_PLACES: Final = tuple(np.linspace(-1.0, 1.0, len(MAP)).tolist())
+_MAP_COLOURS: Final = tuple(zip(*(bytes.fromhex(each[1:]) for each in MAP), strict=True))
+"""Red, green and blue of a map's colours, and where they are between the worst and the best."""
+
+
 def colours(robustness: ArrayLike, scale: ArrayLike) -> Floats:
     """Return the colours (..., 3) of robustness (...): full at `scale`, grey where NaN.
 
@@ -207,11 +225,12 @@ def shade_codes(robustness: Floats, scale: ArrayLike) -> NDArray[np.uint8]:
 
 
 def cell_colours(robustness: Floats) -> NDArray[np.uint8]:
-    """Return the colours (..., 4) of cells (...): full where the map is largest, transparent where NaN."""
-    largest = float(np.abs(robustness[np.isfinite(robustness)]).max(initial=0.0))
-    opacity = np.where(np.isnan(robustness), 0.0, _OPACITY)
-    shares = np.concatenate([colours(robustness, largest or 1.0), opacity[..., None]], axis=-1)
-    return np.asarray(np.round(255.0 * shares), np.uint8)
+    """Return the colours (..., 4) of cells (...), the lighter the better, transparent where NaN."""
+    largest = float(np.abs(robustness[np.isfinite(robustness)]).max(initial=0.0)) or 1.0
+    places = np.clip(np.nan_to_num(robustness) / largest, -1.0, 1.0)
+    shares = [np.interp(places, _MAP_PLACES, column) for column in _MAP_COLOURS]
+    opacity = np.where(np.isnan(robustness), 0.0, 255.0 * _OPACITY)
+    return np.asarray(np.round(np.stack([*shares, opacity], axis=-1)), np.uint8)
 
 
 def _shades() -> NDArray[np.uint8]:
@@ -379,8 +398,9 @@ class SceneContent(NamedTuple):
         forms: (S, names), `ABSENT`, `DELETED`, or from `FIRST_FORM` on the number of its form.
         styles: (S, names), its level, and whether it has a label as the last bit; -1 where it is absent.
         observations: (S, names), rows of `rings`, `footprints` and `middles`.
-        middles: (R, 2), of the boxes around the rings.
+        middles: (R, 2), where names are.
         violations: of the S samples.
+        label: (S,), how high on the plane the arrow's label is.
         arrow: (S,), the same as `forms` for the arrow at the worst violation; its forms are `causes`.
         causes: what decides violations, in words.
         numbers: of each violation that is shown, its number with its unit.
@@ -396,6 +416,7 @@ class SceneContent(NamedTuple):
     rings: Rings
     middles: Floats
     violations: Violations
+    label: Floats
     arrow: Integers
     causes: tuple[CauseText, ...]
     numbers: Sequence[bytes]

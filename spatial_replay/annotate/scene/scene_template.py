@@ -180,10 +180,13 @@ class SceneBounds(NamedTuple):
             low, high = _corners_of_part(vertices)
         if not len(vertices):
             return before
-        if before is not None:
-            low = [min(low[0], before.xmin), min(low[1], before.ymin)]
-            high = [max(high[0], before.xmax), max(high[1], before.ymax)]
-        return cls(low[0], low[1], high[0], high[1])
+        own = cls(low[0], low[1], high[0], high[1])
+        return own if before is None else before.with_points(np.array([low, high]))
+
+    def with_points(self, points: Floats) -> SceneBounds:
+        """Return the box around this one and some points (P, 2)."""
+        low, high = _corners_of_part(np.vstack([points, [self[:2], self[2:]]]))
+        return SceneBounds(low[0], low[1], high[0], high[1])
 
 
 def _corners_of_part(vertices: Floats) -> tuple[list[float], list[float]]:
@@ -580,13 +583,14 @@ _ARROW_NUMBERS: Final = 10
 
 
 def numbers_of_witness(
-    points: Floats, z: Floats, scale: float, labels: Sequence[bytes], words: int
+    points: Floats, z: Floats, label_y: Floats, scale: float, labels: Sequence[bytes], words: int
 ) -> list[Floats]:
     """Return what to fill in for the arrow at the worst violation.
 
     Args:
         points: (S, 2, 2), its begin and its end.
         z: (S,), its height.
+        label_y: (S,), where the label is on the plane, off the arrow.
         scale: the size of objects in the scene.
         labels: S texts.
         words: how many words of 8 bytes each of them takes.
@@ -596,7 +600,7 @@ def numbers_of_witness(
     half = 0.5 * np.arctan2(*(end - begin).T[::-1])
     head = np.minimum(0.5 * length, ARROW_HEAD * scale)
     arrow = [begin, z, np.sin(half), np.cos(half), length - head, head]
-    middle = [(begin + end) / 2.0, z + ARROW_HEAD * scale]
+    middle = [(begin[:, 0] + end[:, 0]) / 2.0, label_y, z + ARROW_HEAD * scale]
     text = b"".join([label.ljust(8 * words) for label in labels])
     label = np.frombuffer(text, "<f8")
     return [column.reshape(len(points), -1) for column in (*arrow, *middle, label)]

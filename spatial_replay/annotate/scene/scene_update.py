@@ -106,7 +106,8 @@ class SceneNumbers:
         if isinstance(layout.witness, CauseText):
             found, labels = content.violations, [content.numbers[index] for index in samples.tolist()]
             z = np.fmax(found.top[samples], 0.0) + 3.0 * LIFT * self._scale
-            columns += numbers_of_witness(found.points[samples], z, self._scale, labels, layout.witness.words)
+            at = found.points[samples], z, content.label[samples]
+            columns += numbers_of_witness(*at, self._scale, labels, layout.witness.words)
         return words_of(columns)
 
 
@@ -128,8 +129,8 @@ _MOST_TEMPLATES: Final = 256
 _MOST_SHADES: Final = 4_096
 """Shades of one message, of each result and each object or region, at most."""
 _NOWHERE: Final = (0.0, 0.0)
-_BANNER_LIFT: Final = 0.06
-"""How far the banner is above the scene, by the scene's height."""
+_LINE: Final = 0.05
+"""How high a line of text is, about, by the longer side of the scene; a letter is half as wide."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,6 +145,7 @@ class SceneState:
         scale: the robustness at which colours are full: the median size (longer side of the bounding box) of
             the objects in the first message that shows any; None before that.
         place: where the banner is: above the objects of that message and the regions.
+        line: how high a line of text is there, about.
         templates: those of the layouts so far; a cache that changes no message.
     """
 
@@ -153,6 +155,7 @@ class SceneState:
     is_pointing: bool = False
     scale: float | None = None
     place: tuple[float, float] | None = None
+    line: float = 0.0
     templates: Mapping[SceneLayout, SceneTemplate] = field(default_factory=lambda: MappingProxyType({}))
 
 
@@ -227,7 +230,7 @@ class SceneEncoder:
         has_label = labelled_objects(results, names, rows >= 0, objects)
         banners = banners_of(results, times_ns, state.place or _NOWHERE, first)
         arrows = arrow_texts(results, violations, state.first_ns or 0, self.unit)
-        content = _content(trace, names, rows, state, scale, violations, arrows, has_label, banners)
+        content = _content(trace, names, rows, state, violations, arrows, has_label, banners)
         shades = colours(objects, scales), colours(regions, scales)
         shown = shades[0].reshape(-1, 3) if (rows >= 0).all() else shades[0][rows >= 0]
         columns = SceneNumbers(times_ns, shades[1], shown, content, scale)
@@ -247,6 +250,7 @@ class SceneEncoder:
             is_pointing=bool(content.violations.is_shown[-1]),
             scale=state.scale,
             place=state.place,
+            line=state.line,
             templates=MappingProxyType(dict(list(templates.items())[-_MOST_TEMPLATES:])),
         )
         find_arrows = partial(_arrows_of, results, trace, written, state.first_ns or 0, self.unit)
@@ -268,17 +272,19 @@ class SceneEncoder:
         first = int(is_shown.argmax())
         scale = state.scale or _scale_of(trace, rows[first])
         scales[first:] = scale
-        return replace(state, scale=scale, place=self._place(trace, rows[first], scale)), scales, first
+        place, line = self._place(trace, rows[first])
+        return replace(state, scale=scale, place=place, line=line), scales, first
 
-    def _place(self, trace: Trace, rows: Integers, scale: float) -> tuple[float, float]:
-        """Return where the banner is: above the objects of one sample and the regions."""
+    def _place(self, trace: Trace, rows: Integers) -> tuple[tuple[float, float], float]:
+        """Return the place above the objects of one sample and the regions, and a line's height."""
         shown = trace.footprints.select(rows[rows >= 0]).vertices
         points = np.concatenate([shown, *(ring for region in self._drawn for ring in region.rings)])
         points = points[np.isfinite(points).all(axis=1)]
         if not len(points):
-            return _NOWHERE
+            return _NOWHERE, 0.0
         (left, low), (right, high) = points.min(axis=0).tolist(), points.max(axis=0).tolist()
-        return (left + right) / 2.0, high + max(_BANNER_LIFT * (high - low), scale)
+        line = _LINE * max(right - left, high - low)
+        return ((left + right) / 2.0, high + 2.0 * line), line
 
 
 def _arrows_of(
@@ -360,7 +366,6 @@ def _content(
     names: tuple[str, ...],
     rows: Integers,
     before: SceneState,
-    scale: float,
     found: Violations,
     arrows: ArrowTexts,
     has_label: NDArray[np.bool_],
@@ -369,7 +374,7 @@ def _content(
     is_present = rows >= 0
     was_present = np.concatenate([[[name in before.shown for name in names]], is_present[:-1]])
     footprints = trace.footprints.select(rows[is_present])
-    rings = rings_of(footprints, _POINT * scale)
+    rings = rings_of(footprints, _POINT * (before.scale or _UNSCALED))
     observations = np.full(rows.shape, -1, np.int64)
     observations[is_present] = np.arange(len(footprints))
     forms = np.where(was_present, DELETED, ABSENT)
@@ -377,13 +382,44 @@ def _content(
     styles = np.full(rows.shape, -1, np.int64)
     low, high = boxes(rings.points, rings.start)
     sizes = extents(footprints) if rings.has_round else np.maximum(*(high - low).T)
-    styles[is_present] = 2 * _levels(sizes, scale) + has_label[is_present]
+    styles[is_present] = 2 * _levels(sizes, before.scale or _UNSCALED) + has_label[is_present]
     was_pointing = np.append(before.is_pointing, found.is_shown[:-1])
     witness = np.where(found.is_shown, FIRST_FORM + arrows.cause, np.where(was_pointing, DELETED, ABSENT))
     said = witness, arrows.causes, arrows.numbers
+    letters = np.broadcast_to(list(map(len, names)), rows.shape)[is_present]
+    drawn = observations, footprints, rings, _name_places(low, high, letters, before.line)
+    label = _label_places(found, observations, (low, high), before)
+    return SceneContent(names, rows, forms, styles, *drawn, found, label, *said, *banners)
+
+
+def _name_places(low: Floats, high: Floats, letters: Integers, line: float) -> Floats:
+    """Return (R, 2) where names are: in the middle of what is large enough for them, else below it."""
     # half the sum of the ends does not depend on the order in which points are added up
-    drawn = observations, footprints, rings, (low + high) / 2.0
-    return SceneContent(names, rows, forms, styles, *drawn, found, *said, *banners)
+    places = (low + high) / 2.0
+    sides = high - low
+    is_small = (sides[:, 1] < 1.5 * line) | (sides[:, 0] < 0.5 * line * letters)
+    places[:, 1] = np.where(is_small, low[:, 1] - 0.75 * line, places[:, 1])
+    return places
+
+
+def _label_places(
+    found: Violations, observations: Integers, boxes: tuple[Floats, Floats], state: SceneState
+) -> Floats:
+    """Return (S,) how high on the plane each arrow's label is: above the objects that it joins, or below."""
+    label = np.full(len(observations), np.nan)
+    shown = np.flatnonzero(found.is_shown)
+    ends = found.points[shown]
+    low, high = ends[:, :, 1].min(axis=1), ends[:, :, 1].max(axis=1)
+    for own in observations[shown].T:
+        # an absent object has the last box, and counts for nothing
+        lower, upper = (box[own][:, None, :] for box in boxes) if len(boxes[0]) else (ends, ends)
+        near = state.line * 0.1
+        touches = ((lower - near <= ends) & (ends <= upper + near)).all(axis=2).any(axis=1) & (own >= 0)
+        low = np.where(touches, np.minimum(low, lower[:, 0, 1]), low)
+        high = np.where(touches, np.maximum(high, upper[:, 0, 1]), high)
+    has_room = high + 2.5 * state.line < (state.place or _NOWHERE)[1]
+    label[shown] = np.where(has_room, high + 1.25 * state.line, low - 1.75 * state.line)
+    return label
 
 
 def _levels(sizes: Floats, scale: float) -> Integers:

@@ -30,7 +30,7 @@ class _StandingEnumTypeWrapper(google.protobuf.internal.enum_type_wrapper._EnumT
     """Satisfied, whatever follows."""
     HOLDS_SO_FAR: _Standing.ValueType  # 32
     """The value is at least 0, and the samples that may follow can still decide either way."""
-    FAILS_SO_FAR: _Standing.ValueType  # 42
+    PENDING: _Standing.ValueType  # 33
     """The value is below 0, and the samples that may follow can still decide either way."""
     VIOLATED: _Standing.ValueType  # 29
     """Violated, whatever follows."""
@@ -39,7 +39,7 @@ class _StandingEnumTypeWrapper(google.protobuf.internal.enum_type_wrapper._EnumT
 
 class Standing(_Standing, metaclass=_StandingEnumTypeWrapper):
     """How a result or a node stands. Viewers colour a state by its number modulo 28: satisfied and holding are blue
-    and light blue there, failing is amber and violated is vermillion; unknown is the palest colour that they have,
+    and light blue there, violated is vermillion, and pending and unknown are the palest colours that they have,
     which has no grey.
     """
 
@@ -48,33 +48,13 @@ SATISFIED: Standing.ValueType  # 28
 """Satisfied, whatever follows."""
 HOLDS_SO_FAR: Standing.ValueType  # 32
 """The value is at least 0, and the samples that may follow can still decide either way."""
-FAILS_SO_FAR: Standing.ValueType  # 42
+PENDING: Standing.ValueType  # 33
 """The value is below 0, and the samples that may follow can still decide either way."""
 VIOLATED: Standing.ValueType  # 29
 """Violated, whatever follows."""
 UNKNOWN: Standing.ValueType  # 47
 """The value is not determined, and nothing is decided. In a final message: what was not seen leaves it open."""
 global___Standing = Standing
-
-class _Present:
-    ValueType = typing.NewType("ValueType", builtins.int)
-    V: typing_extensions.TypeAlias = ValueType
-
-class _PresentEnumTypeWrapper(google.protobuf.internal.enum_type_wrapper._EnumTypeWrapper[_Present.ValueType], builtins.type):
-    DESCRIPTOR: google.protobuf.descriptor.EnumDescriptor
-    PRESENT_UNSPECIFIED: _Present.ValueType  # 0
-    HOLDS_NOW: _Present.ValueType  # 1
-    FAILS_NOW: _Present.ValueType  # 2
-    UNKNOWN_NOW: _Present.ValueType  # 3
-
-class Present(_Present, metaclass=_PresentEnumTypeWrapper):
-    """How a node stands in one sample, without the samples that follow."""
-
-PRESENT_UNSPECIFIED: Present.ValueType  # 0
-HOLDS_NOW: Present.ValueType  # 1
-FAILS_NOW: Present.ValueType  # 2
-UNKNOWN_NOW: Present.ValueType  # 3
-global___Present = Present
 
 @typing.final
 class Robustness(google.protobuf.message.Message):
@@ -182,7 +162,6 @@ class StandingUpdate(google.protobuf.message.Message):
     WORST_FIELD_NUMBER: builtins.int
     FINAL_FIELD_NUMBER: builtins.int
     VIOLATED_FIELD_NUMBER: builtins.int
-    PRESENT_FIELD_NUMBER: builtins.int
     time_ns: builtins.int
     """Time of the sample in nanoseconds; equal to the log time of the message, unless that is final."""
     worst: builtins.str
@@ -195,11 +174,9 @@ class StandingUpdate(google.protobuf.message.Message):
 
     @property
     def violated(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___Violation]:
-        """The results that are violated, whatever comes, the one that was so first before the others."""
-
-    @property
-    def present(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___PresentNode]:
-        """The nodes of the worst result at the newest sample, in the order of their ids, for tables beside a cursor."""
+        """The results that are violated, whatever comes, the one that was so first before the others. While there is
+        none, one entry without numbers says so: viewers draw no table without rows.
+        """
 
     def __init__(
         self,
@@ -209,10 +186,9 @@ class StandingUpdate(google.protobuf.message.Message):
         worst: builtins.str = ...,
         final: builtins.bool = ...,
         violated: collections.abc.Iterable[global___Violation] | None = ...,
-        present: collections.abc.Iterable[global___PresentNode] | None = ...,
     ) -> None: ...
     def HasField(self, field_name: typing.Literal["_time_ns", b"_time_ns", "time_ns", b"time_ns"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["_time_ns", b"_time_ns", "final", b"final", "present", b"present", "results", b"results", "time_ns", b"time_ns", "violated", b"violated", "worst", b"worst"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["_time_ns", b"_time_ns", "final", b"final", "results", b"results", "time_ns", b"time_ns", "violated", b"violated", "worst", b"worst"]) -> None: ...
     def WhichOneof(self, oneof_group: typing.Literal["_time_ns", b"_time_ns"]) -> typing.Literal["time_ns"] | None: ...
 
 global___StandingUpdate = StandingUpdate
@@ -228,6 +204,7 @@ class Violation(google.protobuf.message.Message):
     BY_FIELD_NUMBER: builtins.int
     UNIT_FIELD_NUMBER: builtins.int
     OVER_FIELD_NUMBER: builtins.int
+    AT_FIELD_NUMBER: builtins.int
     name: builtins.str
     """As in `results`."""
     since: builtins.float
@@ -238,6 +215,8 @@ class Violation(google.protobuf.message.Message):
     """Unit of `by`; empty for footprint units."""
     over: builtins.str
     """What decided it: the atom, or the response that was missing. Empty if that is not known."""
+    at: builtins.float
+    """When the value over all samples was first so low: seconds after the first sample."""
     def __init__(
         self,
         *,
@@ -246,9 +225,12 @@ class Violation(google.protobuf.message.Message):
         by: builtins.float | None = ...,
         unit: builtins.str = ...,
         over: builtins.str = ...,
+        at: builtins.float | None = ...,
     ) -> None: ...
-    def HasField(self, field_name: typing.Literal["_by", b"_by", "_since", b"_since", "by", b"by", "since", b"since"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["_by", b"_by", "_since", b"_since", "by", b"by", "name", b"name", "over", b"over", "since", b"since", "unit", b"unit"]) -> None: ...
+    def HasField(self, field_name: typing.Literal["_at", b"_at", "_by", b"_by", "_since", b"_since", "at", b"at", "by", b"by", "since", b"since"]) -> builtins.bool: ...
+    def ClearField(self, field_name: typing.Literal["_at", b"_at", "_by", b"_by", "_since", b"_since", "at", b"at", "by", b"by", "name", b"name", "over", b"over", "since", b"since", "unit", b"unit"]) -> None: ...
+    @typing.overload
+    def WhichOneof(self, oneof_group: typing.Literal["_at", b"_at"]) -> typing.Literal["at"] | None: ...
     @typing.overload
     def WhichOneof(self, oneof_group: typing.Literal["_by", b"_by"]) -> typing.Literal["by"] | None: ...
     @typing.overload
@@ -292,34 +274,3 @@ class ResultStanding(google.protobuf.message.Message):
     def WhichOneof(self, oneof_group: typing.Literal["_robustness", b"_robustness"]) -> typing.Literal["robustness"] | None: ...
 
 global___ResultStanding = ResultStanding
-
-@typing.final
-class PresentNode(google.protobuf.message.Message):
-    """One node at the newest sample, with its text, for tables: the number is rounded to four digits."""
-
-    DESCRIPTOR: google.protobuf.descriptor.Descriptor
-
-    TEXT_FIELD_NUMBER: builtins.int
-    STATE_FIELD_NUMBER: builtins.int
-    NOW_FIELD_NUMBER: builtins.int
-    UNIT_FIELD_NUMBER: builtins.int
-    text: builtins.str
-    state: global___Present.ValueType
-    """Whether it holds there."""
-    now: builtins.float
-    """Robustness there; NaN where it is not determined."""
-    unit: builtins.str
-    """Unit of `now`; empty for footprint units."""
-    def __init__(
-        self,
-        *,
-        text: builtins.str = ...,
-        state: global___Present.ValueType = ...,
-        now: builtins.float | None = ...,
-        unit: builtins.str = ...,
-    ) -> None: ...
-    def HasField(self, field_name: typing.Literal["_now", b"_now", "now", b"now"]) -> builtins.bool: ...
-    def ClearField(self, field_name: typing.Literal["_now", b"_now", "now", b"now", "state", b"state", "text", b"text", "unit", b"unit"]) -> None: ...
-    def WhichOneof(self, oneof_group: typing.Literal["_now", b"_now"]) -> typing.Literal["now"] | None: ...
-
-global___PresentNode = PresentNode

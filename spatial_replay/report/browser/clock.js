@@ -133,11 +133,11 @@ function worstOf(results) {
 }
 
 // Writes time and result to the address and reads them from it: #t=4.2&r=1.
-function linkAddress(clock) {
+function linkAddress(clock, opening = null) {
   const given = new URLSearchParams(location.hash.slice(1));
   if (given.has("r")) clock.choose(Number(given.get("r")));
   const time = given.has("t") ? Number(given.get("t")) : NaN;
-  clock.seek(Number.isFinite(time) ? time : clock.opening);
+  clock.seek(Number.isFinite(time) ? time : opening ?? clock.opening);
   let waiting = null, before = [clock.time, clock.result];
   const write = () => {
     waiting = null;

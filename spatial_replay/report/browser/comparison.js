@@ -30,8 +30,7 @@ function makeComparison([a, b, pairs]) {
       clock.seek(own);
     }}, time.textContent));
   }
-  const first = pairs.first;
-  clock.seek(first === null ? clock.end : first);
+  linkAddress(clock, pairs.first ?? clock.end);
   document.documentElement.dataset.ready = "true";
 }
 

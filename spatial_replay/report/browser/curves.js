@@ -21,6 +21,10 @@ function makeCurves(clock) {
     curves = result ? curvesOf(clock.run, result, shown.quantity) : [];
     legend.replaceChildren(...curves.map((curve) => legendEntry(curve, shown, build)));
     if (!curves.length || !result.samples) return;
+    if (shown.quantity === VALUE && clock.run.settles) {
+      legend.append(element("span", {class: "legend-entry"}, element("span", {class: "swatch band"}),
+        element("span", {}, `what ${result.title} may still become`)));
+    }
     chart = new uPlot(options(clock, result, curves, shown, place.clientWidth), columns(result, curves), place);
     chart.over.append(line);
     scrub(chart.over, clock);

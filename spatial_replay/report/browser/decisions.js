@@ -6,8 +6,7 @@ function makeDecisions(clock) {
   const cards = clock.run.decisions.map((decision) => makeDecision(clock, decision));
   const hasMaps = clock.run.decisions.some((decision) => decision.maps.length);
   if (hasMaps) {
-    place.append(key([{ground: "positive", words: "would hold there"},
-      {ground: "negative", words: "would not hold there"}, {ground: "hatched", words: "blocked"}]));
+    place.append(mapKey());
   }
   place.append(element("ol", {class: "cards"}, ...cards));
   let here = null;
@@ -18,6 +17,15 @@ function makeDecisions(clock) {
     here = now;
     if (now >= 0) cards[now].setAttribute("aria-current", "true");
   });
+}
+
+function mapKey() {
+  const made = key([{ground: "map", words: "from what fails most to what holds most, 0 in the middle"},
+    {ground: "hatched", words: "blocked"}]);
+  const [block] = made.querySelectorAll("i");
+  block.style.background = `linear-gradient(to right, ${MAP.join(", ")})`;
+  block.style.width = "5rem";
+  return made;
 }
 
 function makeDecision(clock, decision) {
@@ -142,8 +150,8 @@ function cellWords(run, map, event, made) {
   return `${numberText(run.numbers(map.values)[cell])}${limit ? `, limited by ${limit}` : ""}`;
 }
 
-// How far the colour of the slightest robustness is from grey, and how much of a map's colours covers the page.
-const LEAST = 0.4, OPACITY = 0.6;
+// The colours of a map, as palette.py has them, and how much of them covers the page.
+const MAP = ["#00204d", "#414d6b", "#7c7b78", "#bcae6c", "#ffea46"], OPACITY = 0.6;
 
 // The picture of a map, a pixel for each cell, lowest row at the bottom; what is blocked stays clear.
 function pictureOf(run, map) {
@@ -159,15 +167,17 @@ function painted(run, map) {
   made.height = rows;
   const context = made.getContext("2d");
   const image = context.createImageData(map.columns, rows);
-  const good = rgb(run.palette.positive), bad = rgb(run.palette.negative), grey = rgb(run.palette.neutral);
+  const colours = MAP.map(rgb), last = colours.length - 1;
   for (let row = 0; row < rows; row++) {
     for (let column = 0; column < map.columns; column++) {
       const number = values[row * map.columns + column];
       if (Number.isNaN(number)) continue;
       const place = 4 * ((rows - 1 - row) * map.columns + column);
-      const share = LEAST + (1 - LEAST) * (map.scale > 0 ? Math.min(Math.abs(number) / map.scale, 1) : 0);
-      const hue = number >= 0 ? good : bad;
-      for (let part = 0; part < 3; part++) image.data[place + part] = grey[part] + share * (hue[part] - grey[part]);
+      const share = map.scale > 0 ? Math.min(Math.max(number / map.scale, -1), 1) : 0;
+      const at = (share + 1) / 2 * last, low = Math.min(Math.floor(at), last - 1);
+      for (let part = 0; part < 3; part++) {
+        image.data[place + part] = colours[low][part] + (at - low) * (colours[low + 1][part] - colours[low][part]);
+      }
       image.data[place + 3] = 255;
     }
   }

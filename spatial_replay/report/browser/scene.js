@@ -420,7 +420,7 @@ function failureWords(part) {
 
 // An atom that decides a violation and holds is one that should not, or the condition of what failed.
 function signWords(number, unit, isPast = false) {
-  const [fails, holds] = isPast ? ["failed", "held"] : ["fails", "holds"];
+  const [fails, holds] = isPast ? ["failed", "held"] : ["fails", "must not hold, and holds"];
   return `${number < 0 ? fails : holds} by ${numberText(Math.abs(number))}${spaced(unit)}`;
 }
 

@@ -122,9 +122,17 @@ function stateLane(clock, result) {
   automaton.path.forEach((code, place) => {
     if (place && code === automaton.path[place - 1]) return;
     if (blocks.length) blocks.at(-1).to = times[place];
-    blocks.push({from: times[place], to: clock.end, text: automaton.sets[code].join(", ")});
+    const states = automaton.sets[code];
+    blocks.push({from: times[place], to: clock.end, text: states.join(", "), ground: groundOf(automaton, states)});
   });
   return blockLane(clock, "state", `States of the automaton of ${result.title}`, blocks);
+}
+
+// The colour of states: whether the run is accepted as it stands, lost, or pending.
+function groundOf(automaton, numbers) {
+  const states = automaton.states.filter(({number}) => numbers.includes(number));
+  if (states.length && states.every(({lost}) => lost)) return "negative";
+  return states.length && states.every(({accepting}) => accepting) ? "positive" : "neutral";
 }
 
 function decisionLane(clock) {
@@ -137,14 +145,16 @@ function decisionLane(clock) {
 
 function blockLane(clock, name, title, blocks) {
   const strip = canvas(title, (context, width, height) => {
-    const ground = colour("line"), ink = colour("ink");
+    const ink = colour("ink");
     context.font = FONT;
     context.textBaseline = "middle";
-    for (const {from, to, text} of blocks) {
+    for (const {from, to, text, ground = "line"} of blocks) {
       const left = Math.max(shareOf(clock, from) * width, 0), right = Math.min(shareOf(clock, to) * width, width);
       if (right < left) continue;
-      context.fillStyle = ground;
+      context.fillStyle = colour(ground);
+      context.globalAlpha = ground === "line" ? 1 : 0.4;
       context.fillRect(left, 3, Math.max(right - left - 1, 1), height - 6);
+      context.globalAlpha = 1;
       if (context.measureText(text).width + 10 > right - left) continue;
       context.fillStyle = ink;
       context.fillText(text, left + 5, height / 2 + 0.5);

@@ -18,7 +18,7 @@ function makeTree(clock) {
     }
     const unit = commonUnit(result.nodes);
     head.replaceChildren(head.firstChild,
-      ...["so far", "now"].map((words) => element("span", {class: "number"}, words + unit)));
+      ...["so far", "between", "now"].map((words) => element("span", {class: "number"}, words + unit)));
     list.replaceChildren(branch(result.nodes[0], rows));
     lightPath(list, rows, result);
   });
@@ -64,22 +64,22 @@ function atFault(fault) {
   return fault === null ? "" : ` at ${secondsText(fault)}`;
 }
 
-function branch(node, rows, hasIntervals = false) {
-  const row = makeRow(node, hasIntervals);
+function branch(node, rows) {
+  const row = makeRow(node);
   rows.push(row);
   if (!node.children.length) return element("li", {}, element("div", {class: "row leaf"}, ...row.parts));
-  const children = element("ul", {}, ...node.children.map((child) => branch(child, rows, hasIntervals)));
+  const children = element("ul", {}, ...node.children.map((child) => branch(child, rows)));
   return element("li", {}, element("details", {open: true},
     element("summary", {class: "row"}, ...row.parts), children));
 }
 
-function makeRow(node, hasIntervals) {
+function makeRow(node) {
   const row = {
     node,
     sign: mark("unknown"),
     words: element("span", {class: "hidden"}),
     soFar: element("span", {class: "number"}),
-    interval: hasIntervals ? element("span", {class: "number quiet"}) : null,
+    interval: element("span", {class: "number quiet"}),
     now: element("span", {class: "number"}),
     status: null,
   };
@@ -106,16 +106,9 @@ function showRow(row, run, result, place, isLast) {
   const hasValue = node.initial && place !== null;
   const at = Math.min(place ?? 0, result.samples - 1);
   showNumber(row.soFar, hasValue ? node.series[VALUE][at] : NaN, !hasValue, isPending);
-  if (row.interval) {
-    const [lower, upper] = [node.series[LOWER][at], node.series[UPPER][at]];
-    write(row.interval, hasValue && lower < upper ? `${numberText(lower)} … ${numberText(upper)}` : "");
-  }
-  if (hasValue && isLast) row.soFar.title = node.value;
-  else row.soFar.title = hasValue && run.settles ? intervalText(node.series[LOWER][at], node.series[UPPER][at]) : "";
-}
-
-function intervalText(lower, upper) {
-  return `final value between ${numberText(lower)} and ${numberText(upper)}`;
+  const [lower, upper] = [node.series[LOWER][at], node.series[UPPER][at]];
+  write(row.interval, hasValue && lower < upper ? `${numberText(lower)} … ${numberText(upper)}` : "");
+  row.soFar.title = hasValue && isLast ? node.value : "";
 }
 
 // What is pending is no violation, whatever its sign.
