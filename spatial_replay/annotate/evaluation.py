@@ -184,21 +184,11 @@ class AnnotatedEvaluation:
             axes: those of the source.
             images: those of the topics that have images.
         """
-        from spatial_replay.annotate.foxglove_layout import LayoutContents, layout_attachment
+        from spatial_replay.annotate.foxglove_layout import layout_attachment
 
-        if not self._has_samples:
-            return layout_attachment(
-                LayoutContents(
-                    self.trees,
-                    [False] * len(self.trees),
-                    None,
-                    topics,
-                    axes,
-                    images=sorted(images),
-                    units=self.units,
-                )
-            )
         contents = self.contents(self._extent, topics, axes, images)
+        if not self._has_samples:
+            return layout_attachment(contents._replace(has_states=[False] * len(self.trees), topics=topics))
         return layout_attachment(contents._replace(outcomes=self._annotator.outcomes))
 
     def automata_metadata(self) -> Mapping[str, str]:

@@ -33,7 +33,6 @@ from spatial_replay.logs.topics import (
     PLAN_PATH,
     REDONE_MAP,
     REDONE_PATH,
-    ROBUSTNESS,
     SCENE,
     SPECIFICATION,
     STANDING,
@@ -292,14 +291,6 @@ def _titled(identifier: str, title: str, config: Config) -> Panel:
     return Panel(identifier, {**config, "foxglovePanelTitle": title, "lichtblickPanelTitle": title})
 
 
-def node_path(
-    tree: ReportedTree, *, id: int | None = None, name: str | None = None, field: str = "value"
-) -> str:
-    """Return the message path of one number of a node, by its id or by its name."""
-    which = f"id=={id}" if name is None else f"name=={_quoted(name)}"
-    return f"{ROBUSTNESS}{_of(tree)}.nodes[:]{{{which}}}.{field}"
-
-
 def _parts(trees: Sequence[ReportedTree]) -> Iterator[tuple[ReportedTree, str, Formula, bool]]:
     """Yield the named specs of all results, and whether no two have that name."""
     names = [name for tree in trees for name in named_parts(tree)]
@@ -367,10 +358,6 @@ def _shown_number(node: Formula) -> str:
     return "value" if looks_ahead(node) else "now"
 
 
-def _of(tree: ReportedTree) -> str:
-    return f"{{specification=={_quoted(tree.name)}}}{{object=={_quoted(tree.object or '')}}}"
-
-
 def _quoted(text: str) -> str:
     return json.dumps(text, ensure_ascii=False)
 
@@ -415,14 +402,10 @@ class LayoutContents(NamedTuple):
         )
 
 
-def layout_attachment(contents: LayoutContents) -> Attachment:
-    """Return the layout of a log as a file to attach to it (see `viewer_layout`)."""
-    return _attachment(viewer_layout(contents))
-
-
-def live_layout_attachment(contents: LayoutContents) -> Attachment:
-    """Return the layout for a server that replays a log as a file (see `layout_for_live`)."""
-    return _attachment(layout_for_live(contents))
+def layout_attachment(contents: LayoutContents, *, live: bool = False) -> Attachment:
+    """Return the layout of a log, or of a server that replays it, as a file."""
+    layout = layout_for_live(contents) if live else viewer_layout(contents)
+    return Attachment(LAYOUT, "application/json", layout_text(layout).encode())
 
 
 def viewer_layout(contents: LayoutContents) -> dict[str, Any]:
@@ -458,13 +441,11 @@ def with_panels(layout: Mapping[str, Any]) -> dict[str, Any]:
     Args:
         layout: that of the log without them (see `viewer_layout`).
     """
-    configs = {
-        identifier: config for identifier, config in layout["configById"].items() if "3D!" in identifier
-    }
-    curves = [(name, layout["configById"][name]) for name in layout["configById"] if name.startswith("Plot!")]
+    configs = {"3D!scene": layout["configById"]["3D!scene"]}
+    curves = [Panel(*each) for each in layout["configById"].items() if each[0].startswith("Plot!")]
     names = ["automaton", *(["decisions"] if "RawMessages!decision" in layout["configById"] else [])]
     own = [(each, Panel(_PANELS.format(each, each), {})) for each in names]
-    own += [(_tab_title(each), each) for each in (Panel(name, config) for name, config in curves)]
+    own += [(_tab_title(each), each) for each in curves]
     tabs, panels = _tabs("Tab!panels", own)
     tree = Panel(_PANELS.format("specification", "tree"), {})
     configs |= {panel.identifier: panel.config for panel in (tree, *panels)}
@@ -499,10 +480,6 @@ def _details(contents: LayoutContents) -> _Details:
 def layout_text(layout: Mapping[str, Any]) -> str:
     """Return a layout as a file has it."""
     return json.dumps(layout, indent=1, sort_keys=True, ensure_ascii=False)
-
-
-def _attachment(layout: Mapping[str, Any]) -> Attachment:
-    return Attachment(LAYOUT, "application/json", layout_text(layout).encode())
 
 
 def _layout(

@@ -25,7 +25,7 @@ from spatial_replay.logs.schemas.Robustness_pb2 import (
     Standing,
 )
 from spatial_replay.logs.topics import CURVES_TOPIC, protobuf_channel
-from spatial_replay.logs.wire import LayoutError, WireTemplate, rows_of, words_of
+from spatial_replay.logs.wire import WireTemplate, words_of
 from spatial_replay.monitor.online.rewriting import looks_ahead
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.spec.formula import Formula, iter_nodes
@@ -126,35 +126,17 @@ def decode_robustness(payloads: Sequence[bytes]) -> list[RobustnessSeries]:
     Raises:
         LogError: a message of another type, or with a standing of a later version.
     """
-    rows_by_heading: dict[_Heading, list[_Rows]] = {}
-    waiting = _by_length(payloads)
-    while waiting:
-        indices = waiting.pop()
-        first = _parse(payloads[int(indices[0])], int(indices[0]))
-        template = _template(first)
-        if template is None:
-            taken = np.arange(len(indices)) == 0
-            rows = _parsed_row(first)
-        else:
-            encoded = rows_of([payloads[index] for index in indices.tolist()])
-            taken = template.matches(encoded)
-            rows = _template_rows(template, encoded[taken])
-        if not first.final:
-            rows_by_heading.setdefault(_heading(first), []).append((indices[taken], *rows))
-        if not taken.all():
-            waiting.append(indices[~taken])
-    ordered = sorted(rows_by_heading.items(), key=lambda entry: min(int(rows[0][0]) for rows in entry[1]))
-    return [_joined(heading, rows) for heading, rows in ordered]
+    rows: dict[_Heading, list[_Row]] = {}
+    for index, payload in enumerate(payloads):
+        message = _parse(payload, index)
+        if not message.final:
+            rows.setdefault(_heading(message), []).append((index, message))
+    return [_joined(heading, own) for heading, own in rows.items()]
 
 
 _Heading = tuple[str, str, tuple[int, ...], tuple[str, ...]]
-_Rows = tuple[Integers, Integers, Floats, Codes]
-"""Columns of T messages: indices (T,), times (T,), numbers (T, N, 4) and standing codes (T, N)."""
-
-
-def _by_length(payloads: Sequence[bytes]) -> list[Integers]:
-    lengths = np.array([len(payload) for payload in payloads], np.int64)
-    return [np.flatnonzero(lengths == length) for length in np.unique(lengths)]
+_Row = tuple[int, Robustness]
+"""A message with its index."""
 
 
 def _parse(payload: bytes, index: int) -> Robustness:
@@ -172,42 +154,11 @@ def _heading(message: Robustness) -> _Heading:
     return message.specification, message.object, ids, tuple(node.name for node in message.nodes)
 
 
-def _template(message: Robustness) -> WireTemplate | None:
-    """Return the byte layout of a message; None if a number is absent because it is its default."""
-    try:
-        template = WireTemplate.of(message)
-    except LayoutError:
-        return None
-    nodes = len(message.nodes)
-    is_full = len(template.word_offsets) == 1 + 4 * nodes and len(template.mark_offsets) == nodes
-    return template if is_full else None
-
-
-def _template_rows(template: WireTemplate, encoded: Codes) -> tuple[Integers, Floats, Codes]:
-    words = template.words(encoded)
-    numbers = np.ascontiguousarray(words[:, 1:]).view(np.float64)
-    return (
-        words[:, 0].astype(np.int64),
-        numbers.reshape(len(words), -1, 4),
-        encoded[:, template.mark_offsets],
-    )
-
-
-def _parsed_row(message: Robustness) -> tuple[Integers, Floats, Codes]:
-    numbers = [(node.value, node.now, node.lower, node.upper) for node in message.nodes]
-    return (
-        np.array([message.time_ns], np.uint64).astype(np.int64),
-        np.array(numbers, np.float64).reshape(1, -1, 4),
-        np.array([[node.standing for node in message.nodes]], np.uint8),
-    )
-
-
-def _joined(heading: _Heading, rows: list[_Rows]) -> RobustnessSeries:
+def _joined(heading: _Heading, rows: Sequence[_Row]) -> RobustnessSeries:
     name, object, ids, names = heading
-    messages, times, numbers, codes = (np.concatenate(column) for column in zip(*rows, strict=True))
-    order = np.argsort(messages, kind="stable")
-    unknown = set(np.unique(codes).tolist()) - set(Standing.values())
-    if unknown:
+    numbers = [[(node.value, node.now, node.lower, node.upper) for node in each.nodes] for _, each in rows]
+    codes = np.array([[node.standing for node in each.nodes] for _, each in rows], np.uint8)
+    if unknown := set(np.unique(codes).tolist()) - set(Standing.values()):
         raise LogError(
             f"a standing of {name!r} has the number {min(unknown)}, which this version does not know; "
             "read the log with the version that wrote it"
@@ -217,10 +168,12 @@ def _joined(heading: _Heading, rows: list[_Rows]) -> RobustnessSeries:
         object=object or None,
         ids=np.array(ids, np.int64),
         names=tuple(node or None for node in names),
-        messages=messages[order],
-        times_ns=times[order],
-        series=np.ascontiguousarray(numbers[order].transpose(1, 2, 0)),
-        codes=np.ascontiguousarray(codes[order].T),
+        messages=np.array([index for index, _ in rows], np.int64),
+        times_ns=np.array([each.time_ns for _, each in rows], np.uint64).astype(np.int64),
+        series=np.ascontiguousarray(
+            np.array(numbers, np.float64).reshape(len(rows), -1, 4).transpose(1, 2, 0)
+        ),
+        codes=np.ascontiguousarray(codes.reshape(len(rows), -1).T),
     )
 
 

@@ -125,7 +125,11 @@ def info(
         raise click.MissingParameter(param_hint="'LOG'", param_type="argument")
     with printing_to(output, () if log is None else input_files(log, reading=reading)):
         if log is None:
-            return _print_panel()
+            # the extension for Foxglove and Lichtblick
+            show_bytes(
+                resources.files("spatial_replay.annotate").joinpath("spatial-replay.foxe").read_bytes()
+            )
+            return ExitCode.SATISFIED
         if layout:
             return _print_layout(log, panels=panels)
         if specification is not None:
@@ -222,12 +226,6 @@ def _print_layout(log: LogFile, *, panels: bool) -> int:
     raise UsageError(
         f"{source.name} has no layout; logs written by spatial-replay record or replay -o have one"
     )
-
-
-def _print_panel() -> int:
-    """Print the extension for Foxglove and Lichtblick."""
-    show_bytes(resources.files("spatial_replay.annotate").joinpath("spatial-replay.foxe").read_bytes())
-    return ExitCode.SATISFIED
 
 
 def _print_specification(log: LogFile, name: str) -> int:

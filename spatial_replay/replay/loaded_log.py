@@ -20,7 +20,7 @@ import numpy as np
 
 from spatial_replay.annotate.annotator import Annotator, shown_regions
 from spatial_replay.annotate.evaluation import AnnotatedEvaluation
-from spatial_replay.annotate.foxglove_layout import live_layout_attachment
+from spatial_replay.annotate.foxglove_layout import layout_attachment
 from spatial_replay.annotate.robustness import encode_curves
 from spatial_replay.annotate.scene.scene_template import SceneBounds
 from spatial_replay.annotate.scene.scene_update import SceneState, scene_start
@@ -483,7 +483,8 @@ class Evaluated:
         """The viewer layout for a server of this log."""
         topics = {each.topic for each in self.loaded.own.channels}
         contents = self.evaluation.contents(SceneBounds.of(self.loaded.inside), topics)
-        return live_layout_attachment(contents._replace(order=worst_first(self.replayed.results)))
+        order = worst_first(self.replayed.results)
+        return layout_attachment(contents._replace(order=order), live=True)
 
     def annotator(self, scene: SceneState | None = None, arrow: str = "") -> Annotator:
         """Return the annotator of these samples, before the first; see `AnnotatedEvaluation`."""

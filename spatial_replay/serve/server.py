@@ -221,7 +221,7 @@ class LiveServer(PublishingServer):
         super().__init__(f"spatial-replay: {session.name}", channels, host, port, origins)
 
     def send_note(self, note: Note) -> None:
-        """See `Viewers.send_note`. Some viewers keep notes permanently: rejected values are in a parameter."""
+        """See `Viewers.send_note`. Some viewers keep notes, so rejected values are in a parameter."""
         if note.about not in (CONSTANTS, ARROW):
             super().send_note(note)
         elif note.text != self._rejected:

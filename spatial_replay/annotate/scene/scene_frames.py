@@ -118,11 +118,7 @@ def _banner(
         if colour is not None:
             others.append(f"{len(own)} {words}")
             continue
-        few = (
-            own
-            if len(own) <= _MOST_TITLES
-            else [*own[: _MOST_TITLES - 1], f"{len(own) - _MOST_TITLES + 1} more"]
-        )
+        few = own[:_MOST_TITLES] + [f"{len(own) - _MOST_TITLES} more"] * (len(own) > _MOST_TITLES)
         worst = f"{own[0]} {words}" if len(results) == 1 else f"{len(own)} {words}: {', '.join(few)}"
         colour = hue
     lines = [line for text in (worst, ", ".join(others)) for line in wrap(text, _BANNER_WIDTH)]
