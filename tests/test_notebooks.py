@@ -53,7 +53,7 @@ EXPECTED = {
         2,
         (
             "301 samples",
-            "`robot dist cart >= 0.5`, which fails by 0.03135 at 13.800 s",
+            "It was violated first at 13.800 s, by 0.03135",
             "too close from 13.8 s on, by up to 0.103 m",
             "violated annotated.mcap drive.bag drive.html drive.yaml",
         ),

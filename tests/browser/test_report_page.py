@@ -248,6 +248,8 @@ def test_the_tree_shows_how_things_stand_at_the_cursor(open_page: Open) -> None:
     # what is pending is no violation: its number is grey
     expect(row(page, "plate_first").locator(".number").first).to_have_class("number is-unknown")
     expect(row(page, "plate_first").locator(".what")).to_contain_text("pending")
+    expect(page.locator("#tree .head")).to_contain_text("between")
+    expect(row(page, "plate_first").locator(".number").nth(1)).to_contain_text("…")
 
 
 def test_choosing_an_event_goes_there(open_page: Open) -> None:
@@ -556,9 +558,9 @@ def test_each_object_of_a_template_can_be_looked_into(open_page: Open) -> None:
     # it left long before the run ended, and stands as it did then
     page.keyboard.press("End")
     expect(page.locator("#tree .which")).to_contain_text("calm(p0)")
-    expect(page.locator(".tree .row .number").nth(1)).to_have_text("")
+    expect(page.locator(".tree .row .number").nth(2)).to_have_text("")
     page.keyboard.press("Home")
-    expect(page.locator(".tree .row .number").nth(1)).not_to_have_text("")
+    expect(page.locator(".tree .row .number").nth(2)).not_to_have_text("")
 
 
 def test_text_arrow_tree_and_curve_are_of_one_atom_when_the_page_opens(open_page: Open) -> None:
@@ -569,7 +571,7 @@ def test_text_arrow_tree_and_curve_are_of_one_atom_when_the_page_opens(open_page
     decides = page.locator(".tree .row.decides").last
     expect(decides).to_be_in_viewport()
     expect(decides).to_contain_text(atom)
-    expect(decides.locator(".number").nth(1)).to_have_text(number)
+    expect(decides.locator(".number").nth(2)).to_have_text(number)
     expect(page.locator(".legend-entry", has_text=atom).locator(".number")).to_have_text(number)
 
 
@@ -656,7 +658,7 @@ def test_numbers_of_a_thinned_run_are_those_of_the_time_that_is_named(open_page:
         sample = round(seconds * 100)
         assert sample == pytest.approx(seconds * 100)
         x = numbers.footprints.vertices[2 * sample, 0]
-        shown = page.locator(".tree .row.leaf", has_text="a dist b >= 0.001").locator(".number").nth(1)
+        shown = page.locator(".tree .row.leaf", has_text="a dist b >= 0.001").locator(".number").nth(2)
         assert float(shown.inner_text().replace(MINUS, "-")) == pytest.approx(1 - x - 0.001, abs=6e-4)
 
 
