@@ -595,6 +595,37 @@ def test_the_arrow_of_an_atom_that_holds_and_should_not_says_that_it_holds(
     assert [text for text in drawn if label in text], drawn
 
 
+def test_a_missing_object_leaves_its_last_outline_and_a_failed_one_keeps_its_mark(open_page: Open) -> None:
+    drawn = open_page("unseen", at="#t=1.5", script=RECORD_TEXTS).evaluate("window.drawn")
+    assert "b, last seen" in drawn
+    page = open_page("violated", at="#t=2", script=RECORD_TEXTS)
+    assert "spoon ✕" not in page.evaluate("window.drawn")
+    page.keyboard.press("End")
+    expect(readout(page)).to_have_text("9.967 s / 9.967 s")
+    assert "spoon ✕" in page.evaluate("window.drawn")
+
+
+@pytest.mark.parametrize("width", [390, 1280])
+def test_the_legend_names_the_grey_band_and_nothing_is_wider_than_the_page(
+    open_page: Open, width: int
+) -> None:
+    page = open_page("violated", width=width)
+    expect(page.locator(".legend")).to_contain_text("what table_set may still become")
+    assert page.evaluate("document.documentElement.scrollWidth") == width
+    for button in page.locator(".transport .button:visible").all():
+        box = button.bounding_box()
+        assert box is not None
+        assert min(box["width"], box["height"]) >= 36
+
+
+def test_a_printed_page_has_the_specification_open(open_page: Open) -> None:
+    page = open_page("violated")
+    page.emulate_media(media="print")
+    text = page.locator(".foot pre").first
+    assert text.bounding_box() is not None
+    assert (text.bounding_box() or {})["height"] > 50
+
+
 def test_what_uncertainty_leaves_open_is_shown_as_open(open_page: Open) -> None:
     page = open_page("unsure")
     between = "between -0.2 and 0.4"

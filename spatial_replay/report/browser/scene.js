@@ -122,12 +122,70 @@ function drawScene(context, clock, scene, layers, width, height) {
   if (layers.trails) drawTrails(context, scene, frame, at);
   const labels = [];
   const colourAt = coloursOf(clock, scene, frame);
-  scene.entities.forEach((entity) => drawEntity(context, entity, frame, at, labels, colourAt(entity)));
+  const marked = failedObjects(clock);
+  for (const entity of scene.entities) {
+    const mark = marked.includes(entity.name) ? " ✕" : "";
+    if (entity.form[frame] !== ABSENT) drawEntity(context, entity, frame, at, labels, colourAt(entity), mark);
+    else if (entity.kind === "object") drawLast(context, entity, frame, at, labels);
+  }
   if (decision) drawPlan(context, clock, decision, at);
   const names = layers.labels ? drawLabels(context, labels, width) : [];
-  const violation = pointerAt(clock) ?? violationAt(clock, scene, frame);
+  const violation = pointerAt(clock) ?? pastOf(clock, violationAt(clock, scene, frame));
+  if (violation?.time !== undefined && violation.time !== clock.run.times[clock.sample]) {
+    drawThen(context, scene, violation, at);
+  }
   const inks = clock.run.results[clock.result]?.left_open ? ["neutral", "quiet"] : ["negative-line", "negative-text"];
   if (violation) drawViolation(context, violation, at, names, [width, height], inks);
+}
+
+// The objects that the chosen result was violated by, from then on.
+function failedObjects({run, result, time}) {
+  const {verdict, pointer} = run.results[result] ?? {};
+  return verdict === "violated" && pointer && time >= pointer.time - 1e-9 ? pointer.objects : [];
+}
+
+// An arrow with the number of an earlier sample joins what stood there then, and not what stands there now.
+function pastOf({run}, violation) {
+  if (!violation || violation.moment === null) return violation;
+  const pointer = run.results[violation.result]?.pointer;
+  return pointer ? {...pointer, label: `${pointer.label} at ${secondsText(pointer.time)}`} : null;
+}
+
+// The outlines of what an arrow joins, as they were at its time.
+function drawThen(context, scene, {objects, time}, at) {
+  const frame = indexAt(scene.times, time);
+  for (const entity of scene.entities) {
+    if (objects?.includes(entity.name) && entity.form[frame] !== ABSENT) outline(context, entity, frame, at);
+  }
+}
+
+// A missing object leaves its last outline.
+function drawLast(context, entity, frame, at, labels) {
+  let last = frame;
+  while (last >= 0 && entity.form[last] === ABSENT) last -= 1;
+  if (last >= 0) labels.push({text: `${entity.name}, last seen`, box: outline(context, entity, last, at), isRegion: false});
+}
+
+// Draws a dashed outline, and returns the box around it.
+function outline(context, entity, frame, at) {
+  context.save();
+  context.strokeStyle = colour("quiet");
+  context.lineWidth = 1.25;
+  context.setLineDash([4, 4]);
+  const box = [Infinity, Infinity, -Infinity, -Infinity];
+  let place = entity.starts[frame];
+  for (const ring of entity.forms[entity.form[frame]]) {
+    context.beginPath();
+    for (let corner = 0; corner < ring; corner++, place += 2) {
+      const x = at.x(entity.points[place]), y = at.y(entity.points[place + 1]);
+      context.lineTo(x, y);
+      [box[0], box[1], box[2], box[3]] = [Math.min(box[0], x), Math.min(box[1], y), Math.max(box[2], x), Math.max(box[3], y)];
+    }
+    context.closePath();
+    context.stroke();
+  }
+  context.restore();
+  return box;
 }
 
 // The arrow of the chosen result in a frame.
@@ -149,9 +207,8 @@ function coloursOf(clock, scene, frame) {
   };
 }
 
-function drawEntity(context, entity, frame, at, labels, [red, green, blue]) {
+function drawEntity(context, entity, frame, at, labels, [red, green, blue], mark) {
   const form = entity.form[frame];
-  if (form === ABSENT) return;
   const isRegion = entity.kind === "region";
   let place = entity.starts[frame];
   const box = [Infinity, Infinity, -Infinity, -Infinity];
@@ -174,7 +231,7 @@ function drawEntity(context, entity, frame, at, labels, [red, green, blue]) {
     context.stroke();
   }
   context.setLineDash([]);
-  labels.push({text: entity.name, box, isRegion});
+  labels.push({text: entity.name + mark, box, isRegion});
 }
 
 // Names of objects, then those of regions; one that would cover another is left out. Returns where they are.
