@@ -205,6 +205,9 @@ def test_the_site_has_every_page_and_public_name_and_loads_nothing_from_elsewher
     reference = (tmp_path / "site/api.html").read_text("utf-8")
     for page in ROOT.glob("docs/*.md"):
         assert f'href="{page.stem}.html"' in index
+    assert 'src="live-report.html"' in index
+    assert (tmp_path / "site/live-report.html").stat().st_size > 100_000
+    assert (tmp_path / "site/search/search_index.js").exists(), "search works in pages opened from a folder"
     for name in sr.__all__:
         assert name.startswith("_") or f'id="spatial_replay.{name}"' in reference
     for result in ("SpecResult", "Update", "Verified", "Tuning", "Automaton", "Step"):

@@ -25,7 +25,7 @@ from spatial_replay.annotate.scene.scene_frames import SceneFrames
 from spatial_replay.annotate.scene.scene_template import encode_frame
 from spatial_replay.annotate.scene.scene_update import SceneEncoder, SceneState
 from spatial_replay.annotate.specification import ReportedTree, encode_specification
-from spatial_replay.annotate.standing import FinalStanding, StandingEncoder
+from spatial_replay.annotate.standing import StandingEncoder
 from spatial_replay.annotate.violations import EvaluatedResult, ShadeTracker, violated_since
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.messages import Channel, Messages, messages_of
@@ -123,7 +123,7 @@ class Annotator:
             )
             for tree, instance, kept in zip(trees, instances, automata, strict=True)
         ]
-        self._standing = StandingEncoder(trees, self._runs, units)
+        self.standing = StandingEncoder(trees, self._runs, units)
         self._encoder = SceneEncoder(shown_regions(files), units.get("", ""))
         self._latest: tuple[Trace, list[SeriesBlock]] | None = None
         self._scene = scene or SceneState()
@@ -134,11 +134,6 @@ class Annotator:
     def scene(self) -> SceneState:
         """State of a viewer after the messages so far."""
         return self._scene
-
-    @property
-    def outcomes(self) -> Sequence[FinalStanding]:
-        """Outcome of each result at the end of the log."""
-        return self._standing.outcomes
 
     @property
     def _over(self) -> list[str]:
@@ -168,7 +163,7 @@ class Annotator:
         messages.append(self._automaton_states(blocks))
         changes = self._changes(trace, blocks)
         if self._trees:
-            standing = self._standing.encode(trace.times_ns, blocks, self._over)
+            standing = self.standing.encode(trace.times_ns, blocks, self._over)
             messages.append(self._messages(_STANDING, *standing))
         messages += self._events(changes)
         messages.append(self._scene_messages(trace, blocks))
@@ -186,7 +181,7 @@ class Annotator:
         for run, block in zip(self._runs, blocks, strict=True):
             if run is not None:
                 run.pass_over(block)
-        self._standing.pass_over(blocks)
+        self.standing.pass_over(blocks)
         self._remember(trace, blocks)
         return self._events(self._changes(trace, blocks))
 
@@ -225,7 +220,7 @@ class Annotator:
         ]
         last_ns = int(trace.times_ns[-1])
         numbers = self._messages(_ROBUSTNESS, np.full(len(robustness), time_ns), robustness)
-        ending = self._standing.end(last_ns, finals, self._over)
+        ending = self.standing.end(last_ns, finals, self._over)
         standing = self._messages(_STANDING, np.array([time_ns]), [ending])
         self._since_ns = [
             violated_since(own, block, since_ns)

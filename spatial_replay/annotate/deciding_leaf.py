@@ -2,17 +2,13 @@
 
 Robustness is made of minima and maxima, so each number is that of some leaf at some sample, perhaps with its
 sign turned. If that sample is the newest, `find_leaf` compares the numbers of the leaves there.
-
-Over a whole log, `DecidingLeaves` does the same for Boolean combinations. A leaf or temporal operand has the
-number of the sample at which its value last changed. In most formulas that is the sample of the deciding
-leaf. Where no number is equal, no leaf is reported.
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -40,7 +36,6 @@ from spatial_replay.monitor.witness.unfinished import UnfinishedNodes, evaluate_
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import (
     Atom,
-    Boolean,
     Formula,
     Outline,
     Protrusion,
@@ -137,76 +132,6 @@ def leaf_key(leaf: Formula) -> tuple[object, ...]:
     if isinstance(leaf, Atom):
         return (leaf.expression,)
     raise TypeError(f"{leaf!r} is not a leaf")
-
-
-class DecidingLeaves:
-    """The operands of some nodes of a formula, each with the leaves at the sample that its value is from.
-
-    Cutting the samples into blocks changes nothing.
-    """
-
-    def __init__(self, formula: Formula, below: Sequence[LeavesBelow], nodes: Collection[int]) -> None:
-        """Start before the first sample.
-
-        Args:
-            below: of each node of the formula, its leaves.
-            nodes: ids of those whose leaves may be asked for.
-        """
-        self._below = below
-        self._nodes = [node for _, _, node in iter_nodes(formula)]
-        self._operands: list[list[int]] = [[] for _ in self._nodes]
-        joined = set(nodes)
-        for identifier, parent, _ in iter_nodes(formula):
-            if parent is not None:
-                self._operands[parent].append(identifier)
-                if parent in joined and isinstance(self._nodes[parent], Boolean):
-                    joined.add(identifier)
-        self._parts = np.array(
-            sorted(each for each in joined if not isinstance(self._nodes[each], Boolean)), np.int64
-        )
-        self._values = np.full(len(self._parts), np.nan)
-        self._leaves: dict[int, Floats] = {}
-
-    def extend(self, block: SeriesBlock) -> None:
-        """Take in the next samples, at least one."""
-        values = block.series[self._parts, 0]
-        before = np.concatenate([self._values[:, None], values[:, :-1]], axis=1)
-        changes = (values != before) & ~(np.isnan(values) & np.isnan(before))
-        self._values = values[:, -1].copy()
-        last = values.shape[1] - 1 - changes[:, ::-1].argmax(axis=1)
-        changed = np.flatnonzero(changes.any(axis=1))
-        # operands that changed together share the numbers of that sample
-        samples = {t: block.leaves[:, :, t].copy() for t in set(last[changed].tolist())}
-        for part, t in zip(self._parts[changed].tolist(), last[changed].tolist(), strict=True):
-            self._leaves[part] = samples[t]
-
-    def find_leaf(self, node: int, ends: Floats, *, low: bool, wide: bool) -> LeafValue | None:
-        """Return the leaf that gives an end of a node's interval; None if comparing numbers finds none.
-
-        Args:
-            ends: (N, 2), lower and upper end of each node.
-            low: whether it is the lower end, or the upper one.
-            wide: whether the ends count uncertainty.
-        """
-        formula, number = self._nodes[node], _end(ends, node, low)
-        if not isinstance(formula, Boolean):
-            if node not in self._leaves:
-                return None
-            leaves = self._leaves[node]
-            lows, highs = low_and_high(len(leaves), wide=wide)
-            return find_leaf(self._below[node], (leaves[lows], leaves[highs]), number, low=low)
-        for place, operand in enumerate(self._operands[node]):
-            for sign in operand_signs(formula, place):
-                is_low = low == (sign > 0)
-                if sign * _end(ends, operand, is_low) == number:
-                    found = self.find_leaf(operand, ends, low=is_low, wide=wide)
-                    if found is not None:
-                        return found
-        return None
-
-
-def _end(ends: Floats, node: int, low: bool) -> float:
-    return float(ends[node, 0 if low else 1])
 
 
 _RECENT: Final = 1024

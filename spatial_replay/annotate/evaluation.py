@@ -128,7 +128,7 @@ class AnnotatedEvaluation:
         """The places of `trees`, the worst first, after `end`."""
         from spatial_replay.annotate.standing import worst_first
 
-        return worst_first(self._annotator.outcomes)
+        return worst_first(self._annotator.standing.outcomes)
 
     @property
     def channels(self) -> tuple[Channel, ...]:
@@ -158,9 +158,9 @@ class AnnotatedEvaluation:
         from spatial_replay.monitor.atoms.terms import footprint_from_outline
 
         if extent is not None:
-            for outline in shown_regions(self._files).values():
-                for ring in outlines_of(footprint_from_outline(outline)):
-                    extent = extent.with_points(ring)
+            outlines = map(footprint_from_outline, shown_regions(self._files).values())
+            for ring in (ring for outline in outlines for ring in outlines_of(outline)):
+                extent = extent.with_points(ring)
         has_states = [each.automaton is not None for each in self.automata]
         # every result has events: a verdict is reported when it is reached, or else when the log ends
         derived = {SCENE, *(DERIVED if self.trees else ())} - set(() if any(has_states) else (AUTOMATON,))
@@ -189,7 +189,7 @@ class AnnotatedEvaluation:
         contents = self.contents(self._extent, topics, axes, images)
         if not self._has_samples:
             return layout_attachment(contents._replace(has_states=[False] * len(self.trees), topics=topics))
-        return layout_attachment(contents._replace(outcomes=self._annotator.outcomes))
+        return layout_attachment(contents._replace(outcomes=self._annotator.standing.outcomes))
 
     def automata_metadata(self) -> Mapping[str, str]:
         """Return the size of each spec's automaton, or the reason why it has none."""

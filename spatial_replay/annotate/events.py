@@ -15,7 +15,6 @@ from google.protobuf.timestamp_pb2 import Timestamp
 
 from spatial_replay.annotate.deciding_leaf import (
     DecidingLeaf,
-    DecidingLeaves,
     LeafHistory,
     LeafValue,
     LeavesBelow,
@@ -389,7 +388,6 @@ class EventReporter:
         below = leaves_below(tree.formula, self._leaves)
         self._reported = _reported_nodes(tree, below, file, units)
         self._nodes = np.array([each.node for each in self._reported], np.int64)
-        self._leaf_finder = DecidingLeaves(tree.formula, below, self._nodes.tolist())
         self._history = LeafHistory(tree.formula, self._leaves, instance.bindings) if self._settles else None
         self._values = np.empty(0)
         self._bindings = instance.bindings
@@ -409,7 +407,6 @@ class EventReporter:
         if not len(block.times_ns) or self._states.are_final:
             return []
         self._values = block.series[:, 0, -1].copy()
-        self._leaf_finder.extend(block)
         if self._history is not None:
             self._history.extend(block)
         tracked = track(self._states, block.times_ns, block.series, self._nodes, settles=self._settles)
@@ -500,7 +497,8 @@ class EventReporter:
         if before is not None:
             worst = self._words(self._deciding_leaf(change.node, before, block), time_ns, past=True)
             unknown_ns = self._after(change.node, before.end_ns, block)
-            past = self._past(reported, before, (unknown_ns, after.start_ns), worst)
+            said = past_sentence(before, unknown_ns, after.start_ns, worst, reported.unit)
+            past = PeriodText(before, worst, said)
         return self._encoded(reported, time_ns, now, past)
 
     def _final_event(self, node: int, time_ns: int, last_ns: int, final: Floats) -> EncodedEvent:
@@ -512,24 +510,15 @@ class EventReporter:
             decided = self._history.finished(reported.node, self._values, final)
             witness, because = self._settled(decided, last_ns, time_ns)
             self._remember(node, decided, time_ns)
-        elif verdict is not Verdict.UNKNOWN:
-            found = self._leaf_finder.find_leaf(reported.node, final, low=low, wide=self._settles)
-            witness = because = self._words(found, time_ns)
-            self._remember(node, found, time_ns)
         after = Period(_ENDED[verdict], last_ns, last_ns, lower if low else upper, OF_CURRENT)
         sentence = end_sentence(reported.title, verdict, (lower, upper), because, reported.unit)
         now = PeriodText(after, witness, sentence, decided)
         past = None
         if before.code != START and before.start_ns < last_ns:
             worst = self._words(self._carried[node, OF_CURRENT], time_ns, past=True)
-            past = self._past(reported, before, (int(self._unknown_ns[node]), last_ns), worst)
+            said = past_sentence(before, int(self._unknown_ns[node]), last_ns, worst, reported.unit)
+            past = PeriodText(before, worst, said)
         return self._encoded(reported, time_ns, now, past)
-
-    def _past(
-        self, reported: ReportedNode, period: Period, until_ns: tuple[int, int], witness: str
-    ) -> PeriodText:
-        """Put a period that has ended into words, and from when until when nothing was known after it."""
-        return PeriodText(period, witness, past_sentence(period, *until_ns, witness, reported.unit))
 
     def _encoded(
         self, reported: ReportedNode, time_ns: int, now: PeriodText, past: PeriodText | None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from itertools import zip_longest
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
@@ -82,16 +82,18 @@ class Panel(NamedTuple):
     config: Config
 
 
-def scene_panel(
-    camera: Mapping[str, Any], topics: Collection[str], axes: Axes = OUR_AXES, *, redone: bool = False
-) -> Panel:
+def scene_panel(camera: Mapping[str, Any], topics: Collection[str], axes: Axes = OUR_AXES) -> Panel:
     """Return the scene from above, with the planner's map below it and its path above.
 
-    Args:
-        redone: show what the planner would have decided otherwise, instead of what it decided.
+    A viewer can show the planner's redone decisions instead.
     """
-    grid, path = (REDONE_MAP, REDONE_PATH) if redone else (GRADIENT_MAP, PLAN_PATH)
-    shown: dict[str, Config] = {SCENE: {}, grid: {"colorMode": "rgba-fields"}, path: {}}
+    shown: dict[str, Config] = {
+        SCENE: {},
+        GRADIENT_MAP: {"colorMode": "rgba-fields"},
+        PLAN_PATH: {},
+        REDONE_MAP: {"colorMode": "rgba-fields", "visible": False},
+        REDONE_PATH: {"visible": False},
+    }
     config = {
         "cameraState": camera,
         "followMode": "follow-none",
@@ -101,11 +103,8 @@ def scene_panel(
         "scene": {"labelScaleFactor": 1, "transforms": {"showLabel": False, "axisScale": 0}},
         "transforms": {f"frame:{frame}": {"visible": False} for frame in FRAMES},
     }
-    title = "Scene, redone" if redone else "Scene"
-    if grid in topics:
-        title += " (map: dark blue fails, grey is 0, yellow holds)"
-    shown_title = title if axes == OUR_AXES else f"{title}, {axes}"
-    return _titled("3D!redone" if redone else "3D!scene", shown_title, config)
+    legend = " (map: dark blue fails, grey is 0, yellow holds)" if GRADIENT_MAP in topics else ""
+    return _titled("3D!scene", f"Scene{legend}" if axes == OUR_AXES else f"Scene{legend}, {axes}", config)
 
 
 def indicators(trees: Sequence[ReportedTree], outcomes: Sequence[FinalStanding] = ()) -> list[Panel]:
@@ -149,11 +148,9 @@ def part_curves(trees: Sequence[ReportedTree], units: Mapping[str, str]) -> list
     """Return the curves of named specs, those of each unit in a panel of their own."""
     curves = [
         _Curve(
-            name if is_clear else part_title(name, tree),
-            _standing_path(part_title(name, tree), "robustness"),
-            unit_of(node, units),
+            part_title(name, tree), _standing_path(part_title(name, tree), "robustness"), unit_of(node, units)
         )
-        for tree, name, node, is_clear in _parts(trees)
+        for tree, name, node in _parts(trees)
     ]
     return _plots("parts", "Robustness of named specs", curves)
 
@@ -185,11 +182,7 @@ def whole_curves(trees: Sequence[ReportedTree], units: Mapping[str, str]) -> lis
 def state_strips(trees: Sequence[ReportedTree]) -> Panel:
     """Return a strip for how each result stands, then for its named specs."""
     strips = [(tree.title, _standing_path(tree.title, "standing")) for tree in trees]
-    more = [
-        (part_title(name, tree), _standing_path(part_title(name, tree), "standing"))
-        for tree, name, node, _ in _parts(trees)
-        if looks_ahead(node)
-    ]
+    more = [(title, _standing_path(title, "standing")) for title, node in _parts(trees) if looks_ahead(node)]
     # Foxglove takes its colours from here, Lichtblick from the numbers
     states = [
         {"value": str(number), "label": words, "color": colour}
@@ -291,13 +284,9 @@ def _titled(identifier: str, title: str, config: Config) -> Panel:
     return Panel(identifier, {**config, "foxglovePanelTitle": title, "lichtblickPanelTitle": title})
 
 
-def _parts(trees: Sequence[ReportedTree]) -> Iterator[tuple[ReportedTree, str, Formula, bool]]:
-    """Yield the named specs of all results, and whether no two have that name."""
-    names = [name for tree in trees for name in named_parts(tree)]
-    names += [tree.title for tree in trees]
-    for tree in trees:
-        for name, (_, node) in named_parts(tree).items():
-            yield tree, name, node, names.count(name) == 1
+def _parts(trees: Sequence[ReportedTree]) -> list[tuple[str, Formula]]:
+    """Return the named specs of all results, with their titles."""
+    return [(part_title(name, tree), node) for tree in trees for name, (_, node) in named_parts(tree).items()]
 
 
 class _Curve(NamedTuple):
@@ -415,9 +404,8 @@ def viewer_layout(contents: LayoutContents) -> dict[str, Any]:
     unit at a time, the states of results, and a panel of tabs.
     """
     contents = contents.worst_first()
-    trees = contents.trees
-    curves = [*result_curves(trees, contents.units), *part_curves(trees, contents.units)] if trees else []
-    return _layout(contents, curves, _details(contents))
+    shown = contents.trees, contents.units
+    return _layout(contents, [*result_curves(*shown), *part_curves(*shown)], _details(contents))
 
 
 def layout_for_live(contents: LayoutContents) -> dict[str, Any]:
@@ -427,8 +415,7 @@ def layout_for_live(contents: LayoutContents) -> dict[str, Any]:
     details = _details(contents)
     if contents.trees:
         details.insert(0, ("whole log", summary()))
-    curves = whole_curves(contents.trees, contents.units) if contents.trees else []
-    return _layout(contents, curves, details, below=constants())
+    return _layout(contents, whole_curves(contents.trees, contents.units), details, below=constants())
 
 
 _PANELS: Final = "spatial-replay.spatial-replay {}!{}"
@@ -470,9 +457,6 @@ def _details(contents: LayoutContents) -> _Details:
         details.append(("automaton", automaton_text(trees[contents.has_states.index(True)])))
     if PLAN_DECISION in contents.topics:
         details.append(("decision", decision_reason()))
-    if REDONE_MAP in contents.topics:
-        about = _camera(contents.extent), contents.topics, contents.axes
-        details.append(("redone", scene_panel(*about, redone=True)))
     cameras = image_panels(contents.images, contents.topics)
     return details + [(each.config["foxglovePanelTitle"].lower(), each) for each in cameras]
 

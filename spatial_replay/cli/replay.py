@@ -164,8 +164,8 @@ def replay(
         hint = "`spatial-replay explain` with the same log and specifications says what would have helped"
         show_message("note", hint, "cyan")
     if output is not None and json_file != "-" and sys.stderr.isatty():
-        own = f"`spatial-replay info {output} --layout -o layout.json`"
-        show_message("note", f"for a viewer: {own} and `info --panel -o spatial-replay.foxe`", "cyan")
+        files = f"`spatial-replay info {output} --layout` and `spatial-replay info --panel`"
+        show_message("note", f"for a viewer: {files}", "cyan")
     failures = _failures(replayed, fail_on, allow)
     return exit_code_from_verdicts([*verdicts, *failures], damaged=bool(replayed.faults))
 

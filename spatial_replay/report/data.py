@@ -423,7 +423,7 @@ def _omissions(report: RunReport, samples: int, kept: int, maps: int) -> Iterato
             "changes of sign, and the extremes of every curve in between."
         )
     if report.scene.stride > 1:
-        yield f"The scene has every {_ordinal(report.scene.stride)} message of /spatial/scene."
+        yield f"The scene has one of {report.scene.stride} messages of /spatial/scene."
     drawn = [each for frame in report.scene.frames[:1] for each in frame.entities.values()]
     if len(report.results) > 1 and not all(each.shades for each in drawn):
         yield "The scene has the colours of all results together: there are too many for colours of each."
@@ -438,8 +438,3 @@ def _omissions(report: RunReport, samples: int, kept: int, maps: int) -> Iterato
         yield f"The first {MOST_EVENTS:,} of {len(report.events):,} events are listed."
     if maps:
         yield f"{maps:,} gradient maps are left out."
-
-
-def _ordinal(number: int) -> str:
-    ends = {2: "nd", 3: "rd"} if number % 100 not in (12, 13) else {}
-    return f"{number}{ends.get(number % 10, 'th')}"

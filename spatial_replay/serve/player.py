@@ -647,19 +647,10 @@ def _with_deletions(payloads: Sequence[bytes], own: Integers, kept: Booleans) ->
     return with_more
 
 
-class Level(Enum):
-    """The severity of a note."""
-
-    INFO = auto()
-    WARNING = auto()
-    ERROR = auto()
-
-
 class Note(NamedTuple):
-    """A status message of viewers; it replaces an earlier one about the same subject."""
+    """An error message of viewers; it replaces an earlier one about the same subject."""
 
     about: str
-    level: Level
     text: str
 
 
@@ -731,7 +722,7 @@ class Player:
                     self._do(requests)
                     self._play_on()
                 except SpatialReplayError as error:
-                    self._viewers.send_note(Note(LOG, Level.ERROR, str(error)))
+                    self._viewers.send_note(Note(LOG, str(error)))
                     self._viewers.send_state(self._session.pause())
         finally:
             self._session.end()
@@ -758,7 +749,7 @@ class Player:
         try:
             self._playback.evaluated = edited.loaded.evaluate(edited)
         except SpatialReplayError as error:
-            self._viewers.send_note(Note(CONSTANTS, Level.ERROR, str(error)))
+            self._viewers.send_note(Note(CONSTANTS, str(error)))
             self._viewers.send_values(self._session.restore(before.edited, error))
             return False
         if edited.loaded is not before.loaded:
@@ -774,7 +765,7 @@ class Player:
             titles = [tree.title for tree in trees]
             named = ", ".join(titles[:_MOST_NAMED]) + (", …" if len(titles) > _MOST_NAMED else "")
             hint = nearest_hint(arrow, titles) or f"the results are: {named}"
-            self._viewers.send_note(Note(ARROW, Level.ERROR, f"there is no result {arrow!r}; {hint}"))
+            self._viewers.send_note(Note(ARROW, f"there is no result {arrow!r}; {hint}"))
             self._session.point_at(self._playback.arrow)
             self._viewers.send_playback()
             return False

@@ -24,7 +24,6 @@ from spatial_replay.serve.player import (
     ARROW,
     CONSTANTS,
     PLAYBACK,
-    Level,
     Note,
     PlaybackState,
     Questions,
@@ -58,13 +57,6 @@ _STATUS: Final = MappingProxyType(
         Status.PLAYING: protocol.PlaybackStatus.Playing,
         Status.PAUSED: protocol.PlaybackStatus.Paused,
         Status.ENDED: protocol.PlaybackStatus.Ended,
-    }
-)
-_LEVELS: Final = MappingProxyType(
-    {
-        Level.INFO: foxglove.StatusLevel.Info,
-        Level.WARNING: foxglove.StatusLevel.Warning,
-        Level.ERROR: foxglove.StatusLevel.Error,
     }
 )
 _CAPABILITIES: Final = (
@@ -154,7 +146,7 @@ class PublishingServer:
 
     def send_note(self, note: Note) -> None:
         """See `Viewers.send_note`."""
-        self._server.publish_status(note.text[:_LONGEST_NOTE], _LEVELS[note.level], note.about)
+        self._server.publish_status(note.text[:_LONGEST_NOTE], foxglove.StatusLevel.Error, note.about)
 
     def remove_note(self, about: str) -> None:
         """See `Viewers.remove_note`."""
@@ -421,7 +413,7 @@ class _Listener(protocol.ServerListener):
             if playback:
                 self._server.send_state(self._session.steer(playback))
         except SpatialReplayError as error:
-            self._server.send_note(Note(CONSTANTS, Level.ERROR, str(error)))
+            self._server.send_note(Note(CONSTANTS, str(error)))
         return [*_parameters(self._server.steering), *_constants(self._session.values)]
 
     def on_playback_control_request(

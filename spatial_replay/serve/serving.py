@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from spatial_replay.annotate.robustness import CURVES_CHANNEL
 from spatial_replay.errors import SpatialReplayError, importing
 from spatial_replay.replay.loaded_log import EditedFiles, Evaluated, Playback
-from spatial_replay.serve.player import SPECIFICATION, Level, Note, Player, Questions, Session
+from spatial_replay.serve.player import SPECIFICATION, Note, Player, Questions, Session
 from spatial_replay.spec.formula import Specification
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ class Serving:
 
     def show_error(self, error: SpatialReplayError) -> None:
         """Show viewers why a specification that was saved cannot be evaluated."""
-        self._server.send_note(Note(SPECIFICATION, Level.ERROR, str(error)))
+        self._server.send_note(Note(SPECIFICATION, str(error)))
 
 
 @contextmanager

@@ -289,10 +289,7 @@ def test_under_the_paper_semantics_the_end_reports_every_verdict(tmp_path):
     text = "spec kept = G battery >= 0\nspec full = F battery >= 3"
     found = events_at_end(tmp_path, text, 2.0, -1.0, 1.0, semantics="paper")
     assert [facts(event)["verdict"] for _, event, _ in found] == ["violated", "violated"]
-    assert [facts(event)["witness"] for _, event, _ in found] == [
-        "`battery >= 0` fails by 1",
-        "`battery >= 3` fails by 1",
-    ]
+    assert [facts(event)["robustness"] for _, event, _ in found] == ["-1.0", "-1.0"]
 
 
 def test_the_end_of_a_window_is_an_end(tmp_path):

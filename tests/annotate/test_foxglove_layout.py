@@ -132,10 +132,10 @@ def test_parts_that_look_ahead_are_plotted_by_their_value_and_others_as_they_are
     text = "spec close = a closeto[2] b\nspec met = F close\nspec all_of_it = met and G a farfrom[0] b"
     log = run(tmp_path, text)
     parts = curves(layout_of(log), "Plot!parts")
-    assert list(parts) == ["met", "close"]
+    assert list(parts) == ["met in all_of_it", "close in all_of_it"]
     result = sr.evaluate(sr.parse_specification(text), sr.read_trace(log)).results[0]
     for name, field in (("met", "value"), ("close", "now")):
-        assert values(log, parts[name])[:-1] == getattr(result.node(name), field).tolist()
+        assert values(log, parts[f"{name} in all_of_it"])[:-1] == getattr(result.node(name), field).tolist()
 
 
 def test_a_planned_run_has_its_map_path_and_decision(tmp_path):

@@ -122,7 +122,8 @@ def test_the_log_and_the_page_of_it_have_both_decisions(tidied, tmp_path):
     assert topics["/plan/redone/gradient_map"] == 2
     assert recompute_decisions(source).differences == ()
     (layout,) = (each.data for each in source.attachments() if each.name == "layout.json")
-    assert {"3D!scene", "3D!redone"} <= json.loads(layout)["configById"].keys()
+    shown = json.loads(layout)["configById"]["3D!scene"]["topics"]
+    assert not shown["/plan/redone/gradient_map"]["visible"], "a viewer can show it instead"
     write_report(source, [], page)
     assert '"redone":' in page_of(page).script("facts")
 

@@ -572,7 +572,7 @@ def test_a_large_run_keeps_less_and_says_so(tmp_path: Path) -> None:
     header = page.within("header#")
     assert f"Curves and tree have {len(kept):,} of 12,000 samples" in header
     assert "24 of 60 results, the worst" in header
-    assert "message of /spatial/scene" in header
+    assert "messages of /spatial/scene" in header
     assert page.within("section#verdicts").count("robustness") >= 60
 
 
