@@ -147,10 +147,8 @@ def result_curves(trees: Sequence[ReportedTree], units: Mapping[str, str]) -> li
 def part_curves(trees: Sequence[ReportedTree], units: Mapping[str, str]) -> list[Panel]:
     """Return the curves of named specs, those of each unit in a panel of their own."""
     curves = [
-        _Curve(
-            part_title(name, tree), _standing_path(part_title(name, tree), "robustness"), unit_of(node, units)
-        )
-        for tree, name, node in _parts(trees)
+        _Curve(title, _standing_path(title, "robustness"), unit_of(node, units))
+        for title, node in _parts(trees)
     ]
     return _plots("parts", "Robustness of named specs", curves)
 

@@ -599,6 +599,9 @@ def test_a_missing_object_leaves_its_last_outline_and_a_failed_one_keeps_its_mar
     drawn = open_page("unseen", at="#t=1.5", script=RECORD_TEXTS).evaluate("window.drawn")
     assert "b, last seen" in drawn
     page = open_page("violated", at="#t=2", script=RECORD_TEXTS)
+    page.evaluate("window.drawn = []")
+    page.keyboard.press("ArrowRight")
+    expect(readout(page)).to_have_text("2.033 s / 9.967 s")
     assert "spoon ✕" not in page.evaluate("window.drawn")
     page.keyboard.press("End")
     expect(readout(page)).to_have_text("9.967 s / 9.967 s")

@@ -113,11 +113,11 @@ def test_what_asks_for_the_past_is_shown_when_it_failed_and_was_worst_when_its_c
     for result in sr.evaluate(sr.parse_specification(PAST_SPECS), sr.Trace.from_samples(samples)):
         if (since_ns := result.violated_at_ns) is None:
             continue
-        assert shown[result.title]["fault"] == since_ns / 1e9
         curve, since = result.nodes[0].value, since_ns // 10**9
         worst_ns = since_ns if result.least_at_ns is None else result.least_at_ns
         first = since + curve[since:].tolist().index(result.robustness)
         assert worst_ns == first * 10**9
+        assert since_ns / 1e9 <= shown[result.title]["fault"] <= worst_ns / 1e9
 
 
 def test_each_violated_result_has_an_arrow_of_its_own(tmp_path: Path) -> None:
@@ -127,9 +127,9 @@ def test_each_violated_result_has_an_arrow_of_its_own(tmp_path: Path) -> None:
     frames = page.numbers(found["frames"]).tolist()
     results = page.numbers(found["places"]).reshape(-1, 2)[:, 0].tolist()
     labels = dict(zip(zip(frames, results, strict=True), found["labels"], strict=True))
-    assert labels[2, 0] == "a dist b <= 3: -2"
+    assert labels[2, 0] == "a dist b <= 3 now: -2"
     assert labels[5, 0] == "a dist b <= 3 at 2.000 s: -2"
-    assert labels[5, 1] == "a dist b >= 4: -2"
+    assert labels[5, 1] == "a dist b >= 4 now: -2"
 
 
 def test_of_equal_times_what_was_certain_comes_before_what_only_the_end_decided(tmp_path: Path) -> None:
@@ -222,7 +222,7 @@ def test_the_scene_is_that_of_the_messages(tmp_path: Path) -> None:
     assert np.allclose(corners[4].min(axis=0), [0, 0], atol=1e-3)
     # the first and the last two samples violate it, and are pointed at
     assert page.numbers(scene["violations"]["frames"]).tolist() == [0, 1, 7, 8]
-    assert scene["violations"]["labels"][0] == "a enclosedin here: -2"
+    assert scene["violations"]["labels"][0] == "a enclosedin here now: -2"
     assert page.numbers(scene["violations"]["robustness"])[0] == -2
     [result] = page.facts["results"]
     places = page.numbers(scene["violations"]["places"]).reshape(-1, 2).tolist()
@@ -422,12 +422,11 @@ def test_the_headline_is_what_settled_the_verdict_and_says_which_part_is_least(t
     assert said.index("robot dist vase >= 0.05") < said.index("robot enclosedin bin")
 
 
-def test_the_page_opens_with_an_arrow_at_what_settled_the_verdict(task: Page) -> None:
+def test_the_page_opens_with_an_arrow_at_what_the_first_cause_came_to(task: Page) -> None:
     [result] = task.facts["results"]
-    assert result["fault"] == 2.3
-    assert result["pointer"]["time"] == 2.3
+    assert result["pointer"]["time"] == result["fault"] > 2.3
     assert result["pointer"]["text"] == "robot dist vase >= 0.05"
-    assert result["pointer"]["label"] == "-0.0172"
+    assert result["pointer"]["label"] == "-0.1"
 
 
 def test_a_goal_that_is_still_to_come_has_no_arrow(task: Page) -> None:
