@@ -44,8 +44,8 @@ SAID_NOW = 1
 """The row of a part's value at the newest sample, after its value at the first one and before its bounds."""
 EXTRA_ROWS = SETS + 5
 
-# rows of the state: the first holds single numbers, the others a number for each node, which has changed from
-# CHANGED to before CHANGED_END, and at the newest sample
+# rows of the state: the first holds single numbers, the others a number for each node; it has changed at the
+# newest sample, and from CHANGED to before CHANGED_END (the newest sample and 0 if nowhere else)
 HEAD, LOWS, LOW, HIGH, PLAIN, CHANGED, CHANGED_END, BOUNDARY, STATE = range(9)
 STARTS = 9  # and then, of each window in seconds: where it starts at each position, and what comes after it
 # columns of the first row: how many samples are forgotten, the time of the first one, the base, whether
@@ -291,7 +291,7 @@ def _unchanged(
         The first of the windows at begin … end - 1 that may change, and what comes after the last one.
     """
     nothing = -np.inf if is_greatest else np.inf
-    if changed == changed_end:
+    if changed >= changed_end:
         begin = end
     if begin < end:
         before = extremum(is_greatest, columns, seen, changed, changed_end, nothing)
@@ -478,7 +478,9 @@ def _bring_up(
                 columns[own, k] = columns[child, at] if 0 <= at <= last else missing
         else:
             begin, end = _run_window(rows, d, stamps, state, columns, mode, last, is_fresh)
-        state[CHANGED, d], state[CHANGED_END, d] = (begin, end) if begin < end else (last, last)
+        if begin >= end:
+            begin, end = last, 0
+        state[CHANGED, d], state[CHANGED_END, d] = begin, end
     if not has_column(rows):
         body = rows[nodes - 1, codes.NODE_B]
         is_until, joined = rows[nodes - 1, codes.NODE_CODE] == codes.UNTIL, EXTRA * nodes + JOINED + mode
