@@ -260,7 +260,7 @@ MAX_SHORT: Final = 12
 """The longest run that is looked for so."""
 
 _ON_ONE_LEVEL: Final = "no gap in height"
-"""What an exclusion names that does not hold for objects above each other."""
+"""The condition of an exclusion that does not hold for objects above each other."""
 
 MAX_PAIRS: Final = 200
 """How many pairs of automata are looked at for two that exclude each other."""

@@ -172,6 +172,26 @@ def test_the_doctor_excludes_nothing_that_is_measured(seed: int) -> None:
     assert examined.specs[0].undecided == ()
 
 
+@examples(25)
+@given(st.integers(0, 2**32))
+def test_without_heights_nothing_that_is_measured_in_the_plane_is_excluded(seed: int) -> None:
+    """In the plane two objects in a region are no further apart than it is wide."""
+    (sample,) = crowded_trace(seed, 1).samples()
+    flat = {name: sr.TrackedObject(each.footprint) for name, each in sample.objects.items()}
+    trace = sr.Trace.from_samples([sr.Sample(0, flat)])
+    pairs = [(a, b) for a, b in PAIRS if b != "tall"]
+    apart = measured([f"{a} dist {b} >= 0" for a, b in pairs], trace)
+    inside = measured([f"{a} enclosedin {b}" for a, b in pairs], trace)
+    literals = []
+    for (a, b), distance, room in zip(pairs, apart, inside, strict=True):
+        literals += [f"{a} dist {b} >= {distance - SLACK:.6f}", f"{a} dist {b} <= {distance + SLACK:.6f}"]
+        enclosed = f"{a} enclosedin {b}" if room > SLACK else f"{a} moved[{-room - SLACK:.6f}] {b}"
+        literals += [enclosed] if abs(room) > SLACK else []
+    planar = "\n".join(line for line in REGIONS.splitlines() if "height" not in line)
+    specification = sr.parse_specification(f"{planar}\nspec all_of_it = F ({' and '.join(literals)})\n")
+    assert sr.doctor(specification, examples=False).findings == ()
+
+
 @examples(60)
 @given(spatial_formulas())
 def test_a_placed_run_is_evaluated_to_the_verdict_that_it_shows(text: str) -> None:

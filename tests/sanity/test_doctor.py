@@ -195,6 +195,12 @@ def test_of_many_antecedents_the_one_that_never_holds_is_found() -> None:
     assert finding.exclusions == (("a7 leftof b7", "b7 leftof a7"),)
 
 
+def test_a_note_says_how_many_implications_were_examined() -> None:
+    text = " and ".join(f"(G (a{n} ovlp b -> F a{n} ovlp c))" for n in range(45))
+    examined = sr.doctor(sr.parse_specification(f"spec s = {text}"), examples=False)
+    assert examined.notes == ("of 45 implications of s, 40 were examined",)
+
+
 def test_specs_are_compared_with_each_other() -> None:
     found = findings(
         "spec far = G (cup dist mug >= 0.2)\n"
