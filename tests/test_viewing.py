@@ -116,7 +116,7 @@ def points(entity: Any) -> np.ndarray:
 
 def test_every_message_path_of_the_layout_has_values(log):
     layout = layout_of(log.path)
-    assert panels(layout["layout"]) == set(layout["configById"])
+    assert panels(layout) == set(layout["configById"])
     for path in paths_of(layout["configById"]):
         assert values(log.path, path), path
 

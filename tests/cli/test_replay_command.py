@@ -364,8 +364,8 @@ def test_the_arrow_of_an_annotated_log_points_at_the_result_that_is_chosen(
     for number, called in enumerate(("R-9 apart", "apart [R-9]")):
         assert run_in_process([*command, "-o", f"{number}.mcap", "--arrow", called]) == 1
         assert pointed_at(f"{number}.mcap") == pointed_at("chosen.mcap")
-    assert pointed_at("first.mcap") == '"cup 物" closeto[0] cube'
-    assert pointed_at("chosen.mcap") == '"cup 物" farfrom[99] cube'
+    assert pointed_at("first.mcap") == '"cup 物" closeto[0] cube now'
+    assert pointed_at("chosen.mcap") == '"cup 物" farfrom[99] cube now'
     # the choice is part of the log, and its certificate is computed again with it
     assert run_in_process(["verify", "chosen.mcap"]) == 0
     capsys.readouterr()
