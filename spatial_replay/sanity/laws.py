@@ -67,8 +67,8 @@ def laws(
         _distance(without_radius(each.first), without_radius(each.second)) for each in distances
     )
     outside = dict.fromkeys(_bare(each) for each in protrusions)
-    inside = {*inside, *between}
-    within = dict.fromkeys(each for each in outside if each in inside)
+    held: set[object] = {*inside, *between}
+    within = dict.fromkeys(each for each in outside if each in held)
     found += _transitive(outside, within, regions)
     found += _nested(bare, within, regions)
     found += _across(bare, outside, diameters)
