@@ -102,8 +102,9 @@ def cause_sentences(cause: Cause, *, first_ns: int, object: str | None = None) -
     requirement = requirement_text(cause.requirement, cause.title)
     if cause.witness is not None:
         has_ended = cause.settled_ns is None and cause.verdict is Verdict.VIOLATED
-        about = {"requirement": requirement, "has_ended": has_ended, "least": cause.least}
-        return sentences_of(cause.witness, first_ns=first_ns, **about)
+        return sentences_of(
+            cause.witness, first_ns=first_ns, requirement=requirement, has_ended=has_ended, least=cause.least
+        )
     instance = f" for {object}" if object is not None else ""
     instance += f" ({requirement})" if requirement else ""
     if cause.settled_ns is not None:

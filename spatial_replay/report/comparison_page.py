@@ -202,7 +202,7 @@ def _pairs(
             [each.apart_ns for each in diff.objects],
             [] if diff.decision is None else [diff.decision.a_ns],
             [spec.first_ns for spec in diff.specs],
-            [each.first_ns for each in (*diff.objects, *diff.signals)],
+            [*(each.first_ns for each in diff.objects), *(each.first_ns for each in diff.signals)],
         )
         known = ([at for at in times_ns if at is not None] for times_ns in found)
         first_ns = next((min(times_ns) for times_ns in known if times_ns), None)

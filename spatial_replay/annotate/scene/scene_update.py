@@ -414,7 +414,8 @@ def _label_places(
         # an absent object has the last box, and counts for nothing
         lower, upper = (box[own][:, None, :] for box in boxes) if len(boxes[0]) else (ends, ends)
         near = state.line * 0.1
-        touches = ((lower - near <= ends) & (ends <= upper + near)).all(axis=2).any(axis=1) & (own >= 0)
+        is_near = np.all((lower - near <= ends) & (ends <= upper + near), axis=2)
+        touches = is_near.any(axis=1) & (own >= 0)
         low = np.where(touches, np.minimum(low, lower[:, 0, 1]), low)
         high = np.where(touches, np.maximum(high, upper[:, 0, 1]), high)
     has_room = high + 2.5 * state.line < (state.place or _NOWHERE)[1]
