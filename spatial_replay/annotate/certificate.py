@@ -137,8 +137,6 @@ def specification_sha256(files: Sequence[Specification]) -> str:
     total = hashlib.sha256()
     for file in files:
         total.update(_text(format_specification(file)))
-        for name, digest in sorted(file.plugins.items()):
-            total.update(_text(name) + _text(digest))
     return total.hexdigest()
 
 

@@ -163,7 +163,8 @@ def format_formula(
 def format_specification(specification: Specification) -> str:
     """Return the canonical text of a specification, every `spec` on a line of its own."""
     relations = RELATION_NAMES | specification.relations
-    lines = [f"use {each}" for each in (specification.profile, *specification.plugins)]
+    lines = [f"use {specification.profile}"]
+    lines += [f"use {name}  # SHA-256 {digest}" for name, digest in specification.plugins.items()]
     for name, outline in specification.regions.items():
         lines.append(f"region {written_name(name, relations)} = {_format_outline(outline)}")
     for scale in specification.scales:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -106,6 +108,21 @@ def test_a_log_names_the_plugin_and_runs_it_only_if_it_is_allowed(
     Path("other/cell.py").write_text(MODULE + "\n# changed\n")
     assert run(["verify", "annotated.mcap", "--plugin", "other/cell.py"]) == 1
     assert "another specification" in capsys.readouterr().out
+
+
+def test_a_batch_evaluates_logs_again_with_a_plugin_that_was_changed(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    batch = ["batch", "cell.mcap", "--spec", "cell.spatial", "--jobs", "1", "--plugin"]
+    Path("other").mkdir()
+    Path("other/cell.py").write_text(MODULE + "\n# changed\n")
+    for evaluated in ("all", "0"):
+        assert run([*batch, "cell.py"]) == 0
+        assert f"({evaluated} evaluated now" in capsys.readouterr().out
+    # another process, as commands are: one process reads a file once
+    program = [sys.executable, "-m", "spatial_replay", *batch, "other/cell.py"]
+    done = subprocess.run(program, capture_output=True, text=True, check=True)
+    assert "(all evaluated now" in done.stdout
 
 
 @pytest.mark.parametrize(
