@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from spatial_replay.trace.sample import Sample
     from spatial_replay.trace.trace import Trace
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 __all__ = [
     "ClusterError",
