@@ -189,7 +189,7 @@ _OUTPUTS = (
         "-o",
         "--output",
         metavar="RESULTS",
-        help="Folder of results, also in a bucket, which another run goes on with.  "
+        help="Folder for results, local or in a bucket; the next run continues from it.  "
         "[default: results, or SUITE.results]",
     ),
     click.option("--junit", metavar="FILE", type=click.Path(path_type=Path), help="JUnit report to write."),
@@ -197,15 +197,21 @@ _OUTPUTS = (
         "--html",
         metavar="DIR",
         type=click.Path(path_type=Path),
-        help="Folder to write a page over all logs to, and a report of each that fails.",
+        help="Folder for a page over all logs, and a report of each failing log.",
     ),
-    click.option("--json", "json_file", metavar="FILE|-", help="Results to write as JSON, one a line."),
+    click.option(
+        "--json", "json_file", metavar="FILE|-", help="Results to write as JSON, one object a line."
+    ),
     click.option(
         "--baseline",
         metavar="RESULTS",
-        help="Results of an earlier run: what got worse than there, or is gone, fails.",
+        help="Results of an earlier run: results that got worse, or are missing now, fail.",
     ),
-    click.option("--tolerance", metavar="T", help="With --baseline: how much worse passes, as 5% or 0.02m."),
+    click.option(
+        "--tolerance",
+        metavar="T",
+        help="With --baseline: how much worse a result may be and still pass, as 5% or 0.02m.",
+    ),
     click.option("--update-baseline", is_flag=True, help="Write this run's results to --baseline."),
 )
 
@@ -236,9 +242,9 @@ def batch(
     LOG is a file, a folder, a pattern such as 'nightly/**/*.mcap', or an address. Results are kept in a
     folder; another run evaluates only what is new. A log that cannot be read is a result, too: its error.
 
-    Exits as replay does over all logs: 0 if everything is as expected, 1 if anything fails, 2 if some logs do
-    not fit, 3 if logs are damaged, 70 if the machine failed. It exits with 4 if results are unknown, tested
-    by nothing, or from logs with dropped samples.
+    Exits as replay does over all logs: 0 if everything is as expected, 1 if anything fails, 2 if an option
+    does not fit a log, 3 if logs are damaged or unfit, 70 if the machine failed. It exits with 4 if results
+    are unknown, tested by nothing, or from logs with dropped samples.
 
     \b
     Examples:

@@ -49,7 +49,8 @@ finding_format_option = click.option(
     "form",
     type=click.Choice(["text", "github", "sarif"]),
     default="text",
-    help="Print only errors and warnings, for GitHub's annotations or for code scanning.  [default: text]",
+    help="github, sarif: print only errors and warnings, as GitHub annotations or for code scanning."
+    "  [default: text]",
 )
 
 
@@ -138,7 +139,12 @@ _AUTOMATON_FILES = (".dot", ".hoa", ".svg")
     "--dfa", metavar="FILE|-", help="Automaton to write, as .dot, .hoa or .svg; - prints it as text."
 )
 @click.option("--result", "of", metavar="NAME", help="With --dfa: which result, if SPEC has several.")
-@click.option("--hz", metavar="N", type=float, help="With --dfa: samples per second, for bounds in seconds.")
+@click.option(
+    "--hz",
+    metavar="N",
+    type=float,
+    help="With --dfa: samples per second, to turn bounds in seconds into samples.",
+)
 def check(
     specification: LogFile,
     log: LogFile | None,

@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     metavar="time|progress[:NAME]|NAME",
     default="time",
     show_default=True,
-    help="Alignment of two logs: time since the first sample, progress of an automaton (of NAME, or the one "
-    "with the most states in common), or the first change of sign of the spec NAME.",
+    help="How to align two logs. time: since the first sample; progress: by the automaton of NAME, or the one"
+    " with the most states in common; NAME: by the first change of sign of that spec.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
 @output_option("Page to write (HTML), with both under one time cursor.")
@@ -53,14 +53,14 @@ def diff(
 ) -> int:
     """Compare two versions of a specification over a log, or two logs.
 
-    Two specifications (--spec OLD --spec NEW; with one, OLD is that of the log): changed verdicts and
-    numbers, the first such sample, and the edit that caused it. That is checked by evaluating with this edit
-    alone, and with all others.
+    Two specifications (--spec OLD --spec NEW; with one --spec, OLD is that of the log): changed verdicts and
+    numbers, the first such sample, and the edit that caused it. The cause is checked: OLD with this edit
+    alone, and NEW without it, are evaluated.
 
     Two logs: objects that moved differently and since when, the effect on each spec, and the planner's first
     different decision.
 
-    Exits with 0 if nothing differs but names of specs, otherwise with 1.
+    Exits with 0 if nothing differs, or only names of specs do; otherwise with 1.
 
     \b
     Examples:

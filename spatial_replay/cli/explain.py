@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     "--result",
     metavar="NAME[@OBJECT]",
     default="",
-    help="Named spec to explain, of a template for one object.  [default: all results]",
+    help="Named spec to explain; NAME@OBJECT for one object of a template.  [default: all results]",
 )
 @click.option("--at", metavar="T", help="Explain the verdict at time T, on the samples up to it.")
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
@@ -56,8 +56,9 @@ def explain(request: EvaluationArguments, result: str, at: str | None, as_json: 
     For each result: the sample, objects and relation that decided it, by how much and since when, and the
     change of a constant that would flip it. For an unknown verdict: the missing parts.
 
-    T is 12.5s or 1500ms after the first sample, 5250000000ns on the log's clock, or 2026-01-31T12:00:00Z.
-    Exits with the code of the explained verdicts, as `replay` does, and with 4 if samples after T decide.
+    A time T is 12.5s or 1500ms after the first sample, 5250000000ns on the log's clock, or
+    2026-01-31T12:00:00Z. Exits with the code of the explained verdicts, as `replay` does, and with 4 if
+    samples after --at decide.
 
     \b
     Examples:

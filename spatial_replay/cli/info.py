@@ -52,7 +52,9 @@ _OF_MESSAGES = frozenset({"mapping", "on_time_jump", "max_lateness", "max_gap"})
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of text.")
 @click.option("--suggest-mapping", is_flag=True, help="Print a first mapping file (YAML) instead.")
 @click.option(
-    "--fit", is_flag=True, help="Print rates, gaps and known objects instead, as `requires` of a suite."
+    "--fit",
+    is_flag=True,
+    help="Print rates, gaps and known objects instead, in the form of `requires` in a suite.",
 )
 @click.option("--decisions", is_flag=True, help="Print the decisions of a planned run instead.")
 @click.option(
@@ -60,12 +62,14 @@ _OF_MESSAGES = frozenset({"mapping", "on_time_jump", "max_lateness", "max_gap"})
     metavar="[NAME]",
     is_flag=False,
     flag_value="",
-    help="Print the recorded specification as it was written instead; NAME: of which file or spec.",
+    help="Print the recorded specification as it was written instead; NAME chooses a file or a spec.",
 )
 @click.option("--layout", is_flag=True, help="Print the layout to import in a viewer instead.")
 @click.option("--panels", is_flag=True, help="With --layout: the one for viewers that have the extension.")
 @click.option(
-    "--panel", is_flag=True, help="Print the extension with panels for viewers instead; it is for every log."
+    "--panel",
+    is_flag=True,
+    help="Print the extension for viewers instead; it is the same for every log, so give no LOG.",
 )
 @output_option("File to write instead of standard output.")
 @reading_options

@@ -88,7 +88,7 @@ def _bytes(context: click.Context, parameter: click.Parameter, text: str) -> int
 @click.option(
     "--until",
     type=click.Choice(["violated", "satisfied", "settled"]),
-    help="End when a spec is violated, when all are satisfied, or when each is one or the other.",
+    help="End when a spec is violated, when all are satisfied, or (settled) when each is one of these.",
 )
 @click.option(
     "--topic-timeout",
@@ -168,9 +168,9 @@ def monitor(
     """Monitor a running robot through foxglove_bridge, or another server of Foxglove's WebSocket protocol.
 
     Prints each change of a verdict with its reason, as it happens. While the connection is lost, everything
-    is unknown; it is made again as soon as the server is back. Ctrl-C ends the run.
+    is unknown; the connection is made again as soon as the server is back. Ctrl-C ends the run.
 
-    Exits with 0 if the recording satisfies all specifications, 1 if any is violated, 4 if none is violated
+    Exits with 0 if the run satisfies all specifications, 1 if any is violated, 4 if none is violated
     and any is unknown. It exits with 3 if the server does not answer, or its time jumps back.
 
     With --clips nothing is written until a trigger fires; then a log of what came before and after. SIGUSR1

@@ -170,7 +170,7 @@ durability_option = click.option(
     type=click.Choice(["process", "disk"]),
     default="process",
     show_default=True,
-    help="Written chunks survive the end of this process, or of the machine, too (fsync).",
+    help="process: written chunks survive a crash of this process; disk: also one of the machine (fsync).",
 )
 
 
@@ -218,7 +218,7 @@ semantics_option = click.option(
     type=click.Choice(["ltlf", "paper"]),
     default="ltlf",
     show_default=True,
-    help="Robustness over finite traces, or Def. 16 of the paper to the letter.",
+    help="ltlf: robustness over finite traces; paper: Def. 16 of the paper to the letter.",
 )
 
 
@@ -267,7 +267,7 @@ plugin_option = click.option(
     is_eager=True,
     expose_value=False,
     callback=_allow_plugins,
-    help="Module or file with own relations and signals, which is run; repeat for several.",
+    help="Python module or file with your own relations and signals; its code is run. Repeat for several.",
 )
 
 
@@ -276,7 +276,7 @@ def profile_option(command: _Command) -> _Command:
     profile = click.option(
         "--profile",
         type=click.Choice(["paper", "spatial_spec"]),
-        help="Relation profile of files without a `use` line.  [default: paper]",
+        help="Definitions of the relations in files without a `use` line.  [default: paper]",
     )
     return profile(plugin_option(command))
 
@@ -341,12 +341,13 @@ _READING = (
     click.option(
         "--max-lateness",
         metavar="T|all",
-        help="External logs: how late messages may come, such as 2s; all sorts the whole log.  [default: 1s]",
+        help="External logs: how late messages may come, such as 2s; with 'all' the whole log is sorted."
+        "  [default: 1s]",
     ),
     click.option(
         "--max-gap",
         metavar="T",
-        help="Pauses of samples, or of a mapped topic, are unknown if they are longer than T.",
+        help="Everything in pauses longer than T, of samples or of a mapped topic, is unknown.",
     ),
     click.option(
         "--read",
@@ -415,7 +416,7 @@ choices_option = click.option(
     "choices",
     multiple=True,
     metavar="VAR=class:C|NAME",
-    help="Objects to evaluate a template for: a class, one object, or VAR=all.",
+    help="Evaluate a template for these objects: VAR=class:C, VAR=NAME or VAR=all.",
 )
 
 _CONDITIONS = (
@@ -426,7 +427,7 @@ _CONDITIONS = (
         metavar="N",
         type=click.IntRange(min=1),
         default=1,
-        help="Use every Nth sample of the log; bounds in samples count only these.",
+        help="Use every Nth sample of the log; bounds in samples, such as F[0, 10], count only these.",
     ),
     choices_option,
     constants_option,

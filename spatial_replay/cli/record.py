@@ -65,8 +65,7 @@ def duration_ns(context: click.Context, parameter: click.Parameter, text: str | 
     "offsets",
     metavar="NAME=T",
     multiple=True,
-    help="Several cameras: shift of the stamps of a video or topic, such as right.mp4=0.12s, or by its"
-    " number, 2=-40ms.",
+    help="With several cameras: shift the stamps of one, by name (right.mp4=0.12s) or number (2=-40ms).",
 )
 @click.option(
     "--tags",
@@ -94,11 +93,14 @@ def duration_ns(context: click.Context, parameter: click.Parameter, text: str | 
     "hold_ns",
     metavar="T",
     callback=duration_ns,
-    help="Keep a hidden object where it was for so long, ever less certain, such as 200ms."
+    help="Keep a hidden object at its last place for this long, such as 200ms, with growing uncertainty."
     "  [default: hold of the tags file, or 0s]",
 )
 @click.option(
-    "--rate", metavar="HZ", type=float, help="Frames a second of a video, instead of its own stamps."
+    "--rate",
+    metavar="HZ",
+    type=float,
+    help="Time a video's frames at this rate, instead of by its own stamps.",
 )
 @click.option(
     "--for", "length_ns", metavar="T", callback=duration_ns, help="Duration of a recording from a camera."

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     "--arrow",
     metavar="RESULT",
     default="",
-    help="With -o: the result whose violation the scene points at.  [default: the first violated one]",
+    help="With -o: the violated result that the scene's arrow points at.  [default: the first violated one]",
 )
 @click.option("--json", "json_file", metavar="FILE|-", help="Results to write, as one JSON object.")
 @click.option("--series", is_flag=True, help="With --json: add the numbers of every node at every sample.")
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     "--to-end",
     "signal",
     is_flag=True,
-    help="With --json: --series, and the robustness of each node from each sample to the end.",
+    help="With --json: as --series, with the robustness of each node from each sample to the end.",
 )
 @click.option(
     "--window",
@@ -80,14 +80,15 @@ def replay(
 ) -> int:
     """Evaluate specifications over a recorded log.
 
-    T is 12.5s or 1500ms after the first sample, 5250000000ns on the log's clock, or 2026-01-31T12:00:00Z.
+    A time T is 12.5s or 1500ms after the first sample, 5250000000ns on the log's clock, or
+    2026-01-31T12:00:00Z.
 
     Exits with 0 if all results are satisfied, 1 if any is violated, 4 if none is violated and any is unknown.
     It exits with 3 if the log is damaged; the verdicts cover only the readable part. The code is also 4 if
-    nothing tested a result, or if the recorder dropped samples; --allow lets these pass. With --fail-on
-    vacuous it is 1 if a part of a specification decided nothing: an empty window, an antecedent that never
-    held, a group without members, a template without objects. With --fail-on cut it is 1 if a window decides
-    that the end of the log cut short.
+    nothing in the log tested a result, or if the recorder dropped samples; --allow lets these pass. With
+    --fail-on vacuous it is 1 if a part of a specification decided nothing: an empty window, an antecedent
+    that never held, a group without members, a template without objects. With --fail-on cut it is 1 if a
+    deciding window was cut short by the end of the log.
 
     With --watch the log stays in memory, and is evaluated again whenever a specification file is saved. The
     key w writes the values of --const into the files. Ctrl-C ends it with exit code 130.

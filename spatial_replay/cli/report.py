@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @click.command()
 @evaluation_options
-@output_option("Report to write (HTML).  [default: the log's name, here]")
+@output_option("Report to write (HTML).  [default: the log's name with .html, in this folder]")
 @semantics_option
 def report(request: EvaluationArguments, output: Path | None, semantics: Semantics) -> int:
     """Write an HTML report of a recorded run, for any browser.
@@ -33,7 +33,8 @@ def report(request: EvaluationArguments, output: Path | None, semantics: Semanti
     It shows verdicts and explanations, the specification's tree, curves, the scene from above, the automaton,
     events and planner decisions, with one time cursor for all. It needs no network and no other file.
 
-    Exits with the code of the verdicts, as `replay` does.
+    Exits with 0 if all results are satisfied, 1 if any is violated, 4 if none is violated and any is unknown,
+    3 if the log is damaged.
 
     \b
     Examples:

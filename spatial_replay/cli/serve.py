@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 @click.command()
 @evaluation_options
 @serving_options(8765)
-@click.option("--play", is_flag=True, help="Start playing at once instead of waiting for a viewer.")
+@click.option("--play", is_flag=True, help="Start playing at once instead of pausing at the first sample.")
 @click.option("--layout", is_flag=True, help="Print the layout to import in the viewer, and exit.")
 @watch_option
 @keep_option("Messages of the log to send")
@@ -53,8 +53,8 @@ def serve(
     log are updated. With --watch they follow the specification files, too, whenever these are saved; the key
     w, and the service write_constants, write what viewers changed into the files.
 
-    T is 12.5s or 1500ms after the first sample, 5250000000ns on the log's clock, or 2026-01-31T12:00:00Z.
-    Ctrl-C stops the server, with exit code 130.
+    A time T is 12.5s or 1500ms after the first sample, 5250000000ns on the log's clock, or
+    2026-01-31T12:00:00Z. Ctrl-C stops the server, with exit code 130.
 
     \b
     Examples:
