@@ -719,7 +719,8 @@ def test_the_terminal_the_page_and_junit_say_which_requirement_fails(fleet: Path
         lines = totals.splitlines()
         (place,) = (number for number, line in enumerate(lines) if line.startswith("  apart [REQ-3] "))
         assert lines[place + 1] == "    keep 30 cm from people"
-    _, _, worst = Path("pages/index.html").read_text().partition("The worst")
+    _, _, page = Path("pages/index.html").read_text().partition("</style>")
+    _, _, worst = page.partition("The worst")
     assert worst.count(f">{about}<") == 2 and worst.count(f'title="{about}"') == 2
     texts = [each.text or "" for each in ElementTree.parse("junit.xml").iterfind(".//failure")]
     assert [text.startswith(f"{about}\n`apart` is violated") for text in texts] == [True] * 2
