@@ -201,6 +201,9 @@ class Propositions:
 
     def _add(self, formula: Formula) -> None:
         shape = self._shapes.of(formula)
+        if shape in (YES, NO):
+            # logic alone decides it, but where a relation and its opposite both are 0
+            shape = self._shapes.of_text(formula)
         negated = self._shapes.negated(shape)
         if negated in self._numbers:
             self._literals[id(formula)] = self._numbers[negated], False
@@ -237,10 +240,14 @@ class Shapes:
                 node = self._of(expand(formula))
             except (NoAutomatonError, RecursionError):
                 # too large to be compared with others by what it means
-                node = self._variable(format_formula(formula))
+                node = self.of_text(formula)
             # the formula is kept, so that its id stays its own
             self._known[id(formula)] = formula, node
         return self._known[id(formula)][1]
+
+    def of_text(self, formula: Formula) -> int:
+        """Return a node that only a formula of the same text has."""
+        return self._variable(format_formula(formula))
 
     def negated(self, node: int) -> int:
         """Return the node of the negation."""

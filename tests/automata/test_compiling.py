@@ -303,3 +303,9 @@ def test_another_threshold_changes_what_propositions_say_and_no_move() -> None:
     # with one threshold for both, the two propositions are one, and the automaton another
     assert len(same.propositions) == 1
     assert len(same.states) < len(second.states)
+
+
+def test_conditions_that_logic_alone_excludes_stay_different_propositions():
+    never = [f"F (cup leftof {one} and cup rightof {one})" for one in ("fork", "plate")]
+    automaton = sr.automaton(sr.parse_specification(" and ".join(f"({each})" for each in never)))
+    assert len(automaton.propositions) == 2

@@ -433,8 +433,10 @@ def test_the_scene_names_what_decided_where_no_arrow_can_show_it(open_page: Open
 def test_the_tree_and_the_curve_of_a_quantifier_name_the_object_that_decided(open_page: Open) -> None:
     page = open_page("quantifier", at="#t=0.8")
     decided = "cy dist car >= 1"
-    expect(page.locator(".row.decides").last).to_contain_text(f"decided at 0.500 s by {decided}")
-    expect(page.locator(".legend-entry").last).to_contain_text(f"{decided} of it decided at 0.500 s")
+    expect(page.locator(".row.decides").last).to_contain_text(f"decided at 0.600 s by {decided}")
+    expect(page.locator(".legend-entry", has_text=decided)).to_contain_text(
+        f"{decided} of it decided at 0.600 s"
+    )
     caption = open_page("quantifier").locator(".caption")
     expect(caption).to_contain_text(f"what decided the verdict: {decided}")
 
