@@ -398,7 +398,7 @@ def layout_attachment(contents: LayoutContents, *, live: bool = False) -> Attach
 def viewer_layout(contents: LayoutContents) -> dict[str, Any]:
     """Return the layout of a log: whether, where and when; all else is in tabs.
 
-    The lights of the worst results are at the top, the scene on the left; on the right are the curves of one
+    The lights of the worst results are at the top, the scene on the left. On the right are the curves of one
     unit at a time, the states of results, and a panel of tabs.
     """
     contents = contents.worst_first()

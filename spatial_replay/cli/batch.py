@@ -243,8 +243,8 @@ def batch(
     folder; another run evaluates only what is new. A log that cannot be read is a result, too: its error.
 
     Exits as replay does over all logs: 0 if everything is as expected, 1 if anything fails, 2 if an option
-    does not fit a log, 3 if logs are damaged or unfit, 70 if the machine failed. It exits with 4 if results
-    are unknown, tested by nothing, or from logs with dropped samples.
+    does not fit a log. It exits with 3 if logs are damaged or unfit, with 70 if the machine failed. It exits
+    with 4 if results are unknown, tested by nothing, or from logs with dropped samples.
 
     \b
     Examples:
