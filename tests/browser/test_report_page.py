@@ -510,7 +510,7 @@ def test_decisions_show_what_was_tried_and_lead_to_their_time(open_page: Open) -
     page = open_page("planned")
     card = page.locator(".card").nth(0)
     card.get_by_role("button").click()
-    expect(readout(page)).to_have_text("0.033 s / 18.167 s")
+    expect(readout(page)).to_have_text("0.033 s / 18.133 s")
     expect(card).to_have_attribute("aria-current", "true")
     card.locator("summary").click()
     expect(card).to_contain_text("Given up: no object can do it.")
