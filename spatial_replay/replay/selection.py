@@ -1,4 +1,4 @@
-"""What is read of a log: the messages that its copies keep, and logs cut to a window."""
+"""Selection from a log: the messages that its copies keep, and logs cut to a window."""
 
 from __future__ import annotations
 

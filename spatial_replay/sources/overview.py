@@ -168,7 +168,7 @@ class Regularity:
 
 @dataclass(frozen=True, slots=True)
 class Fitness:
-    """What judging a log depends on.
+    """Fitness of a log to be judged.
 
     Attributes:
         topics: of a log of messages, by name.

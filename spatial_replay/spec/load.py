@@ -970,7 +970,7 @@ def _profile(statements: Sequence[Statement], plugins: Mapping[str, Plugin], fau
 
 
 _FORMULA = re.compile(r"[(<>=]|\S [a-z]+(\[.*\])? \S")
-"""What formulas have and file names hardly ever do: some characters, and a word between two others."""
+"""Marks of a formula that file names hardly ever have: some characters, and a word between two others."""
 _NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?", re.ASCII)
 
 
