@@ -41,7 +41,7 @@ GROUPS: dict[str, dict[str, str]] = {
         "replay": "Evaluate specifications over a log.",
         "explain": "Explain a verdict.",
         "report": "Write an HTML report of a run.",
-        "serve": "Replay live to a viewer, with constants to change.",
+        "serve": "Replay live to a viewer that can change constants.",
     },
     "Specifications": {
         "check": "Check a specification and print its tree.",
@@ -52,7 +52,7 @@ GROUPS: dict[str, dict[str, str]] = {
     },
     "Logs": {
         "info": "Show the content of a log.",
-        "clip": "Cut the smallest part of a log that shows a verdict.",
+        "clip": "Copy the smallest part of a log that shows a verdict.",
         "diff": "Compare two specifications over a log, or two logs.",
         "verify": "Recompute a log's certificate and compare.",
         "recover": "Save the readable part of a damaged log.",
@@ -121,7 +121,7 @@ class LazyCommands(click.Group):
 @click.group(
     cls=LazyCommands,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
-    epilog="Exit codes: 0 satisfied, 1 violated, 4 unknown or tested by nothing; 2 usage error or invalid "
+    epilog="Exit codes: 0 satisfied, 1 violated, 4 unknown or untested; 2 usage error or invalid "
     "specification, 3 damaged log, 70 internal or system error, 130 interrupted.",
 )
 @click.version_option(__version__, "-V", "--version", prog_name=PROGRAM, message="%(prog)s %(version)s")

@@ -237,7 +237,7 @@ def batch(
     fail_on: frozenset[str],
     allow: frozenset[str],
 ) -> int:
-    """Evaluate many logs and show what fails: a suite file, or logs with specifications.
+    """Evaluate many logs (a suite file, or logs with specifications) and show what fails.
 
     LOG is a file, a folder, a pattern such as 'nightly/**/*.mcap', or an address. Results are kept in a
     folder; another run evaluates only what is new. A log that cannot be read is a result, too: its error.

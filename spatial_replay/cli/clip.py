@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 def clip(
     request: EvaluationArguments, output: Path, of: tuple[str, ...], around: str, topics: tuple[str, ...]
 ) -> int:
-    """Cut the smallest part of a log that shows a verdict, for a bug report.
+    """Copy the smallest part of a log that shows a verdict, for a bug report.
 
     The clip has the same verdicts, robustness and witnesses as the log, of the results that are violated or,
     where none is, of all. It is an annotated log: every

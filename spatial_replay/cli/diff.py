@@ -37,11 +37,11 @@ if TYPE_CHECKING:
     metavar="time|progress[:NAME]|NAME",
     default="time",
     show_default=True,
-    help="How to align two logs. time: since the first sample; progress: by the automaton of NAME, or the one"
-    " with the most states in common; NAME: by the first change of sign of that spec.",
+    help="How to align two logs. time: since the first sample; progress: by states of the automaton of NAME,"
+    " or of the one with most states in common; NAME: by that spec's first change of sign.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
-@output_option("Page to write (HTML), with both under one time cursor.")
+@output_option("HTML page to write: both sides under one time cursor.")
 @semantics_option
 def diff(
     request: EvaluationArguments,
@@ -53,14 +53,14 @@ def diff(
 ) -> int:
     """Compare two versions of a specification over a log, or two logs.
 
-    Two specifications (--spec OLD --spec NEW; with one --spec, OLD is that of the log): changed verdicts and
-    numbers, the first such sample, and the edit that caused it. The cause is checked: OLD with this edit
-    alone, and NEW without it, are evaluated.
+    Two specifications (--spec OLD --spec NEW; with one --spec, OLD is that of the log): which verdicts and
+    numbers changed, at which sample first, and by which edit. The cause is checked: OLD with this edit alone,
+    and NEW without it, are evaluated.
 
     Two logs: objects that moved differently and since when, the effect on each spec, and the planner's first
     different decision.
 
-    Exits with 0 if nothing differs, or only names of specs do; otherwise with 1.
+    Exits with 0 if nothing but names of specs differs, otherwise with 1; with 3 after a damaged log.
 
     \b
     Examples:

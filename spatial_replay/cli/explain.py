@@ -53,12 +53,12 @@ if TYPE_CHECKING:
 def explain(request: EvaluationArguments, result: str, at: str | None, as_json: bool) -> int:
     """Explain a verdict in plain sentences.
 
-    For each result: the sample, objects and relation that decided it, by how much and since when, and the
-    change of a constant that would flip it. For an unknown verdict: the missing parts.
+    For each result: which sample, objects and relation decided it, by how much, since when, and which change
+    of a constant would flip it. For an unknown verdict: the missing parts.
 
     A time T is 12.5s or 1500ms after the first sample, 5250000000ns on the log's clock, or
-    2026-01-31T12:00:00Z. Exits with the code of the explained verdicts, as `replay` does, and with 4 if
-    samples after --at decide.
+    2026-01-31T12:00:00Z. Exits with the code of the explained verdicts, as `replay` does, and with 4 if one
+    is undecided at --at.
 
     \b
     Examples:

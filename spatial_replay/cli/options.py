@@ -77,7 +77,7 @@ def serving_options(port: int, only_with: str = "") -> Callable[[_Command], _Com
             default="127.0.0.1",
             show_default=True,
             help=help_of(
-                "Address to listen on; beyond this machine, viewers need the token in the printed address."
+                "Address to listen on; one open to other machines needs the token in the printed address."
             ),
         ),
         click.option(
@@ -218,7 +218,7 @@ semantics_option = click.option(
     type=click.Choice(["ltlf", "paper"]),
     default="ltlf",
     show_default=True,
-    help="ltlf: robustness over finite traces; paper: Def. 16 of the paper to the letter.",
+    help="ltlf: robustness over finite traces; paper: exactly Def. 16 of SpaTiaL's paper.",
 )
 
 
@@ -276,7 +276,7 @@ def profile_option(command: _Command) -> _Command:
     profile = click.option(
         "--profile",
         type=click.Choice(["paper", "spatial_spec"]),
-        help="Definitions of the relations in files without a `use` line.  [default: paper]",
+        help="Definitions of the relations, for files without a `use` line.  [default: paper]",
     )
     return profile(plugin_option(command))
 
@@ -347,7 +347,7 @@ _READING = (
     click.option(
         "--max-gap",
         metavar="T",
-        help="Everything in pauses longer than T, of samples or of a mapped topic, is unknown.",
+        help="In pauses longer than T, everything is unknown; in those of one topic, its objects only.",
     ),
     click.option(
         "--read",
@@ -416,18 +416,18 @@ choices_option = click.option(
     "choices",
     multiple=True,
     metavar="VAR=class:C|NAME",
-    help="Evaluate a template for these objects: VAR=class:C, VAR=NAME or VAR=all.",
+    help="Objects for a template's parameter VAR: VAR=class:C, VAR=NAME or VAR=all.",
 )
 
 _CONDITIONS = (
-    click.option("--from", "start", metavar="T", help="Start at the first sample at or after T."),
+    click.option("--from", "start", metavar="T", help="Start at the first sample at or after T, such as 2s."),
     click.option("--to", "end", metavar="T", help="End with the last sample before T."),
     click.option(
         "--every",
         metavar="N",
         type=click.IntRange(min=1),
         default=1,
-        help="Use every Nth sample of the log; bounds in samples, such as F[0, 10], count only these.",
+        help="Use every Nth sample of the log; F[0, 10] and other bounds in samples count only these.",
     ),
     choices_option,
     constants_option,

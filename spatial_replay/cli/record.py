@@ -127,7 +127,7 @@ def video(
     Reads a video file, a topic of a log with images or AprilTag detections, or a camera of this machine.
     Objects carry AprilTags; the tags file says which. Every footprint comes with its uncertainty, so that
     a verdict near a threshold is unknown rather than guessed. Several videos or topics are cameras that
-    see the same scene: their frames of one time make one sample. Needs the extra `vision`.
+    see the same scene: frames of equal time make one sample. Needs the extra `vision`.
 
     Exits with 0 if all specifications are satisfied, 1 if any is violated, 4 if none is violated and any is
     unknown. It exits with 3 if the video is damaged; the recording up to there is complete.

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 @evaluation_options
 @output_option("Annotated log to write (MCAP).")
 @click.option("--layer", is_flag=True, help="Write the derived messages only, without the log's own.")
-@keep_option("With -o: messages of the log to copy", "all, of a ROS 2 bag none")
+@keep_option("With -o: messages of the log to copy", "all; none of a ROS 2 bag")
 @click.option(
     "--arrow",
     metavar="RESULT",
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     "--to-end",
     "signal",
     is_flag=True,
-    help="With --json: as --series, with the robustness of each node from each sample to the end.",
+    help="With --json: as --series, plus each node's robustness from each sample to the end.",
 )
 @click.option(
     "--window",
