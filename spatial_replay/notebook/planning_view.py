@@ -36,8 +36,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.image import AxesImage
 
-    from spatial_replay.planning.decision_log import decision_lines, decision_message
-from spatial_replay.planning.decisions import Target
+    from spatial_replay.planning.decisions import Target
 
 _HATCHES: Final = ("", "////", "xxxx", "....", "oooo")
 """Hatches of blocked cells, by the number of the reason."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import re
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import accumulate, pairwise
@@ -553,13 +554,15 @@ def decision_lines(decision: PlanDecision) -> Iterator[str]:
     """Yield lines about one decision."""
     states = ", ".join(map(str, decision.states))
     yield f"step {decision.number} at {time_text(decision.time_ns)}, state {states}"
-    for place, edge in enumerate(decision.considered, 1):
-        yield from _edge_lines(edge, is_aim=place == len(decision.considered) and not edge.pruned)
-    if not decision.HasField("target"):
-        yield f"  {decision.reason}"
-    else:
+    if decision.HasField("target"):
+        yield f"  {why_text(decision)}"
         yield f"  {choice_text(decision)}"
-        yield f"  {_target_text(decision.target)}"
+        yield f"  {_target_text(decision.target)}{_once_all_are_done(decision.considered[-1])}"
+    else:
+        yield f"  {decision.reason}"
+    said: dict[tuple[str, ...], str] = {}
+    for place, edge in enumerate(decision.considered, 1):
+        yield from _edge_lines(edge, said, is_aim=place == len(decision.considered) and not edge.pruned)
     if decision.HasField("lost"):
         why = f": {decision.lost.text}" if decision.lost.text else ""
         yield f"  since {time_text(decision.lost.time_ns)} it cannot be satisfied{why}"
@@ -570,21 +573,72 @@ def decision_lines(decision: PlanDecision) -> Iterator[str]:
         yield f"  {how} at {time_text(outcome.end_ns)}: {outcome.reason}; state {after}"
 
 
+def why_text(decision: PlanDecision) -> str:
+    """Return why an object is moved, and why this one where another could be; "" if none is."""
+    if not (decision.HasField("target") and decision.considered):
+        return ""
+    aim, name = decision.considered[-1], decision.target.object
+    later = [each.object for each in aim.motions[1:] if each.object != name]
+    wanted = [text for guard in aim.progress[:1] for text in _positive_parts(guard.text)]
+    chosen = next((each for each in aim.candidates if each.chosen), PlanCandidate())
+    relations = [each.text for each in chosen.conjuncts] or wanted
+    is_named = [re.search(rf"\b{re.escape(name)}\b", each) is not None for each in relations]
+    if later and aim.joint and (name in [each.object for each in aim.motions[1:]] or not any(is_named)):
+        return f"{name} goes aside: {later[0]} has to pass"
+    own = [each for each in wanted if re.search(rf"\b{re.escape(name)}\b", each)]
+    why = f"{name} moves: {' and '.join(own or wanted) or 'a relation must not hold'}"
+    rivals = [each for each in aim.candidates if each.HasField("target") and not each.chosen]
+    if aim.joint or not rivals:
+        return f"{why} is wanted" if own or wanted else why
+    pushes, other = decision.reason.startswith("push"), rivals[0]
+    costs = [_length(each) if pushes else -each.robustness for each in (decision.target, other.target)]
+    how = "a longer way" if pushes else "less robustness"
+    if costs[0] > costs[1]:
+        how = f"{'a shorter way' if pushes else 'more robustness'}, but no motions lead on from there"
+    numbers = f"{abs(costs[1]):.3g}, here {abs(costs[0]):.3g}"
+    return f"{why} is wanted; {other.object} could do it with {how} ({numbers})"
+
+
+def _positive_parts(text: str) -> list[str]:
+    """Return the parts of a conjunction that are no negations."""
+    parts, depth = [""], 0
+    for word in text.split(" "):
+        if word == "and" and not depth:
+            parts.append("")
+            continue
+        depth += word.count("(") - word.count(")")
+        parts[-1] = f"{parts[-1]} {word}".lstrip()
+    return [each for each in parts if not each.startswith("not ")]
+
+
+def _once_all_are_done(edge: PlanEdge) -> str:
+    """Return when a target has its robustness, of several motions for one edge."""
+    return f" once all {len(edge.motions)} motions are done" if edge.joint and len(edge.motions) > 1 else ""
+
+
 def choice_text(decision: PlanDecision) -> str:
     """Return what is done, without what has to hold next, which is in the decision's edges."""
     aim = _either([guard.text for edge in decision.considered[-1:] for guard in edge.progress])
     return decision.reason.removesuffix(f": {aim}")
 
 
-def _edge_lines(edge: PlanEdge, *, is_aim: bool) -> Iterator[str]:
+def _edge_lines(edge: PlanEdge, said: dict[tuple[str, ...], str], *, is_aim: bool) -> Iterator[str]:
+    """Yield lines about an edge; `said` has the blocks of edges before, which are not repeated."""
     path = " -> ".join(map(str, edge.path))
     yield f"  {'aimed at' if is_aim else 'looked into'} {edge.source} -> {edge.target} on the path {path}"
     yield f"    to reach  {_some([guard.text for guard in edge.progress])}"
     if edge.constraints:
         yield f"    never     {_some([guard.text for guard in edge.constraints])}"
     for candidate in edge.candidates:
+        rows = [f"      {key:<11}{text}" for key, text in candidate_lines(candidate)]
+        # maps have numbers of their own, and may say the same
+        name = f"{edge.source} -> {edge.target}"
+        before = said.setdefault((candidate.object, candidate.rejected, *rows), name)
+        if candidate.rejected and before != name:
+            yield f"    {candidate.object}{_maps(candidate)}: rejected as for {before}"
+            continue
         yield f"    {_candidate_text(candidate)}"
-        yield from (f"      {key:<11}{text}" for key, text in candidate_lines(candidate))
+        yield from rows
     if len(edge.motions) > 1:
         yield f"    planned   {', then '.join(_place_text(each) for each in edge.motions)}"
     if edge.pruned:
@@ -607,12 +661,15 @@ def _maps(candidate: PlanCandidate) -> str:
     return f" (maps {numbers[0]} to {numbers[-1]})"
 
 
-def _target_text(target: PlanTarget) -> str:
+def _length(target: PlanTarget) -> float:
     points = list(zip(target.waypoints[::2], target.waypoints[1::2], strict=True))
-    length = sum(math.dist(one, other) for one, other in pairwise(points))
+    return sum(math.dist(one, other) for one, other in pairwise(points))
+
+
+def _target_text(target: PlanTarget) -> str:
     turned = f", turned by {math.degrees(target.turn):.3g} deg" if target.turn else ""
     return (
-        f"{target.object} to ({target.x:.4g}, {target.y:.4g}){turned}, path length {length:.4g}, "
+        f"{target.object} to ({target.x:.4g}, {target.y:.4g}){turned}, path length {_length(target):.4g}, "
         f"robustness {target.robustness:.4g}"
     )
 

@@ -93,25 +93,27 @@ def surplus(lower: float, upper: float, demand: Demand) -> float:
 class Budget:
     """How many maps a decision may compute."""
 
-    def __init__(self, maps: int) -> None:
+    def __init__(self, maps: float) -> None:
         self.left = maps
 
-    def spend(self, maps: int = 1) -> bool:
+    def spend(self, maps: float = 1.0) -> bool:
         """Count maps; return whether there are any left."""
         self.left -= maps
-        return self.left >= 0
+        return self.left >= 0.0
 
 
-def with_moved(sample: Sample, poses: Mapping[str, Pose]) -> Sample:
+def with_moved(sample: Sample, poses: Mapping[str, Pose], later_ns: int = 0) -> Sample:
     """Return a sample with objects moved to poses (x, y, turn)."""
     tracked = {name: sample.objects[name] for name in poses}
     moved = {name: each for name, each in tracked.items() if isinstance(each, TrackedObject)}
-    return with_objects(sample, {name: moved_object(each, *poses[name]) for name, each in moved.items()})
+    placed = {name: moved_object(each, *poses[name]) for name, each in moved.items()}
+    return with_objects(sample, placed, later_ns)
 
 
-def with_objects(sample: Sample, objects: Mapping[str, TrackedObject]) -> Sample:
-    """Return a sample with some objects in place of those that it has."""
-    return Sample(sample.time_ns, {**sample.objects, **objects}, sample.signals, sample.unknown)
+def with_objects(sample: Sample, objects: Mapping[str, TrackedObject], later_ns: int = 0) -> Sample:
+    """Return a sample with some objects instead of those that it has."""
+    time_ns = sample.time_ns + later_ns
+    return Sample(time_ns, {**sample.objects, **objects}, sample.signals, sample.unknown)
 
 
 # ------------------------------------------------------------------------------------------------------ edges
@@ -415,7 +417,7 @@ class Attempts:
 
     def _kept(self, target: Target, outcome: Outcome, sample: Sample, refused: bool) -> FailedMotion | None:
         """Keep a motion that failed, and return it."""
-        if self._begin is None or self._begin[1].rules < 4:
+        if self._begin is None:
             return None
         before, settings = self._begin
         stayed = _stands(target.name, before, sample, settings)

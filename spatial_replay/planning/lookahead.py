@@ -25,6 +25,8 @@ from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.guards import Transition
 from spatial_replay.geometry.arrays import Booleans, Floats
 from spatial_replay.geometry.footprint import TrackedObject, centre_of, moved_object, radius_of
+from spatial_replay.monitor.atoms.measurements import leaf_values
+from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.planning.decisions import Candidate, Consideration, Edge, Reason, Target
 from spatial_replay.planning.edges import (
     LATER,
@@ -32,7 +34,6 @@ from spatial_replay.planning.edges import (
     Budget,
     Demand,
     Pose,
-    Symbol,
     alternatives,
     consideration_of,
     demands_of,
@@ -42,15 +43,17 @@ from spatial_replay.planning.edges import (
     surplus,
     values_in,
     with_moved,
+    with_objects,
 )
 from spatial_replay.planning.maps import AVOIDED_CELLS, concerns, gradient_map, proposition_maps
 from spatial_replay.planning.motions import Expectations, MotionOrder, Movables, PredictedState, by_cost
 from spatial_replay.planning.settings import Grid, Settings, Workspace
-from spatial_replay.planning.targets import cell_hint
+from spatial_replay.planning.targets import nearest_meeting
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Atom, Formula, Outline, Quantified, SignedDistance, TrackedName
 from spatial_replay.spec.walks import base_of, iter_formulas, terms_of
 from spatial_replay.trace.sample import Sample
+from spatial_replay.trace.trace import Trace
 
 # ----------------------------------------------------------------------------------------------- arrangements
 
@@ -66,6 +69,20 @@ _MOST_NAMED: Final = 3
 """The most things that a sentence names."""
 _ENOUGH: Final = 0.5
 """The share of its cells that each other object keeps after a choice by robustness."""
+_STRICTLY: Final = 1e-12
+"""Least distance of a constraint from holding; it holds at 0."""
+_MOST_BETWEEN: Final = 3
+"""The most sets of objects, and of their arrangements each, that are tried for places between cells."""
+_MOST_STEPS: Final = 12
+"""The most steps by which objects are moved from cells to places between them."""
+_MOST_STALLED: Final = 2
+"""The most steps without a gain."""
+_STEP: Final = 0.5
+"""Cost of such a step, in maps."""
+_TOWARDS: Final = (1.0 / 16.0, 1e-6)
+"""By how much places between cells are to meet demands, in cells; the first that can be met counts."""
+_OLDEST_CUTS: Final = 4
+"""The steps of which demands are kept, as they were there."""
 
 Cell: TypeAlias = tuple[int, int, int]
 """A turn of an object, by its number, and the row and column of its centre."""
@@ -77,15 +94,13 @@ class _Field:
 
     Attributes:
         turns: (A,) angles in radians.
-        open: (A, rows, columns), whether the robot reaches a cell and nothing immovable stands there.
-        clearance: (A, rows, columns), distance to what cannot be moved.
+        clearance: (A, rows, columns), distance to what cannot be moved, less that needed; out of reach, -inf.
         standing: for each thing that cannot be moved, "" for the workspace's obstacles, the distance to it.
         apart: for each other movable object in the way, the distance to it less the clearance needed.
         surplus: for each demand about the object, that with everything else where it is.
     """
 
     turns: Floats
-    open: Booleans
     clearance: Floats
     standing: Mapping[str, Floats]
     apart: Mapping[str, Floats]
@@ -93,11 +108,7 @@ class _Field:
 
 
 class Arranger:
-    """The arrangements of movable objects in one sample that meet demands.
-
-    Attributes:
-        is_tight: whether an object was found that has a place between cells only.
-    """
+    """The arrangements of movable objects in one sample that meet demands."""
 
     def __init__(
         self,
@@ -115,8 +126,11 @@ class Arranger:
         self._movable = {name: present[name] for name in order if name in present}
         self._about = {each: self._names(each) for each in self._demands}
         self._fields: dict[str, _Field] = {}
+        self._stencils: dict[tuple[object, ...], Floats] = {}
         self._visits = 0
-        self.is_tight = False
+        # what an object at the best place of its cell may gain on each demand
+        self._slack = 0.0
+        self._is_placed = settings.refine and settings.skill == "place"
 
     def _names(self, demand: Demand) -> tuple[str, ...]:
         return tuple(name for name in self._movable if concerns(demand.formula, name))
@@ -136,44 +150,19 @@ class Arranger:
             own = [each for each in self._demands if self._about[each] == (name,)]
             if own and any(each in self._unmet for each in own) and (field := self._field(name)) is not None:
                 met = np.minimum.reduce([field.surplus[each] for each in own])
-                if not (field.open & (met >= 0.0)).any() and not self._fits_between(name, field, own):
-                    if self._settings.rules > 3 and (met >= 0.0).any():
+                least = -self._in_cell if self._is_placed else 0.0
+                if not ((field.clearance > least) & (met >= least)).any():
+                    if (met >= 0.0).any():
                         stands = _listed(self._standing(field, met >= 0.0))
                         return f"{stands or 'the robot does not reach'} wherever {name} would have to be"
-                    best = max(float(met[field.open].max(initial=-math.inf)), -math.inf)
-                    hint = cell_hint(-best, self._settings)
-                    return f"{name}: nowhere would all of it hold, {-best:.4g} is missing at best{hint}"
+                    missing = -float(met[field.clearance > 0.0].max(initial=-math.inf))
+                    return f"{name}: nowhere would all of it hold, {missing:.4g} is missing at best"
         return ""
 
-    def _fits_between(self, name: str, field: _Field, own: Sequence[Demand]) -> bool:
-        """Return whether an object has a place between cells where demands hold, if targets are refined."""
-        workspace, tracked = self._settings.workspace, self._movable[name]
-        if self._settings.rules < 4 or not self._settings.refine or self._settings.skill == "push":
-            return False
-        met = np.minimum.reduce([field.surplus[each] for each in own])
-        score = np.where(
-            workspace.within_reach(self._grid),
-            np.minimum(met, field.clearance - workspace.clearance),
-            -np.inf,
-        )
-        turn, row, column = np.unravel_index(int(np.argmax(score)), score.shape)
-        if score[turn, row, column] < -self._grid.cell_size or not self._budget.spend():
-            return False
-        x, y = self._grid.centre(int(row), int(column))
-        size, yaw = self._grid.cell_size / 8.0, (tracked.yaw or 0.0) + float(field.turns[turn])
-        supports = workspace.supports | {each for each in self._movable if each != name}
-        yaws = (yaw,) if workspace.yaws else ()
-        free = replace(workspace, supports=supports, yaws=yaws, keeps_yaw=False)
-        grid = Grid(x - 8.5 * size, y - 8.5 * size, size, 17, 17)
-        formulas = [each.formula for each in own]
-        maps = proposition_maps(formulas, self._regions, self._sample, name, free, grid)
-        good = (maps.clearance > workspace.clearance) & workspace.grid.contains(grid.centres()).reshape(
-            grid.shape
-        )
-        for each, low, high in zip(own, maps.lower, maps.upper, strict=True):
-            good &= ((low if each.wanted else -high) - each.least) >= 0.0
-        self.is_tight |= bool(good.any())
-        return bool(good.any())
+    @property
+    def _in_cell(self) -> float:
+        """How far the middle of a cell is from its corners."""
+        return self._grid.cell_size / math.sqrt(2.0)
 
     def what_stands(self) -> str:
         """Return what cannot be moved and stands where objects could go, as a sentence; "" for nothing."""
@@ -190,30 +179,54 @@ class Arranger:
         counts = {each: int((wanted & (away <= clearance)).sum()) for each, away in field.standing.items()}
         return sorted((each for each in counts if counts[each]), key=lambda each: -counts[each])
 
-    def arrangements(self, most: int) -> Iterator[dict[str, Cell]]:
-        """Yield arrangements of the least sets of objects first.
+    def arrangements(self, most: int) -> Iterator[dict[str, Pose]]:
+        """Yield arrangements of the least sets of objects first, places between cells if there are no others.
 
         Args:
             most: the most objects that are moved.
         """
+        found = None
+        for found in self._over_cells(most):
+            yield found
+        if found is None and self._is_placed:
+            yield from self._between_cells(most)
+
+    def cell_hint(self, most: int) -> str:
+        """Return that smaller cells may help, if only places between cells meet the demands."""
+        fits = not self._is_placed and next(self._between_cells(most), None) is not None
+        return "smaller cells (cell_size) may help" if fits else ""
+
+    def _between_cells(self, most: int) -> Iterator[dict[str, Pose]]:
+        self._slack = self._in_cell
+        try:
+            yield from self._over_cells(most)
+        finally:
+            self._slack = 0.0
+
+    def _over_cells(self, most: int) -> Iterator[dict[str, Pose]]:
         queue = [(len(each), number, each) for number, each in enumerate(self._bases(most))]
         heapq.heapify(queue)
         seen = {each for *_, each in queue}
         count = len(queue)
-        for _ in range(_MOST_SETS):
+        most_sets, most_found = (_MOST_BETWEEN,) * 2 if self._slack else (_MOST_SETS, _MOST_SOLUTIONS)
+        for _ in range(most_sets):
             if not queue:
                 return
             *_, chosen = heapq.heappop(queue)
             domains = self._domains(chosen)
             if domains is not None and all(each.any() for each in domains.values()):
                 self._visits = 0
-                stencils = self._stencils(chosen, domains)
+                stencils = self._conflicts(chosen, domains)
                 found = 0
                 for cells in self._placed({}, domains, stencils):
-                    if self.meets(self.sample_with(cells)):
-                        yield cells
+                    poses: dict[str, Pose] | None = {name: self._pose(name, cells[name]) for name in cells}
+                    if self._slack and poses:
+                        poses = self._settled(poses)
                         found += 1
-                    if found >= _MOST_SOLUTIONS:
+                    if poses is not None and self.meets(with_moved(self._sample, poses)):
+                        yield poses
+                        found += 1
+                    if found >= most_found:
                         break
             if len(chosen) < most and chosen:
                 for name in self._in_the_way(chosen):
@@ -245,10 +258,11 @@ class Arranger:
         for name in chosen:
             if (field := self._field(name)) is None:
                 return []
-            wanted = field.open & self._met(field, name, chosen)
+            is_open = field.clearance > -self._slack
+            wanted = is_open & self._met(field, name, chosen)
             if not wanted.any():
                 # nothing that is moved away would make room; a demand about two may be met by the other one
-                wanted = field.open
+                wanted = is_open
             for other, apart in field.apart.items():
                 if other in counts:
                     counts[other] += int((wanted & (apart <= 0.0)).sum())
@@ -279,16 +293,17 @@ class Arranger:
         }
         measured = zip(others, maps.lower[len(about) :], strict=True)
         apart = {other: low - workspace.clearance for other, low in measured}
-        is_open = (maps.clearance > workspace.clearance) & workspace.within_reach(maps.grid)
+        reached = np.broadcast_to(workspace.within_reach(maps.grid), maps.clearance.shape)
+        clearance = np.where(reached, maps.clearance - workspace.clearance, -np.inf)
         standing = dict(zip(maps.obstacles, maps.distances, strict=True))
-        return _Field(maps.turns, is_open, maps.clearance, standing, apart, met)
+        return _Field(maps.turns, clearance, standing, apart, met)
 
     def _met(self, field: _Field, name: str, chosen: tuple[str, ...]) -> Booleans:
         """Return the cells where the demands hold that no other chosen object matters to."""
-        met = np.ones(field.open.shape, np.bool_)
+        met = np.ones(field.clearance.shape, np.bool_)
         for demand, values in field.surplus.items():
             if all(each == name or each not in chosen for each in self._about[demand]):
-                met &= values >= 0.0
+                met &= values >= -self._slack
         return met
 
     def _domains(self, chosen: tuple[str, ...]) -> dict[str, Booleans] | None:
@@ -297,32 +312,32 @@ class Arranger:
         for name in chosen:
             if (field := self._field(name)) is None:
                 return None
-            domain = field.open & self._met(field, name, chosen)
+            domain = (field.clearance > -self._slack) & self._met(field, name, chosen)
             for other, apart in field.apart.items():
                 if other not in chosen:
-                    domain = domain & (apart > 0.0)
+                    domain = domain & (apart > -self._slack)
             domains[name] = domain
         return domains
 
     # ------------------------------------------------------------------------------------ two objects
 
-    def _stencils(
+    def _conflicts(
         self, chosen: tuple[str, ...], domains: Mapping[str, Booleans]
     ) -> dict[tuple[str, str], Booleans]:
         """Return for each pair the conflicts by the way from one to the other: (A, B, rows, columns)."""
-        stencils = {}
+        conflicts = {}
         # turns without any cell need not be measured
         used = {name: np.asarray(cells.any(axis=(1, 2))) for name, cells in domains.items()}
-        if self._settings.rules < 3:
-            used = {name: np.ones_like(each) for name, each in used.items()}
-        for first, second in product(chosen, chosen):
-            if first != second and (found := self._stencil(first, second, chosen, used)) is not None:
-                stencils[first, second] = found
-        return stencils
+        for first, second in combinations(chosen, 2):
+            if (found := self._stencil(first, second, chosen, used)) is not None:
+                conflicts[first, second] = there = found < -2.0 * self._slack
+                conflicts[second, first] = there.transpose(1, 0, 2, 3)[:, :, ::-1, ::-1]
+        return conflicts
 
     def _stencil(
         self, first: str, second: str, chosen: tuple[str, ...], used: Mapping[str, Booleans]
-    ) -> Booleans | None:
+    ) -> Floats | None:
+        """Return by how much what is about two objects is met; -inf for turns that are not measured."""
         demands = [
             each
             for each in self._demands
@@ -339,22 +354,27 @@ class Arranger:
         cells = side * side * int(used[first].sum()) * int(used[second].sum())
         if not (demands or apart) or cells > _WIDEST:
             return None
+        key = first, second, *demands, used[first].tobytes(), used[second].tobytes()
+        if key in self._stencils:
+            return self._stencils[key]
         local = Grid(-(half + 0.5) * size, -(half + 0.5) * size, size, side, side)
         formulas = [each.formula for each in demands]
         workspace, measured = self._turned_in(local, used[second])
-        conflicts = np.ones((len(turns), len(used[second]), side, side), np.bool_)
+        met = np.full((len(turns), len(used[second]), side, side), -np.inf)
         for number in np.flatnonzero(used[first]).tolist():
             turn = float(turns[number])
             objects = {first: moved_object(one, 0.0, 0.0, turn), second: two}
             sample = Sample(self._sample.time_ns, objects, self._sample.signals)
             maps = proposition_maps(formulas, self._regions, sample, second, workspace)
-            bad = np.zeros(maps.clearance.shape, np.bool_)
+            own = [
+                (low if each.wanted else -high) - each.least
+                for each, low, high in zip(demands, maps.lower, maps.upper, strict=True)
+            ]
             if apart:
-                bad |= maps.clearance <= self._settings.workspace.clearance
-            for each, low, high in zip(demands, maps.lower, maps.upper, strict=True):
-                bad |= ((low if each.wanted else -high) - each.least) < 0.0
-            conflicts[number, measured] = bad
-        return conflicts
+                own.append(maps.clearance - self._settings.workspace.clearance - _STRICTLY)
+            met[number, measured] = np.minimum.reduce(own)
+        self._stencils[key] = met
+        return met
 
     def _turned_in(self, grid: Grid, used: Booleans) -> tuple[Workspace, list[int]]:
         """Return a workspace without obstacles for those turns that are used, and their numbers."""
@@ -417,7 +437,8 @@ class Arranger:
     def _score(self, name: str) -> Floats:
         """Return how good each cell of an object is, the other ones aside."""
         field, settings = self._fields[name], self._settings
-        room = np.minimum.reduce([field.clearance, *field.apart.values()])
+        gaps = np.minimum.reduce([field.clearance, *field.apart.values()])
+        room = gaps + settings.workspace.clearance
         own = [field.surplus[each] for each in field.surplus if self._about[each] == (name,)]
         if own:
             score: Floats = np.minimum.reduce(own)
@@ -430,18 +451,79 @@ class Arranger:
             return np.asarray(np.minimum(room, 1e9))
         here = np.array(centre_of(self._movable[name].footprint))
         away = np.hypot(*(self._grid.centres() - here).T).reshape(self._grid.shape)
-        return np.asarray(np.broadcast_to(-away, field.open.shape))
+        return np.asarray(np.broadcast_to(-away, field.clearance.shape))
 
     # ------------------------------------------------------------------------------------------ poses
 
-    def pose(self, name: str, cell: Cell) -> tuple[float, float, float]:
+    def _pose(self, name: str, cell: Cell) -> Pose:
         """Return x, y and turn of an object in a cell."""
         x, y = self._grid.centre(cell[1], cell[2])
         return x, y, float(self._fields[name].turns[cell[0]])
 
-    def sample_with(self, cells: Mapping[str, Cell]) -> Sample:
-        """Return the sample with objects in cells."""
-        return with_moved(self._sample, {name: self.pose(name, cell) for name, cell in cells.items()})
+    def _settled(self, poses: Mapping[str, Pose]) -> dict[str, Pose] | None:
+        """Return poses near others that meet all demands, and are clear of everything; None if none is found.
+
+        Each step goes to the nearest places that meet the demands, linear as here and in the steps before.
+        Of two sides, a distance has only the nearer one.
+        """
+        workspace, size = self._settings.workspace, self._grid.cell_size
+        obstacles = {
+            f"obstacle {number}": TrackedObject(each) for number, each in enumerate(workspace.obstacles)
+        }
+        sample = with_objects(self._sample, obstacles)
+        others = [each for each in sample.objects if each not in workspace.supports]
+        pairs = {
+            frozenset((name, other)) for name in poses for other in others if name not in workspace.supports
+        }
+        apart = [
+            Demand(
+                Atom("", "dist", SignedDistance(*map(TrackedName, sorted(each)))), True, workspace.clearance
+            )
+            for each in sorted(pairs, key=sorted)
+            if len(each) == 2
+        ]
+        demands = [*self._demands, *apart]
+        start = np.array([pose[:2] for pose in poses.values()])
+        for towards in _TOWARDS:
+            places, cuts, best, stalled = start, list[tuple[Floats, Floats]](), -math.inf, 0
+            for _ in range(_MOST_STEPS):
+                if not self._budget.spend(_STEP):
+                    return None
+                met, slopes = self._slopes(sample, demands, poses, places)
+                stalled = stalled + 1 if met.min() <= best + 1e-3 * size else 0
+                best = max(best, float(met.min()))
+                if (met >= _STRICTLY).all() and self._grid.contains(places).all():
+                    return {
+                        name: (*place, poses[name][2])
+                        for name, place in zip(poses, places.tolist(), strict=True)
+                    }
+                if stalled > _MOST_STALLED:
+                    break
+                near = met < 2.0 * size
+                normals = slopes[near].reshape(-1, places.size)
+                least = normals @ places.ravel() - met[near] + towards * size
+                cuts = [*cuts, (normals, least)][-_OLDEST_CUTS:]
+                every = (np.concatenate(each) for each in zip(*cuts, strict=True))
+                places = nearest_meeting(places.ravel(), *every).reshape(-1, 2)
+        return None
+
+    def _slopes(
+        self, sample: Sample, demands: Sequence[Demand], poses: Mapping[str, Pose], places: Floats
+    ) -> tuple[Floats, Floats]:
+        """Return (D,) by how much demands are met with objects at places (N, 2), and (D, N, 2) its slopes."""
+        step = 1e-4 * self._grid.cell_size
+        moved = [places, *(places + step * each.reshape(-1, 2) for each in np.eye(places.size))]
+        samples = [
+            with_moved(
+                sample, {n: (*at, poses[n][2]) for n, at in zip(poses, each.tolist(), strict=True)}, number
+            )
+            for number, each in enumerate(moved)
+        ]
+        trace = Trace.from_samples(samples)
+        leaves = leaf_values(TraceScene(trace, self._regions), [each.formula for each in demands], {})
+        values = np.stack([leaves[0][n] if each.wanted else -leaves[-1][n] for n, each in enumerate(demands)])
+        values -= np.array([[each.least] for each in demands])
+        return values[:, 0], ((values[:, 1:] - values[:, :1]) / step).reshape(-1, *places.shape)
 
     def meets(self, sample: Sample) -> bool:
         """Return whether a sample meets all demands."""
@@ -509,18 +591,20 @@ def _is_of(formula: Formula, names: Sequence[str]) -> bool:
 
 # ---------------------------------------------------------------------------------------------- motions ahead
 
-MOST_MAPS: Final = 150
-"""The most maps that looking ahead computes for one decision."""
+MOST_MAPS: Final = 230
+"""The most maps that one decision computes; a look at one sample counts as a quarter of a map."""
 _MOST_WHY_NOT: Final = 60
-"""The most maps that are computed to say what cannot be done."""
+"""The most maps that are computed to say what cannot be done, after a decision that found nothing."""
+_JOINT_SHARE: Final = 0.4
+"""The share of the maps left that is spent on moving several objects for one edge, in one of its ways."""
+_HOPELESS_SHARE: Final = 0.5
+"""The share of the maps left that is spent on finding edges that nothing can take."""
 _MOST_EDGES: Final = 12
 """The most edges that are tried from one state that is foreseen."""
 _MOST_ORDERED: Final = 6
 """The most arrangements of which the order of motions is looked for."""
 _STILL_TURN: Final = math.radians(1.0)
 """The widest turn of an object that stays as it is."""
-_STRICTLY: Final = 1e-12
-"""Least distance of a constraint from holding; it holds at 0."""
 
 
 class Lookahead:
@@ -533,13 +617,15 @@ class Lookahead:
         regions: Mapping[str, Outline],
         settings: Settings,
         attempts: Attempts,
+        budget: Budget,
     ) -> None:
         """Begin with what is known about a run.
 
         Args:
             attempts: the motions so far.
+            budget: of the whole decision.
         """
-        self._expected = Expectations(automaton, formulas, regions, settings, attempts, Budget(MOST_MAPS))
+        self._expected = Expectations(automaton, formulas, regions, settings, attempts, budget)
         self._automaton, self._formulas, self._regions = automaton, formulas, regions
         self._settings, self._attempts = settings, attempts
         self._pruned: set[Edge] = set()
@@ -607,27 +693,32 @@ class Lookahead:
         automaton, symbol = self._automaton, self._expected.symbol(scene)
         idle = idle_transitions(automaton, state, symbol)
         pruned = self._pruned - idle.edges
-        for _ in range(_MOST_EDGES):
+        looked_into: list[tuple[tuple[Transition, ...], Consideration]] = []
+        while len(looked_into) < _MOST_EDGES and self._expected.budget.left > 0:
             pruned |= self._ruled_out
-            path = next(automaton.paths(state, pruned), None)
-            if path is None or self._expected.budget.left <= 0:
-                return None
+            if (path := next(automaton.paths(state, pruned), None)) is None:
+                break
             if ahead := idle.along(path):
                 return self._ahead(scene, ahead[-1])
             consideration = consideration_of(automaton, path, pruned, symbol)
             for motions, after in self._ways(scene, path, consideration):
                 if (rest := self._ahead(*after)) is not None:
                     return (*motions, *rest)
-            # what is hopeless is worked out when something has failed
-            self._ruled_out = self._hopeless
+            looked_into.append((path, consideration))
             pruned.add(consideration.edge)
             pruned |= set(equivalent_edges(automaton, consideration, idle, pruned, symbol))
+        # edges that nothing can take are worked out when one motion after the other does not lead on
+        self._ruled_out = self._hopeless
+        for path, consideration in looked_into:
+            for motions, after in islice(self._joint(scene, path, consideration), 2):
+                if (rest := self._ahead(*after)) is not None:
+                    return (*motions, *rest)
         return None
 
     def _ways(
         self, scene: PredictedState, path: tuple[Transition, ...], consideration: Consideration
     ) -> Iterator[tuple[tuple[Target, ...], tuple[PredictedState, int]]]:
-        """Yield motions that take the first edge of a path, and where they lead."""
+        """Yield single motions that take the first edge of a path, and where they lead."""
         movables = self._expected.movables(scene)
         candidates: list[Candidate] = []
         later = moved_later(path, self._expected.symbol(scene), self._formulas, movables.names)
@@ -647,7 +738,6 @@ class Lookahead:
             self._why[f"{consideration.progress}: {causes or 'nothing that can be moved matters to it'}"] = (
                 None
             )
-        yield from islice(self._joint(scene, path, consideration), 2)
 
     def _after(
         self, scene: PredictedState, state: int, motions: tuple[Target, ...], aim: int
@@ -669,24 +759,23 @@ class Lookahead:
         if self._settings.motions < 2:
             return
         for length in dict.fromkeys((len(path), 1)):
-            if length == 1 and not self._can_be_taken_in_turns(scene, path[0]):
-                continue
             aims = path[:length]
             if any((each.source, each.target) in self._ruled_out for each in aims):
                 continue
             for demands in self._demands_of(scene, aims):
+                # other edges need maps, too
+                least = self._expected.budget.left * (1.0 - _JOINT_SHARE)
                 about = Arranger(scene.sample, self._regions, self._settings, demands, self._expected.budget)
                 if self._expected.budget.left <= 0 or about.why_hopeless():
                     continue
-                near_failures = []
-                for cells in islice(about.arrangements(self._settings.motions), _MOST_ORDERED):
-                    if self._is_near_failure(about, cells):
-                        near_failures.append(cells)
-                    else:
-                        yield from self._ordered_from(scene, aims, consideration, about, cells)
-                # a motion may fail by chance: places where one did come again, after all others
-                for cells in near_failures if self._settings.rules > 1 else ():
-                    yield from self._ordered_from(scene, aims, consideration, about, cells)
+                found: Iterable[dict[str, Pose]] = islice(
+                    about.arrangements(self._settings.motions), _MOST_ORDERED
+                )
+                if self._attempts.are_any:
+                    # a motion may fail by chance: places where one did come again, after all others
+                    found = sorted(found, key=self._is_near_failure)
+                for poses in found:
+                    yield from self._ordered_from(scene, aims, consideration, about, poses, least)
 
     def _demands_of(self, scene: PredictedState, aims: Sequence[Transition]) -> Iterator[tuple[Demand, ...]]:
         """Yield what has to hold for some edges to be taken, as conjunctions: all progress, no trap."""
@@ -706,54 +795,12 @@ class Lookahead:
             for demands in demands_of(literals, self._formulas, self._settings.margin):
                 yield (*demands, *kept)
 
-    def _can_be_taken_in_turns(self, scene: PredictedState, edge: Transition) -> bool:
-        """Return whether moving one object after the other can take an edge, and no other one before.
-
-        This looks at propositions alone: each motion may change those about one object.
-        """
-        symbol = self._expected.symbol(scene)
-        movables = self._expected.movables(scene)
-        for cube in edge.guard:
-            false = [number for number, wanted in cube if symbol[number] is not wanted]
-            wanted = {number: value for number, value in cube if number in false}
-            if None in (symbol[number] for number in false) or len(false) > 8:
-                continue
-            groups = [
-                {number for number in false if concerns(self._formulas[number], name)}
-                for name in movables.names
-            ]
-            if self._turns_lead(symbol, wanted, groups, edge):
-                return True
-        return False
-
-    def _turns_lead(
-        self, symbol: Symbol, wanted: Mapping[int, bool], groups: Sequence[set[int]], edge: Transition
-    ) -> bool:
-        open_sets, seen = [frozenset[int]()], set[frozenset[int]]()
-        while open_sets:
-            done = open_sets.pop()
-            if done in seen:
-                continue
-            seen.add(done)
-            now = tuple(wanted[n] if n in done else value for n, value in enumerate(symbol))
-            states = self._automaton.step_set({edge.source}, now)
-            if edge.target in states:
-                return True
-            if states != {edge.source} and done:
-                continue
-            for group in groups:
-                left = sorted(group - done)
-                for size in range(1, len(left) + 1):
-                    open_sets += (done | frozenset(each) for each in combinations(left, size))
-        return False
-
-    def _is_near_failure(self, about: Arranger, cells: Mapping[str, Cell]) -> bool:
+    def _is_near_failure(self, poses: Mapping[str, Pose]) -> bool:
         """Return whether an arrangement brings an object near a place where that failed."""
         near = AVOIDED_CELLS * self._settings.workspace.grid.cell_size
-        poses = ((name, about.pose(name, cell)) for name, cell in cells.items())
         return any(
             (x - u) ** 2 + (y - v) ** 2 <= near**2
-            for name, (x, y, _) in poses
+            for name, (x, y, _) in poses.items()
             for u, v in self._attempts.places_of(name)
         )
 
@@ -763,33 +810,32 @@ class Lookahead:
         aims: Sequence[Transition],
         consideration: Consideration,
         about: Arranger,
-        cells: Mapping[str, Cell],
+        poses: Mapping[str, Pose],
+        least: float,
     ) -> Iterator[tuple[tuple[Target, ...], tuple[PredictedState, int]]]:
         """Yield the motions to an arrangement, in an order in which each is possible."""
-        if self._settings.rules > 3:
-            cells = self._without_staying(scene, about, cells)
-        poses = {name: about.pose(name, cell) for name, cell in cells.items()}
-        robustness = self._expected.robustness(about.sample_with(cells), aims[0].guard)
-        order = MotionOrder(self._expected, scene, aims, consideration, poses, robustness)
+        poses = self._without_staying(scene, about, poses)
+        robustness = self._expected.robustness(with_moved(scene.sample, poses), aims[0].guard)
+        order = MotionOrder(self._expected, scene, aims, consideration, poses, robustness, least)
         if (found := order.found()) is not None:
             yield found.motions, (found.scene, found.state)
         elif scene is self._first and len(poses) > 1 and not self._unordered:
             self._unordered = " and ".join(sorted(poses))
 
     def _without_staying(
-        self, scene: PredictedState, about: Arranger, cells: Mapping[str, Cell]
-    ) -> Mapping[str, Cell]:
+        self, scene: PredictedState, about: Arranger, poses: Mapping[str, Pose]
+    ) -> Mapping[str, Pose]:
         """Return an arrangement without the objects that may as well stay where they are."""
-        for name in list(cells):
-            tracked, (x, y, turn) = scene.sample.objects[name], about.pose(name, cells[name])
-            others = {other: cell for other, cell in cells.items() if other != name}
+        for name in list(poses):
+            tracked, (x, y, turn) = scene.sample.objects[name], poses[name]
+            others = {other: pose for other, pose in poses.items() if other != name}
             if not isinstance(tracked, TrackedObject) or abs(turn) > _STILL_TURN:
                 continue
             away = math.dist((x, y), centre_of(tracked.footprint))
             is_near = away <= self._settings.workspace.grid.cell_size
-            if is_near and about.meets(about.sample_with(others)):
-                cells = others
-        return cells
+            if is_near and about.meets(with_moved(scene.sample, others)):
+                poses = others
+        return poses
 
     def _begun(
         self,
@@ -814,12 +860,13 @@ class Lookahead:
         )
         cubes = consideration.progress.cubes, consideration.constraints.cubes
         gradient = gradient_map(now, *cubes, settings.workspace, settings.constraint_margin, then)
-        place = gradient.cell_of(first.x, first.y, first.turn)
-        target = replace(first, robustness=float(gradient.robustness[place]))
+        there = with_moved(sample, {**poses, first.name: (first.x, first.y, first.turn)})
+        target = replace(first, robustness=self._expected.robustness(there, consideration.progress.cubes))
         if all(each.name != first.name for each in motions[1:]):
             target = self._refined(target, consideration, movables, poses, (*motions[1:], *rest))
         candidate = Candidate(first.name, gradient, target, is_chosen=True)
-        others = tuple(replace(each, is_chosen=False) for each in consideration.candidates)
+        kept = (each for each in consideration.candidates if each.name != first.name)
+        others = tuple(replace(each, is_chosen=False) for each in kept)
         planned = (target, *motions[1:], *rest)
         return replace(
             consideration, candidates=(*others, candidate), pruned=None, motions=planned, is_joint=True
@@ -881,13 +928,14 @@ class Lookahead:
             literal for each in self._automaton.transitions for cube in each.guard for literal in cube
         }
         hopeless: list[tuple[int, bool]] = []
-        budget = Budget(MOST_MAPS)
+        budget = Budget(self._expected.budget.left * _HOPELESS_SHARE)
         for number, wanted in sorted(literals):
             if symbol[number] is (not wanted) and budget.left > 0:
                 why = self._why_hopeless(self._first.sample, number, wanted, budget)
                 if why:
                     hopeless.append((number, wanted))
                     self._why[f"{self._automaton.propositions[number].literal(wanted)}: {why}"] = None
+        self._expected.budget.spend(self._expected.budget.left * _HOPELESS_SHARE - budget.left)
         return tuple(hopeless)
 
     def why_not(self, state: int) -> str:
@@ -895,7 +943,7 @@ class Lookahead:
 
         Or else, which objects have places to which no order of motions was found; "" without either.
         """
-        if self._first is None or self._settings.rules < 4:
+        if self._first is None:
             return ""
         for literal in self._hopeless_literals:
             if next(self._automaton.paths(state, self._needing({literal})), None) is None:
@@ -918,26 +966,22 @@ class Lookahead:
         about = Arranger(sample, self._regions, self._settings, core, budget)
         what = " and ".join(_text_of(each) for each in core)
         if why := about.why_hopeless():
-            return f"{what}: {why}"
+            return f"{what}: {'; '.join(filter(None, (why, about.cell_hint(self._settings.motions))))}"
         stands = about.what_stands()
-        said = "no places were found for all at once", stands, "smaller cells (cell_size) may help"
+        said = "no places were found for all at once", stands, about.cell_hint(self._settings.motions)
         return f"{what}: {'; '.join(filter(None, said))}"
 
     def _is_possible(self, sample: Sample, demands: Sequence[Demand], budget: Budget) -> bool:
         """Return whether demands hold in some arrangement, as far as that is looked for."""
         about = Arranger(sample, self._regions, self._settings, demands, budget)
         why = about.why_hopeless()
-        return about.is_tight or (
-            not why and next(about.arrangements(self._settings.motions), None) is not None
-        )
+        return not why and next(about.arrangements(self._settings.motions), None) is not None
 
     def _why_hopeless(self, sample: Sample, number: int, wanted: bool, budget: Budget) -> str:
         why = "it never holds"
         for demands in demands_of(((number, wanted),), self._formulas, self._settings.margin):
             about = Arranger(sample, self._regions, self._settings, demands, budget)
             why = about.why_hopeless()
-            if about.is_tight:
-                return ""
             if not why:
                 found = next(about.arrangements(self._settings.motions), None)
                 if found is not None or budget.left <= 0:

@@ -708,7 +708,7 @@ def avoided_cells(
     """Return (rows, columns): the cells that a target avoids after failed motions."""
     avoided = near(failed, gradient.grid)
     holds = (gradient.blocked == FREE) & (gradient.robustness >= settings.margin)
-    if settings.rules > 1 and holds.any() and not (holds & ~avoided).any():
+    if holds.any() and not (holds & ~avoided).any():
         # a motion may fail by chance: then places come again, those farther from the failures first
         away = distance_to(failed, gradient.grid)
         return np.asarray(away < away[holds.any(axis=0)].max() / 2.0)

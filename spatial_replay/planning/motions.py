@@ -52,7 +52,6 @@ from spatial_replay.planning.settings import Grid, Settings, Workspace
 from spatial_replay.planning.targets import (
     Measured,
     begins_as,
-    between_cells,
     can_turn_in,
     find_target,
     is_repeated,
@@ -142,9 +141,6 @@ class Movables:
         target = find_target(
             gradient, tracked, settings, maps.room(room_from), failed, self.failed_here(name)
         )
-        if isinstance(target, str) and settings.refine and settings.rules > 3:
-            measured = self._measures(name, consideration, room_from)
-            target = between_cells(gradient, tracked, settings, measured, self.failed_here(name)) or target
         if isinstance(target, Target) and refine:
             target = self.refined(target, consideration, room_from)
         if isinstance(target, Target):
@@ -185,7 +181,7 @@ class Movables:
             then: where other objects are moved to later, for the robustness, and as obstacles.
         """
         settings, name = self._settings, target.name
-        if not settings.refine or (settings.skill == "push" and settings.rules < 3):
+        if not settings.refine:
             return target
         failures = () if settings.skill == "push" else self.failed_here(name)
         measured = self._measures(name, consideration, room_from, then)
@@ -262,8 +258,6 @@ class Movables:
                 # a way of two points is one that does not matter
                 middle = ((here[0] + there[0]) / 2.0, (here[1] + there[1]) / 2.0)
                 return replace(target, waypoints=(here, *(turns or [middle]), there))
-        if settings.rules < 4:
-            return "on every way there a constraint would hold"
         # what is crossed by the shortest way of all
         path = shortest_path(reached, grid.cell(*here), goals)
         if path is None:
@@ -351,8 +345,8 @@ def by_cost(candidates: Sequence[Candidate], settings: Settings) -> list[int]:
 
 # ----------------------------------------------------------------------------------------------- expectations
 
-_MOST_ASIDE: Final = 80
-"""The most maps that are computed to bring objects aside for one decision."""
+_LOOK: Final = 0.25
+"""Cost of looking at one sample, in maps."""
 
 
 class PredictedState(NamedTuple):
@@ -380,7 +374,7 @@ class Expectations:
     Attributes:
         automaton, formulas, regions, settings: of the planner; `formulas` are the automaton's propositions.
         attempts: the motions of the run so far.
-        budget, aside_budget: the maps that may still be computed, those for what goes aside apart.
+        budget: the maps that may still be computed.
     """
 
     def __init__(
@@ -395,7 +389,6 @@ class Expectations:
         """Begin with no scene."""
         self.automaton, self.formulas, self.regions = automaton, formulas, regions
         self.settings, self.attempts, self.budget = settings, attempts, budget
-        self.aside_budget = Budget(_MOST_ASIDE)
         self._movables: dict[tuple[tuple[str, Pose], ...], Movables] = {}
         self._symbols: dict[tuple[tuple[str, Pose], ...], Symbol] = {}
 
@@ -415,7 +408,14 @@ class Expectations:
 
     def values(self, sample: Sample, more: Sequence[Formula] = ()) -> tuple[list[float], list[float]]:
         """Return the lower and the upper robustness of all propositions, and more formulas, in a sample."""
+        self.budget.spend(_LOOK)
         return values_in(sample, [*self.formulas, *more], self.regions)
+
+    def clearances(self, sample: Sample, name: str, others: Collection[str]) -> list[float]:
+        """Return the distance of an object of a sample to each of others."""
+        self.budget.spend(_LOOK)
+        apart = [Atom("", "dist", SignedDistance(TrackedName(name), TrackedName(each))) for each in others]
+        return values_in(sample, apart, self.regions)[0] if apart else []
 
     def movables(self, scene: PredictedState) -> Movables:
         """Return the movable objects of a scene."""
@@ -454,8 +454,6 @@ _MOST_PARKED: Final = 2
 """The most objects that stand aside for others at once."""
 _MOST_PLACES: Final = 4
 """The most places that are tried for an object that is brought aside."""
-_MOST_MAPS: Final = 40
-"""The most maps that are computed to bring objects aside for one arrangement."""
 
 
 class Ordered(NamedTuple):
@@ -477,6 +475,7 @@ class MotionOrder:
         consideration: Consideration,
         places: Mapping[str, Pose],
         robustness: float,
+        least: float,
     ) -> None:
         """Begin in a scene.
 
@@ -485,21 +484,19 @@ class MotionOrder:
             consideration: the first of them, with what must not hold on the way.
             places: where each object is to go.
             robustness: of the progress set with all objects there.
+            least: how many maps the search leaves to the decision.
         """
         self._expected, self._begin, self._aims = expected, scene, aims
         self._constraints, self._places = consideration.constraints.cubes, places
         self._robustness = robustness
         self._dead: set[tuple[frozenset[str], tuple[tuple[str, Pose], ...]]] = set()
         self._idle = set(expected.idle(scene, aims[0].source).states)
-        self._is_careful = expected.settings.rules > 3
         self._targets: dict[tuple[tuple[tuple[str, Pose], ...], int, str], Target | None] = {}
         self._most_parked = _MOST_PARKED
-        self._aside_maps = Budget(_MOST_MAPS)
+        self._least = least
 
     def found(self) -> Ordered | None:
         """Return the first order found, with as few objects brought aside as possible; None without one."""
-        if not self._is_careful:
-            return self._motions(self._begin, self._aims[0].source, frozenset(self._places))
         for self._most_parked in range(_MOST_PARKED + 1):
             self._dead.clear()
             found = self._motions(self._begin, self._aims[0].source, frozenset(self._places))
@@ -513,18 +510,21 @@ class MotionOrder:
         """Return the motions of the objects left, and the scene and the state after them."""
         if not left:
             return Ordered((), scene, state) if self._is_done(state) else None
-        if (left, scene.moved) in self._dead:
+        if (left, scene.moved) in self._dead or not self._spend(0):
             return None
         is_first = len(left) == len(self._places)
         for name in sorted(left):
             key = scene.moved, state, name
             if key not in self._targets:
-                self._targets[key] = self._target(scene, state, name, parked, is_first)
+                # where the automaton goes is known sooner than how the object gets there
+                leads_on = self._reached(self._with(scene, name), state, is_first) is not None
+                found = self._target(scene, state, name, is_first) if leads_on else None
+                self._targets[key] = found
             target = self._targets[key]
-            still = tuple(each for each in parked if each != name) if self._is_careful else parked
+            still = tuple(each for each in parked if each != name)
             if (found := self._on(scene, state, target, left - {name}, still, is_first)) is not None:
                 return found
-        if self._expected.settings.rules > 1 and len(parked) < self._most_parked:
+        if len(parked) < self._most_parked:
             for name in sorted(left):
                 for other, target in self._aside(scene, state, name, left, parked, is_first):
                     more = (*parked, other)
@@ -576,6 +576,11 @@ class MotionOrder:
             is_strict = is_strict and state != aim
         return state
 
+    def _with(self, scene: PredictedState, name: str) -> PredictedState:
+        """Return a scene with an object at its place."""
+        x, y, turn = self._place_of(scene, name)
+        return scene.after(Target(name, x, y, turn, None, (), 0.0))
+
     def _place_of(self, scene: PredictedState, name: str) -> Pose:
         """Return where an object is to go, with the turn from how it is oriented in a scene."""
         (x, y, turn), still = self._places[name], (0.0, 0.0, 0.0)
@@ -587,23 +592,20 @@ class MotionOrder:
         is_strict = is_first or len(self._aims) == 1
         return self._constraints if is_strict else self._expected.traps(state)
 
-    def _spend(self, parked: Sequence[str], maps: int = 1) -> bool:
-        """Count maps; return whether there are any left. Motions that clear the way are counted apart."""
-        if not (self._is_careful and parked):
-            return self._expected.budget.spend(maps)
-        return self._aside_maps.spend(maps) and self._expected.aside_budget.spend(maps)
+    def _spend(self, maps: int) -> bool:
+        """Count maps; return whether there are any left for this search."""
+        self._expected.budget.spend(maps)
+        return self._expected.budget.left >= self._least
 
-    def _target(
-        self, scene: PredictedState, state: int, name: str, parked: tuple[str, ...], is_first: bool
-    ) -> Target | None:
+    def _target(self, scene: PredictedState, state: int, name: str, is_first: bool) -> Target | None:
         """Return the motion of an object to its place; None if it is not possible now."""
         settings, constraints = self._expected.settings, self._constraints_at(state, is_first)
         tracked = scene.sample.objects[name]
         if not isinstance(tracked, TrackedObject):
             return None
-        if settings.skill == "place" and not is_first:
+        if settings.skill == "place":
             return self._placed(scene, name, tracked, constraints)
-        if not self._spend(parked):
+        if not self._spend(1):
             return None
         movables = self._expected.movables(scene)
         cubes = self._aims[0].guard, constraints
@@ -626,18 +628,21 @@ class MotionOrder:
         settings, (x, y, turn) = self._expected.settings, self._place_of(scene, name)
         there = with_moved(scene.sample, {name: (x, y, turn)})
         others = [each for each in there.objects if each != name and each not in settings.workspace.supports]
-        apart = [Atom("", "dist", SignedDistance(TrackedName(name), TrackedName(each))) for each in others]
-        lower, upper = self._expected.values(there, apart)
-        if any(each <= settings.workspace.clearance for each in lower[len(self._expected.formulas) :]):
+        if (
+            min(self._expected.clearances(there, name, others), default=math.inf)
+            <= settings.workspace.clearance
+        ):
             return None
+        lower, upper = self._expected.values(there)
         for cube in constraints:
             danger = min((upper[n] if w else -lower[n] for n, w in cube), default=0.0)
             if danger >= -settings.constraint_margin:
                 return None
         yaw = None if tracked.yaw is None else tracked.yaw + turn
         target = Target(name, x, y, turn, yaw, (centre_of(tracked.footprint), (x, y)), self._robustness)
-        found = self._expected.movables(scene).with_way(target, constraints)
-        return None if isinstance(found, str) else found
+        movables = self._expected.movables(scene)
+        found = movables.with_way(target, constraints)
+        return None if isinstance(found, str) or movables.is_repeated(found) else found
 
     # ---------------------------------------------------------------------------------------- in the way
 
@@ -653,22 +658,19 @@ class MotionOrder:
         """Yield motions that bring aside what is in the way of an object, or on its place."""
         constraints, settings = self._constraints_at(state, is_first), self._expected.settings
         names = [each for each in self._expected.movables(scene).names if each != name]
-        if self._is_careful:
-            names = [each for each in names if each in left or each not in {*parked, *self._places}]
-        aside = (*parked, name)
-        if settings.skill == "push" and not self._spend(aside):
+        names = [each for each in names if each in left or each not in {*parked, *self._places}]
+        if settings.skill == "push" and not self._spend(1):
             return
         way = self._way_past(scene, name, names, constraints)
         if way is None:
             return
-        bound = self._bound_by(scene, {name: way}, constraints) if self._is_careful else set()
+        bound = self._bound_by(scene, {name: way}, constraints)
+        names = [each for each in names if isinstance(scene.sample.objects[each], TrackedObject)]
         beside = self._beside(scene, name, names)
-        for other in names:
-            if not isinstance(scene.sample.objects[other], TrackedObject):
-                continue
-            clearance = self._clearance(scene, {name: way}, other)
+        clearances = self._expected.clearances(with_objects(scene.sample, {name: way}), name, names)
+        for other, clearance in zip(names, clearances, strict=True):
             in_way = other in bound | beside or clearance <= settings.workspace.clearance
-            if in_way and self._spend(aside, 3 if self._is_careful else 2):
+            if in_way and self._spend(3):
                 for target in self._parked(scene, state, other, {name: way}, left, is_first, other in beside):
                     yield other, target
 
@@ -682,10 +684,9 @@ class MotionOrder:
             return None
         if settings.skill == "place":
             return moved_object(tracked, *place)
-        formulas, workspace = self._expected.formulas, settings.workspace
-        if self._is_careful:
-            ways = [each for each in self._ways_to_hold(constraints) if not _concerned(each, others)]
-            formulas, constraints = _cubes_of(ways)
+        workspace = settings.workspace
+        ways = [each for each in self._ways_to_hold(constraints) if not _concerned(each, others)]
+        formulas, constraints = _cubes_of(ways)
         free = replace(workspace, supports=workspace.supports.union(others))
         about = formulas, self._expected.regions, scene.sample, name, free
         maps = proposition_maps(*about, self._expected.movables(scene).maps_of(name).grid)
@@ -693,10 +694,8 @@ class MotionOrder:
         target = target_in(gradient, tracked, settings, place)
         if isinstance(target, str):
             return None
-        step = workspace.grid.cell_size
-        if self._is_careful:
-            # footprints that overlap by half leave no gap in which another object could stand
-            step = max(step, radius_of(tracked) / 2.0)
+        # footprints that overlap by half leave no gap in which another object could stand
+        step = max(workspace.grid.cell_size, radius_of(tracked) / 2.0)
         parts = [
             part
             for x, y in points_along(target.waypoints, step)
@@ -733,18 +732,11 @@ class MotionOrder:
         if not (isinstance(tracked, TrackedObject) and self._expected.movables(scene).failed_here(name)):
             return set()
         near = BESIDE * radius_of(tracked)
-        return {each for each in others if self._clearance(scene, {name: tracked}, each) <= near}
-
-    def _clearance(self, scene: PredictedState, covered: Mapping[str, TrackedObject], other: str) -> float:
-        """Return the distance of an object to what another one covers."""
-        (name,) = covered
-        apart = Atom("", "dist", SignedDistance(TrackedName(name), TrackedName(other)))
-        return self._expected.values(with_objects(scene.sample, covered), [apart])[0][-1]
+        clearances = zip(others, self._expected.clearances(scene.sample, name, others), strict=True)
+        return {each for each, clearance in clearances if clearance <= near}
 
     def _formulas_about(self, name: str, constraints: Cubes) -> tuple[Sequence[Formula], Cubes]:
         """Return relations with an object, and the conjunctions of them that must not hold."""
-        if not self._is_careful:
-            return (), ()
         return _cubes_of([each for each in self._ways_to_hold(constraints) if _concerned(each, [name])])
 
     def _is_kept(
@@ -784,7 +776,7 @@ class MotionOrder:
         clear, maps = self._is_kept(with_objects(there, covered), name, now.grid, *later)
         good = (gradient.blocked == FREE) & clear
         after = np.ones_like(good)
-        if self._is_careful and settings.skill == "push":
+        if settings.skill == "push":
             after, _ = self._is_kept(there, name, now.grid, *later)
             onwards = _reachable_from(centre_of(tracked.footprint), now.grid, gradient.blocked == FREE)
             if name in self._places:
@@ -795,8 +787,6 @@ class MotionOrder:
         # what is picked up or pushed again needs room
         room = np.minimum(maps.clearance, gradient.clearance)
         roomy = good & (room >= settings.room)
-        if settings.skill == "push" and not self._is_careful:
-            roomy = good
         (blocked,) = covered
         beside = scene.sample.objects[blocked]
         if is_beside and isinstance(beside, TrackedObject):
@@ -804,13 +794,13 @@ class MotionOrder:
             far = good & (now.room([blocked]) > BESIDE * radius_of(beside))
             roomy = roomy & far if (roomy & far).any() else far
         free = np.ones_like(good)
-        for is_at_edge in (False, True) if self._is_careful and settings.skill == "push" else (False,):
+        for is_at_edge in (False, True) if settings.skill == "push" else (False,):
             if is_at_edge:
                 # in a corridor no place is clear of a way through its middle: others give way at its edges
                 if is_beside:
                     return
                 good = roomy = (gradient.blocked == FREE) & after & free
-            for _ in range(_MOST_PLACES if self._is_careful else 1):
+            for _ in range(_MOST_PLACES):
                 among = roomy if roomy.any() else good
                 if is_at_edge and among.any():
                     among = among & (maps.clearance >= maps.clearance[among].max() - now.grid.cell_size / 2.0)

@@ -25,6 +25,7 @@ from spatial_replay.planning.decisions import (
 from spatial_replay.planning.edges import (
     LATER,
     Attempts,
+    Budget,
     Observer,
     Symbol,
     consideration_of,
@@ -36,7 +37,7 @@ from spatial_replay.planning.edges import (
     why_no_path,
     worst_state,
 )
-from spatial_replay.planning.lookahead import Lookahead
+from spatial_replay.planning.lookahead import MOST_MAPS, Lookahead
 from spatial_replay.planning.maps import refuse_delays, refuse_unknown
 from spatial_replay.planning.motions import Movables, with_choice
 from spatial_replay.planning.settings import Settings, Workspace, kind_faults, refuse_faults
@@ -283,8 +284,9 @@ class Planner:
     def _step_from(self, state: int) -> Step:
         """Return the step for the first edge, over the paths by length, that can be taken."""
         idle = idle_transitions(self.automaton, state, self._symbol)
+        budget = Budget(MOST_MAPS)
         movables = self._movables(self._attempts)
-        foresight = self._foresight(self._attempts)
+        foresight = self._foresight(self._attempts, budget)
         considered: list[Consideration] = []
         # time takes idle transitions without any object being moved, so they stay possible
         pruned = set(self._pruned) - idle.edges
@@ -296,7 +298,7 @@ class Planner:
             if considered[-1].pruned and self._may_repeat(consideration.edge):
                 # a motion may fail by chance: without any other, one that failed is made again
                 forgiven = self._attempts.forgiven()
-                again = self._movables(forgiven), self._foresight(forgiven)
+                again = self._movables(forgiven), self._foresight(forgiven, budget)
                 repeated = self._considered(consideration, path, *again)
                 considered[-1] = considered[-1] if repeated.pruned else repeated
             if (reason := considered[-1].pruned) is None:
@@ -305,7 +307,7 @@ class Planner:
             self._pruned[edge] = reason
             pruned |= {edge, *equivalent_edges(self.automaton, consideration, idle, pruned, self._symbol)}
         why = ""
-        if foresight is not None and self.settings.rules > 3 and not self._attempts.are_any:
+        if foresight is not None and not self._attempts.are_any:
             first = considered[0].pruned if considered else None
             is_later = any(each.kind == LATER for each in self._pruned.values())
             why = foresight.why_not(state) or ("" if first is None or is_later else first.detail)
@@ -315,13 +317,13 @@ class Planner:
     def _movables(self, attempts: Attempts) -> Movables:
         return Movables(self._formulas, self._regions, self._newest(), self.settings, attempts)
 
-    def _foresight(self, attempts: Attempts) -> Lookahead | None:
+    def _foresight(self, attempts: Attempts, budget: Budget) -> Lookahead | None:
         about = self.automaton, self._formulas, self._regions, self.settings
-        return Lookahead(*about, attempts) if self.settings.motions > 1 else None
+        return Lookahead(*about, attempts, budget) if self.settings.motions > 1 else None
 
     def _may_repeat(self, edge: Edge) -> bool:
         exhausted = self._attempts.why_exhausted(edge, self.settings.attempts)
-        return self.settings.rules > 3 and self._attempts.motions > 0 and exhausted is None
+        return self._attempts.motions > 0 and exhausted is None
 
     def _considered(
         self,

@@ -706,6 +706,10 @@ def _specification_changes(old: Planner, new: Planner) -> Iterator[str]:
     names = [f"{each.specification.filename}, {each.automaton.name}" for each in (old, new)]
     if texts[0] != texts[1] or old.automaton.name != new.automaton.name:
         yield f"specification {names[0]} -> {names[1]}"
+    before, after = (each.specification.constants for each in (old, new))
+    for name in before:
+        if name in after and before[name].value != after[name].value:
+            yield f"const {name} {before[name].value:g} -> {after[name].value:g}"
 
 
 class _Redoing:

@@ -305,7 +305,6 @@ _PLAIN = (
     "motions",
     "lift",
     "refine",
-    "rules",
 )
 """Settings that stand in the text as they are."""
 
@@ -333,10 +332,6 @@ class Settings:
             to the robot.
         refine: whether targets are refined near their cell, and, between several orientations, to turns in
             between; without it, they are middles of cells.
-        rules: 4, or those of earlier versions, so that their logs can be recomputed. 3: what only makes room
-            goes to the nearest place, whatever has to be kept there later, and a motion that failed may be
-            made again while nothing has changed. 2: targets of pushes are not refined, either. 1: also no
-            motions that only make room, and an object is never brought near a place where that failed before.
 
     Raises:
         UsageError: invalid values, all of them reported.
@@ -350,10 +345,9 @@ class Settings:
     room: float = 0.0
     room_from: RoomFrom = "later"
     attempts: int = 6
-    motions: int = 6
+    motions: int = 8
     lift: float | None = 0.0
     refine: bool = True
-    rules: int = 4
 
     def __post_init__(self) -> None:
         refuse_faults(self._faults())
@@ -374,8 +368,6 @@ class Settings:
         if self.room_from not in _ROOM_FROM:
             yield f"room_from is {self.room_from!r}; give {' or '.join(_ROOM_FROM)}"
         yield from kind_faults("refine", self.refine, bool, "True or False")
-        if self.rules not in (1, 2, 3, 4):
-            yield f"rules is {self.rules!r}; give 4, or 1 to 3 for the rules of earlier versions"
 
 
 def text_from_settings(settings: Settings) -> str:
@@ -425,22 +417,9 @@ def _settings(read: dict[str, Any]) -> Settings:
         supports=frozenset(read["supports"]),
         clearance=float(read["clearance"]),
     )
-    return Settings(
-        workspace,
-        read["skill"],
-        movable=None if read["movable"] is None else tuple(read["movable"]),
-        margin=float(read["margin"]),
-        constraint_margin=float(read["constraint_margin"]),
-        room=float(read["room"]),
-        attempts=int(read["attempts"]),
-        # logs of planners that did not look ahead do not have it
-        motions=int(read.get("motions", 1)),
-        lift=None if read.get("lift") is None else float(read["lift"]),
-        # logs of earlier planners state none of these
-        room_from=read.get("room_from", "all"),
-        refine=read.get("refine", False),
-        rules=read.get("rules", 1),
-    )
+    plain = {name: read[name] for name in _PLAIN}
+    movable = None if read["movable"] is None else tuple(read["movable"])
+    return Settings(workspace, **{**plain, "movable": movable})
 
 
 # ------------------------------------------------------------------------------------- files and options

@@ -219,13 +219,6 @@ def _failed_directions(grid: Grid, tracked: TrackedObject, failures: Sequence[Ta
     return towards
 
 
-def cell_hint(missing: float, settings: Settings) -> str:
-    """Return that smaller cells may help, if less than a cell is missing, and nothing looks between cells."""
-    looks_between = settings.rules < 4 or (settings.refine and settings.skill == "place")
-    is_close = missing <= settings.workspace.grid.cell_size
-    return "" if looks_between or not is_close else "; smaller cells (cell_size) may help"
-
-
 def begins_as(target: Target, failures: Sequence[Target], tracked: TrackedObject) -> bool:
     """Return whether a push begins in about the direction of one that failed."""
     radius = radius_of(tracked)
@@ -283,8 +276,7 @@ def _why_nowhere(gradient: GradientMap, settings: Settings, has_failed: bool) ->
     enough = gradient.robustness >= settings.margin
     if not enough.any():
         best = float(gradient.robustness.max())
-        hint = cell_hint(settings.margin - best, settings)
-        return f"nowhere would it hold: {best:.4g} at best, {settings.margin:.4g} needed{hint}"
+        return f"nowhere would it hold: {best:.4g} at best, {settings.margin:.4g} needed"
     counts = np.bincount(gradient.blocked[enough], minlength=len(REASONS))
     if counts[FREE] and has_failed:
         return "it was tried wherever it would hold"
@@ -294,52 +286,6 @@ def _why_nowhere(gradient: GradientMap, settings: Settings, has_failed: bool) ->
 
 
 # ------------------------------------------------------------------------------------------------ refined
-
-
-def between_cells(
-    gradient: GradientMap,
-    tracked: TrackedObject,
-    settings: Settings,
-    measured: Measured,
-    failures: Sequence[Target] = (),
-) -> Target | None:
-    """Return a target between cells, if no cell of a map is good enough but a place near the best one is.
-
-    A compass search as in `refined`, until nothing is missing. Only placed objects have such targets, since
-    no path over cells leads there.
-    """
-    missing, size = _missing(gradient, settings), settings.workspace.grid.cell_size
-    place = tuple(map(int, np.unravel_index(int(np.argmin(missing)), missing.shape)))
-    least = float(missing[place])
-    if settings.skill == "push" or not 0.0 < least <= size:
-        return None
-    (x, y), turn, spacing = (
-        gradient.grid.centre(*place[1:]),
-        float(gradient.turns[place[0]]),
-        _COARSEST * size,
-    )
-    yaws = ((tracked.yaw or 0.0) + turn,) if settings.workspace.yaws else ()
-    while spacing >= _COARSEST * size / 2.0**_HALVED:
-        near, _ = measured(Grid(x - 2.5 * spacing, y - 2.5 * spacing, spacing, 5, 5), yaws)
-        missing = _missing(near, settings)
-        place = tuple(map(int, np.unravel_index(int(np.argmin(missing)), missing.shape)))
-        if missing[place] >= least:
-            spacing /= 2.0
-            continue
-        least, (x, y) = float(missing[place]), near.grid.centre(*place[1:])
-        if near.blocked[place] == FREE and near.robustness[place] > settings.margin + _BETTER:
-            here, yaw = centre_of(tracked.footprint), None if tracked.yaw is None else tracked.yaw + turn
-            found = Target(gradient.name, x, y, turn, yaw, (here, (x, y)), float(near.robustness[place]))
-            return refined(found, tracked, settings, measured, failures)
-    return None
-
-
-def _missing(gradient: GradientMap, settings: Settings) -> Floats:
-    """Return (A, rows, columns): what is missing of progress, clearance or distance to constraints."""
-    workspace, parts = settings.workspace, gradient.made_of
-    missing = np.maximum(settings.margin - gradient.robustness, workspace.clearance - gradient.clearance)
-    missing = np.maximum(missing, danger_of(parts.now, parts.constraints) + settings.constraint_margin)
-    return np.where(workspace.within_reach(gradient.grid), missing, np.inf)
 
 
 def refined(
@@ -444,3 +390,17 @@ def _widest_turn(target: Target, tracked: TrackedObject, settings: Settings) -> 
     if len(yaws) < 2 or tracked.yaw is None or (settings.skill == "push" and target.turn == 0.0):
         return 0.0
     return min(after - before for before, after in pairwise(yaws)) / 2.0
+
+
+def nearest_meeting(point: Floats, normals: Floats, least: Floats) -> Floats:
+    """Return the point nearest to another one for which `normals @ point >= least`, if there are any.
+
+    The dual problem by accelerated projected gradients.
+    """
+    gram, missing = normals @ normals.T, least - normals @ point
+    rate = 1.0 / max(float(np.linalg.norm(gram, 2)), 1e-12)
+    weights = ahead = np.zeros(len(least))
+    for number in range(400):
+        newest = np.maximum(ahead + rate * (missing - gram @ ahead), 0.0)
+        weights, ahead = newest, newest + number / (number + 3.0) * (newest - weights)
+    return np.asarray(point + normals.T @ weights)

@@ -88,13 +88,6 @@ def test_a_corridor_without_room_to_pass_is_said_before_the_first_motion():
     assert "a and b: there are places for all, but no order of motions to them was found" in steps[0].reason
 
 
-def test_earlier_rules_do_not_look_at_what_has_to_be_apart():
-    specification = sr.parse_specification(f"{REGIONS}spec s = ({SWAP}) and G (a dist b >= 0.5)")
-    things = {name: THINGS[name] for name in "ab"}
-    steps, _ = run(Planner(specification, replace(TABLE, rules=3)), things)
-    assert [step.kind for step in steps] == ["no path"]
-
-
 # --------------------------------------------------------------------------------- what failed at once
 
 

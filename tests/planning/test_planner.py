@@ -263,9 +263,6 @@ def test_the_only_target_is_tried_again_until_attempts_are_used_up():
     steps, _ = run(planner(text, settings), THINGS, stuck={"cup"})
     assert [step.kind for step in steps] == ["execute"] * 4 + ["no path"]
     assert steps[-1].pruned == (((0, 1), Reason("tried 4 times", "it does not move")),)
-    steps, _ = run(planner(text, replace(settings, rules=1)), THINGS, stuck={"cup"})
-    assert [step.kind for step in steps] == ["execute", "no path"]
-    assert "it was tried wherever it would hold" in steps[-1].pruned[0][1].detail
 
 
 def test_an_edge_without_movable_objects_is_pruned():

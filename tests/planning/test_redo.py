@@ -193,7 +193,6 @@ def test_every_setting_of_a_file_is_taken():
     motions: 2
     lift: null
     refine: false
-    rules: 1
     area: [0, 0, 2, 1]
     cell_size: 0.1
     yaws: [0, 90deg]
@@ -229,7 +228,6 @@ def test_every_setting_of_a_file_is_taken():
         motions=2,
         lift=None,
         refine=False,
-        rules=1,
     )
     found = changed_settings(None, parse_settings(text))
     assert text_from_settings(found) == text_from_settings(expected)
