@@ -30,6 +30,7 @@ from spatial_replay.planning import (
     settings_from_text,
     text_from_settings,
 )
+from spatial_replay.planning.decision_log import decision_message, why_text
 from spatial_replay.sources import open_source
 
 TABLE = Settings(
@@ -92,6 +93,22 @@ def test_one_push_that_leads_all_the_way_comes_before_two():
     assert len(steps[0].aim.motions) == 1
 
 
+def test_a_row_that_is_narrower_than_whole_cells_is_filled():
+    # three objects and the gaps between them leave 0.1 of 3.2, less than half a cell
+    goal = " and ".join(f"{name} enclosedin row" for name in "abc")
+    moved, end, _, table = planned(f"region row = box(4.05, 4.05, 7.3, 5.2)\nspec s = F ({goal})")
+    assert (sorted(moved), end) == (["a", "b", "c"], "hold")
+    centres = sorted(centre_of(table.objects[name].footprint)[0] for name in "abc")
+    assert all(after - before > 1.05 for before, after in pairwise(centres))
+
+
+def test_the_reason_names_the_rival_and_what_is_wanted():
+    _, _, steps, _ = planned("spec s = F (a rightof c)")
+    assert why_text(decision_message(steps[0])).startswith(
+        f"{steps[0].target.name} moves: a rightof c is wanted; "
+    )
+
+
 def test_what_is_in_the_way_is_moved_first():
     moved, end, _, _ = planned("region spot = box(7.2, 0.2, 8.8, 1.8)\nspec s = F (a enclosedin spot)")
     assert moved == ["c", "a"]
@@ -137,6 +154,7 @@ def test_two_objects_change_places_by_parking_one(goal, skill):
     moved, end, steps, _ = planned(f"{SWAP}spec s = {goal}", settings, PAIR)
     assert (moved[0], moved[-1], len(moved), end) == (moved[2], moved[0], 3, "hold")
     parked = steps[0].target
+    assert why_text(decision_message(steps[0])) == f"{moved[0]} goes aside: {moved[1]} has to pass"
     assert [each.name for each in steps[0].aim.motions] == moved
     assert (parked.x, parked.y) != (steps[2].target.x, steps[2].target.y)
 
@@ -296,6 +314,10 @@ def worlds():
         "swapped_apart",
         "ring_apart",
         "pushed_apart",
+        "chain",
+        "ring",
+        "corridor",
+        "slot",
     ],
 )
 def test_scenes_of_the_campaign_end_as_they_should(campaign, kind):
