@@ -518,8 +518,7 @@ class MotionOrder:
             if key not in self._targets:
                 # where the automaton goes is known sooner than how the object gets there
                 leads_on = self._reached(self._with(scene, name), state, is_first) is not None
-                found = self._target(scene, state, name, is_first) if leads_on else None
-                self._targets[key] = found
+                self._targets[key] = self._target(scene, state, name, is_first) if leads_on else None
             target = self._targets[key]
             still = tuple(each for each in parked if each != name)
             if (found := self._on(scene, state, target, left - {name}, still, is_first)) is not None:
