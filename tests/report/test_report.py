@@ -303,7 +303,7 @@ def test_a_result_without_automaton_says_why(violated: Page) -> None:
 def test_decisions_come_with_their_maps(planned: Page) -> None:
     decisions = planned.facts["decisions"]
     first = decisions[0]
-    assert first["reason"].startswith("push red")
+    assert first["reason"].startswith("red moves: red above blue")
     assert first["outcome"]["succeeded"]
     assert [each["chosen"] for each in first["maps"]].count(True) == 1
     chosen = next(each for each in first["maps"] if each["chosen"])
