@@ -31,7 +31,7 @@ from spatial_replay.sources.overview import Overview, overview_of
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import load_specifications
 from spatial_replay.spec.relations import DEFAULT_PROFILE
-from spatial_replay.text import nearest_hint
+from spatial_replay.text import refuse_unknown
 from spatial_replay.trace.sample import FOREVER
 from spatial_replay.trace.trace import Trace
 from spatial_replay.tuning.margins import load_runs
@@ -248,17 +248,9 @@ def clip_log(
     )
 
 
-def _refuse_unknown(options: Mapping[str, object], known: type) -> None:
-    for name in options:
-        names = known.__annotations__
-        if name not in names:
-            remedy = nearest_hint(name, names) or f"the options are {', '.join(names)}"
-            raise UsageError(f"{name}={shortened(options[name])} is no option; {remedy}")
-
-
 def _evaluation(options: Evaluating) -> tuple[Mapping[str, float | str] | None, ReplayOptions]:
     """Take the options of evaluating out, and return them; those of reading remain."""
-    _refuse_unknown(options, Evaluating)
+    refuse_unknown(options, (*Evaluating.__annotations__, "specifications", "output"))
     window = Window(options.pop("start_ns", 0), options.pop("end_ns", FOREVER), options.pop("every", 1))
     each, constants = options.pop("each", None), options.pop("constants", None)
     semantics, strict_names = options.pop("semantics", "ltlf"), options.pop("strict_names", False)
@@ -302,7 +294,7 @@ def tune(
         file = specification
     else:
         (file,) = load_specifications([local_copy(specification)], constants=constants)
-    _refuse_unknown(reading, Reading)
+    refuse_unknown(reading, Reading.__annotations__)
     runs = load_runs(_logs(good), _logs(bad), lambda path: read_trace(path, **reading))
     return tune_runs(file, runs, dict(vary or {}), each=each, seed=seed)
 
@@ -331,7 +323,7 @@ def learn(
             nothing that the good runs have in common.
         LogError: a log cannot be read.
     """
-    _refuse_unknown(reading, Reading)
+    refuse_unknown(reading, Reading.__annotations__)
     runs = load_runs(_logs(good), _logs(bad), lambda path: read_trace(path, **reading))
     return learn_runs(runs, lines=lines, profile=profile)
 
@@ -384,7 +376,7 @@ def evaluate_logs(
     from spatial_replay.batch.run import prepare, run_batch, workers_of
     from spatial_replay.batch.suite import Conditions, Suite, load_suite
 
-    _refuse_unknown(reading, Reading)
+    refuse_unknown(reading, Reading.__annotations__)
     fails, allowed = (
         checked_kinds("fail_on", fail_on, FAILING_KINDS),
         checked_kinds("allow", allow, ALLOWED_KINDS),
@@ -439,7 +431,7 @@ def verify(
     Raises:
         UsageError, LogError, SpecificationError: it cannot be evaluated.
     """
-    _refuse_unknown(reading, Reading)
+    refuse_unknown(reading, Reading.__annotations__)
     if source is None and reading:
         raise UsageError(f"{', '.join(reading)} applies to the source of the log; give source=…")
     original = None if source is None else open_source(source, **reading)
@@ -456,7 +448,6 @@ def info(log: PathName, **reading: Unpack[Reading]) -> Overview:
         UsageError: a missing file, or an external log without a mapping.
         LogError: nothing in it can be read.
     """
-    _refuse_unknown(reading, Reading)
     return overview_of(open_source(log, **reading))
 
 

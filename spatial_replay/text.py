@@ -6,10 +6,16 @@ import difflib
 import hashlib
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
-from functools import partial
-from typing import Final
+from functools import partial, wraps
+from inspect import signature
+from reprlib import repr as shortened
+from typing import Any, Final, TypeVar, cast
+
+from spatial_replay.errors import UsageError
+
+_Called = TypeVar("_Called", bound=Callable[..., Any])
 
 _LONGEST: Final = 300
 """Characters of a printable text."""
@@ -101,6 +107,8 @@ LARGEST_PLAIN: Final = 1e12
 
 def number_text(number: float) -> str:
     """Return a number with four digits, enough for a reader; JSON and logs have all of them."""
+    # 0 has no sign
+    number += 0.0
     is_long = 10.0**DIGITS <= abs(number) < LARGEST_PLAIN
     return f"{number:.0f}" if is_long else f"{number:.{DIGITS}g}"
 
@@ -186,6 +194,40 @@ def nearest_hint(name: str, known: Iterable[str]) -> str:
     same = [candidate for candidate in candidates if candidate.casefold() == name.casefold()]
     close = same or difflib.get_close_matches(name, candidates, n=_MOST_ALIKE)
     return f"did you mean {max(close, key=partial(_likeness, name))!r}?" if close else ""
+
+
+def named_arguments(called: _Called) -> _Called:
+    """Let a function, or the constructor of a class, answer an unknown argument with the nearest name.
+
+    Raises:
+        UsageError: raised by what is returned.
+    """
+    function = called.__init__ if isinstance(called, type) else called  # type: ignore[misc]
+
+    @wraps(function)
+    def checked(*values: Any, **named: Any) -> Any:
+        try:
+            return function(*values, **named)
+        except TypeError:
+            refuse_unknown(named, signature(called).parameters)
+            raise
+
+    if not isinstance(called, type):
+        return cast("_Called", checked)
+    setattr(called, "__init__", checked)  # noqa: B010
+    return called
+
+
+def refuse_unknown(given: Mapping[str, object], known: Collection[str]) -> None:
+    """Refuse arguments without a known name.
+
+    Raises:
+        UsageError: the first such argument, with the nearest name.
+    """
+    for name in given:
+        if name not in known:
+            remedy = nearest_hint(name, known) or f"there are {', '.join(known)}"
+            raise UsageError(f"{name}={shortened(given[name])} is no argument; {remedy}")
 
 
 def _likeness(name: str, known: str) -> tuple[float, float]:

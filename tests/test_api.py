@@ -79,8 +79,10 @@ def test_mistakes_are_named(tmp_path: Path) -> None:
     with pytest.raises(sr.UsageError, match=r"report writes an HTML page; name it run\.html"):
         sr.write_report(LOG, SPEC, output=log)
     assert log.read_bytes() == b"a log that is needed"
-    with pytest.raises(sr.UsageError, match="evry=2 is no option; did you mean 'every'"):
+    with pytest.raises(sr.UsageError, match="evry=2 is no argument; did you mean 'every'"):
         sr.replay_log(LOG, SPEC, evry=2)  # type: ignore[call-arg]
+    with pytest.raises(sr.UsageError, match=r"is no argument; there are .*, specifications, "):
+        sr.replay_log(LOG, spec=SPEC)  # type: ignore[call-arg]
     for kinds, said in (
         ({"fail_on": "vacuous"}, "give a sequence"),
         ({"allow": ["droped"]}, "mean 'dropped'"),
@@ -88,5 +90,29 @@ def test_mistakes_are_named(tmp_path: Path) -> None:
         with pytest.raises(sr.UsageError, match=said):
             sr.evaluate_logs(LOG, SPEC, output="out", **kinds)  # type: ignore[arg-type]
     for asked in (sr.info, sr.verify, lambda log, **own: sr.evaluate_logs(log, output="out", **own)):
-        with pytest.raises(sr.UsageError, match=r"maping=.m\.yaml. is no option; did you mean .mapping."):
+        with pytest.raises(sr.UsageError, match=r"maping=.m\.yaml. is no argument; did you mean .mapping."):
             asked(LOG, maping="m.yaml")
+
+
+def test_an_argument_that_does_not_exist_names_the_nearest_and_what_is_no_object_says_so(
+    tmp_path: Path,
+) -> None:
+    specification = sr.parse_specification("G (a dist b >= 1)")
+    disc = sr.Footprint.disc(0, 0, 1)
+    for name, given, said in (
+        ("Sample", ((0, {}), {"signal": {"battery": 1}}), "did you mean 'signals'"),
+        ("TrackedObject", ((disc,), {"heigth": (0, 1)}), "did you mean 'height'"),
+        ("Monitor", ((specification,), {"stric_names": True}), "did you mean 'strict_names'"),
+        ("Recorder", ((tmp_path / "a.mcap",), {"specification": []}), "did you mean 'specifications'"),
+        ("Trigger", (("violated",), {"before": 1}), "did you mean 'before_s'"),
+        ("evaluate", ((specification, None), {"semantic": "paper"}), "did you mean 'semantics'"),
+        ("automaton", ((specification,), {"rate": 3}), "did you mean 'rate_hz'"),
+        ("doctor", ((specification,), {"example": False}), "did you mean 'examples'"),
+        ("parse_specification", (("true",), {"const": {}}), "did you mean 'constants'"),
+        ("read_trace", (("a.jsonl",), {"maping": "m.yaml"}), "did you mean 'mapping'"),
+        ("Sample", ((0, {"mode": "on"}), {}), "numbers and texts are signals: Sample"),
+        ("Sample", ((0, {"battery": 0.5}), {}), "numbers and texts are signals: Sample"),
+    ):
+        values, named = given
+        with pytest.raises((sr.UsageError, sr.TraceError), match=said):
+            getattr(sr, name)(*values, **named)

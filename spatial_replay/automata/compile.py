@@ -23,6 +23,7 @@ from spatial_replay.spec.diagnostics import SourceText, nearest_hint
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import NamedSpec, Specification
 from spatial_replay.spec.load import require_specification
+from spatial_replay.text import named_arguments
 
 Obligation: TypeAlias = tuple[int, bool]
 """A subformula's number, and whether there has to be a next sample."""
@@ -462,6 +463,7 @@ Compiler: TypeAlias = Literal["own", "mona"]
 _NAMES: MappingProxyType[Compiler, str] = MappingProxyType({"own": "this package", "mona": "MONA"})
 
 
+@named_arguments
 def automaton(
     specification: Specification,
     name: str | None = None,

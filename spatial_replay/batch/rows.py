@@ -33,7 +33,7 @@ from spatial_replay.replay.engine import Replay, Replayed
 from spatial_replay.replay.selection import ReplayOptions, Window, first_sample_ns
 from spatial_replay.sources.open_log import open_source
 from spatial_replay.sources.overview import fitness_of
-from spatial_replay.spec.diagnostics import SourceText
+from spatial_replay.spec.diagnostics import Diagnostic, SourceText
 from spatial_replay.spec.formula import NamedSpec, Specification
 from spatial_replay.spec.load import SpecificationText, load_specifications
 from spatial_replay.text import counted_from, encodable, printable
@@ -282,9 +282,15 @@ def _row_of_log(replayed: Replayed) -> ResultRow:
         duration_ns=replayed.end_ns - replayed.start_ns,
         faults=_some(replayed.faults),
         remarks=_some(replayed.remarks),
-        missing=_some([each.message for each in replayed.missing]),
+        missing=_some([_missing(each) for each in replayed.missing]),
         dropped=replayed.dropped.text or None,
     )
+
+
+def _missing(name: Diagnostic) -> str:
+    """Return that a log lacks a name, with the nearest one; the names of each log are others."""
+    nearest, mark, _ = name.hint.partition("'?")
+    return f"{name.message}; {nearest}{mark}" if mark else name.message
 
 
 def _row(log: ResultRow, result: SpecResult, first_ns: int, line: int) -> ResultRow:

@@ -87,8 +87,10 @@ def read_specification_text(path: Path | str) -> SpecificationText:
     Raises:
         MissingFileError, UsageError, SpecificationError: see `load_specification`.
     """
-    from spatial_replay.spec.load import load_specification
+    from spatial_replay.spec.load import is_formula, load_specification
 
+    if isinstance(path, Path) and is_formula(path):
+        raise UsageError(f"{path} is a formula, and results name files; write it into one: gate.spatial")
     return SpecificationText(load_specification(local_copy(path)).source, encodable(log_file(path).name))
 
 

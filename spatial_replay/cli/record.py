@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypedDict
@@ -30,6 +31,7 @@ from spatial_replay.cli.output import change_line, ending_lines
 from spatial_replay.cli.terminal import progress, show, show_diagnostics, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import LogFile, local_files
+from spatial_replay.spec import check_names
 from spatial_replay.text import counted
 from spatial_replay.trace.trace import duration_ns_from_text
 
@@ -154,6 +156,9 @@ def video(
     files = load_spec_options(specs, profile, constants)
     show_diagnostics(warning for file in files for warning in file.warnings)
     tags = load_tags(tags_file)
+    names = [each.name for each in tags.objects]
+    unknown = [each for file in files for each in check_names(file, names, (), where="tags file")]
+    show_diagnostics(replace(each, severity="warning") for each in unknown)
     cameras = _opened(sources, camera, topics, rate, length_ns)
     offsets_ns = _offsets_ns(offsets, camera_names(cameras))
     first_ns: list[int] = []

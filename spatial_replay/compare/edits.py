@@ -359,11 +359,6 @@ class Edit:
     old_specs: tuple[tuple[str, str], ...] = ()
     new_specs: tuple[tuple[str, str], ...] = ()
 
-    @property
-    def is_structural(self) -> bool:
-        """Whether operators, objects or operands changed, not only numbers, shapes or names."""
-        return self.kind in ("replaced", "added", "removed", "moved")
-
     def __str__(self) -> str:
         about = f" {self.subject}" if self.subject else ""
         match self.kind:

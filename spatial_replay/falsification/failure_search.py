@@ -49,7 +49,7 @@ from spatial_replay.spec.format import format_specification
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import load_specifications
 from spatial_replay.spec.walks import declared_unit
-from spatial_replay.text import counted, json_number, with_unit
+from spatial_replay.text import counted, json_number, named_arguments, with_unit
 from spatial_replay.trace.sample import Sample
 
 _MOST_FAILURES: Final = 20
@@ -755,6 +755,7 @@ _DRAWN: Final = 10
 """Runs of a round where nothing but seeds is varied."""
 
 
+@named_arguments
 def falsify(
     simulation: str | Callable[[Mapping[str, float]], Iterable[Sample]],
     specifications: Specification | str | PathLike[str] | Sequence[Specification | str | PathLike[str]] = (),

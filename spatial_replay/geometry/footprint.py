@@ -37,7 +37,7 @@ from spatial_replay.geometry.outline import (
     normalise_polygon,
     normalise_polygons,
 )
-from spatial_replay.text import is_encodable
+from spatial_replay.text import is_encodable, named_arguments
 
 Concave: TypeAlias = Literal["decompose", "hull"]
 """How a non-convex polygon is treated: split into convex parts, or replaced by its convex hull."""
@@ -221,6 +221,7 @@ class Footprint:
         return cls(tuple(part for footprint in footprints for part in footprint.parts))
 
 
+@named_arguments
 @dataclass(frozen=True, slots=True)
 class TrackedObject:
     """An object at one time: its footprint and what else a log reports of it.

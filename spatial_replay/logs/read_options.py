@@ -13,6 +13,7 @@ from typing import Final, Literal, TypedDict, cast, get_args
 
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.footprint import Concave
+from spatial_replay.text import named_arguments
 from spatial_replay.trace.sample import LATEST_NS
 
 Lost = Literal["drop", "keep"]
@@ -44,6 +45,7 @@ KEYS: Final = tuple(key for key in Reading.__annotations__ if key != "mapping")
 """Keys of suites and of metadata; a mapping file has a key of its own there."""
 
 
+@named_arguments
 @dataclass(frozen=True, slots=True)
 class ReadOptions:
     """Options for reading a log; the defaults fit every log.

@@ -22,6 +22,7 @@ from spatial_replay.spec.checks import check_names
 from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import require_specification
+from spatial_replay.text import named_arguments
 from spatial_replay.trace.sample import FOREVER, require_time
 from spatial_replay.trace.trace import Trace, window_of
 
@@ -153,6 +154,7 @@ class Evaluation(Displayed):
         return f"<Evaluation: {self.verdict}; {', '.join(map(repr, self.results))}>"
 
 
+@named_arguments
 def evaluate(
     specification: Specification,
     trace: Trace,

@@ -23,7 +23,7 @@ from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.formula import NamedSpec, Specification, iter_nodes
 from spatial_replay.spec.load import require_specification
 from spatial_replay.spec.walks import declared_unit
-from spatial_replay.text import counted, time_text, times_apart
+from spatial_replay.text import counted, named_arguments, time_text, times_apart
 from spatial_replay.trace.sample import Sample, require_time
 from spatial_replay.trace.trace import duration_ns_from_text
 from spatial_replay.trace.units import checked_units
@@ -186,6 +186,7 @@ class Ending(NamedTuple):
     unit: str = ""
 
 
+@named_arguments
 class Monitor:
     """Evaluates a specification as samples come.
 

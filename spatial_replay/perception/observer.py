@@ -691,11 +691,6 @@ class TagObserver:
         """How many samples were made."""
         return self._frames
 
-    @property
-    def has_tags(self) -> bool:
-        """Whether any tag of the file was in any frame."""
-        return any(number in self.tags.ids for camera in self._cameras for number in camera.seen)
-
     def remarks(self) -> tuple[str, ...]:
         """Return what is worth knowing about the run: tags that are not in the file, objects never seen."""
         of_cameras = [line for camera in self._cameras for line in camera.remarks()]

@@ -344,21 +344,14 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
     plane = value.get("plane")
     references = plane.get("tags") if isinstance(plane, dict) else None
     reach = _reach(references)
+    if fault := _beyond(value.get("size"), reach):
+        faults.append((("size",), fault))
     for name, entry in cast("dict[str, Any]", value["objects"]).items():
         if not isinstance(entry, dict):
             continue
         place: Place = ("objects", name)
-        for key in ("box", "disc", "polygon"):
-            number = max(_plain_numbers(entry.get(key)), default=0.0)
-            if number > reach:
-                faults.append(
-                    (
-                        (*place, key),
-                        f"{number:g} is {number:g} m, and the reference tags are within {reach:.3g} m; write"
-                        f" {number:g}mm, or {number:g}m if that is meant",
-                    )
-                )
         shapes = [key for key in ("box", "disc", "polygon") if key in entry]
+        faults += [((*place, key), fault) for key in shapes if (fault := _beyond(entry[key], reach))]
         if len(shapes) != 1:
             faults.append(
                 (place, "give one of box, disc and polygon, the footprint around the object's centre")
@@ -410,6 +403,17 @@ def _reach(references: Any) -> float:
         return float(np.linalg.norm(np.ptp(places, axis=0))) or math.inf
     except (AttributeError, KeyError, TypeError, ValueError, UsageError):
         return math.inf
+
+
+def _beyond(value: Any, reach: float) -> str:
+    """Return that a length without a unit is larger than the plane; "" where it is not."""
+    number = max(_plain_numbers(value), default=0.0)
+    if number <= reach:
+        return ""
+    return (
+        f"{number:g} is {number:g} m, and the reference tags are within {reach:.3g} m; write {number:g}mm,"
+        f" or {number:g}m if that is meant"
+    )
 
 
 def _plain_numbers(value: Any) -> Iterator[float]:

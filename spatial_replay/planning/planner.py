@@ -42,10 +42,11 @@ from spatial_replay.planning.maps import refuse_delays, refuse_unknown
 from spatial_replay.planning.motions import Movables, with_choice
 from spatial_replay.planning.settings import Settings, Workspace, kind_faults, refuse_faults
 from spatial_replay.spec.formula import Specification
-from spatial_replay.text import counted, times_apart
+from spatial_replay.text import counted, named_arguments, times_apart
 from spatial_replay.trace.sample import Sample
 
 
+@named_arguments
 class Planner:
     """Plans for a specification step by step, from observed samples (section 5.2 of the paper).
 

@@ -355,13 +355,7 @@ def recompute_decisions(source: Source, advance: Callable[[int], None] = lambda 
     faults: list[str] = []
     samples = 0
 
-    def iter_blocks() -> Iterator[Block]:
-        for block in read_blocks(source):
-            faults.extend(block.trace.faults)
-            yield block
-            advance(len(block.trace))
-
-    for sample, messages in iter_moments(iter_blocks()):
+    for sample, messages in iter_moments(_iter_blocks(source, faults, advance)):
         if sample is not None:
             comparison.rerun.box.observe(sample)
             samples += 1
@@ -689,16 +683,17 @@ def redo_decisions(
     changed = (*_specification_changes(old, planner), *changes_text(old.settings, settings))
     faults: list[str] = []
 
-    def iter_blocks() -> Iterator[Block]:
-        for block in read_blocks(source):
-            faults.extend(block.trace.faults)
-            yield block
-            advance(len(block.trace))
-
     redoing = _Redoing(source, planner, changed)
-    for sample, messages in iter_moments(iter_blocks()):
+    for sample, messages in iter_moments(_iter_blocks(source, faults, advance)):
         redoing.take(sample, messages)
     return redoing.redone(tuple(faults))
+
+
+def _iter_blocks(source: Source, faults: list[str], advance: Callable[[int], None]) -> Iterator[Block]:
+    for block in read_blocks(source):
+        faults.extend(block.trace.faults)
+        yield block
+        advance(len(block.trace))
 
 
 def _specification_changes(old: Planner, new: Planner) -> Iterator[str]:

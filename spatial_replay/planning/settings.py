@@ -23,6 +23,7 @@ from spatial_replay.geometry.arrays import Booleans, Floats
 from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
 from spatial_replay.logs.remote import log_file
 from spatial_replay.mapping.yaml_document import checked_document, read_yaml_text
+from spatial_replay.text import named_arguments
 from spatial_replay.trace.sample import Sample
 
 # ---------------------------------------------------------------------------------------------- the workspace
@@ -309,6 +310,7 @@ _PLAIN = (
 """Settings that stand in the text as they are."""
 
 
+@named_arguments
 @dataclass(frozen=True)
 class Settings:
     """The settings of a planner, besides the specification.

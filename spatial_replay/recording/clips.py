@@ -33,7 +33,7 @@ from spatial_replay.recording.log import (
     warm_up,
 )
 from spatial_replay.spec.formula import Specification, iter_nodes
-from spatial_replay.text import counted, nearest_hint
+from spatial_replay.text import counted, named_arguments, nearest_hint
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
 from spatial_replay.trace.units import units_from_metadata
@@ -53,6 +53,7 @@ _BELOW: Final = re.compile(r"(?P<name>.+?)\s*<=?\s*(?P<number>[-+]?[\d.]+(?:[eE]
 Condition: TypeAlias = Callable[[Sequence[Update], bool], str | None]
 
 
+@named_arguments
 @dataclass(frozen=True, slots=True)
 class Trigger:
     """When a recorder writes a clip, and how much of what it holds.

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 from spatial_replay.errors import UsageError
 from spatial_replay.planning.decisions import Executor, Outcome, Step
 from spatial_replay.planning.planner import Planner
+from spatial_replay.text import named_arguments
 
 if TYPE_CHECKING:
     from spatial_replay.recording.recorder import Recorder
@@ -46,6 +47,7 @@ class LoopEnd(NamedTuple):
     motions: int
 
 
+@named_arguments
 def plan(planner: Planner, robot: Robot, recorder: Recorder, *, timings: bool = False) -> Step:
     """Let a planner decide and a robot act until there is nothing more to do, and record all of it.
 

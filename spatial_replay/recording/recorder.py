@@ -45,7 +45,7 @@ from spatial_replay.spec import check_names
 from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import listed_specifications
-from spatial_replay.text import counted_from, times_apart
+from spatial_replay.text import counted_from, named_arguments, times_apart
 from spatial_replay.trace.sample import LATEST_NS, Sample
 from spatial_replay.trace.trace import Trace
 from spatial_replay.trace.units import checked_units, signal_units_metadata, units_metadata
@@ -779,6 +779,7 @@ class SampleWriter:
             raise self._failure
 
 
+@named_arguments
 class Recorder(SampleWriter):
     """Record samples into an MCAP log, with the robustness of specifications beside them.
 

@@ -389,8 +389,8 @@ def verify_certificate(
         )
     keep = None if source is None else _kept(about, options)
     clip = metadata.get(CLIP_METADATA, {})
-    # a replay of a clip has its record, too, but was made from all of the clip
-    if source is not None and clip and clip.get("source") == about.get("source"):
+    # a replay of a clip has its record, too: where the source is that clip, all of it counts
+    if source is not None and clip and dict(source.metadata()).get(CLIP_METADATA) != clip:
         source, keep = clipped_source(source, clip), None
     evaluated = log if source is None else source
     chosen = ReplayOptions(

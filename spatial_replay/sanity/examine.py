@@ -31,7 +31,7 @@ from spatial_replay.spec.formula import (
 )
 from spatial_replay.spec.load import require_specification
 from spatial_replay.spec.walks import is_spatial, iter_formulas, looks_back, other_names, terms_of
-from spatial_replay.text import counted, json_number, number_text, shortened_formula
+from spatial_replay.text import counted, json_number, named_arguments, number_text, shortened_formula
 
 MAX_PAIRS: Final = 300
 """How many pairs of specs are compared at most."""
@@ -202,6 +202,7 @@ def _example_document(example: Example | None) -> dict[str, Any] | None:
     }
 
 
+@named_arguments
 def doctor(specification: Specification, *, examples: bool = True) -> Examination:
     """Find what is wrong with a specification before any run is evaluated.
 

@@ -111,7 +111,7 @@ from spatial_replay.spec.walks import (
     substitute,
     terms_of,
 )
-from spatial_replay.text import encodable, text_number
+from spatial_replay.text import encodable, named_arguments, text_number
 
 _MIRRORED = MappingProxyType({">=": "<=", ">": "<"})
 _AXES: tuple[str, ...] = get_args(Axis)
@@ -753,6 +753,7 @@ _MAX_WARNINGS = 100
 _RELATION_NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 
 
+@named_arguments
 def parse_specification(
     text: str,
     *,
@@ -839,6 +840,7 @@ def parse_specification(
     )
 
 
+@named_arguments
 def load_specification(
     path: str | Path,
     *,
@@ -1030,6 +1032,12 @@ def load_specifications(
     ]
 
 
+def is_formula(source: Path) -> bool:
+    """Return whether a formula was written where a file is expected."""
+    written = str(source)
+    return bool(_FORMULA.search(written)) and not written.endswith(".spatial") and not source.exists()
+
+
 def _parsed(
     source: Path | SpecificationText, profile: str | None, constants: Mapping[str, float | str]
 ) -> Specification:
@@ -1037,11 +1045,12 @@ def _parsed(
         return parse_specification(
             source.text, filename=source.filename, profile=profile, constants=constants
         )
-    written = str(source)
-    if _FORMULA.search(written) and not written.endswith(".spatial") and not source.exists():
-        return parse_specification(written, filename="<formula>", profile=profile, constants=constants)
+    if is_formula(source):
+        return parse_specification(str(source), filename="<formula>", profile=profile, constants=constants)
     if source.suffix in (".yaml", ".yml"):
-        raise UsageError(f"{source.name} is a mapping, not a specification; give it by --mapping")
+        raise UsageError(
+            f"{source.name} is YAML, not a specification; give a mapping by --mapping, a tags file by --tags"
+        )
     return load_specification(source, profile=profile, constants=constants)
 
 

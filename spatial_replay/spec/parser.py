@@ -59,6 +59,7 @@ from spatial_replay.spec.tokens import (
     BINARY_TYPES,
     KEYWORDS,
     STATEMENT_TYPES,
+    is_called,
     meant,
     meant_statement,
     quoted,
@@ -640,10 +641,6 @@ def _place(token: Token, tokens: Sequence[Token]) -> Span:
     return span_of(token)
 
 
-def _is_call(tokens: Sequence[Token], position: int) -> bool:
-    return position + 1 < len(tokens) and tokens[position + 1].type == "LPAR"
-
-
 def _between_objects(tokens: Sequence[Token], position: int) -> str:
     """Return a relation that was written like a function, `closeto(a, b, 0.1)`, between its objects."""
     arguments: list[list[str]] = [[]]
@@ -677,7 +674,10 @@ def _report(
         faults.add(span, f"the statement ends too early: expected {_expected(accepted)}")
         return
     found = f"expected {_expected(accepted)}, found {token.value!r}"
-    if token.type == "NAME" and "RELATION" in accepted:
+    kinds = [each.type for each in tokens[: position + 1]]
+    if kinds.count("RPAR") > kinds.count("LPAR"):
+        faults.add(span, f"{token.value!r} closes nothing", "leave it out, or open it in front with '('")
+    elif token.type == "NAME" and "RELATION" in accepted:
         known = (*relations, "dist", "closer", "between", "and", "or", "implies")
         hint = faults.nearest(token.value, known) or f"relations are {', '.join(sorted(relations))}, dist"
         faults.add(span, f"unknown relation {token.value!r}", hint)
@@ -686,7 +686,7 @@ def _report(
     ):  # fmt: skip
         hint = f"put it before the relation; an object of that name is written {quoted(token.value)}"
         faults.add(span, f"{token.value!r} cannot stand inside a relation", hint)
-    elif token.type in ("RELATION", "DIST") and _is_call(tokens, position):
+    elif token.type in ("RELATION", "DIST") and is_called(tokens, position):
         hint = f"write it between its objects: {_between_objects(tokens, position)}"
         faults.add(span, f"{token.value!r} is not a function", hint)
     elif token.type == "EQUAL" and tokens[0].type != "CONST":

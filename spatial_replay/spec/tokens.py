@@ -64,6 +64,7 @@ _MEANT_RELATIONS: Mapping[str, str] = MappingProxyType(
         **dict.fromkeys(("touches", "touching"), "touch[e]"),
         **dict.fromkeys(("over", "on_top_of"), "above"),
         **dict.fromkeys(("under", "beneath"), "below"),
+        **dict.fromkeys(("d", "distance", "dist_to"), "dist"),
     }
 )
 _MEANT_SIGNS: Mapping[str, str] = MappingProxyType(
@@ -93,12 +94,14 @@ _LENGTHS: Mapping[str, float] = MappingProxyType(
 )
 """Units of length, in metres."""
 _TIMES: Mapping[str, float] = MappingProxyType({"us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "sec": 1.0})
+_PER = re.compile(r"\s*/\s*([a-z]+)")
 _OPPOSITE: Mapping[str, str] = MappingProxyType({"STAR": "/", "SLASH": "*", "PLUS": "-", "MINUS": "+"})
 """Signs of arithmetic, and what each is on the other side of a comparison."""
 _SHAPES: Mapping[str, str] = MappingProxyType(
     {
-        **dict.fromkeys(("rect", "rectangle", "square", "aabb"), "box(xmin, ymin, xmax, ymax)"),
-        **dict.fromkeys(("disc", "disk", "sphere", "ellipse"), "circle((x, y), r)"),
+        **dict.fromkeys(("rect", "rectangle", "square", "aabb", "box"), "box(xmin, ymin, xmax, ymax)"),
+        **dict.fromkeys(("disc", "disk", "sphere", "ellipse", "circle"), "circle((x, y), r)"),
+        "polygon": "polygon((x, y), ...)",
     }
 )
 _TYPES = frozenset(
@@ -246,10 +249,15 @@ def meant_sign(sign: str) -> str:
     return _MEANT_SIGNS.get(sign) or _MEANT_SIGNS.get(sign[:1], "")
 
 
-def unit_hint(number: str, unit: str) -> str:
-    """Return how a number with a unit is written, or "" where the unit is none."""
+def unit_hint(number: str, unit: str, per: str = "") -> str:
+    """Return how a number with a unit is written, or "" where the unit is none.
+
+    Args:
+        per: the unit of time of a speed.
+    """
     if unit in _LENGTHS:
-        metres = format(float(number) * _LENGTHS[unit], "g")
+        seconds = _TIMES.get(per, 1.0)
+        metres = format(float(number) * _LENGTHS[unit] / seconds, ".4g")
         return f"lengths are in the unit of the log's footprints: write {metres} if those are metres"
     if unit == "px":
         return f"lengths are in the unit of the log's footprints: write {number} if those are pixels"
@@ -291,6 +299,8 @@ def meant(tokens: Sequence[Token], position: int, accepted: Collection[str]) -> 
             return f"{name.value!r} is not a function", hint
     if shape := _meant_shape(tokens, position, accepted):
         return found, shape
+    if token.type == "RPAR" and last.type == "NUMBER" and before.value == "=>":
+        return "'=>' means implies", "at least is written >="
     if token.type == "NUMBER" and (operator := _AT_TIMES.get(last.value.lower())):
         return found, f"a window stands behind its operator: {operator.format(token.value)} (...)"
     if last.type in _STATEMENTS and token.type != "NAME" and token.value.isidentifier():
@@ -299,7 +309,8 @@ def meant(tokens: Sequence[Token], position: int, accepted: Collection[str]) -> 
     if "EQUAL" in accepted and tokens[0].type in _STATEMENTS:
         return _meant_definition(tokens, position)
     if last.type == "NUMBER" and token.type == "NAME":
-        hint = unit_hint(last.value, token.value)
+        per = tokens[position + 2].value if after.type == "SLASH" and position + 2 < len(tokens) else ""
+        hint = unit_hint(last.value, token.value, per)
         return f"{token.value!r} is no unit here", hint or f"only s and ms are units: leave out {token.value}"
     if token.type == "COMMA" and last.type == after.type == "NUMBER" and token.end_pos == after.start_pos:
         return "a comma within a number", f"decimals have a point: {last.value}.{after.value}"
@@ -348,7 +359,8 @@ def _meant_call(tokens: Sequence[Token], comparison: str, limit: str) -> tuple[s
 
 def _meant_window(tokens: Sequence[Token], position: int) -> str:
     """Return the window that was meant behind the nearest operator; "" where none was begun."""
-    start = next((n for n in range(position - 1, max(-1, position - 6), -1) if _is_temporal(tokens[n])), None)
+    places = range(position - 1, max(-1, position - 6), -1)
+    start = next((n for n in places if tokens[n].type in ("PREFIX", "INFIX")), None)
     if start is None:
         return ""
     inner = tokens[start + 1 : start + 6]
@@ -398,10 +410,6 @@ def _meant_arithmetic(tokens: Sequence[Token], position: int) -> str:
     return f"put the numbers on the other side: {name} {comparison} {right.value} {_OPPOSITE[sign]} {number}"
 
 
-def _is_temporal(token: Token) -> bool:
-    return token.type in ("PREFIX", "INFIX")
-
-
 def _meant_definition(tokens: Sequence[Token], position: int) -> tuple[str, str] | None:
     """Return what was meant between the name of a statement and its =."""
     token, name = tokens[position] if position < len(tokens) else None, tokens[1].value
@@ -417,7 +425,7 @@ def _meant_word(token: Token, last: Token, after: Token, accepted: Collection[st
     if "RELATION" in accepted:
         if word in ("is", "are") and after.type in _RELATIONS:
             return f"{token.value!r} cannot stand here", f"leave it out: {last.value} {after.value} ..."
-        if word in _MEANT_RELATIONS:
+        if word in _MEANT_RELATIONS and after.type == "NAME":
             hint = f"write {last.value} {_MEANT_RELATIONS[word]} {after.value or 'b'}"
             return f"unknown relation {token.value!r}", hint
     if "AND" in accepted and word in _MEANT_BETWEEN:
@@ -463,6 +471,10 @@ def _meant_shape(tokens: Sequence[Token], position: int, accepted: Collection[st
     token = tokens[position] if position < len(tokens) else None
     if token is not None and "CIRCLE" in accepted and token.value.lower() in _SHAPES:
         return f"it is written {_SHAPES[token.value.lower()]}"
+    called = next((n for n in (position, position - 1) if is_called(tokens, n)), 0)
+    shape = _SHAPES.get(tokens[called].value.lower())
+    if called and shape and tokens[0].type != "REGION" and tokens[called - 1].type not in _STATEMENTS:
+        return f"a shape gets a name first: region goal = {shape}"
     start = next(
         (n for n in range(position - 1, max(-1, position - 5), -1) if tokens[n].type in _SHAPE), None
     )
@@ -478,6 +490,11 @@ def _meant_shape(tokens: Sequence[Token], position: int, accepted: Collection[st
         case "POLYGON" if len(numbers) > 5:
             return f"each corner stands in brackets: polygon({', '.join(pairs)})"
     return ""
+
+
+def is_called(tokens: Sequence[Token], position: int) -> bool:
+    """Return whether a bracket opens behind a token."""
+    return 0 <= position < len(tokens) - 1 and tokens[position + 1].type == "LPAR"
 
 
 _SHAPE = frozenset({"BOX", "CIRCLE", "POLYGON"})
@@ -643,7 +660,9 @@ def tokenize(text: str, relations: frozenset[str], faults: Faults) -> list[Token
             token_type = "NUMBER"
             unit = found.group("unit")
             if unit is not None and unit not in ("s", "ms"):
-                hint = _unit_hint(value, unit)
+                per = _PER.match(text, found.end())
+                hint = unit_hint(value.removesuffix(unit), unit, per.group(1) if per else "")
+                hint = hint or f"units of time are s and ms; a name is written in quotes: {quoted(value)}"
                 faults.add(span, f"{value!r} is neither a number, nor a duration, nor a name", hint)
                 value = value[: -len(unit)]
         tokens.append(Token(token_type, value, span.start, line, None, line, None, span.end))
@@ -682,11 +701,6 @@ def _unquoted(literal: str, span: Span, faults: Faults) -> str:
             hint = 'in quotes, \\" stands for a quote and \\\\ for a backslash'
             faults.add(Span(at, at + 2), f"unknown escape {escape.group()!r} in a name", hint)
     return _ESCAPED.sub(r"\1", name)
-
-
-def _unit_hint(text: str, unit: str) -> str:
-    hint = unit_hint(text.removesuffix(unit), unit)
-    return hint or f"units of time are s and ms; a name is written in quotes: {quoted(text)}"
 
 
 def _report_unknown(text: str, span: Span, faults: Faults, before: Sequence[Token], after: str) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from spatial_replay.errors import TraceError, UsageError
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
-from spatial_replay.text import is_encodable, text_number
+from spatial_replay.text import is_encodable, named_arguments, text_number
 
 LATEST_NS = 2**63 - 1
 """The latest time of a sample."""
@@ -66,6 +66,7 @@ def _signal_value(name: str, value: Any) -> float:
     return number
 
 
+@named_arguments
 @dataclass(frozen=True, slots=True)
 class Sample:
     """Every object and signal at one time.
@@ -103,7 +104,10 @@ class Sample:
             if isinstance(tracked, Footprint):
                 tracked = TrackedObject(tracked)
             elif not isinstance(tracked, TrackedObject):
-                raise TraceError(f"object {name!r} is {tracked!r}; give a Footprint or a TrackedObject")
+                raise TraceError(
+                    f"object {name!r} is {shortened(tracked)}; give a Footprint or a TrackedObject; numbers"
+                    f" and texts are signals: Sample(time_ns, objects, {{{name!r}: ...}})"
+                )
             objects[name] = tracked
         given: Mapping[str, object] = self.signals
         signals: dict[str, float] = {}

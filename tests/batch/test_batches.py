@@ -127,6 +127,7 @@ def test_a_misspelt_class_of_a_template_passes_nowhere_and_names_the_nearest(fle
     misspelt = ("walk.jsonl", "--spec", "clear.spatial", "--each", "ego=class:pedestrain")
     done = batch(*misspelt, "--junit", "junit.xml")
     assert (done.code, "did you mean 'pedestrian'?" in done.out) == (4, True)
+    assert "the log never has the class 'pedestrain'; did you mean 'pedestrian'? (in walk.jsonl)" in done.err
     assert ElementTree.parse("junit.xml").getroot().get("failures") == "1"
 
 
@@ -177,11 +178,15 @@ def test_samples_that_a_recorder_dropped_are_said_and_do_not_pass(fleet: Path) -
         for sample in samples[2:]:
             recorder.miss(sample)
     lossy = ("lossy.mcap", "--spec", "gate.spatial")
+    Path("close.spatial").write_text("G (cart dist person <= 0.1)")
     said = "the recorder dropped 3 of 5 samples"
     for run in ("replay", "batch"):
         done = command(run, *lossy)
         assert (done.code, said in done.out) == (4, True)
         assert command(run, *lossy, "--allow", "dropped").code == 0
+    # also where another failure comes first
+    violated = batch("lossy.mcap", "--spec", "close.spatial")
+    assert (violated.code, f"warning: {said} (in lossy.mcap)" in violated.err) == (1, True)
     assert command("report", *lossy, "-o", "lossy.html").code == 0
     assert said in Path("lossy.html").read_text()
 
@@ -541,6 +546,7 @@ def test_all_errors_of_a_suite_are_reported_at_once_with_their_lines(fleet: Path
         (["nightly/*.mcap", "missing.mcap", "--spec", "gate.spatial"], "no log matches this pattern"),
         (["empty", "--spec", "gate.spatial"], "no log in this folder"),
         (["logs"], "give a specification with --spec FILE"),
+        (["logs", "--spec", "G (cart dist person >= 0)"], "is a formula, and results name files"),
         (["logs", "--spec", "gate.spatial", "-o", "gate.spatial"], "is a file; results are a folder"),
         (["logs", "--spec", "gate.spatial", "-o", "https://h/results"], "give a folder of a bucket"),
         (["logs", "--spec", "gate.spatial", "-o", "logs"], "does not hold the results of a batch"),

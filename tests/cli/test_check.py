@@ -331,4 +331,4 @@ def test_a_formula_stands_in_place_of_a_file_and_a_mapping_does_not(
     mapping = tmp_path / "own.yaml"
     mapping.write_text("topics: {}\n")
     assert run(["replay", str(log), "--spec", str(mapping)]) == 2
-    assert "own.yaml is a mapping, not a specification; give it by --mapping" in capsys.readouterr().err
+    assert "own.yaml is YAML, not a specification; give a mapping by --mapping" in capsys.readouterr().err

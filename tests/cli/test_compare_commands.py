@@ -307,3 +307,9 @@ def test_a_clip_of_a_bag_keeps_what_was_valid_before_it(
         # the last messages before the clip are cut out again, too
         source = ("--source", "drive.bag", "--mapping", "drive.yaml")
         assert said(capsys, "verify", name, *source)[0] == 0
+    # a clip of the annotated bag was cut from that, and a replay of the clip was not cut
+    assert said(capsys, "replay", *arguments, "-o", "annotated.mcap")[0] == 1
+    assert said(capsys, "clip", "annotated.mcap", "-o", "cut.mcap")[0] == 0
+    assert said(capsys, "replay", "cut.mcap", "-o", "again.mcap")[0] == 1
+    for name, origin in (("cut", "annotated"), ("again", "cut"), ("again", "annotated")):
+        assert said(capsys, "verify", f"{name}.mcap", "--source", f"{origin}.mcap")[0] == 0

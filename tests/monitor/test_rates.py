@@ -73,6 +73,7 @@ def test_a_result_with_a_rate_begins_at_the_second_sample() -> None:
         ("speed(2) <= 1", "a number has no speed", "write speed(a) or speed(a, b)"),
         ("speed() <= 1", "'speed' takes one or two objects", "write speed(a) <= c or speed(a, b) <= c"),
         ("rate(a, b) <= 1", "'rate' takes one signal", "write rate(battery) <= c"),
+        ("speed(a) <= 3km/h", "'3km' is neither a number", "write 0.8333 if those are metres"),
         ("speed(a) != 1", "a rate is hardly ever exactly a number", "write what is too slow or too fast"),
         ("velocity(a) <= 1", "'velocity' is not a function", "it is written speed(a) <= 1"),
         ("derivative(x) <= 1", "'derivative' is not a function", "it is written rate(x) <= 1"),
@@ -85,6 +86,14 @@ def test_what_is_no_rate_is_refused_with_what_to_write(
     said = capsys.readouterr().err
     assert message in said
     assert hint in said
+
+
+def test_the_papers_semantics_says_how_a_rate_is_written_for_it(capsys: pytest.CaptureFixture[str]) -> None:
+    log = str(Path(__file__).resolve().parents[2] / "recordings/table.jsonl")
+    paper = ("--semantics", "paper")
+    assert run(["replay", log, "--spec", "G (speed(cup) <= 9)", *paper]) == 2
+    assert "read from the second sample on: write X in front, or" in capsys.readouterr().err
+    assert run(["replay", log, "--spec", "X G (speed(cup) <= 9)", *paper]) == 0
 
 
 def test_speed_and_rate_stay_names_without_a_bracket_and_of_macros() -> None:

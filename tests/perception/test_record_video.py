@@ -54,6 +54,17 @@ def test_verdicts_are_printed_as_they_change(folder: Path, capsys: pytest.Captur
     assert end.startswith("  apart  violated   robustness -0.02")
 
 
+def test_a_name_that_the_tags_file_lacks_is_said_before_the_run(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    video, tags = (f"{folder}/{name}" for name in ("table.mp4", "tags.yaml"))
+    wrong = ("--spec", "G (rde dist blue >= 0)", "-o", f"{folder}/wrong.mcap")
+    assert run(["record", "video", video, "--tags", tags, *wrong]) == 4
+    said = capsys.readouterr().err
+    assert "warning: the tags file never has the object 'rde'" in said
+    assert "did you mean 'red'?" in said
+
+
 def test_the_log_holds_truth_within_its_uncertainty_and_a_replay_gives_the_same_bytes(folder: Path) -> None:
     trace = read_trace(folder / "run.mcap")
     assert list(trace.names) == ["blue", "red"] or set(trace.names) == {"blue", "red"}

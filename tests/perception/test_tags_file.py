@@ -64,6 +64,10 @@ MISTAKES = {
         "objects.red.polygon: the polygon's boundary crosses or touches itself at (0.5, 0.5); list its"
         " corners in order around it, or split it",
     ),
+    "the size of tags without a unit": (
+        TABLE.replace("size: 48mm", "size: 48", 1),
+        "size: 48 is 48 m, and the reference tags are within 0.488 m; write 48mm, or 48m if that is meant",
+    ),
     "millimetres without a unit": (
         TABLE.replace("box: [50mm, 50mm]", "box: [50, 50]", 1),
         "objects.red.box: 50 is 50 m, and the reference tags are within 0.488 m; write 50mm, or 50m if",

@@ -215,7 +215,7 @@ def colours(robustness: ArrayLike, scale: ArrayLike) -> Floats:
 
 def shade_codes(robustness: Floats, scale: ArrayLike) -> NDArray[np.uint8]:
     """Return robustness (...) as places in `SHADES`: what `colours` makes of it, to the step of a screen."""
-    share = np.minimum(np.abs(np.nan_to_num(robustness)) / np.asarray(scale), 1.0)
+    share = np.minimum(np.abs(np.nan_to_num(robustness)), scale) / np.asarray(scale)
     codes = np.where(robustness >= 0.0, 128.0 + np.round(127.0 * share), 127.0 - np.round(126.0 * share))
     return np.where(np.isnan(robustness), 0.0, codes).astype(np.uint8)
 

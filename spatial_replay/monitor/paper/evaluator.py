@@ -18,6 +18,7 @@ from spatial_replay.monitor.paper.kernel import PaperMemory, step_paper
 from spatial_replay.monitor.paper.scans import OPERATORS, PaperTable, paper_table
 from spatial_replay.spec.diagnostics import SourceText
 from spatial_replay.spec.formula import Atom, Formula, Quantified, Specification, Temporal, iter_nodes
+from spatial_replay.spec.walks import has_rate
 
 _TILE = 256
 _FIRST_ROOM = 1024
@@ -177,7 +178,10 @@ def check_operators(specification: Specification) -> None:
             if isinstance(node, Temporal) and node.operator not in OPERATORS:
                 source = SourceText.of(specification.source, specification.filename)
                 fault = source.diagnostic("error", node.span, f"the paper's semantics has no {node.operator}")
+                remedy = "write it with X, F, G and U"
+                if node is spec.formula and has_rate(node):
+                    remedy = "a rate of change is read from the second sample on: write X in front"
                 raise UsageError(
                     f"{fault.filename}:{fault.line}:{fault.column}: {fault.message}, as {spec.name} has; "
-                    "write it with X, F, G and U, or evaluate with the semantics 'ltlf'"
+                    f"{remedy}, or evaluate with the semantics 'ltlf'"
                 )
