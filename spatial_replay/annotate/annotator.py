@@ -124,7 +124,8 @@ class Annotator:
             for tree, instance, kept in zip(trees, instances, automata, strict=True)
         ]
         self.standing = StandingEncoder(trees, self._runs, units)
-        self._encoder = SceneEncoder(shown_regions(files), units.get("", ""))
+        named = frozenset(name for own in self._requirements for each in own for name in each.objects)
+        self._encoder = SceneEncoder(shown_regions(files), units.get("", ""), named)
         self._latest: tuple[Trace, list[SeriesBlock]] | None = None
         self._scene = scene or SceneState()
         self._show = show
@@ -142,7 +143,7 @@ class Annotator:
 
     def redraw(self) -> None:
         """Draw the whole scene with the next sample, for a viewer that shows nothing yet."""
-        self._scene = SceneState(first_ns=self._scene.first_ns)
+        self._scene = SceneState(first_ns=self._scene.first_ns, last=self._scene.last)
 
     def messages(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> list[Messages]:
         """Return what to write beside the next samples.
@@ -182,6 +183,7 @@ class Annotator:
             if run is not None:
                 run.pass_over(block)
         self.standing.pass_over(blocks)
+        self._scene = self._encoder.pass_over(trace, self._scene)
         self._remember(trace, blocks)
         return self._events(self._changes(trace, blocks))
 

@@ -42,10 +42,11 @@ from spatial_replay.spec.formula import (
     Quantified,
     SignedDistance,
     Term,
+    TrackedName,
     iter_nodes,
 )
 from spatial_replay.spec.relations import RELATION_NAMES
-from spatial_replay.spec.walks import iter_expressions, looks_back, operand_signs, substitute
+from spatial_replay.spec.walks import base_of, iter_expressions, looks_back, operand_signs, substitute
 from spatial_replay.trace.trace import Trace
 
 
@@ -168,7 +169,7 @@ class NewestSamples:
             leaf: with the object of a template.
             now_ns: the time of the sample from which the number is looked back at.
         """
-        sample = None if found.time_ns is None else self._sample(found.time_ns, now_ns)
+        sample = None if found.time_ns is None else self.sample(found.time_ns, now_ns)
         if sample is None or look_back([leaf]) != (0, 0):
             return None
         decided = deciding_atom(TraceScene(sample, regions), leaf, found.end)
@@ -179,7 +180,8 @@ class NewestSamples:
         ends = decided.value, decided.lower if decided.end is End.LOW else decided.upper
         return (decided.atom, number) if number in ends else None
 
-    def _sample(self, time_ns: int, now_ns: int) -> Trace | None:
+    def sample(self, time_ns: int, now_ns: int) -> Trace | None:
+        """Return the sample of a time, if it is recent."""
         between = 0
         for trace in reversed(self._blocks):
             at, now = np.searchsorted(trace.times_ns, [time_ns, now_ns], side="right").tolist()
@@ -235,15 +237,26 @@ class SettledViolation(NamedTuple):
     Attributes:
         time_ns: of the sample since which it is certain.
         leaf: what decided it then, perhaps at an earlier sample; None if no leaf did.
+        atom: the leaf to point at or, for a quantifier, the atom of the objects that decide it.
+        sample: the sample of that leaf, if it was recent then.
     """
 
     time_ns: int
     leaf: DecidingLeaf | None
+    atom: Formula | None = None
+    sample: Trace | None = None
 
     @property
     def shown(self) -> DecidingLeaf | None:
         """The leaf to point at, if there is one."""
         return None if self.leaf is None else self.leaf.shown
+
+    @property
+    def objects(self) -> list[str]:
+        """The objects that the atom relates, as it can be pointed at."""
+        pair = None if self.atom is None else pair_of(self.atom)
+        terms = [] if pair is None else [base_of(pair.first), base_of(pair.second)]
+        return [term.name for term in terms if isinstance(term, TrackedName)]
 
 
 class LeafHistory:

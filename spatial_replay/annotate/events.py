@@ -483,7 +483,7 @@ class EventReporter:
             settled = self._history.settled(reported.node, series, time_ns, verdict)
             witness, because = self._settled(settled, time_ns, time_ns)
             if change.node == 0 and verdict is Verdict.VIOLATED:
-                self.settled = SettledViolation(time_ns, settled)
+                self.settled = self._violation(settled, time_ns)
             self._remember(change.node, settled, time_ns)
         else:
             found = self._deciding_leaf(change.node, after, block)
@@ -567,6 +567,13 @@ class EventReporter:
         self.over = self._leaf_text(leaf)
         if missed and missed.is_condition:
             self.over = f"missed {missed.response}"
+
+    def _violation(self, found: DecidingLeaf | None, time_ns: int) -> SettledViolation:
+        """Return the violation of the root with the atom that settled it, as it stood then."""
+        if found is None:
+            return SettledViolation(time_ns, found)
+        atom, _ = self._leaf(found.shown.value, time_ns)
+        return SettledViolation(time_ns, found, atom, self._samples.sample(found.shown.time_ns, time_ns))
 
     def _leaf(self, found: LeafValue, now_ns: int) -> tuple[Formula, float]:
         """Return a leaf with its number, in place of a quantifier that of the objects that decide it."""

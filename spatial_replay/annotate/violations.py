@@ -302,8 +302,8 @@ def first_violations(results: Sequence[EvaluatedResult], trace: Trace, samples: 
     It is shown at the atom that gives the requirement its number, between the two points that attain the
     signed distance of its terms. For an enclosure it follows the protrusion. In the sample that settled the
     formula's violation that is the atom that settled it. A requirement with a deadline or in response to a
-    condition keeps its arrow afterwards, with the number that settled it. Conditions of implications are not
-    pointed at: those hold, and what had to follow does not.
+    condition keeps its arrow afterwards, between the places and with the number that settled it. Conditions
+    of implications are not pointed at: those hold, and what had to follow does not.
 
     Args:
         samples: (S,) int64, indices.
@@ -452,7 +452,9 @@ def _locate(
     """Fill in the points of the samples `here` (H,), whose leaves are given, and the atoms of quantifiers."""
     if result.leaf_pairs is None:
         return
-    here = here[found.leaf[here] >= 0]
+    is_past = found.moment_ns[here] >= 0
+    _point_at_past(result, result.leaf_pairs, here[is_past], found)
+    here = here[(found.leaf[here] >= 0) & ~is_past]
     if not len(here):
         return
     # of all samples, these are often few
@@ -464,11 +466,24 @@ def _locate(
             _point_at(scene, pair, there, here[there], found)
         for body, those in _bound(result, index, scene.trace.times_ns[there]):
             of_body = pair_of(body)
-            those = there[those][found.moment_ns[here[there[those]]] < 0]
+            those = there[those]
             if of_body is not None and len(those):
                 found.atom[here[those]] = len(found.atoms)
                 found.atoms.append(result.leaf_pairs.text_of(body))
                 _point_at(scene, of_body, those, here[those], found)
+
+
+def _point_at_past(result: EvaluatedResult, pairs: LeafPairs, past: Integers, found: Violations) -> None:
+    """Point at what settled a violation in an earlier sample, where it stood then."""
+    settled = result.settled
+    pair = None if settled is None or settled.atom is None else pair_of(settled.atom)
+    if not len(past) or settled is None or settled.atom is None or settled.sample is None or pair is None:
+        return
+    found.atom[past] = len(found.atoms)
+    found.atoms.append(pairs.text_of(settled.atom))
+    _point_at(TraceScene(settled.sample, pairs.regions), pair, np.zeros(1, np.int64), past[:1], found)
+    for column in (found.points, found.top, found.is_shown):
+        column[past] = column[past[0]]
 
 
 def _bound(result: EvaluatedResult, leaf: int, times_ns: Integers) -> Iterator[tuple[Formula, Integers]]:

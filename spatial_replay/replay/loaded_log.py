@@ -613,7 +613,7 @@ class Playback:
         regions = shown_regions(self.evaluated.edited.files)
         if regions != self._regions:
             self._start, self._regions = scene_start(self.evaluated.loaded.inside, regions), regions
-        scene = replace(self._annotator.scene, written_ns=None, place=self._start.place)
+        scene = replace(self._annotator.scene, written_ns=None, last={}, place=self._start.place)
         self._annotator = self.evaluated.annotator(scene, self.arrow)
         self._has_ended = False
         events = _last(merge(self._annotator.pass_over(*self.evaluated.part(0, shown))))

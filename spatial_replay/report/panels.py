@@ -506,6 +506,7 @@ def scene_value(
         if place < most and (arrow := frame.violation(result)) is not None
     ]
     arrows = [arrow for _, arrow in shown]
+    outlines = list(dict.fromkeys(each.dashes for each in arrows))
     box = _box(entities, arrows)
     return {
         "times": packing.add((scene.times_ns - first_ns) / 1e9, "f8"),
@@ -524,6 +525,8 @@ def scene_value(
             "atoms": [each.atom for each in arrows],
             "robustness": packing.add(np.array([each.robustness for each in arrows]), "f8"),
             "holds": packing.add(np.array([each.holds for each in arrows]), "u1"),
+            "outlines": outlines,
+            "outline": packing.add(np.array([outlines.index(each.dashes) for each in arrows]), "i4"),
             # of those about an earlier sample
             "moments": [
                 None if each.moment_ns is None else (each.moment_ns - first_ns) / 1e9 for each in arrows
@@ -580,10 +583,10 @@ def _entity_value(
     Args:
         results: those of the page, which it has shades for in this order.
     """
-    forms: dict[tuple[int, ...], int] = {}
+    forms: dict[tuple[tuple[int, ...], bool], int] = {}
     of_frame = np.full(frames, _ABSENT, np.int64)
     for number, each in shown.items():
-        form = tuple(len(ring) for ring in each.rings)
+        form = tuple(len(ring) for ring in each.rings), each.is_last
         of_frame[number] = forms.setdefault(form, len(forms))
     kind, _, name = identifier.partition("/")
     rings = [ring for each in shown.values() for ring in each.rings]
@@ -592,7 +595,9 @@ def _entity_value(
     return {
         "kind": kind,
         "name": name,
-        "forms": list(forms),
+        "forms": [rings for rings, _ in forms],
+        # a missing object leaves its last outline
+        "last": [number for (_, is_last), number in forms.items() if is_last],
         "form": packing.add(of_frame, "u2"),
         "points": packing.add(box.steps(_joined(rings)), "u2"),
         "colours": packing.add(np.array([each.colour for each in shown.values()]), "u1"),

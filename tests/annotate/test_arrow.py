@@ -12,6 +12,7 @@ from mcap.reader import make_reader
 
 import spatial_replay as sr
 from spatial_replay.logs import MemorySource
+from spatial_replay.logs.topics import SCENE
 from spatial_replay.replay import run_replay
 
 STEP_NS = 100_000_000
@@ -33,11 +34,31 @@ def labels(folder: Path, text: str, gaps: list[float], unit: str = "") -> list[s
     with output.open("rb") as stream:
         for _, _, message in make_reader(stream).iter_messages(["/spatial/scene"]):
             drawn = SceneUpdate.FromString(message.data).entities
-            texts = [
-                each.text.rstrip() for entity in drawn if entity.id == "witness" for each in entity.texts
-            ]
+            texts = [each.text for entity in drawn if entity.id == "witness" for each in entity.texts]
             found.append("".join(texts))
     return found
+
+
+def test_an_arrow_with_a_past_number_joins_the_places_of_then_and_marks_what_failed(tmp_path: Path) -> None:
+    samples = [
+        sr.Sample(index * STEP_NS, {"a": sr.Footprint.box(0, 0, 1, 1), "b": sr.Footprint.box(x, 0, x + 1, 1)})
+        for index, x in enumerate((3.0, 4.0, 5.0, 6.0, 7.0, 8.0))
+    ]
+    output, log = tmp_path / "annotated.mcap", MemorySource(sr.Trace.from_samples(samples), "run")
+    run_replay(log, [sr.parse_specification("spec s = F[0s, 0.3s] (a dist b <= 1.5)")], output=output)
+    with output.open("rb") as stream:
+        drawn = [SceneUpdate.FromString(each.data) for *_, each in make_reader(stream).iter_messages([SCENE])]
+    for message in drawn[4:]:
+        entities = {each.id: each for each in message.entities}
+        [arrow], [label], [then] = (
+            getattr(entities["witness"], part) for part in ("arrows", "texts", "lines")
+        )
+        # at 0 s the boxes were 2 apart
+        assert label.text == "a dist b <= 1.5 at 0.000 s: -0.5"
+        assert (arrow.pose.position.x, arrow.shaft_length + arrow.head_length) == (1.0, 2.0)
+        assert (min(each.x for each in then.points), max(each.x for each in then.points)) == (0.0, 4.0)
+        assert [entities[f"object/{name}"].texts[0].text for name in "ab"] == ["a ✕", "b ✕"]
+    assert [each.texts[0].text for each in drawn[0].entities if each.id == "object/a"] == ["a"]
 
 
 NEARING = [5.0 - step / 4 for step in range(20)]

@@ -51,8 +51,14 @@ def run(*samples: dict, period_ns: int = FRAME_NS) -> Trace:
     return Trace.from_samples(Sample(index * period_ns, objects) for index, objects in enumerate(samples))
 
 
+def named(requirements) -> frozenset[str]:
+    """The objects that some requirements name."""
+    return frozenset(name for each in requirements for name in each.objects)
+
+
 def messages(trace: Trace, *evaluated: EvaluatedResult, regions=None) -> list[SceneUpdate]:
-    encoded = SceneEncoder(regions or {}).encode(trace, evaluated)
+    asked = named(own for each in evaluated for own in each.requirements)
+    encoded = SceneEncoder(regions or {}, "", asked).encode(trace, evaluated)
     return [SceneUpdate.FromString(payload) for payload in encoded.payloads]
 
 
@@ -116,7 +122,7 @@ def runs(draw: st.DrawFn) -> Trace:
 @given(runs(), st.data())
 def test_cutting_a_run_into_blocks_changes_no_byte(trace, data):
     said = says(near("a", "goal"), trace, np.linspace(-1.0, 1.0, len(trace)))
-    encoder = SceneEncoder(REGIONS)
+    encoder = SceneEncoder(REGIONS, "", frozenset({"a", "ccc"}))
     whole = encoder.encode(trace, [said])
     cuts = sorted(data.draw(st.sets(st.integers(0, len(trace)))) | {0, len(trace)})
     times, payloads, state = [], [], None
@@ -370,7 +376,8 @@ def pointed(text: str, *samples: dict, cuts: tuple[int, ...] = ()) -> list[Scene
     instances = find_instances(spec, {}, (), 0, 2**63 - 1)
     evaluation = EvaluationStream(instances, spec.regions)
     requirements = [requirements_of(instance.formula) for instance in instances]
-    encoder, state, payloads = SceneEncoder(spec.regions), None, []
+    asked = named(each for own in requirements for each in own)
+    encoder, state, payloads = SceneEncoder(spec.regions, "", asked), None, []
     for begin, end in pairwise((0, *cuts, len(trace))):
         part = trace.slice(begin, end)
         results = [

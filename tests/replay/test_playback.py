@@ -11,6 +11,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
+from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from hypothesis import given
 from hypothesis import strategies as st
@@ -122,13 +123,17 @@ def test_a_seek_sends_the_latest_messages(time_ns: int) -> None:
     assert [each for each in found if each[0] == "/spatial/log"] == lines
 
 
-def test_a_seek_deletes_shown_objects_that_are_gone() -> None:
+def test_a_seek_shows_the_last_outline_of_an_object_that_a_specification_misses() -> None:
     player = playback()
     player.seek(2 * STEP_NS)
     [drawn] = [data for topic, _, data in sent(player.seek(3 * STEP_NS)) if topic == SCENE]
     update = SceneUpdate.FromString(drawn)
     assert "cup 物" not in sample(3).objects
-    assert [each.id for each in update.deletions] == ["object/cup 物"]
+    [left] = [each for each in update.entities if each.id == "object/cup 物"]
+    assert [each.text for each in left.texts] == ["cup 物, last seen"]
+    assert [each.type for each in left.lines] == [LinePrimitive.LINE_LIST]
+    [again] = [data for topic, _, data in sent(player.seek(3 * STEP_NS)) if topic == SCENE]
+    assert again == drawn
 
 
 @pytest.mark.parametrize("window", [Window(), Window(3 * STEP_NS, 17 * STEP_NS), Window(every=3)])

@@ -270,14 +270,17 @@ def test_a_page_says_where_results_are_too_many_for_colours_of_each(tmp_path: Pa
         assert is_alike == (count > 64) == all(each["shades"] is None for each in drawn)
 
 
-def test_an_absent_object_is_not_drawn(tmp_path: Path) -> None:
+def test_an_absent_object_leaves_its_last_outline(tmp_path: Path) -> None:
     samples = [
         each if t != 2 else sr.Sample(each.time_ns, {"a": each.objects["a"]})
         for t, each in enumerate(moving(5))
     ]
     page = report_of_samples(tmp_path / "run.html", samples, "spec s = F (a ovlp b)")
     entity = next(each for each in page.facts["scene"]["entities"] if each["name"] == "b")
-    assert page.numbers(entity["form"]).tolist() == [0, 0, 65535, 0, 0]
+    assert page.numbers(entity["form"]).tolist() == [0, 0, 1, 0, 0]
+    assert entity["last"] == [1]
+    points = page.numbers(entity["points"]).reshape(5, -1)
+    assert points[2].tolist() == points[1].tolist()
 
 
 def test_the_automaton_is_drawn_as_it_leads_on(planned: Page) -> None:

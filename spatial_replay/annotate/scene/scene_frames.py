@@ -12,15 +12,19 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from spatial_replay.annotate.deciding_leaf import SettledViolation
 from spatial_replay.annotate.robustness import standing_codes
 from spatial_replay.annotate.scene.scene_template import (
     OBJECT,
     REGION,
     Banner,
     CauseText,
+    Dashes,
     Region,
     Rings,
     border_of,
+    dashes_of,
+    rings_of,
 )
 from spatial_replay.annotate.violations import EvaluatedResult, Violations
 from spatial_replay.geometry.arrays import Floats, Integers, combined, equal_places
@@ -36,21 +40,32 @@ from spatial_replay.palette import HOLDING, MAP, NEGATIVE, NEUTRAL, POSITIVE
 from spatial_replay.text import Instant
 
 
+def failed_objects(
+    results: Sequence[EvaluatedResult], names: Sequence[str], times_ns: Integers
+) -> NDArray[np.bool_]:
+    """Return (S, objects), by which objects a result was violated so far, as far as atoms name them."""
+    failed = np.zeros((len(times_ns), len(names)), np.bool_)
+    for settled in [result.settled for result in results if result.settled is not None]:
+        for name in settled.objects:
+            if name in names:
+                failed[times_ns >= settled.time_ns, names.index(name)] = True
+    return failed
+
+
 def labelled_objects(
-    results: Sequence[EvaluatedResult],
-    names: Sequence[str],
-    is_present: NDArray[np.bool_],
-    robustness: Floats,
+    named: frozenset[str], names: Sequence[str], is_present: NDArray[np.bool_], robustness: Floats
 ) -> NDArray[np.bool_]:
     """Return (S, objects), which objects have their names beside them.
 
     Where a sample has very many, these are the ones that violate a specification there, the worst first, and
     then those that it names.
+
+    Args:
+        named: the objects that specifications name.
     """
     is_crowded = is_present.sum(axis=1) >= _CROWD
     if not is_crowded.any():
         return np.ones(is_present.shape, np.bool_)
-    named = {each for result in results for own in result.requirements for each in own.objects}
     is_named = np.array([name in named for name in names], np.bool_)
     urgency = np.where(robustness < 0.0, robustness, np.where(is_named, 0.0, np.inf))
     urgency[~is_present] = np.inf
@@ -155,24 +170,35 @@ def arrow_texts(
     shown = np.flatnonzero(found.is_shown)
     robustness = np.where(found.holds, -found.robustness, found.robustness)[shown].tolist()
     texts = [robustness_text(number, unit).encode() for number in robustness]
-    words = -(-np.fromiter(map(len, texts), np.int64, len(texts)) // 8)
+    lengths = np.fromiter(map(len, texts), np.int64, len(texts))
     of = found.result, found.leaf, found.holds, found.moment_ns, found.atom
     columns = [each[shown] for each in of]
     causes, cause = list[CauseText](), np.zeros(len(found.result), np.int64)
-    for places in equal_places(combined([*columns, words], len(shown))):
+    for places in equal_places(combined([*columns, lengths], len(shown))):
         cause[shown[places]] = len(causes)
         result, leaf, holds, moment_ns, atom = (int(each[places[0]]) for each in columns)
         known = results[result].leaf_pairs if result >= 0 and leaf >= 0 else None
         text = found.atoms[atom] if atom >= 0 else "" if known is None else known.texts[leaf]
         text = text if len(text) <= _LONGEST_CAUSE else f"{text[: _LONGEST_CAUSE - 1]}…"
         at = " now" if moment_ns < 0 else f" at {Instant(moment_ns, first_ns)}"
-        causes.append(
-            CauseText(f"{text}{at}: {'must not hold, holds by ' if holds else ''}", int(words[places[0]]))
-        )
+        said = f"{text}{at}: {'must not hold, holds by ' if holds else ''}"
+        dashes = () if moment_ns < 0 else _outlines_then(results[result].settled)
+        causes.append(CauseText(said, int(lengths[places[0]]), dashes))
     numbers = [b""] * len(found.result)
     for index, number in zip(shown.tolist(), texts, strict=True):
         numbers[index] = number
     return ArrowTexts(tuple(causes), cause, numbers)
+
+
+def _outlines_then(settled: SettledViolation | None) -> tuple[float, ...]:
+    """Return the dashes of the objects that settled a violation, as they stood then: x and y in turn."""
+    if settled is None or settled.sample is None:
+        return ()
+    sample = settled.sample
+    rows = sample.rows[0, [sample.names.index(name) for name in settled.objects]]
+    rings = rings_of(sample.footprints.select(rows[rows >= 0]), 0.0)
+    listed = [ring for index in range(int((rows >= 0).sum())) for ring in rings.rings_of(index)]
+    return tuple(dashes_of(listed).reshape(-1).tolist()) if listed else ()
 
 
 _LONGEST_CAUSE: Final = 60
@@ -253,11 +279,13 @@ class DrawnEntity(NamedTuple):
         colour: red, green and blue, 0 to 255.
         shades: of each result, its colour if that were the only one, a place in `SHADES`; empty for one
             result, and for very many.
+        is_last: whether the object is missing, and the outlines are its last ones.
     """
 
     rings: tuple[Floats, ...]
     colour: tuple[int, int, int]
     shades: bytes = b""
+    is_last: bool = False
 
 
 class DrawnViolation(NamedTuple):
@@ -274,6 +302,7 @@ class DrawnViolation(NamedTuple):
             it is of this one.
         holds: whether it is an atom that holds and should not.
         atom: the atom of the objects that decide a quantifier, where the leaf is one, or "".
+        dashes: see `CauseText`.
     """
 
     ends: Floats
@@ -285,6 +314,7 @@ class DrawnViolation(NamedTuple):
     moment_ns: int | None = None
     holds: bool = False
     atom: str = ""
+    dashes: tuple[float, ...] = ()
 
 
 class Arrows(NamedTuple):
@@ -310,7 +340,8 @@ class Arrows(NamedTuple):
         moment_ns = int(found.moment_ns[index]) if found.moment_ns[index] >= 0 else None
         node, leaf, atom = (int(each[index]) for each in (found.node, found.leaf, found.atom))
         of = (self.result, node, robustness, leaf, moment_ns, holds, found.atoms[atom] if atom >= 0 else "")
-        return DrawnViolation(found.points[index], label, *of)
+        dashes = self.texts.causes[self.texts.cause[index]].dashes
+        return DrawnViolation(found.points[index], label, *of, dashes)
 
 
 class SceneFrame(NamedTuple):
@@ -378,10 +409,14 @@ class SceneFrames:
         }
         content = self._content
         for column, name in enumerate(content.names):
-            if content.forms[index, column] >= FIRST_FORM:
-                rings = content.rings.rings_of(int(content.observations[index, column]))
-                colour = _bytes(self.object_colours[index, column])
-                entities[OBJECT + name] = DrawnEntity(rings, colour, of_objects[place, column].tobytes())
+            last = int(content.missing[index, column])
+            if content.forms[index, column] < FIRST_FORM and last < 0:
+                continue
+            row = int(content.observations[index, column])
+            rings = content.last.rings[last] if last >= 0 else content.rings.rings_of(row)
+            colour = _bytes(self.object_colours[index, column])
+            shade = of_objects[place, column].tobytes()
+            entities[OBJECT + name] = DrawnEntity(rings, colour, shade, last >= 0)
         return SceneFrame(entities, found, place)
 
 
@@ -392,7 +427,9 @@ class SceneContent(NamedTuple):
         names: objects that are shown, or have just been.
         rows: (S, names), rows of the trace; below 0 where an object is absent.
         forms: (S, names), `ABSENT`, `DELETED`, or from `FIRST_FORM` on the number of its form.
-        styles: (S, names), its level, and whether it has a label as the last bit; -1 where it is absent.
+        styles: (S, names), its level, whether a result was violated by it as the second last bit, and whether
+            it has a label as the last bit; -1 where it is absent.
+        missing: (S, names), which of `last` an object is that is missing; else -1.
         observations: (S, names), rows of `rings`, `footprints` and `middles`.
         middles: (R, 2), where names are.
         violations: of the S samples.
@@ -407,6 +444,8 @@ class SceneContent(NamedTuple):
     rows: Integers
     forms: Integers
     styles: Integers
+    missing: Integers
+    last: Dashes
     observations: Integers
     footprints: FootprintBatch
     rings: Rings

@@ -32,7 +32,7 @@ from spatial_replay.geometry.arrays import (
 )
 from spatial_replay.geometry.footprint import Footprint, FootprintBatch
 from spatial_replay.logs.wire import WireTemplate, Words
-from spatial_replay.palette import LABEL, NEGATIVE
+from spatial_replay.palette import LABEL, NEGATIVE, NEUTRAL
 from spatial_replay.spec.formula import Outline
 from spatial_replay.trace.trace import Trace
 
@@ -64,6 +64,29 @@ class Rings(NamedTuple):
             begin, end = end, end + length
             rings.append(self.points[begin:end])
         return tuple(rings)
+
+
+class Dashes(NamedTuple):
+    """Dashed outlines, each a row of points: two for each dash, then the place of a name.
+
+    Attributes:
+        rows: (n, 2) each.
+        rings: the outlines of each, (n, 2).
+    """
+
+    rows: Sequence[Floats]
+    rings: Sequence[tuple[Floats, ...]]
+
+
+_DASHES: Final = 4
+"""Parts of each side of a dashed outline: every second one is drawn."""
+
+
+def dashes_of(rings: Sequence[Floats]) -> Floats:
+    """Return the ends (n, 2) of the dashes of some rings, two for each dash."""
+    shares = (np.arange(_DASHES) / _DASHES)[:, None]
+    sides = [(ring[:, None], (np.roll(ring, -1, axis=0) - ring)[:, None]) for ring in rings]
+    return np.concatenate([(begin + shares * along).reshape(-1, 2) for begin, along in sides])
 
 
 class Form(NamedTuple):
@@ -235,7 +258,7 @@ class Elevation(NamedTuple):
 
 def draw(
     entity: SceneEntity,
-    name: str | None,
+    name: str,
     outlines: list[Floats],
     faces: list[Floats],
     anchor: tuple[float, float],
@@ -247,7 +270,7 @@ def draw(
     `scene_template` fills in the numbers in this order.
 
     Args:
-        name: what the label says; None leaves it out.
+        name: what the label says; "" leaves it out.
         outlines, faces: rings (n, 2); a face is convex.
         anchor: the position of the label.
         opacity: of the faces.
@@ -261,17 +284,25 @@ def draw(
         for ring in outlines:
             if len(ring) > 1:
                 _add_sides(entity, ring, *elevation.sides, opacity)
-    if name is None:
-        return
+    if name:
+        _add_label(entity, name, anchor, elevation.label)
+
+
+def _add_label(entity: SceneEntity, text: str, anchor: tuple[float, float], z: float) -> None:
     label = entity.texts.add(
-        billboard=True,
-        font_size=_LABEL_PIXELS,
-        scale_invariant=True,
-        text=name,
-        pose=lying_at(elevation.label),
+        billboard=True, font_size=_LABEL_PIXELS, scale_invariant=True, text=text, pose=lying_at(z)
     )
     label.pose.position.x, label.pose.position.y = anchor
     label.color.r, label.color.g, label.color.b, label.color.a = *LABEL, 1.0
+
+
+def _add_dashes(entity: SceneEntity, ends: Floats, z: float) -> None:
+    line = entity.lines.add(
+        type=LinePrimitive.LINE_LIST, thickness=_LINE_PIXELS, scale_invariant=True, pose=lying_at(z)
+    )
+    for x, y in ends.tolist():
+        line.points.add(x=x, y=y)
+    line.color.r, line.color.g, line.color.b, line.color.a = *NEUTRAL, 1.0
 
 
 def point_at(entity: SceneEntity, label: str, lift: float) -> None:
@@ -286,10 +317,7 @@ def point_at(entity: SceneEntity, label: str, lift: float) -> None:
     arrow.pose.position.x = arrow.pose.position.y = arrow.pose.position.z = SLOT
     arrow.pose.orientation.z = arrow.pose.orientation.w = SLOT
     arrow.color.r, arrow.color.g, arrow.color.b, arrow.color.a = *NEGATIVE, 1.0
-    text = entity.texts.add(billboard=True, font_size=_LABEL_PIXELS, scale_invariant=True, text=label)
-    text.pose.position.x = text.pose.position.y = text.pose.position.z = SLOT
-    text.pose.orientation.w = 1.0
-    text.color.r, text.color.g, text.color.b, text.color.a = *LABEL, 1.0
+    _add_label(entity, label, (SLOT, SLOT), SLOT)
 
 
 def _add_outline(entity: SceneEntity, ring: Floats, z: float) -> None:
@@ -367,11 +395,24 @@ class CauseText(NamedTuple):
 
     Attributes:
         text: all before the number.
-        words: how long the number is with its unit and the spaces after it, in words of 8 bytes.
+        length: how many bytes the number has with its unit.
+        dashes: of an arrow about an earlier sample, the outlines then: x and y of the ends of dashes.
     """
 
     text: str
-    words: int
+    length: int
+    dashes: tuple[float, ...] = ()
+
+    def ends(self, numbers: Sequence[bytes]) -> list[bytes]:
+        """Return the last bytes of labels, in which the number is: 8 or more, as those are filled in."""
+        text = self.text.encode().rjust(8)
+        return [(text + number)[-max(8, self.length) :] for number in numbers]
+
+    @property
+    def words(self) -> list[int]:
+        """Where the words of 8 bytes begin that such an end is filled in by; the last may overlap another."""
+        last = max(8, self.length) - 8
+        return [*range(0, last, 8), last]
 
 
 class DrawnObject(NamedTuple):
@@ -379,13 +420,13 @@ class DrawnObject(NamedTuple):
 
     Attributes:
         level: how small it is, 0 to `LEVELS`: what is smaller lies higher, so that nothing larger hides it.
-        has_label: whether its name stands beside it.
+        label: its name, with a mark if a result was violated by it; "" for none.
     """
 
     name: str
     form: Form
     level: int
-    has_label: bool
+    label: str
 
 
 class SceneLayout(NamedTuple):
@@ -394,6 +435,8 @@ class SceneLayout(NamedTuple):
     Attributes:
         deleted: objects that were in the message before and are gone.
         objects: those observed.
+        missing: the names of those that a specification is about and that are not, and the lengths of their
+            last outlines (see `Dashes`).
         witness: what decides the worst violation, which an arrow points at; "deleted" deletes the arrow of
             the message before, and without one it is None.
         banner: None without any result.
@@ -401,6 +444,7 @@ class SceneLayout(NamedTuple):
 
     deleted: tuple[str, ...]
     objects: tuple[DrawnObject, ...]
+    missing: tuple[tuple[str, int], ...] = ()
     witness: CauseText | Literal["deleted"] | None = None
     banner: Banner | None = None
 
@@ -479,7 +523,8 @@ def make_template(layout: SceneLayout, regions: EncodedRegions, lift: float) -> 
 
     A message has these numbers, each once: its timestamp (2), the colours of the regions (3 each), the points
     of all objects (2 each), their colours (3 each) and the places of names (2 each). If any object has a
-    height, tops, bottoms, heights and those of names follow (4 each). The arrow's numbers come last.
+    height, tops, bottoms, heights and those of names follow (4 each), then the last outlines of missing
+    objects (see `Dashes`). The arrow's numbers come last.
 
     Args:
         lift: height of flat objects above the plane, so that they cover regions.
@@ -492,21 +537,28 @@ def make_template(layout: SceneLayout, regions: EncodedRegions, lift: float) -> 
     if layout.banner is not None:
         _add_banner(_add_entity(last, BANNER), layout.banner, lift)
     places, end = _places(layout, regions.number)
-    number, order = "", [*regions.order]
+    label, order = list[int](), [*regions.order]
     for drawn, own in zip(layout.objects, places, strict=True):
         order += _order_of_object(drawn, own)
+    for name, length in layout.missing:
+        entity = _add_entity(last, OBJECT + name)
+        _add_dashes(entity, np.full((length - 1, 2), SLOT), lift)
+        _add_label(entity, f"{name}, last seen", (SLOT, SLOT), 2.5 * lift)
+        order += range(end, end + 2 * length)
+        end += 2 * length
     if isinstance(layout.witness, CauseText):
-        number = "#" * (8 * layout.witness.words)
-        point_at(_add_entity(last, WITNESS), layout.witness.text + number, lift)
-        order += range(end, end + _ARROW_NUMBERS + layout.witness.words)
+        number = "#" * layout.witness.length
+        entity = _add_entity(last, WITNESS)
+        if layout.witness.dashes:
+            _add_dashes(entity, np.reshape(layout.witness.dashes, (-1, 2)), lift)
+        point_at(entity, layout.witness.text + number, lift)
+        label = layout.witness.words
+        order += range(end, end + _ARROW_NUMBERS + len(label))
     objects = [_encoded_object(drawn, lift) for drawn in layout.objects]
     # messages are joined by joining their bytes
     encoded = b"".join([_encoded(gone), regions.entities, *objects, _encoded(last)])
-    slots = _offsets(encoded, SLOT_BYTES)
-    if number:
-        # the end of the last text of all
-        begin = encoded.rindex(number.encode())
-        slots += range(begin, begin + len(number), 8)
+    # the arrow's label is the last of all fields
+    slots = [*_offsets(encoded, SLOT_BYTES), *(len(encoded) - 8 - label[-1] + at for at in label)]
     stamps = _offsets(encoded, _STAMP_BYTES)
     payload = np.frombuffer(encoded.replace(SLOT_BYTES, bytes(8)), np.uint8)
     words = [*slots, *(begin + at for begin in stamps for at in _STAMP_WORDS)]
@@ -564,7 +616,7 @@ def _order_of_object(drawn: DrawnObject, begin: _Places) -> list[int]:
             if len(ring) > 1:
                 raised = [at for x, y in ring for at in (x, y, height)]
                 order += [bottom, *points, *raised, *colour]
-    if drawn.has_label:
+    if drawn.label:
         order += [begin.middle, begin.middle + 1, *([label] if form.has_height else [])]
     return order
 
@@ -583,7 +635,7 @@ _ARROW_NUMBERS: Final = 10
 
 
 def numbers_of_witness(
-    points: Floats, z: Floats, label_y: Floats, scale: float, labels: Sequence[bytes], words: int
+    points: Floats, z: Floats, label_y: Floats, scale: float, labels: Sequence[bytes], words: Sequence[int]
 ) -> list[Floats]:
     """Return what to fill in for the arrow at the worst violation.
 
@@ -592,8 +644,8 @@ def numbers_of_witness(
         z: (S,), its height.
         label_y: (S,), where the label is on the plane, off the arrow.
         scale: the size of objects in the scene.
-        labels: S texts.
-        words: how many words of 8 bytes each of them takes.
+        labels: the ends of S labels, of one length.
+        words: where in them words of 8 bytes begin.
     """
     begin, end = points[:, 0], points[:, 1]
     length = np.hypot(*(end - begin).T)
@@ -601,7 +653,7 @@ def numbers_of_witness(
     head = np.minimum(0.5 * length, ARROW_HEAD * scale)
     arrow = [begin, z, np.sin(half), np.cos(half), length - head, head]
     middle = [(begin[:, 0] + end[:, 0]) / 2.0, label_y, z + ARROW_HEAD * scale]
-    text = b"".join([label.ljust(8 * words) for label in labels])
+    text = b"".join([label[at : at + 8] for label in labels for at in words])
     label = np.frombuffer(text, "<f8")
     return [column.reshape(len(points), -1) for column in (*arrow, *middle, label)]
 
@@ -647,8 +699,7 @@ def _add_object(entity: SceneEntity, drawn: DrawnObject, lift: float) -> None:
     elevation = Elevation(lift * (1.0 + drawn.level / LEVELS), None, 2.5 * lift)
     if drawn.form.has_height:
         elevation = Elevation(SLOT, (SLOT, SLOT), SLOT)
-    name = drawn.name if drawn.has_label else None
-    draw(entity, name, rings, rings, (SLOT, SLOT), elevation, OBJECT_OPACITY)
+    draw(entity, drawn.label, rings, rings, (SLOT, SLOT), elevation, OBJECT_OPACITY)
 
 
 def _add_banner(entity: SceneEntity, banner: Banner, lift: float) -> None:

@@ -26,6 +26,7 @@ from spatial_replay.annotate.scene.scene_frames import (
     arrow_texts,
     banners_of,
     colours,
+    failed_objects,
     labelled_objects,
     shade_codes,
 )
@@ -33,12 +34,14 @@ from spatial_replay.annotate.scene.scene_template import (
     LEVELS,
     Banner,
     CauseText,
+    Dashes,
     DrawnObject,
     EncodedRegions,
     Region,
     SceneLayout,
     SceneTemplate,
     boxes,
+    dashes_of,
     encode_regions,
     encoded_stamps,
     extents,
@@ -55,6 +58,7 @@ from spatial_replay.annotate.violations import (
     worst_robustness,
 )
 from spatial_replay.geometry.arrays import Floats, Integers, combined, equal_places
+from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.logs.wire import Words, placed, words_of
 from spatial_replay.monitor.atoms.terms import footprint_from_outline
 from spatial_replay.spec.formula import Outline
@@ -103,11 +107,17 @@ class SceneNumbers:
             columns.append(_runs(content.rings.points, content.rings.start[first], corners))
             of_objects = self._of_objects[: 3 if layout.has_heights else 2]
             columns += [_runs(each, first, count) for each in of_objects]
+        for name, length in layout.missing:
+            rows = content.missing[samples, content.names.index(name)]
+            columns.append(
+                np.array([content.last.rows[row] for row in rows.tolist()]).reshape(-1, 2 * length)
+            )
         if isinstance(layout.witness, CauseText):
-            found, labels = content.violations, [content.numbers[index] for index in samples.tolist()]
+            found, witness = content.violations, layout.witness
+            labels = witness.ends([content.numbers[index] for index in samples.tolist()])
             z = np.fmax(found.top[samples], 0.0) + 3.0 * LIFT * self._scale
             at = found.points[samples], z, content.label[samples]
-            columns += numbers_of_witness(*at, self._scale, labels, layout.witness.words)
+            columns += numbers_of_witness(*at, self._scale, labels, witness.words)
         return words_of(columns)
 
 
@@ -141,6 +151,7 @@ class SceneState:
         first_ns: the time of the first sample, or None before it.
         written_ns: the time of the last message, or None before the first.
         shown: the objects in it.
+        last: of the objects that specifications name, where they were last seen: a row of footprints.
         is_pointing: whether it has an arrow at a violation.
         scale: the robustness at which colours are full: the median size (longer side of the bounding box) of
             the objects in the first message that shows any; None before that.
@@ -152,6 +163,7 @@ class SceneState:
     first_ns: int | None = None
     written_ns: int | None = None
     shown: tuple[str, ...] = ()
+    last: Mapping[str, tuple[FootprintBatch, int]] = field(default_factory=lambda: MappingProxyType({}))
     is_pointing: bool = False
     scale: float | None = None
     place: tuple[float, float] | None = None
@@ -184,17 +196,20 @@ class SceneEncoder:
     """Draws traces over the regions of a specification.
 
     Every message holds all regions and all objects that are observed, so that a viewer can jump to any of
-    them; objects that are gone are deleted. Blue, vermillion and grey show the worst of the requirements on
-    an object or region (see `palette` and `requirements`). Where one is violated, an arrow with its
-    robustness points at the one that was certain first (see `violations`).
+    them; objects that are gone are deleted, and those that a specification names leave their last outlines.
+    Blue, vermillion and grey show the worst of the requirements on an object or region (see `palette` and
+    `requirements`). Where one is violated, an arrow with its robustness points at the one that was certain
+    first (see `violations`).
 
     Attributes:
         regions: by name.
         unit: that of lengths, "" where nothing declares it.
+        named: the objects that specifications name.
     """
 
     regions: Mapping[str, Outline]
     unit: str = ""
+    named: frozenset[str] = frozenset()
     _drawn: tuple[Region, ...] = field(init=False, repr=False)
     _encoded: EncodedRegions = field(init=False, repr=False)
 
@@ -219,18 +234,22 @@ class SceneEncoder:
         written = spaced(trace.times_ns, state.written_ns)
         times_ns = trace.times_ns[written]
         if not len(written):
-            return SceneMessages(times_ns, [], state, None)
+            return SceneMessages(times_ns, [], self.pass_over(trace, state), None)
         state, scales, first = self.scaled(state, trace, trace.rows[written])
+        names = tuple(sorted({*trace.names, *state.shown, *state.last}))
+        missing, state = self._missing(names, trace, state, written)
+        missing[0][:first] = -1
         scale = state.scale or _UNSCALED
         violations = first_violations(results, trace, written)
-        names = tuple(sorted({*trace.names, *state.shown}))
         rows = _rows_of(names, trace, trace.rows[written])
         presence = Presence(times_ns, names, _class_codes(trace, rows), trace.classes)
         objects, regions = worst_robustness(results, presence, [region.name for region in self._drawn])
-        has_label = labelled_objects(results, names, rows >= 0, objects)
+        objects[missing[0] >= 0] = np.nan
+        has_label = labelled_objects(self.named, names, rows >= 0, objects)
+        labels = has_label, failed_objects(results, names, times_ns)
         banners = banners_of(results, times_ns, state.place or _NOWHERE, first)
         arrows = arrow_texts(results, violations, state.first_ns or 0, self.unit)
-        content = _content(trace, names, rows, state, violations, arrows, has_label, banners)
+        content = _content(trace, names, rows, state, violations, arrows, labels, missing, banners)
         shades = colours(objects, scales), colours(regions, scales)
         shown = shades[0].reshape(-1, 3) if (rows >= 0).all() else shades[0][rows >= 0]
         columns = SceneNumbers(times_ns, shades[1], shown, content, scale)
@@ -240,17 +259,12 @@ class SceneEncoder:
             if layout not in templates:
                 templates[layout] = make_template(layout, self._encoded, LIFT * scale)
             encoded.append((samples, templates[layout].encode(columns.of_messages(layout, samples))))
-        last = content.forms[-1] >= FIRST_FORM
-        after = SceneState(
-            first_ns=state.first_ns,
+        is_shown = (content.forms[-1] >= FIRST_FORM) | (content.missing[-1] >= 0)
+        after = replace(
+            state,
             written_ns=int(times_ns[-1]),
-            shown=tuple(
-                name for name, is_shown in zip(content.names, last.tolist(), strict=True) if is_shown
-            ),
+            shown=tuple(name for name, own in zip(content.names, is_shown.tolist(), strict=True) if own),
             is_pointing=bool(content.violations.is_shown[-1]),
-            scale=state.scale,
-            place=state.place,
-            line=state.line,
             templates=MappingProxyType(dict(list(templates.items())[-_MOST_TEMPLATES:])),
         )
         find_arrows = partial(_arrows_of, results, trace, written, state.first_ns or 0, self.unit)
@@ -259,6 +273,40 @@ class SceneEncoder:
             times_ns, objects, regions, *shades, scale, content, self._drawn, find_arrows, find_shades
         )
         return SceneMessages(times_ns, placed(len(written), encoded), after, frames)
+
+    def pass_over(self, trace: Trace, state: SceneState) -> SceneState:
+        """Take in samples without a message."""
+        return self._missing(trace.names, trace, state, np.empty(0, np.int64))[1]
+
+    def _missing(
+        self, names: tuple[str, ...], trace: Trace, state: SceneState, written: Integers
+    ) -> tuple[tuple[Integers, Dashes], SceneState]:
+        """Return (S, names) which of some last outlines each object that is missing has, and -1 for others;
+        these outlines; and the state after the samples."""
+        last, found = dict(state.last), np.full((len(written), len(names)), -1, np.int64)
+        outlines = list[tuple[Floats, ...]]()
+        for name in sorted(self.named & {*trace.names, *last}):
+            column = trace.names.index(name) if name in trace.names else None
+            rows = np.full(len(trace), -1) if column is None else trace.rows[:, column]
+            seen = np.maximum.accumulate(np.where(rows >= 0, np.arange(len(rows)), -1))
+            here = np.where(rows[written] < 0, seen[written], len(rows))
+            for at in np.unique(here).tolist():
+                if at < len(rows) and (at >= 0 or name in last):
+                    batch, row = last[name] if at < 0 else (trace.footprints, int(rows[at]))
+                    found[here == at, names.index(name)] = len(outlines)
+                    rings = rings_of(batch.select(np.array([row])), _POINT * (state.scale or _UNSCALED))
+                    outlines.append(rings.rings_of(0))
+            if len(seen) and seen[-1] >= 0:
+                last[name] = trace.footprints, int(rows[seen[-1]])
+        places = [np.concatenate(rings) for rings in outlines]
+        under = [
+            [[(each[:, 0].min() + each[:, 0].max()) / 2.0, each[:, 1].min() - 0.75 * state.line]]
+            for each in places
+        ]
+        rows_of = [
+            np.concatenate([dashes_of(rings), name]) for rings, name in zip(outlines, under, strict=True)
+        ]
+        return (found, Dashes(rows_of, outlines)), replace(state, last=MappingProxyType(last))
 
     def scaled(self, state: SceneState, trace: Trace, rows: Integers) -> tuple[SceneState, Floats, int]:
         """Return the state with its scale and place, once an object is shown, the scale (S, 1) of each
@@ -368,28 +416,31 @@ def _content(
     before: SceneState,
     found: Violations,
     arrows: ArrowTexts,
-    has_label: NDArray[np.bool_],
+    labels: tuple[NDArray[np.bool_], NDArray[np.bool_]],
+    missing: tuple[Integers, Dashes],
     banners: tuple[Integers, tuple[Banner | None, ...]],
 ) -> SceneContent:
     is_present = rows >= 0
-    was_present = np.concatenate([[[name in before.shown for name in names]], is_present[:-1]])
+    is_drawn = is_present | (missing[0] >= 0)
+    was_present = np.concatenate([np.isin([names], before.shown), is_drawn[:-1]])
     footprints = trace.footprints.select(rows[is_present])
     rings = rings_of(footprints, _POINT * (before.scale or _UNSCALED))
     observations = np.full(rows.shape, -1, np.int64)
     observations[is_present] = np.arange(len(footprints))
-    forms = np.where(was_present, DELETED, ABSENT)
+    forms = np.where(was_present & (missing[0] < 0), DELETED, ABSENT)
     forms[is_present] = FIRST_FORM + rings.form
     styles = np.full(rows.shape, -1, np.int64)
     low, high = boxes(rings.points, rings.start)
     sizes = extents(footprints) if rings.has_round else np.maximum(*(high - low).T)
-    styles[is_present] = 2 * _levels(sizes, before.scale or _UNSCALED) + has_label[is_present]
+    has_label, failed = (each[is_present] for each in labels)
+    styles[is_present] = 4 * _levels(sizes, before.scale or _UNSCALED) + 2 * failed + (has_label | failed)
     was_pointing = np.append(before.is_pointing, found.is_shown[:-1])
     witness = np.where(found.is_shown, FIRST_FORM + arrows.cause, np.where(was_pointing, DELETED, ABSENT))
     said = witness, arrows.causes, arrows.numbers
     letters = np.broadcast_to(list(map(len, names)), rows.shape)[is_present]
     drawn = observations, footprints, rings, _name_places(low, high, letters, before.line)
     label = _label_places(found, observations, (low, high), before)
-    return SceneContent(names, rows, forms, styles, *drawn, found, label, *said, *banners)
+    return SceneContent(names, rows, forms, styles, *missing, *drawn, found, label, *said, *banners)
 
 
 def _name_places(low: Floats, high: Floats, letters: Integers, line: float) -> Floats:
@@ -439,7 +490,8 @@ def _class_codes(trace: Trace, rows: Integers) -> Integers:
 
 def _by_layout(content: SceneContent) -> Iterator[tuple[SceneLayout, Integers]]:
     """Yield the layouts, each with its samples (S,)."""
-    keys = [*content.forms.T, *content.styles.T, content.arrow, content.banner]
+    lengths = np.array([*map(len, content.last.rows), -1])[content.missing]
+    keys = [*content.forms.T, *content.styles.T, *lengths.T, content.arrow, content.banner]
     for samples in equal_places(combined(keys, len(content.arrow))):
         yield _layout(content, int(samples[0])), samples
 
@@ -449,12 +501,18 @@ def _layout(content: SceneContent, message: int) -> SceneLayout:
     of_objects = content.forms[message].tolist(), content.styles[message].tolist()
     listed: list[tuple[str, int, int]] = list(zip(content.names, *of_objects, strict=True))
     shown = tuple(
-        DrawnObject(name, content.rings.forms[form - FIRST_FORM], style >> 1, bool(style & 1))
+        DrawnObject(name, content.rings.forms[form - FIRST_FORM], style >> 2, _label(name, style))
         for name, form, style in listed
         if form >= FIRST_FORM
     )
     deleted = tuple(name for name, form, _ in listed if form == DELETED)
+    last = zip(content.names, content.missing[message].tolist(), strict=True)
+    missing = tuple((name, len(content.last.rows[row])) for name, row in last if row >= 0)
     cause: CauseText | Literal["deleted"] | None = None
     if arrow != ABSENT:
         cause = "deleted" if arrow == DELETED else content.causes[arrow - FIRST_FORM]
-    return SceneLayout(deleted, shown, cause, content.banners[banner])
+    return SceneLayout(deleted, shown, missing, cause, content.banners[banner])
+
+
+def _label(name: str, style: int) -> str:
+    return f"{name} ✕" if style & 2 else name if style & 1 else ""

@@ -59,7 +59,8 @@ function readScene(run) {
   const size = [scene.high[0] - scene.low[0], scene.high[1] - scene.low[1]];
   const coordinates = (steps) => Float64Array.from(
     steps, (step, index) => scene.low[index % 2] + step / STEPS_OF_SCENE * size[index % 2]);
-  const {labels, atoms, moments, ...found} = scene.violations;
+  const {labels, atoms, moments, outlines, ...found} = scene.violations;
+  const outline = numbers(found.outline);
   const points = coordinates(numbers(found.points)), places = numbers(found.places);
   const robustness = numbers(found.robustness), holds = numbers(found.holds);
   // of each frame, those of its violated results
@@ -70,6 +71,7 @@ function readScene(run) {
       ends: points.subarray(4 * index, 4 * index + 4), label: labels[index], atom: atoms[index],
       robustness: robustness[index],
       result: places[2 * index], node: places[2 * index + 1], holds: holds[index] === 1, moment: moments[index],
+      outline: outlines[outline[index]],
     });
   });
   const maps = run.decisions.flatMap((decision) => decision.maps);
@@ -125,17 +127,16 @@ function drawScene(context, clock, scene, layers, width, height) {
   const marked = failedObjects(clock);
   for (const entity of scene.entities) {
     const mark = marked.includes(entity.name) ? " ✕" : "";
-    if (entity.form[frame] !== ABSENT) drawEntity(context, entity, frame, at, labels, colourAt(entity), mark);
-    else if (entity.kind === "object") drawLast(context, entity, frame, at, labels);
+    if (isThere(entity, frame)) drawEntity(context, entity, frame, at, labels, colourAt(entity), mark);
+    else if (entity.form[frame] !== ABSENT) drawLast(context, entity, frame, at, labels);
   }
   if (decision) drawPlan(context, clock, decision, at);
   const names = layers.labels ? drawLabels(context, labels, width) : [];
-  const violation = pointerAt(clock) ?? pastOf(clock, violationAt(clock, scene, frame));
-  if (violation?.time !== undefined && violation.time !== clock.run.times[clock.sample]) {
-    drawThen(context, scene, violation, at);
-  }
+  const violation = pointerAt(clock) ?? violationAt(clock, scene, frame);
+  if (violation?.outline) drawDashes(context, violation.outline, at);
   const inks = clock.run.results[clock.result]?.left_open ? ["neutral", "quiet"] : ["negative-line", "negative-text"];
-  if (violation) drawViolation(context, violation, at, names, [width, height], inks);
+  const boxes = labels.filter((each) => !each.isRegion).map((each) => each.box);
+  if (violation) drawViolation(context, violation, at, [names, boxes], [width, height], inks);
 }
 
 // The objects that the chosen result was violated by, from then on.
@@ -144,36 +145,18 @@ function failedObjects({run, result, time}) {
   return verdict === "violated" && pointer && time >= pointer.time - 1e-9 ? pointer.objects : [];
 }
 
-// An arrow with the number of an earlier sample joins what stood there then, and not what stands there now.
-function pastOf({run}, violation) {
-  if (!violation || violation.moment === null) return violation;
-  const pointer = run.results[violation.result]?.pointer;
-  return pointer ? {...pointer, label: `${pointer.label} at ${secondsText(pointer.time)}`} : null;
-}
-
-// The outlines of what an arrow joins, as they were at its time.
-function drawThen(context, scene, {objects, time}, at) {
-  const frame = indexAt(scene.times, time);
-  for (const entity of scene.entities) {
-    if (objects?.includes(entity.name) && entity.form[frame] !== ABSENT) outline(context, entity, frame, at);
-  }
+// Whether an entity is in a frame, and not only its last outline.
+function isThere({form, last}, frame) {
+  return form[frame] !== ABSENT && !last.includes(form[frame]);
 }
 
 // A missing object leaves its last outline.
 function drawLast(context, entity, frame, at, labels) {
-  let last = frame;
-  while (last >= 0 && entity.form[last] === ABSENT) last -= 1;
-  if (last >= 0) labels.push({text: `${entity.name}, last seen`, box: outline(context, entity, last, at), isRegion: false});
-}
-
-// Draws a dashed outline, and returns the box around it.
-function outline(context, entity, frame, at) {
-  context.save();
+  const box = [Infinity, Infinity, -Infinity, -Infinity];
+  let place = entity.starts[frame];
   context.strokeStyle = colour("quiet");
   context.lineWidth = 1.25;
   context.setLineDash([4, 4]);
-  const box = [Infinity, Infinity, -Infinity, -Infinity];
-  let place = entity.starts[frame];
   for (const ring of entity.forms[entity.form[frame]]) {
     context.beginPath();
     for (let corner = 0; corner < ring; corner++, place += 2) {
@@ -184,8 +167,19 @@ function outline(context, entity, frame, at) {
     context.closePath();
     context.stroke();
   }
-  context.restore();
-  return box;
+  context.setLineDash([]);
+  labels.push({text: `${entity.name}, last seen`, box, isRegion: false});
+}
+
+// The outlines of what an arrow with the number of an earlier sample joins, as they were then.
+function drawDashes(context, points, at) {
+  context.strokeStyle = colour("quiet");
+  context.lineWidth = 1.25;
+  context.beginPath();
+  for (let place = 0; place < points.length; place += 2) {
+    context[place % 4 ? "lineTo" : "moveTo"](at.x(points[place]), at.y(points[place + 1]));
+  }
+  context.stroke();
 }
 
 // The arrow of the chosen result in a frame.
@@ -273,7 +267,7 @@ function outlined(context, text, x, y, fill) {
   context.fillText(text, x, y);
 }
 
-function drawViolation(context, {ends, label, text: atom}, at, names, [width, height], [line, ink]) {
+function drawViolation(context, {ends, label, text: atom}, at, [names, boxes], [width, height], [line, ink]) {
   const [x0, y0, x1, y1] = [at.x(ends[0]), at.y(ends[1]), at.x(ends[2]), at.y(ends[3])];
   const length = Math.hypot(x1 - x0, y1 - y0), angle = Math.atan2(y1 - y0, x1 - x0);
   const head = Math.min(11, length / 2);
@@ -296,10 +290,15 @@ function drawViolation(context, {ends, label, text: atom}, at, names, [width, he
   const texts = atom ? [48, 32, 20, 12].map((most) => `${shortened(atom, most)}: ${number}`) : [];
   const text = [...texts, number].find((words) => 2 * halfOf(words) <= width) ?? number;
   const half = halfOf(text), x = Math.min(Math.max((x0 + x1) / 2, half), width - half);
-  // above the arrow's middle, else as near to it as no name is
-  const rows = [-12, 15, -27, 30, -42, 45, -57, 60, -72, 75].map((step) => (y0 + y1) / 2 + step)
+  // above or below the part of the arrow there, as near to it as no name and no object is
+  const along = [x - half, x + half].map((side) => Math.min(Math.max((side - x0) / (x1 - x0 || 1), 0), 1));
+  const [low, high] = along.map((share) => y0 + share * (y1 - y0)).sort((one, other) => one - other);
+  const rows = Array.from({length: 16}, (_, step) => [low - 13 - 14 * step, high + 15 + 14 * step]).flat()
     .filter((row) => row >= 10 && row <= height - 10);
-  const row = rows.find((each) => !covers(names, x, each, half)) ?? rows[0] ?? 10;
+  const isFree = (row) => !covers(names, x, row, half);
+  const isOff = (row) => boxes.every(([left, top, right, bottom]) =>
+    x - half > right || x + half < left || row - 8 > bottom || row + 8 < top);
+  const row = rows.find((each) => isFree(each) && isOff(each)) ?? rows.find(isFree) ?? rows[0] ?? 10;
   outlined(context, text, x, row, colour(ink));
 }
 
@@ -360,7 +359,7 @@ function drawTrail(context, entity, first, last, at) {
 function middlesOf(entity) {
   const middles = new Float64Array(2 * entity.form.length).fill(NaN);
   for (let frame = 0; frame < entity.form.length; frame++) {
-    if (entity.form[frame] === ABSENT) continue;
+    if (!isThere(entity, frame)) continue;
     const [corners] = entity.forms[entity.form[frame]];
     const start = entity.starts[frame];
     for (const axis of [0, 1]) {
