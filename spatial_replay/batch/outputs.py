@@ -114,7 +114,7 @@ def worst_annotations(table: pa.Table, folder: Path = Path()) -> Iterator[str]:
     for row in (rows[place] for place in order[:_ANNOTATIONS]):
         about = requirement_of(row)
         name = f"{row['spec']} ({about})" if about else row["spec"]
-        message = f"{row['log']}: {row['failure']}. {row['reason']}".rstrip()
+        message = f"{row['log']}: {row['failure'].rstrip('.')}. {row['reason']}".rstrip()
         file = row["file"] if is_address(row["file"]) else folder / row["file"]
         yield annotation("error", repository_path(file), row["line"], message, title=name)
 
@@ -271,7 +271,7 @@ def _case(
         # errors are about the test, failures about what it tests
         tag = "failure" if row["error"] is None else "error"
         kind = row["error_kind"] or f"{verdict_word(row)}{damage_word(row)}"
-        texts = [*row["explanation"], *row["vacuous"]] or [row["failure"]]
+        texts = [*dict.fromkeys([*row["explanation"], *row["vacuous"]])] or [row["failure"]]
         text = "\n".join(filter(None, [requirement_of(row), *texts]))
         text = text if limit is None or len(text) <= limit else text[: limit - 1] + "…"
         message = printable(row["failure"], limit or 1_000)
@@ -521,9 +521,9 @@ def _cell(row: Values | None) -> Html:
         )
     shown = verdict if math.isnan(number) or verdict == "untested" else f"{number:.4g}"
     value = "0" if math.isnan(number) else f"{max(-1e300, min(1e300, number)):.17g}"
-    why = f": {row['failure']}" if fails else ""
+    why = f": {row['failure'].rstrip('.')}" if fails else ""
     tip = f"{result_name(row['spec'], row['object'])} is {verdict}{damage_word(row)}{why}. {row['reason']}"
-    tip = " ".join([tip, *(row["untested"] or ())])
+    tip = " ".join([tip, *(each for each in row["untested"] or () if each.rstrip(".") not in why)])
     shown = f"{shown}{damage_word(row)}{before}"
     return element("td", shown, title=tip, **{"class": kind, "data-value": value})
 

@@ -10,11 +10,9 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
-from functools import cache
-from importlib.resources import files
 from os import PathLike
 from pathlib import Path
-from typing import Any, Final, Protocol, TypeAlias, TypeVar, cast
+from typing import Any, Final, Protocol, TypeAlias, TypeVar
 
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.read_options import KEYS
@@ -26,6 +24,7 @@ from spatial_replay.mapping.yaml_document import (
     faults_by_place,
     numbered_faults,
     read_yaml_text,
+    schema_of,
 )
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.verdict import Verdict
@@ -257,7 +256,7 @@ def load_suite(path: str | PathLike[str]) -> Suite:
         return list(_contradictions(document.value, path.parent))
 
     document = document_from_text(text, "a suite", LARGEST_SUITE)
-    by_place = faults_by_place(document, _schema(), find)
+    by_place = faults_by_place(document, schema_of("batch", "suite"), find)
     faults = tuple(numbered_faults(document, by_place))
     return Suite(
         path.stem.removesuffix(".replay"), path.parent, tuple(_cases(document, by_place, path)), path, faults
@@ -394,9 +393,3 @@ def _pairs(table: Mapping[str, _Value]) -> Pairs[_Value]:
 def _listed(value: Any) -> Sequence[Any]:
     """Return what a key with one value or several lists; nothing for anything else."""
     return [value] if isinstance(value, str) else value if isinstance(value, list) else ()
-
-
-@cache
-def _schema() -> Mapping[str, Any]:
-    text = files(__package__).joinpath("suite.schema.json").read_text(encoding="utf-8")
-    return cast("Mapping[str, Any]", json.loads(text))

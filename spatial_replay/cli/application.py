@@ -274,6 +274,8 @@ def message_from_error(error: BaseException) -> str:
             path, what = context.command_path, error.format_message()
             if "unexpected extra" in what and any("--spec" in each.opts for each in context.command.params):
                 what += f"; specifications come after --spec: {path} LOG --spec FILE"
+            if "'--spec'" in what and any(each.name == "specification" for each in context.command.params):
+                what += f" {path} FILE takes the specification without it."
             return f"{what}\n  see '{path} --help'"
         case click.ClickException():
             return error.format_message()

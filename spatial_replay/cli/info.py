@@ -105,18 +105,15 @@ def info(
       spatial-replay info annotated.mcap --layout --panels -o layout.json
       spatial-replay info --panel -o spatial-replay.foxe
     """
-    wanted = [
-        name
-        for name, is_given in (
-            ("--suggest-mapping", suggest_mapping),
-            ("--fit", fit),
-            ("--decisions", decisions),
-            ("--specification", specification is not None),
-            ("--layout", layout),
-            ("--panel", panel),
-        )
-        if is_given
-    ]
+    given = {
+        "--suggest-mapping": suggest_mapping,
+        "--fit": fit,
+        "--decisions": decisions,
+        "--specification": specification is not None,
+        "--layout": layout,
+        "--panel": panel,
+    }
+    wanted = [name for name, is_given in given.items() if is_given]
     if len(wanted) > 1:
         raise UsageError(f"{' and '.join(wanted)} print different things; give one of them")
     if as_json and wanted and not decisions:

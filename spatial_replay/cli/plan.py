@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 from collections.abc import Callable, Mapping
-from functools import cache, wraps
-from importlib.resources import files
+from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,18 +33,11 @@ from spatial_replay.cli.record import (
 from spatial_replay.cli.terminal import fitted, progress, show, show_json, terminal_width, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import LogFile, local_files
+from spatial_replay.mapping.yaml_document import schema_of
 from spatial_replay.text import counted, counted_from
 
 if TYPE_CHECKING:
     from spatial_replay.logs.output_file import Durability
-
-
-@cache
-def _properties() -> Mapping[str, Mapping[str, Any]]:
-    # read here, so that --help loads no planner
-    text = files("spatial_replay.planning").joinpath("settings.schema.json").read_text(encoding="utf-8")
-    properties: Mapping[str, Mapping[str, Any]] = json.loads(text)["properties"]
-    return properties
 
 
 def setting_options(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -55,7 +46,7 @@ def setting_options(command: Callable[..., Any]) -> Callable[..., Any]:
     @wraps(command)
     def changing(**arguments: Any) -> Any:
         file: LogFile | None = arguments.pop("settings")
-        texts = {key: arguments.pop(key) for key in _properties()}
+        texts = {key: arguments.pop(key) for key in schema_of("planning", "settings")["properties"]}
         return command(changes=_changes(file, texts), **arguments)
 
     options = [
@@ -66,7 +57,7 @@ def setting_options(command: Callable[..., Any]) -> Callable[..., Any]:
             help="Settings of the planner (YAML); the options below have precedence.",
         )
     ]
-    for key, kind in _properties().items():
+    for key, kind in schema_of("planning", "settings")["properties"].items():
         what = kind["description"]
         text = f"{what[0].upper()}{what[1:]}."
         options.append(click.option(f"--{key.replace('_', '-')}", key, metavar="VALUE", help=text))

@@ -185,7 +185,7 @@ def _lines(tuning: Tuning) -> Iterator[str]:
             yield from (f"  {part}" for part in needs)
         return
     kind = ("widest margin" if tuning.is_widest else "margin") if count[False] else "tightest values"
-    yield f"{kind} for {runs}: {tuning.margin:.6g}" if count[False] else f"{kind} for {runs}"
+    yield f"{kind} for {runs}: {tuning.margin + 0.0:.6g}" if count[False] else f"{kind} for {runs}"
     undecided = [each.name for each in tuning.constants if not each.is_decided]
     if undecided:
         names = ", ".join(undecided)
@@ -201,7 +201,7 @@ def _lines(tuning: Tuning) -> Iterator[str]:
     width = max(len(run.name) for run in closest[:_MOST_LISTED])
     for run in closest[:_MOST_LISTED]:
         kind = "good" if run.is_good else "bad "
-        yield f"  {run.name:<{width}}  {kind}  {run.verdict:<9}  robustness {run.robustness:.6g}"
+        yield f"  {run.name:<{width}}  {kind}  {run.verdict:<9}  robustness {run.robustness + 0.0:.6g}"
     if len(closest) > _MOST_LISTED:
         yield f"  … and {counted(len(closest) - _MOST_LISTED, 'more run')}"
 

@@ -13,18 +13,16 @@ from collections.abc import Mapping as Table
 from dataclasses import dataclass
 from dataclasses import field as value_of
 from decimal import Decimal
-from functools import cache
-from importlib.resources import files
 from itertools import combinations
 from math import pi
 from os import PathLike
 from types import MappingProxyType
-from typing import Any, Literal, TypeAlias, cast
+from typing import Any, Literal, TypeAlias
 
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import log_file
 from spatial_replay.mapping.field_paths import FieldPath, NameTemplate
-from spatial_replay.mapping.yaml_document import Document, Place, checked_document, read_yaml_text
+from spatial_replay.mapping.yaml_document import Document, Place, checked_document, read_yaml_text, schema_of
 from spatial_replay.text import nearest_hint
 from spatial_replay.trace.units import OUR_AXES, Axes, signal_units_metadata
 
@@ -227,8 +225,6 @@ def age_ns(text: str) -> int:
     return FOREVER_NS if text == "forever" else duration_ns(text)
 
 
-SCHEMA_FILE = "mapping.schema.json"
-
 _NO_TIME = re.compile(r"0+(\.0*)?[nums]*", re.ASCII)
 _SIGNAL_KEYS = frozenset({"signals", "max_age", "clock", "stamp", "optional", "missing"})
 """Keys that do not concern objects: a topic with signals and no other keys has no objects."""
@@ -241,8 +237,10 @@ def load_mapping(path: str | PathLike[str]) -> LogMapping:
         MissingFileError: there is no such file.
         UsageError: the file is not a valid mapping; all errors are listed.
     """
-    text = read_yaml_text(path)
-    return parse_mapping(text, log_file(path).name)
+    name = log_file(path).name
+    if name.endswith(".spatial"):
+        raise UsageError(f"{name} is a specification, not a mapping; give it by --spec")
+    return parse_mapping(read_yaml_text(path), name)
 
 
 def parse_mapping(text: str, name: str = "mapping") -> LogMapping:
@@ -254,7 +252,7 @@ def parse_mapping(text: str, name: str = "mapping") -> LogMapping:
     Raises:
         UsageError: the text is not a valid mapping; all errors are listed.
     """
-    document = checked_document(text, name, _schema(), _contradictions, "a mapping")
+    document = checked_document(text, name, schema_of("mapping", "mapping"), _contradictions, "a mapping")
     try:
         return _mapping(document, name)
     except UsageError as error:
@@ -420,9 +418,3 @@ def _signal(name: str, value: Any) -> SignalMapping:
         table = {text: float(number) for text, number in value.get("names", {}).items()}
         return SignalMapping(name, value["field"], value.get("unit", ""), MappingProxyType(table))
     return SignalMapping(name, value)
-
-
-@cache
-def _schema() -> Table[str, Any]:
-    text = files(__package__).joinpath(SCHEMA_FILE).read_text(encoding="utf-8")
-    return cast("Table[str, Any]", json.loads(text))

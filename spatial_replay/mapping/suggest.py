@@ -198,14 +198,15 @@ def _names_beside(guess: Guess, messages: Sequence[object]) -> Iterator[str]:
             yield f"$.{path.text}[{INDEX}]"
 
 
-def numbers_in(message: object) -> tuple[str, ...]:
+def signals_in(message: object) -> tuple[str, ...]:
     """Return the paths of the numbers and truth values in a message, but for times and the header.
 
-    A list is found only next to a list `name`, such as `position[name=elbow]`.
+    A list is found only next to a list `name`, such as `position[name=elbow]`; a text only where it is the
+    whole message, as of `std_msgs/String`.
     """
     paths: list[str] = []
     for path, value in _iter_fields(message, is_skipped=_is_time):
-        if isinstance(value, int | float):
+        if isinstance(value, int | float) or (isinstance(value, str) and path == "data"):
             paths.append(path)
         elif is_list(value) and len(value) and isinstance(value[0], int | float):
             prefix, _, last = path.rpartition(".")
@@ -674,7 +675,7 @@ def _suggestion(topic: Topic, examples: Sequence[object]) -> TopicSuggestion:
         return _placed(topic, reading, examples, fields, name, remarks)
     guess = guess_objects(topic.name, topic.type, examples)
     if guess is None:
-        return TopicSuggestion(topic, numbers=numbers_in(examples[0]) if examples else ())
+        return TopicSuggestion(topic, numbers=signals_in(examples[0]) if examples else ())
     name = _name(topic, guess)
     layout = layout_of_topic(topic.type, TopicMapping(topic.name, objects=guess.objects))
     made = _placed(topic, layout, examples, _fields(name, guess), name, _remarks(guess))

@@ -12,8 +12,10 @@ import json
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cache
+from importlib.resources import files
 from os import PathLike
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 from spatial_replay.errors import MissingFileError, UsageError
 from spatial_replay.logs.remote import local_copy, log_file
@@ -186,6 +188,13 @@ def read_yaml_text(path: str | PathLike[str], largest: int = LARGEST_TEXT) -> st
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
         raise UsageError(f"{log_file(path).name}:{line}: a byte is not UTF-8; give a text file") from None
+
+
+@cache
+def schema_of(room: str, kind: str) -> Mapping[str, Any]:
+    """Return the JSON Schema of a kind of file, which lies in a room of the package."""
+    text = files(f"spatial_replay.{room}").joinpath(f"{kind}.schema.json").read_text(encoding="utf-8")
+    return cast("Mapping[str, Any]", json.loads(text))
 
 
 def checked_document(

@@ -102,7 +102,7 @@ class Violation:
         number = _settling(self.atom)
         amount = abs(without_residue(number, self.atom.atom)) * divisor_of(self.atom.atom)
         unit = declared_unit(self.atom.atom, self.witness.units, is_scaled=False)
-        short = _short(self.atom, self.spec, with_unit(amount, unit))
+        short = _short(self.atom, self.spec, with_unit(amount, unit) if amount else "just")
         return f"{short}: {_deciding_words(self.atom, self.witness, self.first_ns)}"
 
 
@@ -114,7 +114,9 @@ def _deciding_words(atom: DecidingAtom, witness: Witness, first_ns: int) -> str:
     """Return an atom, its number, and when it decided."""
     number = _settling(atom)
     how = "holds" if number >= 0.0 else "fails"
-    if isfinite(number):
+    if not without_residue(number, atom.atom):
+        how = f"just {how}"
+    elif isfinite(number):
         how += f" by {amount_text(abs(number), atom.atom, witness.units)}"
     return f"`{atom.text}` {how} at {Instant(witness.time_ns, first_ns)}"
 

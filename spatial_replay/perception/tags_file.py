@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cache
-from importlib.resources import files
 from os import PathLike
 from types import MappingProxyType
 from typing import Any, Final, Literal, cast
@@ -19,11 +16,10 @@ from spatial_replay.errors import GeometryError, UsageError
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.geometry.footprint import Footprint
 from spatial_replay.logs.remote import log_file
-from spatial_replay.mapping.yaml_document import Document, Place, checked_document, read_yaml_text
+from spatial_replay.mapping.yaml_document import Document, Place, checked_document, read_yaml_text, schema_of
 from spatial_replay.perception.opencv import FAMILY_SIZES, Camera, pose_looking_at
 from spatial_replay.trace.trace import duration_ns_from_text
 
-SCHEMA_FILE: Final = "tags.schema.json"
 LEAST_REFERENCES: Final = 4
 """Reference tags that a plane takes without a calibrated camera; with one, a single tag could do, but a wrong
 place of it would not be noticed."""
@@ -190,7 +186,7 @@ def parse_tags(text: str, name: str = "tags") -> TagsFile:
     Raises:
         UsageError: the text is not valid; all errors are listed.
     """
-    document = checked_document(text, name, _schema(), _contradictions, "a tags file")
+    document = checked_document(text, name, schema_of("perception", "tags"), _contradictions, "a tags file")
     value: Any = document.value
     camera_value = value.get("camera") or {}
     size = value.get("size")
@@ -435,9 +431,3 @@ def _outline_fault(corners: Any) -> str | None:
     except (UsageError, TypeError, ValueError):
         pass
     return None
-
-
-@cache
-def _schema() -> Mapping[str, Any]:
-    text = files(__package__).joinpath(SCHEMA_FILE).read_text(encoding="utf-8")
-    return cast("Mapping[str, Any]", json.loads(text))

@@ -10,8 +10,6 @@ import json
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import cache
-from importlib.resources import files
 from os import PathLike
 from types import MappingProxyType
 from typing import Any, Final, Literal, TypeAlias
@@ -22,7 +20,7 @@ from spatial_replay.errors import GeometryError, LogError, UsageError
 from spatial_replay.geometry.arrays import Booleans, Floats
 from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
 from spatial_replay.logs.remote import log_file
-from spatial_replay.mapping.yaml_document import checked_document, read_yaml_text
+from spatial_replay.mapping.yaml_document import checked_document, read_yaml_text, schema_of
 from spatial_replay.text import named_arguments
 from spatial_replay.trace.sample import Sample
 
@@ -293,7 +291,6 @@ RoomFrom: TypeAlias = Literal["later", "all"]
 """From what a placed object keeps the preferred room: from what may still be moved, or from everything."""
 
 _SKILLS = ("push", "place")
-SCHEMA_FILE: Final = "settings.schema.json"
 _ROOM_FROM = ("later", "all")
 _PLAIN = (
     "skill",
@@ -427,14 +424,6 @@ def _settings(read: dict[str, Any]) -> Settings:
 # ------------------------------------------------------------------------------------- files and options
 
 
-@cache
-def settings_schema() -> Mapping[str, Any]:
-    """Return the JSON Schema of settings files; its properties are all settings, each with a description."""
-    text = files("spatial_replay.planning").joinpath(SCHEMA_FILE).read_text(encoding="utf-8")
-    schema: Mapping[str, Any] = json.loads(text)
-    return schema
-
-
 def load_settings(path: str | PathLike[str], base: Settings | None = None) -> Settings:
     """Load a settings file (YAML), which changes some settings of others.
 
@@ -458,7 +447,9 @@ def parse_settings(text: str, name: str = "settings") -> Mapping[str, Any]:
     Raises:
         UsageError: the text is not valid; all errors are listed.
     """
-    document = checked_document(text, name, settings_schema(), lambda document: [], "a settings file")
+    document = checked_document(
+        text, name, schema_of("planning", "settings"), lambda document: [], "a settings file"
+    )
     value: Any = document.value
     return dict(value)
 
@@ -469,7 +460,7 @@ def parse_setting(key: str, text: str) -> Mapping[str, Any]:
     Raises:
         UsageError: the value is not valid.
     """
-    kind = settings_schema()["properties"][key]
+    kind = schema_of("planning", "settings")["properties"][key]
     is_list = kind.get("type") == "array" or any("names" in each.get("$ref", "") for each in _options(kind))
     if is_list and text.strip() != "null" and not text.strip().startswith("["):
         text = f"[{text}]"

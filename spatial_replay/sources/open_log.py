@@ -42,7 +42,7 @@ from spatial_replay.logs.remote import (
 )
 from spatial_replay.logs.source import IterTraces, Source, TrackSource, reading_only, units_of
 from spatial_replay.logs.topics import MAGIC
-from spatial_replay.text import counted_from
+from spatial_replay.text import counted_from, printable
 from spatial_replay.trace.trace import Trace
 from spatial_replay.trace.units import Axes
 
@@ -83,7 +83,10 @@ def open_source(path: str | PathLike[str], **reading: Unpack[Reading]) -> Source
         raise LogError(
             f"{path.name} is a compressed file of a ROS 2 bag; give its folder, {path.absolute().parent}"
         )
-    raise LogError(f"{path.name} is not a log in a known format; known formats are {', '.join(FORMATS)}")
+    raise LogError(
+        f"{path.name} is not a log in a known format; known formats are {', '.join(FORMATS)}; "
+        "a video becomes a log by `record video`"
+    )
 
 
 def read_trace(path: str | PathLike[str], *, allow_damage: bool = False, **reading: Unpack[Reading]) -> Trace:
@@ -138,8 +141,10 @@ def readable_file(path: str | PathLike[str]) -> LogFile:
             # the bag, by one of its files
             return file.absolute().parent
         if file.is_dir() and not is_bag_folder(file):
-            what = "no file of a ROS 2 bag (.db3, .mcap)" if any(file.iterdir()) else "nothing"
-            raise MissingFileError(f"{path}: there is {what} in this folder; give the path of a log")
+            first = min((each.name for each in file.iterdir()), default=None)
+            what = "no file of a ROS 2 bag (.db3, .mcap)" if first else "nothing"
+            such = f", such as {printable(str(file / first))}" if first else ""
+            raise MissingFileError(f"{path}: there is {what} in this folder; give the path of a log{such}")
         return file
     if not file.version.has_ranges:
         return downloaded(file, "its server does not give parts of files")

@@ -124,11 +124,19 @@ def test_a_misspelt_class_of_a_template_passes_nowhere_and_names_the_nearest(fle
     Path("clear.spatial").write_text("spec clear(ego) = G (ego dist cart >= 0)")
     objects = [_box("cart", 0.0), {**_box("anna", 3.0), "class": "pedestrian"}]
     Path("walk.jsonl").write_text(json.dumps({"time_ns": 0, "objects": objects}))
+    Path("idle.spatial").write_text("G ((cart dist person <= 0) -> (cart dist person <= 1))")
     misspelt = ("walk.jsonl", "--spec", "clear.spatial", "--each", "ego=class:pedestrain")
     done = batch(*misspelt, "--junit", "junit.xml")
     assert (done.code, "did you mean 'pedestrian'?" in done.out) == (4, True)
     assert "the log never has the class 'pedestrain'; did you mean 'pedestrian'? (in walk.jsonl)" in done.err
     assert ElementTree.parse("junit.xml").getroot().get("failures") == "1"
+    # each reason once, and one point after it
+    idle = batch("logs/run-0.jsonl", "--spec", "idle.spatial", "--junit", "idle.xml", "--html", "pages")
+    assert idle.code == 4
+    (failure,) = ElementTree.parse("idle.xml").getroot().iter("failure")
+    assert (failure.text or "").count("was never tested") == 1
+    page = Path("pages/index.html").read_text()
+    assert "never held.." not in page
 
 
 def test_a_cut_window_is_said_and_can_fail(fleet: Path) -> None:
@@ -578,6 +586,7 @@ def test_what_cannot_work_is_refused_with_the_remedy(fleet: Path, arguments: lis
         ("lgos: logs", "unknown key; did you mean 'logs'?"),
         ("logs: [logs/run-[0-3].jsonl]", "put patterns in quotes"),
         ("logs: *.jsonl", "put patterns in quotes"),
+        ("each: ego=class:cart", "as in {ego: class:NAME}"),
     ],
 )
 def test_a_slip_in_a_suite_gets_its_remedy(fleet: Path, line: str, said: str) -> None:

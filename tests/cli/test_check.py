@@ -328,6 +328,8 @@ def test_a_formula_stands_in_place_of_a_file_and_a_mapping_does_not(
     log.write_text(LOG)
     assert run(["replay", str(log), "--spec", "F (cube dist hans <= 1)"]) in (1, 4)
     assert "spec" in capsys.readouterr().out
+    assert run(["check", "--spec", str(log)]) == 2
+    assert "check FILE takes the specification without it" in capsys.readouterr().err
     mapping = tmp_path / "own.yaml"
     mapping.write_text("topics: {}\n")
     assert run(["replay", str(log), "--spec", str(mapping)]) == 2

@@ -185,9 +185,11 @@ def test_a_file_without_a_sample_is_an_error(tmp_path, jsonl):
     empty.touch()
     with pytest.raises(LogError, match="empty"):
         open_source(empty)
+    with pytest.raises(MissingFileError, match=r"give the path of a log, such as .*empty\.jsonl$"):
+        open_source(tmp_path)
     other = tmp_path / "picture.png"
     other.write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(100))
-    with pytest.raises(LogError, match=r"not a log in a known format"):
+    with pytest.raises(LogError, match=r"not a log in a known format.*`record video`"):
         open_source(other)
     with pytest.raises(LogError, match=r"holds no sample: run\.jsonl:1"):
         read_trace(jsonl('{"a": 1}'))

@@ -13,7 +13,6 @@ from mapping.feeding import Feed, make, pose_stamped
 from spatial_replay import MissingFileError, UsageError
 from spatial_replay.bags import Topic
 from spatial_replay.mapping import ReadingPlan, load_mapping, parse_mapping
-from spatial_replay.mapping import mapping_file as schema
 from spatial_replay.mapping.mapping_file import FOREVER_NS, Sampling, ShapeMapping, SignalMapping, Uncertainty
 
 EXAMPLE = """
@@ -134,6 +133,8 @@ def test_an_invalid_mapping_is_refused(text: str, what: str) -> None:
 def test_an_unreadable_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(MissingFileError, match="no such file"):
         load_mapping(tmp_path / "missing.yaml")
+    with pytest.raises(UsageError, match=r"a\.spatial is a specification, not a mapping; give it by --spec"):
+        load_mapping(tmp_path / "a.spatial")
     (tmp_path / "latin.yaml").write_bytes(b"topics:\n  /\xe4: {}\n")
     with pytest.raises(UsageError, match=r"latin.yaml:2: a byte is not UTF-8"):
         load_mapping(tmp_path / "latin.yaml")
@@ -142,9 +143,9 @@ def test_an_unreadable_file_is_refused(tmp_path: Path) -> None:
 
 
 def test_the_published_schema_is_the_one_in_use() -> None:
-    used = files("spatial_replay.mapping").joinpath(schema.SCHEMA_FILE).read_text(encoding="utf-8")
+    used = files("spatial_replay.mapping").joinpath("mapping.schema.json").read_text(encoding="utf-8")
     Draft202012Validator.check_schema(json.loads(used))
-    published = Path(__file__).parents[2] / "schemas" / schema.SCHEMA_FILE
+    published = Path(__file__).parents[2] / "schemas" / "mapping.schema.json"
     assert published.read_text(encoding="utf-8") == used
 
 

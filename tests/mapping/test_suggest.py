@@ -349,10 +349,18 @@ def test_joints_are_signals_by_their_names() -> None:
 
 
 def test_a_log_without_objects_and_numbers_has_no_topic_chosen() -> None:
-    text = suggest_mapping("run", [Topic("/text", "std_msgs/msg/String", "cdr")], {"/text": [{"data": "a"}]})
+    text = suggest_mapping("run", [Topic("/text", "own/Text", "cdr")], {"/text": [{"words": "a"}]})
     assert "# no topic was chosen" in text
     with pytest.raises(UsageError, match="topics: no topic was chosen"):
         parse_mapping(text)
+
+
+def test_a_message_that_is_one_text_is_suggested_as_a_signal() -> None:
+    text = suggest_mapping(
+        "run", [Topic("/mode", "std_msgs/msg/String", "cdr")], {"/mode": [{"data": "AUTO"}]}
+    )
+    (topic,) = parse_mapping(text).topics
+    assert {each.name: each.field for each in topic.signals} == {"mode_data": "data"}
 
 
 @pytest.mark.parametrize(
@@ -375,14 +383,9 @@ def test_what_is_suggested_for_a_log_is_accepted_as_it_is(
     assert run(["info", str(log), "--suggest-mapping"]) == 0
     printed = capsys.readouterr().out
     file.write_text(printed)
-    if name.startswith("talker"):
-        assert "no topic was chosen" in printed
-    else:
-        trace = next(
-            block.trace for block in open_source(log, mapping=file).iter_blocks() if len(block.trace)
-        )
-        assert trace.names
-        assert trace.faults == ()
+    trace = next(block.trace for block in open_source(log, mapping=file).iter_blocks() if len(block.trace))
+    assert tuple(trace.signals) == ("topic_data",) if name.startswith("talker") else trace.names
+    assert trace.faults == ()
 
 
 def test_what_is_suggested_for_protobuf_is_accepted_as_it_is(
@@ -398,10 +401,10 @@ def test_topics_without_objects_are_listed_as_comments() -> None:
     topics = [
         Topic("/rosout", "rcl_interfaces/msg/Log", "cdr", 12),
         Topic("/odd name\n", "b\n: c", "x", unreadable="no\ndefinition"),
-        Topic("/text", "std_msgs/msg/String", "cdr"),
+        Topic("/text", "own/Text", "cdr"),
     ]
     text = suggest_mapping(
-        "run\n.bag", topics, {"/text": [{"data": "hello"}], "/rosout": [{"x": 1.0, "y": 1.0}]}
+        "run\n.bag", topics, {"/text": [{"words": "hello"}], "/rosout": [{"x": 1.0, "y": 1.0}]}
     )
     assert all(
         line.startswith("#") or line.split(":")[0] in ("clock", "topics")

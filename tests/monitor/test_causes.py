@@ -279,6 +279,11 @@ def test_a_violation_says_amounts_in_the_units_of_the_log_and_the_time_of_its_at
         update = monitor.update(sr.Sample(half_seconds * SECOND // 2, {}, {"force": force}))
     soft, soon = map(str, update.violations)
     assert soft.startswith("force is 0.2 too high: `force <= 14` fails") and soft.endswith("at 1.000 s")
+    late = sr.Monitor(sr.parse_specification("G (rate(force) <= 0.1)"))
+    for tenths in range(30):
+        update = late.update(sr.Sample(tenths * SECOND // 10, {}, {"force": 0.01 * tenths}))
+    (residue,) = map(str, update.violations)
+    assert residue.startswith("rate(force) is just too high: `rate(force) <= 0.1` just fails at ")
     # the best attempt before the window closed
     assert soon.startswith("force is 5.8 too low: `force >= 20` fails") and soon.endswith("at 1.000 s")
 

@@ -260,6 +260,17 @@ def test_of_several_results_each_colours_objects_as_if_it_were_the_only_one(tmp_
             assert np.abs(palette[shades] - expected).max() <= 1, (line, drawn["name"])
 
 
+def test_exact_comparisons_are_drawn_beside_others(tmp_path: Path) -> None:
+    objects = {"car": sr.Footprint.disc(0, 0, 1), "bus": sr.Footprint.disc(4, 0, 1)}
+    samples = [sr.Sample(t, objects, {"mode": "AUTO"}) for t in range(3)]
+    lines = (
+        'spec a = G (mode == "AUTO" -> car dist bus >= 1)',
+        'spec b = G (mode == "AUTO" and car dist bus >= 3)',
+    )
+    page = report_of_samples(tmp_path / "both.html", samples, "\n".join(lines))
+    assert [each["verdict"] for each in page.facts["results"]] == ["violated", "satisfied"]
+
+
 def test_a_page_says_where_results_are_too_many_for_colours_of_each(tmp_path: Path) -> None:
     discs = {f"o{number}": sr.Footprint.disc(3 * number, 0, 0.3) for number in range(64)}
     page = tmp_path / "run.html"

@@ -55,6 +55,15 @@ def test_the_value_is_in_the_middle_between_good_and_bad_runs(
     assert (folder / "s.spatial").read_text() == TEXT
 
 
+def test_a_margin_of_nothing_has_no_sign(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_tracks(run_at([6, 5, 4, 4]), folder / "good/edge.jsonl")
+    edge = ("--good", "good/edge.jsonl", "good/0.jsonl", "--bad", "bad/0.jsonl", "--vary", "near=2:4")
+    assert tune(*edge) == 0
+    said = capsys.readouterr().out
+    assert "margin for 2 good runs and 1 bad run: 0\n" in said
+    assert "robustness -0\n" not in said
+
+
 def test_write_changes_the_numbers_and_nothing_else(folder: Path) -> None:
     assert tune(*LOGS[:3], "--vary", "near", "--vary", "hold=500ms:1500ms", "--write") == 0
     written = (folder / "s.spatial").read_text()
