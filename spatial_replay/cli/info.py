@@ -21,7 +21,6 @@ from spatial_replay.cli.terminal import (
     printing_to,
     progress,
     show,
-    show_bytes,
     show_file,
     show_json,
     terminal_width,
@@ -39,6 +38,8 @@ if TYPE_CHECKING:
     from spatial_replay.spec.formula import NamedSpec
     from spatial_replay.spec.load import SpecificationText
 
+_EXTENSION = "spatial-replay.foxe"
+"""For Foxglove and Lichtblick."""
 _EPOCH_LIKELY_NS = 10**18
 """Later times are taken to count from 1970 (2001 or later), earlier ones from the start of the run."""
 
@@ -69,9 +70,9 @@ _OF_MESSAGES = frozenset({"mapping", "on_time_jump", "max_lateness", "max_gap"})
 @click.option(
     "--panel",
     is_flag=True,
-    help="Print the extension for viewers instead; it is the same for every log, so give no LOG.",
+    help="Write the extension for viewers instead; it is the same for every log, so give no LOG.",
 )
-@output_option("File to write instead of standard output.")
+@output_option("File to write instead of standard output; with --panel, of spatial-replay.foxe.")
 @reading_options
 def info(
     log: LogFile | None,
@@ -103,7 +104,7 @@ def info(
       spatial-replay info annotated.mcap --specification -o used.spatial
       spatial-replay info annotated.mcap --layout -o layout.json
       spatial-replay info annotated.mcap --layout --panels -o layout.json
-      spatial-replay info --panel -o spatial-replay.foxe
+      spatial-replay info --panel
     """
     given = {
         "--suggest-mapping": suggest_mapping,
@@ -121,16 +122,18 @@ def info(
     if panels and not layout:
         raise UsageError("--panels chooses a layout; add --layout")
     if panel and log is not None:
-        raise UsageError("--panel prints the extension, which is the same for every log; remove the log")
-    if log is None and not panel:
-        raise click.MissingParameter(param_hint="'LOG'", param_type="argument")
-    with printing_to(output, () if log is None else input_files(log, reading=reading)):
-        if log is None:
-            # the extension for Foxglove and Lichtblick
-            show_bytes(
-                resources.files("spatial_replay.annotate").joinpath("spatial-replay.foxe").read_bytes()
-            )
-            return ExitCode.SATISFIED
+        raise UsageError("--panel writes the extension, which is the same for every log; remove the log")
+    if log is None:
+        if not panel:
+            raise click.MissingParameter(param_hint="'LOG'", param_type="argument")
+        from spatial_replay.logs.output_file import replacing
+
+        output = output or Path(_EXTENSION)
+        with replacing(output) as stream:
+            stream.write(resources.files("spatial_replay.annotate").joinpath(_EXTENSION).read_bytes())
+        show(f"wrote {output}")
+        return ExitCode.SATISFIED
+    with printing_to(output, input_files(log, reading=reading)):
         if layout:
             return _print_layout(log, panels=panels)
         if specification is not None:

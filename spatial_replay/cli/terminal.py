@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
 
 import click
 
-from spatial_replay.errors import UsageError
 from spatial_replay.text import escaped, without_repetition
 
 if TYPE_CHECKING:
@@ -120,17 +119,6 @@ def show_file(text: str) -> None:
     if sys.stdout.isatty():
         text = "\n".join(escaped(line, "\t") for line in text.splitlines()) + "\n"
     click.echo(text, nl=not text.endswith("\n"))
-
-
-def show_bytes(content: bytes) -> None:
-    """Print a file that is no text.
-
-    Raises:
-        UsageError: to a terminal, which would show it as noise.
-    """
-    if sys.stdout.isatty():
-        raise UsageError("this is no text; add -o FILE, as in -o spatial-replay.foxe")
-    click.echo(content, nl=False)
 
 
 @contextmanager

@@ -45,6 +45,29 @@ def test_the_edit_that_flips_a_verdict_is_named_with_its_lines(capsys: pytest.Ca
 
 
 @pytest.mark.usefixtures("folder")
+def test_numbers_of_a_diff_have_the_units_that_replay_says(capsys: pytest.CaptureFixture[str]) -> None:
+    assert said(capsys, "record", "tracks", "table.jsonl", "--unit", "m", "-o", "metres.mcap")[0] == 0
+    edited = said(capsys, "diff", "metres.mcap", *TABLE[1:])[1]
+    for line in (
+        "table_set: satisfied (0.02487 m) → violated (-0.1552 m)",
+        "first differs at 5.433 s: -0.1543 m → -0.1552 m",
+        "with this edit alone: violated, robustness -0.1552 m",
+        "fails by 0.1552 m at 4.000 s (within `laid`): spoon and plate are 0.2352 m apart.",
+    ):
+        assert line in edited
+    replayed = said(capsys, "replay", "metres.mcap", "--spec", "table_edited.spatial")[1]
+    assert "robustness -0.1552 m" in replayed
+    # of two runs, distances and numbers alike
+    Path("late.jsonl").write_text("".join(Path("table.jsonl").read_text().splitlines(keepends=True)[30:]))
+    assert said(capsys, "record", "tracks", "late.jsonl", "--unit", "m", "-o", "late.mcap")[0] == 0
+    runs = said(capsys, "diff", "metres.mcap", "late.mcap", "--spec", "table.spatial")[1]
+    assert "table_set: satisfied (0.02487 m) | " in runs
+    (moved,) = (line for line in runs.splitlines() if line.strip().startswith("spoon: differs"))
+    assert "by up to 0.3058 m; apart from itself" in moved
+    assert "farthest by 0.1766 m at" in moved
+
+
+@pytest.mark.usefixtures("folder")
 def test_what_is_equal_differs_in_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     same = ("--spec", "table.spatial")
     assert said(capsys, "diff", "table.jsonl", *same, *same)[0] == 0

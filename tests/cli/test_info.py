@@ -321,9 +321,13 @@ def test_an_overview_goes_to_a_file_and_never_to_the_log(
     assert log.read_bytes() == before
 
 
-def test_the_extension_for_viewers_is_printed(log: Path, capfdbinary: pytest.CaptureFixture[bytes]) -> None:
+def test_the_extension_for_viewers_is_written(
+    log: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(log.parent)
     assert run(["info", "--panel"]) == 0
-    content = capfdbinary.readouterr().out
+    assert capsys.readouterr().out == "wrote spatial-replay.foxe\n"
+    content = Path("spatial-replay.foxe").read_bytes()
     assert len(content) <= 200_000
     with zipfile.ZipFile(BytesIO(content)) as archive:
         assert archive.testzip() is None
@@ -334,9 +338,8 @@ def test_the_extension_for_viewers_is_printed(log: Path, capfdbinary: pytest.Cap
     assert package["name"] and package["publisher"] and package["version"]
     # a text of a log is never read as HTML, or as code
     assert not re.search(rb"innerHTML|outerHTML|insertAdjacentHTML|\beval\(|new Function", script)
-    file = log.with_name("spatial-replay.foxe")
-    assert run(["info", "--panel", "-o", str(file)]) == 0
-    assert (file.read_bytes(), capfdbinary.readouterr().out) == (content, b"")
+    assert run(["info", "--panel", "-o", "panels.foxe"]) == 0
+    assert Path("panels.foxe").read_bytes() == content
     assert run(["info", "--panel", str(log)]) == 2
     assert run(["info", "--panel", "--json"]) == 2
     assert run(["info"]) == 2
