@@ -60,6 +60,7 @@ export interface ResultMessage {
 export interface SpecificationMessage {
   readonly files: readonly { readonly name: string; readonly source: string }[];
   readonly results: readonly ResultMessage[];
+  readonly start_ns?: Long | null;
 }
 
 export interface RobustnessMessage {

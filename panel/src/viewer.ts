@@ -6,7 +6,7 @@ import { createElement, type ReactElement } from "react";
 import * as ReactDom from "react-dom";
 import style from "style.css";
 
-import { nanoseconds, stampOf, wide, type Long, type Received, type SpecificationMessage, type Stamp } from "./messages";
+import { nanoseconds, stampOf, wide, type EventMessage, type Long, type Received, type SpecificationMessage, type Stamp } from "./messages";
 
 export const SPECIFICATION = "/spatial/specification";
 
@@ -70,6 +70,13 @@ export interface Viewer {
   seconds(ns: bigint): number;
 }
 
+/** What tells messages apart that come before the specification. */
+interface EarlyMessage {
+  readonly specification?: string;
+  readonly object?: string;
+  readonly metadata?: EventMessage["metadata"];
+}
+
 /** A pointer's time is a double of seconds since 1970. */
 const PREVIEW_TOLERANCE_S = 5e-7;
 
@@ -90,7 +97,7 @@ class Panel implements Viewer {
   private start: bigint | null = null;
   private current: bigint | null = null;
   private hover: number | undefined;
-  /** Messages that came before the specification, the newest of each kind. */
+  /** Messages that came before the specification: all events, and the newest of each other kind. */
   private readonly early = new Map<string, Received>();
   private frame: readonly Received[] | undefined;
   private topics: ReadonlySet<string> | undefined;
@@ -193,12 +200,13 @@ class Panel implements Viewer {
     const ns = nanoseconds(received.receiveTime);
     if (topic === SPECIFICATION) {
       // a live source sends it again whenever playback jumps, with the time of the jump
-      this.specify(message as SpecificationMessage, isOfRange ? ns : this.origin ?? this.start ?? ns);
+      const specification = message as SpecificationMessage;
+      this.specify(specification, isOfRange ? ns : wide(specification.start_ns));
       return;
     }
     if (this.origin === null) {
-      const { specification = "", object = "" } = message as { specification?: string; object?: string };
-      this.early.set(JSON.stringify([topic, specification, object]), received);
+      const { specification = "", object = "", metadata } = message as EarlyMessage;
+      this.early.set(JSON.stringify([topic, specification, object, metadata]), received);
       return;
     }
     const own = (message as { time_ns?: Long | null }).time_ns;

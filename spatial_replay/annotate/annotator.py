@@ -159,7 +159,15 @@ class Annotator:
                 self._messages(_FRAME, trace.times_ns[:1], [encode_frame(int(trace.times_ns[0]))])
             )
         if self._trees and not self._written[SPECIFICATION]:
-            messages.append(self._messages(_SPECIFICATION, trace.times_ns[:1], [self.specification()]))
+            specification = encode_specification(
+                self._files,
+                self._trees,
+                self._units,
+                [() if run is None else run.propositions for run in self._runs],
+                self._automata,
+                int(trace.times_ns[0]) if self._scene.first_ns is None else self._scene.first_ns,
+            )
+            messages.append(self._messages(_SPECIFICATION, trace.times_ns[:1], [specification]))
         messages.append(self._robustness(blocks))
         messages.append(self._automaton_states(blocks))
         changes = self._changes(trace, blocks)
@@ -242,11 +250,6 @@ class Annotator:
             for block, earlier in zip(blocks, before, strict=True)
         ]
         self._latest = trace.slice(len(trace) - 1, len(trace)), latest
-
-    def specification(self) -> bytes:
-        """Return the message of the specifications and the trees of their results."""
-        propositions = [() if run is None else run.propositions for run in self._runs]
-        return encode_specification(self._files, self._trees, self._units, propositions, self._automata)
 
     def _robustness(self, blocks: Sequence[SeriesBlock]) -> Messages:
         """Return one message per sample and result."""

@@ -164,6 +164,7 @@ def encode_specification(
     units: Mapping[str, str] | None = None,
     propositions: Sequence[Sequence[int]] | None = None,
     automata: Sequence[Automaton | None] = (),
+    start_ns: int = 0,
 ) -> bytes:
     """Return the message with the specifications of a log; equal arguments give equal bytes.
 
@@ -171,11 +172,12 @@ def encode_specification(
         units: those that are declared, of signals by their names, of lengths by "".
         propositions: of each tree, the nodes that are propositions of its automaton.
         automata: of each tree, its automaton.
+        start_ns: the time of the first sample.
     """
     # imported here since an evaluation without messages needs no message types
     from spatial_replay.logs.schemas.Specification_pb2 import Specification as SpecificationMessage
 
-    message = SpecificationMessage()
+    message = SpecificationMessage(start_ns=start_ns)
     for file in files:
         message.files.add(
             name="" if file.filename == "<text>" else file.filename,

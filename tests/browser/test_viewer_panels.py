@@ -177,6 +177,25 @@ def test_a_live_source_is_followed_and_may_jump_back(open_panel: Open, results: 
         expect(now).to_have_text(number_text(results[0].series[0, 1, sample]))
 
 
+def test_a_panel_that_joins_late_has_the_time_of_the_log_and_all_events(open_panel: Open) -> None:
+    page = open_panel("table", "specification", "live")
+    count = page.evaluate(
+        """() => {
+            const late = {sec: 4, nsec: 0};
+            const of = (topic) => MESSAGES
+                .filter((each) => each.topic === topic && compare(each.receiveTime, late) <= 0)
+                .map((each) => ({...each, receiveTime: late}));
+            const events = of("/spatial/events"), numbers = of("/spatial/robustness").slice(-3);
+            viewer.render({startTime: late, currentTime: late, currentFrame: [...events, ...numbers]});
+            viewer.render({currentFrame: of("/spatial/specification")});
+            return events.length;
+        }"""
+    )
+    assert count > 1
+    expect(page.locator(".panel-head")).to_contain_text("at 4.000 s")
+    expect(page.locator(".events summary")).to_have_text(f"{count} events")
+
+
 def test_a_node_shows_its_curve_and_an_event_is_one_click_away(open_panel: Open) -> None:
     page = open_panel("table", "specification")
     seek(page, 4 * 10**9)

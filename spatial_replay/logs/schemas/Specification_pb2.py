@@ -24,25 +24,25 @@ _sym_db = _symbol_database.Default()
 
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\"spatial_replay/Specification.proto\x12\x0espatial_replay\"w\n\rSpecification\x12\x30\n\x05\x66iles\x18\x01 \x03(\x0b\x32!.spatial_replay.SpecificationFile\x12\x34\n\x07results\x18\x02 \x03(\x0b\x32#.spatial_replay.SpecificationResult\"U\n\x11SpecificationFile\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0e\n\x06source\x18\x02 \x01(\t\x12\x11\n\tcanonical\x18\x03 \x01(\t\x12\x0f\n\x07profile\x18\x04 \x01(\t\"\xbf\x01\n\x13SpecificationResult\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0e\n\x06object\x18\x02 \x01(\t\x12\x11\n\x04\x66ile\x18\x03 \x01(\rH\x00\x88\x01\x01\x12#\n\x05nodes\x18\x04 \x03(\x0b\x32\x14.spatial_replay.Node\x12\x14\n\x0cpropositions\x18\x05 \x03(\r\x12\x33\n\tautomaton\x18\x06 \x01(\x0b\x32 .spatial_replay.AutomatonDrawingB\x07\n\x05_file\"\xa2\x01\n\x10\x41utomatonDrawing\x12\x0f\n\x07summary\x18\x01 \x01(\t\x12-\n\x06states\x18\x02 \x03(\x0b\x32\x1d.spatial_replay.AutomatonNode\x12,\n\x05moves\x18\x03 \x03(\x0b\x32\x1d.spatial_replay.AutomatonMove\x12\x10\n\x08left_out\x18\x04 \x01(\r\x12\x0e\n\x06legend\x18\x05 \x03(\t\"\xc3\x01\n\rAutomatonNode\x12\x13\n\x06number\x18\x01 \x01(\rH\x00\x88\x01\x01\x12\r\n\x05\x61\x62out\x18\x02 \x01(\t\x12\x13\n\x06\x63olumn\x18\x03 \x01(\x01H\x01\x88\x01\x01\x12\x10\n\x03row\x18\x04 \x01(\x01H\x02\x88\x01\x01\x12\x11\n\taccepting\x18\x05 \x01(\x08\x12\x12\n\ncan_reject\x18\x06 \x01(\x08\x12\x15\n\x08\x64istance\x18\x07 \x01(\rH\x03\x88\x01\x01\x42\t\n\x07_numberB\t\n\x07_columnB\x06\n\x04_rowB\x0b\n\t_distance\"m\n\rAutomatonMove\x12\x13\n\x06source\x18\x01 \x01(\rH\x00\x88\x01\x01\x12\x13\n\x06target\x18\x02 \x01(\rH\x01\x88\x01\x01\x12\r\n\x05guard\x18\x03 \x01(\t\x12\r\n\x05label\x18\x04 \x01(\tB\t\n\x07_sourceB\t\n\x07_target\"\xd7\x01\n\x04Node\x12\x0f\n\x02id\x18\x01 \x01(\rH\x00\x88\x01\x01\x12\x13\n\x06parent\x18\x02 \x01(\rH\x01\x88\x01\x01\x12\x10\n\x08operator\x18\x03 \x01(\t\x12\x0c\n\x04name\x18\x04 \x01(\t\x12\x0c\n\x04text\x18\x05 \x01(\t\x12\x17\n\nspan_start\x18\x06 \x01(\rH\x02\x88\x01\x01\x12\x15\n\x08span_end\x18\x07 \x01(\rH\x03\x88\x01\x01\x12\x0c\n\x04unit\x18\x08 \x01(\t\x12\x0f\n\x07written\x18\t \x01(\tB\x05\n\x03_idB\t\n\x07_parentB\r\n\x0b_span_startB\x0b\n\t_span_endb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\"spatial_replay/Specification.proto\x12\x0espatial_replay\"\x89\x01\n\rSpecification\x12\x30\n\x05\x66iles\x18\x01 \x03(\x0b\x32!.spatial_replay.SpecificationFile\x12\x34\n\x07results\x18\x02 \x03(\x0b\x32#.spatial_replay.SpecificationResult\x12\x10\n\x08start_ns\x18\x03 \x01(\x03\"U\n\x11SpecificationFile\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0e\n\x06source\x18\x02 \x01(\t\x12\x11\n\tcanonical\x18\x03 \x01(\t\x12\x0f\n\x07profile\x18\x04 \x01(\t\"\xbf\x01\n\x13SpecificationResult\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0e\n\x06object\x18\x02 \x01(\t\x12\x11\n\x04\x66ile\x18\x03 \x01(\rH\x00\x88\x01\x01\x12#\n\x05nodes\x18\x04 \x03(\x0b\x32\x14.spatial_replay.Node\x12\x14\n\x0cpropositions\x18\x05 \x03(\r\x12\x33\n\tautomaton\x18\x06 \x01(\x0b\x32 .spatial_replay.AutomatonDrawingB\x07\n\x05_file\"\xa2\x01\n\x10\x41utomatonDrawing\x12\x0f\n\x07summary\x18\x01 \x01(\t\x12-\n\x06states\x18\x02 \x03(\x0b\x32\x1d.spatial_replay.AutomatonNode\x12,\n\x05moves\x18\x03 \x03(\x0b\x32\x1d.spatial_replay.AutomatonMove\x12\x10\n\x08left_out\x18\x04 \x01(\r\x12\x0e\n\x06legend\x18\x05 \x03(\t\"\xc3\x01\n\rAutomatonNode\x12\x13\n\x06number\x18\x01 \x01(\rH\x00\x88\x01\x01\x12\r\n\x05\x61\x62out\x18\x02 \x01(\t\x12\x13\n\x06\x63olumn\x18\x03 \x01(\x01H\x01\x88\x01\x01\x12\x10\n\x03row\x18\x04 \x01(\x01H\x02\x88\x01\x01\x12\x11\n\taccepting\x18\x05 \x01(\x08\x12\x12\n\ncan_reject\x18\x06 \x01(\x08\x12\x15\n\x08\x64istance\x18\x07 \x01(\rH\x03\x88\x01\x01\x42\t\n\x07_numberB\t\n\x07_columnB\x06\n\x04_rowB\x0b\n\t_distance\"m\n\rAutomatonMove\x12\x13\n\x06source\x18\x01 \x01(\rH\x00\x88\x01\x01\x12\x13\n\x06target\x18\x02 \x01(\rH\x01\x88\x01\x01\x12\r\n\x05guard\x18\x03 \x01(\t\x12\r\n\x05label\x18\x04 \x01(\tB\t\n\x07_sourceB\t\n\x07_target\"\xd7\x01\n\x04Node\x12\x0f\n\x02id\x18\x01 \x01(\rH\x00\x88\x01\x01\x12\x13\n\x06parent\x18\x02 \x01(\rH\x01\x88\x01\x01\x12\x10\n\x08operator\x18\x03 \x01(\t\x12\x0c\n\x04name\x18\x04 \x01(\t\x12\x0c\n\x04text\x18\x05 \x01(\t\x12\x17\n\nspan_start\x18\x06 \x01(\rH\x02\x88\x01\x01\x12\x15\n\x08span_end\x18\x07 \x01(\rH\x03\x88\x01\x01\x12\x0c\n\x04unit\x18\x08 \x01(\t\x12\x0f\n\x07written\x18\t \x01(\tB\x05\n\x03_idB\t\n\x07_parentB\r\n\x0b_span_startB\x0b\n\t_span_endb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
 _builder.BuildTopDescriptorsAndMessages(DESCRIPTOR, 'spatial_replay.Specification_pb2', _globals)
 if not _descriptor._USE_C_DESCRIPTORS:
   DESCRIPTOR._loaded_options = None
-  _globals['_SPECIFICATION']._serialized_start=54
-  _globals['_SPECIFICATION']._serialized_end=173
-  _globals['_SPECIFICATIONFILE']._serialized_start=175
-  _globals['_SPECIFICATIONFILE']._serialized_end=260
-  _globals['_SPECIFICATIONRESULT']._serialized_start=263
-  _globals['_SPECIFICATIONRESULT']._serialized_end=454
-  _globals['_AUTOMATONDRAWING']._serialized_start=457
-  _globals['_AUTOMATONDRAWING']._serialized_end=619
-  _globals['_AUTOMATONNODE']._serialized_start=622
-  _globals['_AUTOMATONNODE']._serialized_end=817
-  _globals['_AUTOMATONMOVE']._serialized_start=819
-  _globals['_AUTOMATONMOVE']._serialized_end=928
-  _globals['_NODE']._serialized_start=931
-  _globals['_NODE']._serialized_end=1146
+  _globals['_SPECIFICATION']._serialized_start=55
+  _globals['_SPECIFICATION']._serialized_end=192
+  _globals['_SPECIFICATIONFILE']._serialized_start=194
+  _globals['_SPECIFICATIONFILE']._serialized_end=279
+  _globals['_SPECIFICATIONRESULT']._serialized_start=282
+  _globals['_SPECIFICATIONRESULT']._serialized_end=473
+  _globals['_AUTOMATONDRAWING']._serialized_start=476
+  _globals['_AUTOMATONDRAWING']._serialized_end=638
+  _globals['_AUTOMATONNODE']._serialized_start=641
+  _globals['_AUTOMATONNODE']._serialized_end=836
+  _globals['_AUTOMATONMOVE']._serialized_start=838
+  _globals['_AUTOMATONMOVE']._serialized_end=947
+  _globals['_NODE']._serialized_start=950
+  _globals['_NODE']._serialized_end=1165
 # @@protoc_insertion_point(module_scope)

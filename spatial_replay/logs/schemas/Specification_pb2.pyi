@@ -22,6 +22,9 @@ class Specification(google.protobuf.message.Message):
 
     FILES_FIELD_NUMBER: builtins.int
     RESULTS_FIELD_NUMBER: builtins.int
+    START_NS_FIELD_NUMBER: builtins.int
+    start_ns: builtins.int
+    """The time of the first sample, in nanoseconds: a live source sends this message again at later times."""
     @property
     def files(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___SpecificationFile]:
         """The files, in the order in which they were given."""
@@ -35,8 +38,9 @@ class Specification(google.protobuf.message.Message):
         *,
         files: collections.abc.Iterable[global___SpecificationFile] | None = ...,
         results: collections.abc.Iterable[global___SpecificationResult] | None = ...,
+        start_ns: builtins.int = ...,
     ) -> None: ...
-    def ClearField(self, field_name: typing.Literal["files", b"files", "results", b"results"]) -> None: ...
+    def ClearField(self, field_name: typing.Literal["files", b"files", "results", b"results", "start_ns", b"start_ns"]) -> None: ...
 
 global___Specification = Specification
 
