@@ -297,6 +297,8 @@ def meant(tokens: Sequence[Token], position: int, accepted: Collection[str]) -> 
         name = tokens[position - 3]
         if name.type == "NAME" and (hint := function_hint(name.value, _argument(tokens, position - 1))):
             return f"{name.value!r} is not a function", hint
+    if tokens[0].type == "GROUP" and last.type == "EQUAL" and token.type in ("LSQB", "LPAR"):
+        return found, f"members stand without brackets: group {tokens[1].value} = a, b"
     if shape := _meant_shape(tokens, position, accepted):
         return found, shape
     if token.type == "RPAR" and last.type == "NUMBER" and before.value == "=>":
@@ -487,7 +489,7 @@ def _meant_shape(tokens: Sequence[Token], position: int, accepted: Collection[st
             return f"a box has four numbers: box({', '.join(numbers)})"
         case "CIRCLE" if len(numbers) == 3:
             return f"the centre stands in brackets: circle({pairs[0]}, {numbers[2]})"
-        case "POLYGON" if len(numbers) > 5:
+        case "POLYGON" if len(numbers) > 3:
             return f"each corner stands in brackets: polygon({', '.join(pairs)})"
     return ""
 
