@@ -340,14 +340,14 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
     plane = value.get("plane")
     references = plane.get("tags") if isinstance(plane, dict) else None
     reach = _reach(references)
-    if fault := _beyond(value.get("size"), reach):
-        faults.append((("size",), fault))
+    if large := _beyond(value.get("size"), reach):
+        faults.append((("size",), large))
     for name, entry in cast("dict[str, Any]", value["objects"]).items():
         if not isinstance(entry, dict):
             continue
         place: Place = ("objects", name)
         shapes = [key for key in ("box", "disc", "polygon") if key in entry]
-        faults += [((*place, key), fault) for key in shapes if (fault := _beyond(entry[key], reach))]
+        faults += [((*place, key), large) for key in shapes if (large := _beyond(entry[key], reach))]
         if len(shapes) != 1:
             faults.append(
                 (place, "give one of box, disc and polygon, the footprint around the object's centre")

@@ -243,7 +243,7 @@ class AtomBuilder:
             self.resolver.fault(name.span, scope, message)
         elif defined is not None and not isinstance(defined, BrokenStatement):
             message = f"{name.text!r} is {kind_of(defined)}; a signal of the log is expected"
-            self.resolver.fault(name.span, scope, message, "if the log has it, give the definition another name")
+            self.resolver.fault(name.span, scope, message, "if the log has it, rename the definition")
         return Signal(name.text) if plugin is None else ComputedSignal(name.text, plugin)
 
     def _atom(
