@@ -759,7 +759,12 @@ class LiveAssembler:
                 known[place] = reached_ns >= each.at_ns
         for (frame, by_stamp), places in kinds.items():
             at_ns = np.array([self._held[place].at_ns for place in places], np.int64)
-            found = tree.between(fixed, frame, at_ns, by_stamp=by_stamp).known
+            time_ns = np.array([self._held[place].time_ns for place in places], np.int64)
+            log_ns = time_ns if self._plan.by_log_time else None
+            found = tree.between(fixed, frame, at_ns, by_stamp=by_stamp, log_ns=log_ns).known
+            if by_stamp:
+                # the next transform shows whether the clock has stepped back before such a stamp
+                found = found & ((at_ns > tree.newest_stamp_ns - DISORDER_NS) | (time_ns < reached_ns))
             for place, is_known in zip(places, found.tolist(), strict=True):
                 known[place] = is_known
         return known

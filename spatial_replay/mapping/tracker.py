@@ -8,9 +8,10 @@ The tracker holds the last state of every object and signal, so that a log can b
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -448,7 +449,7 @@ class Tracker:
         self, reader: TopicReader, times_ns: Integers, log_times_ns: Integers, detections: Detections
     ) -> None:
         if detections.skipped:
-            self._remarks.count_skipped(reader.name, detections.skipped)
+            self._remarks.skipped[reader.name] += detections.skipped
         self._claim_names(reader.name, detections.name)
         layout = reader.planned.layout
         is_complete = layout is not None and layout.complete
@@ -457,7 +458,7 @@ class Tracker:
         def report(index: int, what: str) -> None:
             self._report_object(reader.name, log_times_ns[detections.message[index]], detections, index, what)
 
-        transforms = self._transforms(reader, detections, times_ns)
+        transforms = self._transforms(reader, detections, times_ns, log_times_ns)
         rows = rows_from_detections(detections, transforms, self._plan.mapping.axes, self._concave, report)
         number = self._add(rows)
         for place in self._follows(reader, detections).tolist():
@@ -488,7 +489,10 @@ class Tracker:
         """Return the rows of an object that stays in a frame, where that is at some times."""
         mapping, (frame, detections, index) = self._plan.mapping, following
         fixed, longest_ns = mapping.fixed_frame or "", self._readers[topic].planned.between_ns
-        found = self._tree.between(fixed, frame, times_ns, by_stamp=False, longest_ns=longest_ns, holds=True)
+        log_ns = times_ns if self._plan.by_log_time else None
+        found = self._tree.between(
+            fixed, frame, times_ns, by_stamp=False, log_ns=log_ns, longest_ns=longest_ns, holds=True
+        )
         self._count_missing(topic, frame, times_ns[~found.known])
         # while nothing moves, one observation is enough
         changed = _changes(found)
@@ -506,7 +510,7 @@ class Tracker:
     def _count_missing(self, topic: str, frame: str, times_ns: Integers) -> None:
         if len(times_ns):
             is_known = frame in self._tree.names
-            self._remarks.count_missing(topic, frame, len(times_ns), int(times_ns[0]), is_known=is_known)
+            self._remarks.missing.add((topic, frame, is_known), times_ns)
 
     def _count_replaced(self, topic: str, times_ns: Integers, replaced: Integers) -> None:
         """Count messages of which nothing, or not all, counts, because a later one has the same time."""
@@ -514,7 +518,7 @@ class Tracker:
         at = times_ns[replaced]
         at = at[(at >= start_ns) & (at < end_ns)]
         if len(at):
-            self._remarks.count_replaced(topic, len(at), int(at[0]))
+            self._remarks.replaced.add(topic, at)
 
     def _store_added(self) -> None:
         if self._added:
@@ -537,7 +541,7 @@ class Tracker:
                 )
 
     def _transforms(
-        self, reader: TopicReader, detections: Detections, times_ns: Integers
+        self, reader: TopicReader, detections: Detections, times_ns: Integers, log_times_ns: Integers
     ) -> Transforms | None:
         """Return fixed_from_frame of each object; None if everything is in the fixed frame."""
         fixed = self._plan.mapping.fixed_frame
@@ -547,7 +551,7 @@ class Tracker:
         of_frame = np.array([codes[frame] for frame in detections.frames], np.int64)
         count = len(of_frame)
         result = Transforms.unknown(count)
-        clock_ns = times_ns[detections.message]
+        clock_ns, log_ns = times_ns[detections.message], log_times_ns[detections.message]
         stamp_ns = np.zeros(count, np.int64) if detections.stamp_ns is None else detections.stamp_ns
         # a stamp of 0 is one that was never set
         stamped = stamp_ns != 0
@@ -561,9 +565,10 @@ class Tracker:
                 chosen = np.flatnonzero(stays & (of_frame == code) & (stamped == by_stamp))
                 if not len(chosen):
                     continue
-                at = stamp_ns[chosen] if by_stamp else clock_ns[chosen]
-                longest_ns = reader.planned.between_ns
-                between = self._tree.between(fixed, frame, at, by_stamp=by_stamp, longest_ns=longest_ns)
+                at, log = (stamp_ns if by_stamp else clock_ns)[chosen], log_ns[chosen]
+                between = self._tree.between(
+                    fixed, frame, at, by_stamp=by_stamp, log_ns=log, longest_ns=reader.planned.between_ns
+                )
                 result.put(chosen, between)
                 missing = clock_ns[chosen[~between.known]]
                 self._count_missing(reader.name, frame, missing[self._is_relevant(reader, missing)])
@@ -615,9 +620,8 @@ class Tracker:
     def _count_stale(self, topic: str, times_ns: Integers, codes: Integers, rows: Integers) -> None:
         stale = rows == STALE
         for column in np.flatnonzero(stale.any(axis=0)).tolist():
-            at = np.flatnonzero(stale[:, column])
             name = self._names.by_code[int(codes[column])]
-            self._remarks.count_stale(topic, name, len(at), int(times_ns[at[0]]))
+            self._remarks.stale.add((topic, name), times_ns[stale[:, column]])
 
     def _signal_columns(self, times_ns: Integers, newest_ns: int) -> dict[str, Floats]:
         columns: dict[str, Floats] = {}
@@ -635,17 +639,30 @@ class Tracker:
         return columns
 
 
+class _Counts(dict[Any, tuple[int, int]]):
+    """Counts by key, each with the first time."""
+
+    def add(self, key: Hashable, times_ns: Integers) -> None:
+        count, first_ns = self.get(key, (0, int(times_ns[0])))
+        self[key] = count + len(times_ns), first_ns
+
+
 class Remarks:
-    """Counts of objects that became unknown, and why."""
+    """Counts of objects that became unknown, and why.
+
+    Attributes:
+        missing: observations without a transform, by topic, frame, and whether the frame is known.
+        stale: samples in which an object is unknown because its topic was silent, by topic and name.
+        replaced: messages that have the time of a later one, by topic.
+        skipped: objects without solids, by topic.
+    """
 
     def __init__(self, name: str, mapping: LogMapping) -> None:
         self._name = name
         self._mapping = mapping
         self._texts: list[str] = []
-        self._missing: dict[tuple[str, str, bool], tuple[int, int]] = {}
-        self._stale: dict[tuple[str, str], tuple[int, int]] = {}
-        self._skipped: dict[str, int] = {}
-        self._replaced: dict[str, tuple[int, int]] = {}
+        self.missing, self.stale, self.replaced = _Counts(), _Counts(), _Counts()
+        self.skipped: Counter[str] = Counter()
         self._frames: set[str] = set()
         self._samples = Pauses()
         self._messages: dict[str, Pauses] = {}
@@ -672,25 +689,6 @@ class Remarks:
     def add(self, text: str) -> None:
         self._texts.append(text)
 
-    def count_missing(self, topic: str, frame: str, count: int, first_ns: int, *, is_known: bool) -> None:
-        """Count objects without a transform into the fixed frame."""
-        before, first = self._missing.get((topic, frame, is_known), (0, first_ns))
-        self._missing[topic, frame, is_known] = before + count, first
-
-    def count_stale(self, topic: str, name: str, count: int, first_ns: int) -> None:
-        """Count samples in which an object is unknown because its topic was silent."""
-        before, first = self._stale.get((topic, name), (0, first_ns))
-        self._stale[topic, name] = before + count, first
-
-    def count_skipped(self, topic: str, count: int) -> None:
-        """Count objects without solids."""
-        self._skipped[topic] = self._skipped.get(topic, 0) + count
-
-    def count_replaced(self, topic: str, count: int, first_ns: int) -> None:
-        """Count messages that have the time of a later one."""
-        before, first = self._replaced.get(topic, (0, first_ns))
-        self._replaced[topic] = before + count, first
-
     def note_frames(self, frames: Iterable[str]) -> None:
         """Note frames whose coordinates are not transformed."""
         if len(self._frames) < _MOST_NAMES:
@@ -699,10 +697,10 @@ class Remarks:
     def take(self) -> tuple[str, ...]:
         """Return all remarks, and forget them."""
         texts = [*self._texts, *self._missing_texts(), *self._stale_texts()]
-        for topic, count in sorted(self._skipped.items()):
+        for topic, count in sorted(self.skipped.items()):
             were = "object was" if count == 1 else "objects were"
             texts.append(f"{topic}: {count} {were} left out, without a solid: lines, arrows or texts")
-        for topic, (count, first_ns) in sorted(self._replaced.items()):
+        for topic, (count, first_ns) in sorted(self.replaced.items()):
             was = "message was" if count == 1 else "messages were"
             first = f"{topic}: {count} {was} left out, the first at "
             texts.append(
@@ -714,13 +712,13 @@ class Remarks:
                 f"coordinates are in the frames {listed} and taken as they are;"
                 " `fixed_frame` in the mapping brings them into one"
             )
-        self._texts, self._missing, self._stale, self._frames = [], {}, {}, set()
-        self._skipped, self._replaced = {}, {}
+        for noted in (self._texts, self.missing, self.stale, self._frames, self.skipped, self.replaced):
+            noted.clear()
         return tuple(Sentence(f"{self._name}: ", text) for text in texts)
 
     def _missing_texts(self) -> Iterator[Sentence]:
         fixed = self._mapping.fixed_frame
-        for (topic, frame, is_known), (count, first_ns) in sorted(self._missing.items()):
+        for (topic, frame, is_known), (count, first_ns) in sorted(self.missing.items()):
             reason = f"no transform from {frame!r} to {fixed!r} at that time"
             if not frame:
                 reason = "its messages name no frame; give one with `frame`"
@@ -733,7 +731,7 @@ class Remarks:
 
     def _stale_texts(self) -> Iterator[Sentence]:
         by_topic: dict[str, list[tuple[str, int, int]]] = {}
-        for (topic, name), (count, first_ns) in sorted(self._stale.items()):
+        for (topic, name), (count, first_ns) in sorted(self.stale.items()):
             by_topic.setdefault(topic, []).append((name, count, first_ns))
         for topic, stale in by_topic.items():
             names = ", ".join(name for name, _, _ in stale[:_MOST_NAMES])

@@ -2,19 +2,23 @@
 
 A transform places a child frame in its parent. Between two transforms of a child, translation is interpolated
 linearly and rotation along the shorter arc, as tf2 does; there is no extrapolation. A static transform holds
-until another one replaces it. Rotations are arrays of many at once: quaternions (x, y, z, w) and matrices.
+until another one replaces it. Where stamps step back, a new run begins, such as that of a simulation: only
+static transforms last beyond it. Rotations are arrays of many at once: quaternions (x, y, z, w) and matrices.
 """
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import compress
 from math import hypot, isfinite
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from spatial_replay.bags.reader import DISORDER_NS
 from spatial_replay.geometry.arrays import Booleans, Floats, Integers
 from spatial_replay.mapping.field_paths import (
     FieldError,
@@ -124,6 +128,7 @@ _OFF_LENGTH = 0.01
 _LEAST_JUMP = 0.1
 """Least jump of a frame, in metres and radians."""
 _MANY_JUMPS = 3
+_MOST_RESTARTS = 1_000
 
 
 class Transforms(NamedTuple):
@@ -177,14 +182,27 @@ class _Entry(NamedTuple):
     clock_ns: int
     parent: str
     pose: tuple[float, ...]
+    log_ns: int
+
+
+class _Restart(NamedTuple):
+    """Where stamps step back: the last transform before, and the first one after."""
+
+    old: _Entry
+    new: _Entry
 
 
 @dataclass(slots=True)
 class _Child:
-    """The transforms of one child frame; static ones, if it has any, count alone."""
+    """The transforms of one child frame; static ones, if it has any, count alone.
+
+    Attributes:
+        restart: where the stamps step back, if they do so at the last transform.
+    """
 
     moving: list[_Entry] = field(default_factory=list)
     static: list[_Entry] = field(default_factory=list)
+    restart: _Restart | None = None
 
     @property
     def entries(self) -> list[_Entry]:
@@ -200,13 +218,20 @@ class _Series(NamedTuple):
     parent: Integers
     poses: Floats
 
+    def at(self, times_ns: Integers) -> Integers:
+        """Return which transform was the last at each time; before the first, the first."""
+        return np.maximum(np.searchsorted(self.times_ns, times_ns, "right") - 1, 0)
+
 
 class FrameTree:
     """The transforms of a log, added as they arrive; see `remarks` for those that contradict each other."""
 
     def __init__(self) -> None:
         self._children: dict[str, _Child] = {}
-        self._series: dict[tuple[str, bool], _Series] = {}
+        self._series: dict[str, dict[tuple[str, int | None], _Series]] = {}
+        self._restarts: list[_Restart] = []
+        self.newest_stamp_ns = 0
+        """Of the last transform that is not static."""
         self._ignored: dict[str, tuple[int, _Entry, str]] = {}
         self._contradictions: dict[str, Sentence] = {}
         self._jumps: dict[str, tuple[int, float, _Entry, _Entry]] = {}
@@ -221,6 +246,7 @@ class FrameTree:
         *,
         stamp_ns: int,
         clock_ns: int,
+        log_ns: int,
         is_static: bool,
     ) -> None:
         """Add one transform; those that tf2 ignores are only counted.
@@ -232,15 +258,16 @@ class FrameTree:
             pose: x, y, z, then the quaternion x, y, z, w.
             stamp_ns: the time inside the message.
             clock_ns: the time of the message on the clock of the samples.
+            log_ns: when the message was recorded.
         """
-        entry = _Entry(stamp_ns, clock_ns, parent, pose)
+        entry = _Entry(stamp_ns, clock_ns, parent, pose, log_ns)
         if (reason := _why_ignored(child, entry)) is not None:
             count, first, first_child = self._ignored.get(reason, (0, entry, child))
             self._ignored[reason] = count + 1, first, first_child
             return
         known = self._children.setdefault(child, _Child())
         if is_static:
-            if known.static and known.static[-1][2:] == entry[2:]:
+            if known.static and known.static[-1][2:4] == entry[2:4]:
                 return
             last_ns = known.static[-1].stamp_ns if known.static else -1
             if stamp_ns == 0 or stamp_ns < last_ns:
@@ -248,9 +275,30 @@ class FrameTree:
         entries = known.static if is_static else known.moving
         if entries and (entries[-1].parent != parent or is_static) and child not in self._contradictions:
             self._contradict(child, entries[-1], entry)
+        if not is_static:
+            self.newest_stamp_ns = stamp_ns
+            if known.moving:
+                self._note_restart(known, entry)
         entries.append(entry)
-        for by_stamp in (False, True):
-            self._series.pop((child, by_stamp), None)
+        self._series.pop(child, None)
+
+    def _note_restart(self, child: _Child, new: _Entry) -> None:
+        """Note that the stamps of a frame step back.
+
+        If the next transform steps forward again, two programs with different clocks take turns.
+        """
+        old, before, child.restart = child.moving[-1], child.restart, None
+        if before in self._restarts and new.stamp_ns >= before.old.stamp_ns - DISORDER_NS:
+            self._restarts.remove(before)
+            self._series.clear()
+        if new.stamp_ns >= old.stamp_ns - DISORDER_NS or new.log_ns < old.log_ns:
+            return
+        restart = child.restart = _Restart(old, new)
+        if self._restarts and self._restarts[-1].new.log_ns > old.log_ns:
+            # in one restart, all frames step back one after the other
+            restart = min(restart, self._restarts.pop(), key=lambda each: each.new.log_ns)
+        self._restarts = [*self._restarts[1 - _MOST_RESTARTS :], restart]
+        self._series.clear()
 
     def forget_before(self, clock_ns: int) -> None:
         """Drop the moving transforms of messages before a time, except the last one of each child."""
@@ -284,6 +332,7 @@ class FrameTree:
         times_ns: Integers,
         *,
         by_stamp: bool,
+        log_ns: Integers | None = None,
         longest_ns: int = HISTORY_NS,
         holds: bool = False,
     ) -> Transforms:
@@ -291,33 +340,51 @@ class FrameTree:
 
         Args:
             times_ns: (N,) stamps, or times of messages on the clock of the samples (`by_stamp=False`).
+            log_ns: (N,) when that was recorded, which shows its run; without it, all runs count.
             longest_ns: between two transforms that are farther apart, nothing is known.
             holds: whether a transform holds for `longest_ns` if none follows in that time.
         """
-        if target == source or not len(times_ns):
-            return Transforms.identity(len(times_ns))
-        ask = _Question(times_ns, by_stamp, min(longest_ns, HISTORY_NS), holds)
-        parts = self._parts(ask)
+        count = len(times_ns)
+        if target == source or not count:
+            return Transforms.identity(count)
+        ask = _Question(np.arange(count), times_ns, log_ns, by_stamp, min(longest_ns, HISTORY_NS), holds)
+        parts = [part for run in self._by_run(ask) for part in self._by_parents(run)]
         if len(parts) == 1:
-            return self._in_one_tree(target, source, ask)
-        result = Transforms.unknown(len(times_ns))
+            return self._in_one_tree(target, source, parts[0])
+        result = Transforms.unknown(count)
         for part in parts:
-            result.put(part, self._in_one_tree(target, source, ask._replace(times_ns=times_ns[part])))
+            result.put(part.places, self._in_one_tree(target, source, part))
         return result
 
-    def _parts(self, ask: _Question) -> list[Integers]:
-        """Return the indices of times in groups in each of which every frame has one parent."""
+    def _by_run(self, ask: _Question) -> list[_Question]:
+        """Divide a question by the runs of the log, and by whether stamps are far from times of the log."""
+        times_ns, log_ns = ask.times_ns, ask.log_ns
+        if log_ns is None:
+            return [ask]
+        runs = np.searchsorted([each.new.log_ns for each in self._restarts], log_ns, "right")
+        if ask.by_stamp:
+            for number, (old, new) in enumerate(self._restarts, 1):
+                # an observation may come before the first transform of its run
+                is_early = np.abs(times_ns - new.stamp_ns) < np.abs(times_ns - old.stamp_ns)
+                runs[is_early & (log_ns > old.log_ns) & (log_ns < new.log_ns)] = number
+        kinds = 2 * runs + (ask.by_stamp & (np.abs(log_ns - times_ns) > HISTORY_NS))
+        return [
+            ask.part(kinds == kind)._replace(run=kind // 2, is_apart=kind % 2 > 0)
+            for kind in np.unique(kinds).tolist()
+        ]
+
+    def _by_parents(self, ask: _Question) -> list[_Question]:
+        """Divide a question so that in each part every frame has one parent."""
         keys = [np.zeros(len(ask.times_ns), np.int64)]
         for name in self._children:
-            series = self._series_of(name, ask.by_stamp)
+            series, times_ns = self._series_of(name, ask)
             if len(series.parents) > 1:
-                at = np.searchsorted(series.times_ns, ask.times_ns, "right") - 1
-                keys.append(series.parent[np.maximum(at, 0)])
+                keys.append(series.parent[series.at(times_ns)])
         if len(keys) == 1:
-            return [np.arange(len(ask.times_ns))]
+            return [ask]
         _, group = np.unique(np.stack(keys), axis=1, return_inverse=True)
         group = group.reshape(-1)
-        return [np.flatnonzero(group == each) for each in range(int(group.max()) + 1)]
+        return [ask.part(group == each) for each in range(int(group.max()) + 1)]
 
     def _in_one_tree(self, target: str, source: str, ask: _Question) -> Transforms:
         up = self._ancestors(source, ask)
@@ -333,9 +400,10 @@ class FrameTree:
         """Return a frame, its parent, the parent of that and so on, at the first time."""
         chain = [frame]
         while len(chain) < _LONGEST_CHAIN:
-            parent = self._parent(chain[-1], int(ask.times_ns[0]), ask.by_stamp)
-            if parent is None:
+            series, times_ns = self._series_of(chain[-1], ask)
+            if not series.parents:
                 break
+            parent = series.parents[int(series.parent[series.at(times_ns[:1])][0])]
             if parent in chain:
                 loop = chain[chain.index(parent) :]
                 first = loop.index(min(loop))
@@ -343,13 +411,6 @@ class FrameTree:
                 break
             chain.append(parent)
         return chain
-
-    def _parent(self, frame: str, time_ns: int, by_stamp: bool) -> str | None:
-        if frame not in self._children:
-            return None
-        series = self._series_of(frame, by_stamp)
-        at = int(np.searchsorted(series.times_ns, time_ns, "right")) - 1
-        return series.parents[int(series.parent[max(at, 0)])]
 
     def _climb(self, frames: list[str], ask: _Question) -> Transforms:
         """Return the transform from the first frame of a chain into the parent of the last."""
@@ -360,11 +421,10 @@ class FrameTree:
 
     def _step(self, frame: str, ask: _Question) -> Transforms:
         """Return parent_from_child at each time."""
-        series, times_ns = self._series_of(frame, ask.by_stamp), ask.times_ns
+        series, times_ns = self._series_of(frame, ask)
         last = len(series.times_ns) - 1
         if self._children[frame].static:
-            at = np.maximum(np.searchsorted(series.times_ns, times_ns, "right") - 1, 0)
-            poses = series.poses[at]
+            poses = series.poses[series.at(times_ns)]
             return _transforms(poses[:, :3], poses[:, 3:], np.ones(len(times_ns), np.bool_))
         after = np.searchsorted(series.times_ns, times_ns, "left")
         inside = after <= last
@@ -391,26 +451,26 @@ class FrameTree:
         turned = slerp(first[:, 3:], second[:, 3:], share)
         return _transforms(translation, np.where((share == 0.0)[:, None], first[:, 3:], turned), known)
 
-    def _series_of(self, frame: str, by_stamp: bool) -> _Series:
-        """Return the transforms of a child in order; of equal times, the later entry counts."""
-        series = self._series.get((frame, by_stamp))
-        if series is None:
-            entries = self._children[frame].entries
-            times = np.array([entry[0 if by_stamp else 1] for entry in entries], np.int64)
-            order = np.argsort(times, kind="stable")
-            ordered = times[order]
-            keep = order[np.append(ordered[1:] != ordered[:-1], True)]
-            kept = [entries[i] for i in keep.tolist()]
-            number = {parent: index for index, parent in enumerate(dict.fromkeys(e.parent for e in kept))}
-            series = _Series(
-                times[keep],
-                np.array([entry.clock_ns for entry in kept], np.int64),
-                list(number),
-                np.array([number[entry.parent] for entry in kept], np.int64),
-                np.array([entry.pose for entry in kept], np.float64),
-            )
-            self._series[frame, by_stamp] = series
-        return series
+    def _series_of(self, frame: str, ask: _Question) -> tuple[_Series, Integers]:
+        """Return the transforms of a child that a question is about, in order, and the times to look for.
+
+        Static transforms of all runs count. If stamps are not times of the log, these count from when they
+        were recorded.
+        """
+        child = self._children.get(frame, _Child())
+        clock, run, times_ns = "stamp_ns" if ask.by_stamp else "clock_ns", ask.run, ask.times_ns
+        if child.static:
+            run = None
+            if ask.is_apart and ask.log_ns is not None:
+                clock, times_ns = "log_ns", ask.log_ns
+        known = self._series.setdefault(frame, {})
+        if (clock, run) not in known:
+            entries = [each for each in child.entries if run is None or self._run_of(each) == run]
+            known[clock, run] = _series(entries, clock)
+        return known[clock, run], times_ns
+
+    def _run_of(self, entry: _Entry) -> int:
+        return bisect_right(self._restarts, entry.log_ns, key=lambda each: each.new.log_ns)
 
     def _contradict(self, child: str, old: _Entry, new: _Entry) -> None:
         """Note, once for each frame, a static transform that changes, or another parent."""
@@ -424,8 +484,9 @@ class FrameTree:
 
     def _look_for_jumps(self, name: str, entries: list[_Entry]) -> None:
         """Count the transforms of a child that lie far from the one before and the one after, which agree."""
-        for parent in {entry.parent for entry in entries}:
-            self._look_for_jumps_in(name, sorted(entry for entry in entries if entry.parent == parent))
+        kinds = [(entry.parent, self._run_of(entry)) for entry in entries]
+        for kind in dict.fromkeys(kinds):
+            self._look_for_jumps_in(name, sorted(compress(entries, (each == kind for each in kinds))))
 
     def _look_for_jumps_in(self, name: str, entries: list[_Entry]) -> None:
         if len(entries) < _MANY_JUMPS:
@@ -458,6 +519,14 @@ class FrameTree:
             of = f", the first of {owner!r} in {first.parent!r} at "
             texts.append(Sentence(f"{count} {were} left out{of}", Instant(first.clock_ns, 0), f": {reason}"))
         texts += self._contradictions.values()
+        doubtful = [child.restart for child in self._children.values()]
+        if restarts := [each for each in self._restarts if each not in doubtful]:
+            (old, new), count = restarts[0], len(restarts)
+            times = "" if count == 1 else f" {count} times, first"
+            step = f"step back{times} by {(old.stamp_ns - new.stamp_ns) / 1e9:.3f} s at "
+            rule = "earlier ones do not count from there on; cut the log there to evaluate each run by itself"
+            why = f", as when a simulation restarts: {rule}"
+            texts.append(Sentence(f"the stamps of transforms {step}", Instant(new.clock_ns, 0), why))
         for name, (count, most, old, new) in sorted(self._jumps.items()):
             if count < _MANY_JUMPS:
                 continue
@@ -484,12 +553,43 @@ class FrameTree:
 
 
 class _Question(NamedTuple):
-    """At which times transforms are wanted; see `FrameTree.between`."""
+    """At which times transforms are wanted; see `FrameTree.between`.
 
+    Attributes:
+        places: indices of the times in the whole question.
+        run: the number of the run; None for all.
+        is_apart: whether stamps are on a clock far from that of the log.
+    """
+
+    places: Integers
     times_ns: Integers
+    log_ns: Integers | None
     by_stamp: bool
     longest_ns: int
     holds: bool
+    run: int | None = None
+    is_apart: bool = False
+
+    def part(self, chosen: Booleans) -> _Question:
+        log_ns = None if self.log_ns is None else self.log_ns[chosen]
+        return self._replace(places=self.places[chosen], times_ns=self.times_ns[chosen], log_ns=log_ns)
+
+
+def _series(entries: Sequence[_Entry], clock: str) -> _Series:
+    """Return transforms in order of a clock; of equal times, the later one counts."""
+    times = np.array([getattr(entry, clock) for entry in entries], np.int64)
+    order = np.argsort(times, kind="stable")
+    ordered = times[order]
+    keep = order[np.append(ordered[1:] != ordered[:-1], True)[: len(order)]]
+    kept = [entries[i] for i in keep.tolist()]
+    number = {parent: index for index, parent in enumerate(dict.fromkeys(e.parent for e in kept))}
+    return _Series(
+        times[keep],
+        np.array([entry.clock_ns for entry in kept], np.int64),
+        list(number),
+        np.array([number[entry.parent] for entry in kept], np.int64),
+        np.array([entry.pose for entry in kept], np.float64),
+    )
 
 
 def _why_ignored(child: str, entry: _Entry) -> str | None:
@@ -528,13 +628,13 @@ class TransformReader:
         self._get: Get | None = None
 
     def add(
-        self, tree: FrameTree, message: object, clock_ns: int | None, *, is_static: bool, log_ns: int = 0
+        self, tree: FrameTree, message: object, clock_ns: int | None, *, log_ns: int, is_static: bool
     ) -> None:
         """Add the transforms of a message to a tree.
 
         Args:
             clock_ns: of the message, on the clock of the samples; None for the stamp of each transform.
-            log_ns: when the message was recorded, for transforms without a stamp.
+            log_ns: when the message was recorded.
 
         Raises:
             FieldError, AttributeError, LookupError, TypeError, ValueError: the message holds no transforms.
@@ -548,6 +648,7 @@ class TransformReader:
                 tuple(map(float, pose)),
                 stamp_ns=stamp_ns,
                 clock_ns=(stamp_ns or log_ns) if clock_ns is None else clock_ns,
+                log_ns=log_ns,
                 is_static=is_static,
             )
 

@@ -79,7 +79,7 @@ def test_the_way_back_through_a_tree_undoes_the_way_there(
         # each frame hangs below an earlier one, not always the one before
         parent = f"f{number // 2}"
         pose = (*translation.tolist(), *(rotation / np.linalg.norm(rotation)).tolist())
-        tree.add(f"f{number + 1}", parent, pose, stamp_ns=0, clock_ns=0, is_static=True)
+        tree.add(f"f{number + 1}", parent, pose, stamp_ns=0, clock_ns=0, log_ns=0, is_static=True)
     a, b = f"f{min(one, len(steps))}", f"f{min(other, len(steps))}"
     times = np.zeros(1, np.int64)
     there, back = (tree.between(x, y, times, by_stamp=True) for x, y in ((a, b), (b, a)))

@@ -257,7 +257,7 @@ def test_old_transforms_are_dropped_except_the_last() -> None:
     tree = FrameTree()
     for tick in range(100):
         pose = (float(tick), 0.0, 0.0, *NO_TURN)
-        tree.add("base", "map", pose, stamp_ns=tick, clock_ns=tick, is_static=False)
+        tree.add("base", "map", pose, stamp_ns=tick, clock_ns=tick, log_ns=tick, is_static=False)
     tree.forget_before(50)
     known = tree.between("map", "base", np.array([10, 50, 60]), by_stamp=True).known
     assert known.tolist() == [False, True, True]
@@ -414,3 +414,84 @@ def test_a_window_of_a_log_with_frames_is_a_slice_of_the_whole(
         assert part == whole.slice(int(inside[0]), int(inside[-1]) + 1)
     else:
         assert len(part) == 0
+
+
+def restarted(*, begin_ns: int = 1_700_000_000 * SECOND, before: int = 150, after: int = 200) -> Feed:
+    """Return two runs of a simulation: the base goes away from 0 in the first, back from 100 in the second.
+
+    Its first transform comes half a second after the restart; those of `odom` are dated ahead.
+    """
+    feed = Feed(latched=frozenset({"/tf_static"}))
+    feed.add("/tf_static", begin_ns, tf(transform("base", "cam", (0, 5, 0))))
+    for number in range(before + after):
+        tick = number if number < before else number - before
+        at, stamp = begin_ns + number * SECOND // 10, tick * SECOND // 10
+        x = tick if number < before else 100 - tick
+        feed.add("/p", at + 1, pose_stamped(0, 0, "cam", time_ns=stamp))
+        if number < before or tick >= 5:
+            feed.add("/tf", at + 2, tf(transform("odom", "base", (x, 0, 0), time_ns=stamp)))
+        if tick % 5 == 0:
+            ahead = stamp + 6 * SECOND // 10
+            feed.add("/tf", at + 3, tf(transform("map", "odom", (0, 0, 0), time_ns=ahead)))
+    return feed
+
+
+RESTARTED = "fixed_frame: map\ntopics: {/p: {}}"
+
+
+def test_transforms_of_a_run_place_nothing_of_the_next_run() -> None:
+    made = make(RESTARTED, restarted())
+    assert made.states("p") == 6 * "?" + 144 * "+" + 6 * "?" + 194 * "+"
+    assert [made.centre(n, "p")[0] for n in range(6, 150)] == list(range(6, 150))
+    assert [made.centre(n, "p")[0] for n in range(156, 350)] == [100 - tick for tick in range(6, 200)]
+    restart, missing = made.remarks
+    assert "the stamps of transforms step back by 14.500 s at 1700000015.000 s, as when" in restart
+    assert "cut the log there to evaluate each run by itself" in restart
+    assert "/p: 12 observations are unknown" in missing
+
+
+@pytest.mark.parametrize("batch", [1, 7, 333])
+def test_runs_do_not_depend_on_windows_and_blocks(batch: int) -> None:
+    feed = restarted()
+    whole, begin_ns = make(RESTARTED, feed).trace, feed.messages[0][1]
+    assert make(RESTARTED, feed, batch=batch).trace == whole
+    for first, last in ((100, 160), (150, 156), (152, 350), (160, 350)):
+        window = {"start_ns": begin_ns + first * SECOND // 10, "end_ns": begin_ns + last * SECOND // 10}
+        assert make(RESTARTED, feed, batch=batch, **window).trace == whole.slice(first, last)
+
+
+def test_transforms_of_the_next_run_place_nothing_before_a_jump_that_ends_the_log() -> None:
+    feed = Feed()
+    for number in range(40):
+        # in the second run, transforms come first
+        tick, at = number % 20 + 1, number * SECOND // 10
+        feed.add("/tf", at, tf(transform("map", "base", (number, 0, 0), time_ns=tick * SECOND // 10)))
+        if number not in range(20, 25):
+            feed.add("/p", at + 1, pose_stamped(0, 0, "base", time_ns=tick * SECOND // 10))
+    made = make("fixed_frame: map\nclock: header\ntopics: {/p: {}}", feed, on_time_jump="split")
+    assert [made.centre(n, "p")[0] for n in range(20)] == list(range(20))
+
+
+def test_two_clocks_that_take_turns_are_no_restart() -> None:
+    feed = Feed()
+    for tick in range(200):
+        at = tick * SECOND // 10
+        feed.add("/tf", at, tf(transform("map", "base", (tick, 0, 0), time_ns=at + 30 * SECOND)))
+        feed.add("/tf", at, tf(transform("map", "base", (tick, 0, 0), time_ns=at)))
+        feed.add("/p", at, pose_stamped(0, 0, "base", time_ns=at))
+    made = make("fixed_frame: map\ntopics: {/p: {}}", feed)
+    assert made.states("p") == 200 * "+"
+    assert not any("step back" in remark for remark in made.remarks)
+
+
+def test_a_static_transform_counts_from_its_recording_where_stamps_are_those_of_a_simulation() -> None:
+    feed, begin_ns = Feed(latched=frozenset({"/tf_static"})), 1_700_000_000 * SECOND
+    for tick in range(12):
+        # the simulation restarts after six seconds, and its second static transform has no stamp
+        at, stamp = begin_ns + tick * SECOND, tick % 6 * SECOND + 1
+        if tick in (0, 3, 6):
+            stamped = transform("map", "odom", (tick, 0, 0), time_ns=0 if tick == 3 else stamp)
+            feed.add("/tf_static", at, tf(stamped))
+        feed.add("/p", at + 1, pose_stamped(0, 0, "odom", time_ns=stamp))
+    made = make("fixed_frame: map\ntopics: {/p: {}}", feed)
+    assert [made.centre(n, "p")[0] for n in range(12)] == 3 * [0] + 3 * [3] + 6 * [6]

@@ -108,3 +108,19 @@ def test_what_is_lost_is_unknown_until_it_is_reported_again() -> None:
         ({"a"}, {"b"}),
         ({"a", "b"}, set()),
     ]
+
+
+def test_a_clock_that_steps_back_gives_the_same_samples_while_it_comes() -> None:
+    feed = Feed()
+    for number in range(60):
+        stamp, at = (number % 30) * 100 * MS, 20 * SECOND + number * 100 * MS
+        feed.add("/a", at, pose_stamped(0, 0, "cam", time_ns=max(1, stamp - 60 * MS)))
+        # the first transform of the second run comes late
+        if number not in range(30, 33):
+            x = stamp / SECOND if number < 30 else 50
+            feed.add("/tf", at + MS, tf(transform("map", "cam", (x, 0, 0), time_ns=stamp)))
+    assembler, _ = live(FRAMED, feed, max_delay_s=1.0)
+    traces = [assembler.add([message], message.log_time_ns / SECOND) for message in feed.raw()]
+    whole = make(FRAMED, feed)
+    assert Trace.concatenate([*traces, assembler.finish()]) == whole.trace
+    assert whole.states("a") == 30 * "+" + 4 * "?" + 26 * "+"
