@@ -95,6 +95,7 @@ def _of_specifications(
     request: EvaluationArguments, output: Path | None, semantics: Semantics
 ) -> SpecificationDiff:
     from spatial_replay.compare.specifications import diff_over_source
+    from spatial_replay.replay.engine import recorded_texts
     from spatial_replay.report.comparison_page import write_comparison
 
     if len(request.specs) > 2:
@@ -104,6 +105,8 @@ def _of_specifications(
     inputs = open_inputs(request)
     files = list(inputs.files)
     if len(request.specs) == 1:
+        if not recorded_texts(inputs.source):
+            raise UsageError(f"{inputs.source.name} holds no specification of its own; give --spec OLD, too")
         recorded = open_inputs(replace(request, specs=()))
         if len(recorded.files) != 1:
             names = ", ".join(file.filename for file in recorded.files)

@@ -149,6 +149,7 @@ def test_of_two_runs_it_says_who_moved_differently_since_when_and_what_that_did(
     ("arguments", "words"),
     [
         (["diff", "table.jsonl"], "give a second log, or --spec OLD --spec NEW"),
+        (["diff", *TABLE[:3]], "table.jsonl holds no specification of its own; give --spec OLD, too"),
         (["diff", *TABLE, "--spec", "push_edited.spatial"], "3 specifications; give two"),
         (
             ["diff", "table.jsonl", "--spec", "table.spatial", "--spec", "push_edited.spatial"],
