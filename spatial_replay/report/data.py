@@ -147,6 +147,7 @@ class RunReport:
         gaps: sentences on what unknown results lack before or after a time.
         unreadable: how many observations have no finite numbers.
         declared_units: those of signals by their names, and of lengths by "".
+        planned_for: the file that decisions were made for, if another one is evaluated; else "".
     """
 
     log: str
@@ -169,6 +170,7 @@ class RunReport:
     events: tuple[ReportedEvent, ...]
     decisions: ReportedDecisions
     pictures: ReportedPictures = NO_PICTURES
+    planned_for: str = ""
 
     @property
     def verdict(self) -> Verdict:

@@ -70,7 +70,9 @@ def panels(report: RunReport) -> Html:
         panel("events", "Events"),
     ]
     if report.decisions.decisions:
-        sections.append(panel("decisions", "Decisions"))
+        other = f"They were made for another specification: {report.planned_for}, as it was recorded."
+        note = [element("p", text(other), **{"class": "axes"})] if report.planned_for else []
+        sections.append(panel("decisions", "Decisions", *note))
     return element("main", *sections, id="main", tabindex="-1")
 
 

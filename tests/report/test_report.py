@@ -294,6 +294,13 @@ def test_an_absent_object_leaves_its_last_outline(tmp_path: Path) -> None:
     assert points[2].tolist() == points[1].tolist()
 
 
+def test_decisions_for_another_specification_are_marked_so(tmp_path: Path) -> None:
+    for name, is_marked in (("push.spatial", False), ("push_edited.spatial", True)):
+        report_of_recording(tmp_path / "run.html", "push.mcap", name)
+        said = "made for another specification: push.spatial" in (tmp_path / "run.html").read_text("utf-8")
+        assert said == is_marked
+
+
 def test_the_automaton_is_drawn_as_it_leads_on(planned: Page) -> None:
     automaton = planned.facts["results"][0]["automaton"]
     columns = {state["number"]: state["at"][0] for state in automaton["states"]}
