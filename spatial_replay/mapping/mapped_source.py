@@ -166,7 +166,8 @@ class MappedSource:
         mapped = {*(each.topic for each in self.mapping.topics), self.mapping.sampling.topic}
         reasons = [topic.unreadable for topic in topics if topic.name in mapped and topic.unreadable]
         if reasons:
-            raise LogError("\n".join(f"{self.name}: {reason}" for reason in reasons))
+            texts = [f"{self.name}: {reason}" for reason in reasons]
+            raise LogError("\n".join([*texts, *reader.take_faults()]))
         try:
             mapping = replace(self.mapping, max_gap_ns=self.max_gap_ns)
             return ReadingPlan.of(mapping, topics, late_ns(self.late))

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import pytest
 
 from bags.bag_files import (
+    MAPPING,
     START_NS,
     TEXT,
     Sent,
@@ -24,7 +25,7 @@ from bags.bag_files import (
     write_ros1,
     write_ros2,
 )
-from spatial_replay import LogError
+from spatial_replay import LogError, read_trace
 from spatial_replay.bags import Message, open_messages
 from spatial_replay.cli import run
 
@@ -295,3 +296,15 @@ def test_a_compressed_file_that_was_cut_is_named(tmp_path: Path, share: float) -
         count, faults = 0, str(error)
     assert f"{packed.name} breaks off" in faults
     assert (count > 0) == (share > 0.9)
+
+
+def test_a_mapped_topic_that_a_cut_file_lost_is_refused_with_the_file(tmp_path: Path) -> None:
+    folder = write_ros2(tmp_path / "drive", drive(3000), compression="file")
+    packed = next(folder.glob("*.zstd"))
+    packed.write_bytes(packed.read_bytes()[: packed.stat().st_size // 2])
+    mapping = tmp_path / "drive.yaml"
+    mapping.write_text(MAPPING)
+    with pytest.raises(
+        LogError, match=f"'/a' is in none of the bag's files\n(.*\n)*.*{packed.name} breaks off"
+    ):
+        read_trace(folder, mapping=mapping)
