@@ -132,10 +132,13 @@ def _redo(
     "log",
     metavar="LOG",
     type=LogPath(),
-    help="Decide again on the samples of a planned run, with what the options below change.",
+    help="Decide again on the samples of a planned run, with the changes of the options below.",
 )
 @click.option(
-    "-o", "--output", type=LogOutput(path_type=Path), help="Log to write with both decisions (MCAP)."
+    "-o",
+    "--output",
+    type=LogOutput(path_type=Path),
+    help="Copy of the log to write, with old and redone decisions (MCAP).",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of text.")
 @click.option("--spec", metavar="SPEC", type=LogPath(), help="Specification to plan for instead.")

@@ -314,7 +314,7 @@ class Settings:
 
     Attributes:
         workspace: where objects can be put.
-        skill: "push", for which the path matters, or "place", for which only the target does.
+        skill: "push" (the path matters) or "place" (only the target does).
         movable: names of the objects that the robot can move; None for all objects of a sample.
         margin: the least robustness of progress at a target, in the unit of the relations, at least 0.
         constraint_margin: how far constraints have to stay from holding, in the same unit, at least 0.

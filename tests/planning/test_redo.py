@@ -150,7 +150,7 @@ def test_settings_come_from_a_file_and_options_have_precedence(tidied, tmp_path)
         (("--room", "-1"), "--room: expected a number of 0 or more; got -1"),
         (("--attempts", "0"), "--attempts: expected a whole number of at least 1; got 0"),
         (("--yaws", "0,3x"), "3x"),
-        (("--skill", "throw"), "--skill: expected push, for which the path matters"),
+        (("--skill", "throw"), "--skill: expected push (the path matters)"),
         (("push",), "--redo takes no scenario"),
     ],
 )
