@@ -374,6 +374,31 @@ def test_formulas_that_hold_together_are_decided_as_one_formula_is(formulas: lis
     assert lengths[0] == lengths[1]
 
 
+responses = st.builds(
+    "G ({0} -> F[{1}, {2}] {3})".format,
+    st.sampled_from(("a leftof b", "c ovlp d", "not (e leftof f)")),
+    st.integers(0, 2),
+    st.integers(2, 5),
+    st.sampled_from(("g ovlp h", "not (g ovlp h)", "i leftof j", "not (a leftof b)")),
+)
+untils = st.builds(
+    "({}) U ({})".format, st.sampled_from(("g ovlp h", "i leftof j")), st.sampled_from(ATOMS[:2])
+)
+
+
+@examples(20)
+@given(st.lists(st.one_of(responses, untils, parts), min_size=3, max_size=6))
+def test_a_conjunction_that_its_automaton_decides_is_decided(formulas: list[str]) -> None:
+    specification = sr.parse_specification(f"spec s = {' and '.join(f'({each})' for each in formulas)}")
+    automaton = sr.automaton(specification)
+    examined = sr.doctor(specification, examples=False)
+    (spec,) = examined.specs
+    assert spec.undecided == ()
+    if automaton.initial not in automaton.can_accept:
+        # geometry may exclude more runs than propositions do
+        assert ("unsatisfiable", ("s",)) in [(each.kind, each.specs) for each in examined.findings]
+
+
 def test_a_template_is_examined_about_any_object() -> None:
     specification = sr.parse_specification("spec s(e) = G (e dist cup >= 0.3) and F (e dist cup <= 0.2)")
     examined = sr.doctor(specification)
