@@ -579,7 +579,7 @@ def why_text(decision: PlanDecision) -> str:
         return ""
     aim, name = decision.considered[-1], decision.target.object
     later = [each.object for each in aim.motions[1:] if each.object != name]
-    wanted = [text for guard in aim.progress[:1] for text in _positive_parts(guard.text)]
+    wanted = [text for guard in aim.progress[:1] for text in _wanted(guard, aim.constraints)]
     chosen = next((each for each in aim.candidates if each.chosen), PlanCandidate())
     relations = [each.text for each in chosen.conjuncts] or wanted
     is_named = [re.search(rf"\b{re.escape(name)}\b", each) is not None for each in relations]
@@ -599,16 +599,24 @@ def why_text(decision: PlanDecision) -> str:
     return f"{why} is wanted; {other.object} could do it with {how} ({numbers})"
 
 
-def _positive_parts(text: str) -> list[str]:
-    """Return the parts of a conjunction that are no negations."""
+def _wanted(progress: PlanGuard, constraints: Iterable[PlanGuard]) -> list[str]:
+    """Return what has to hold of a conjunction, without what always has to."""
     parts, depth = [""], 0
-    for word in text.split(" "):
+    for word in progress.text.split(" "):
         if word == "and" and not depth:
             parts.append("")
             continue
         depth += word.count("(") - word.count(")")
         parts[-1] = f"{parts[-1]} {word}".lstrip()
-    return [each for each in parts if not each.startswith("not ")]
+    always = {
+        number
+        for each in constraints
+        if len(each.propositions) == 1
+        for number, value in zip(each.propositions, each.values, strict=False)
+        if not value
+    }
+    literals = zip(parts, progress.propositions, progress.values, strict=False)
+    return [part for part, number, value in literals if value and number not in always]
 
 
 def _once_all_are_done(edge: PlanEdge) -> str:

@@ -109,6 +109,12 @@ def test_the_reason_names_the_rival_and_what_is_wanted():
     )
 
 
+def test_the_reason_does_not_repeat_what_always_has_to_hold():
+    _, _, steps, _ = planned("spec s = (F a rightof c) and G (a dist b >= 0.01 and b dist c >= 0.01)")
+    why, _, _ = why_text(decision_message(steps[0])).partition("; ")
+    assert why == f"{steps[0].target.name} moves: a rightof c is wanted"
+
+
 def test_what_is_in_the_way_is_moved_first():
     moved, end, _, _ = planned("region spot = box(7.2, 0.2, 8.8, 1.8)\nspec s = F (a enclosedin spot)")
     assert moved == ["c", "a"]
