@@ -5,7 +5,12 @@ Ragged rows keep rows of unequal length in one flat array: row r is `values[star
 
 from __future__ import annotations
 
+import math
+import mmap
+import os
+import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import fields, replace
 from itertools import chain
 from typing import Any, Final, TypeAlias, TypeVar, cast
@@ -20,6 +25,32 @@ Booleans: TypeAlias = NDArray[np.bool_]
 
 Empty: TypeAlias = Callable[[tuple[int, ...]], Floats]
 """Returns an array of some shape whose numbers are not set yet, as `numpy.empty` does."""
+
+
+_Number = TypeVar("_Number", np.float64, np.int64)
+
+_LARGE_BYTES: Final = 2**24
+"""Arrays of this size and more lie in a file, if the disk has room."""
+
+
+def roomy(shape: tuple[int, ...], dtype: type[_Number]) -> NDArray[_Number]:
+    """Return an array whose numbers are not set yet; a large one lies in a temporary file.
+
+    Its pages can leave memory, unlike those of other arrays: a long log then needs room on a disk instead.
+    """
+    size = np.dtype(dtype).itemsize * math.prod(shape)
+    if size >= _LARGE_BYTES:
+        with suppress(OSError), tempfile.TemporaryFile() as file:
+            os.posix_fallocate(file.fileno(), 0, size)  # otherwise a full disk would end the process later
+            return np.frombuffer(mmap.mmap(file.fileno(), size), dtype).reshape(shape)
+    return np.empty(shape, dtype)
+
+
+def joined(parts: Sequence[NDArray[_Number]], axis: int = 0) -> NDArray[_Number]:
+    """Concatenate arrays of one type into a `roomy` one."""
+    shape = list(parts[0].shape)
+    shape[axis] = sum(part.shape[axis] for part in parts)
+    return np.concatenate(parts, axis=axis, out=roomy(tuple(shape), parts[0].dtype.type))
 
 
 def read_only_floats(values: ArrayLike) -> Floats:

@@ -14,7 +14,7 @@ from types import MappingProxyType
 import numpy as np
 
 from spatial_replay.errors import UsageError
-from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.geometry.arrays import Floats, Integers, roomy
 from spatial_replay.monitor.offline_kernel import run_offline, run_windows
 from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.codes import OFFLINE_TARGET, low_and_high
@@ -103,7 +103,7 @@ class OfflineFormula:
 
     def evaluate(self, leaves: Floats, times_ns: Integers) -> OfflineNodes:
         """Evaluate every node over all samples; see `evaluate_offline`."""
-        columns = np.empty((len(leaves), self.width, len(times_ns)))
+        columns = roomy((len(leaves), self.width, len(times_ns)), np.float64)
         extrema = np.empty(len(times_ns))
         run_offline(self.table, np.ascontiguousarray(leaves), times_ns, 0, len(times_ns), columns, extrema)
         return OfflineNodes(columns[:, : self.nodes])

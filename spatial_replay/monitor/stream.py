@@ -15,13 +15,13 @@ from typing import cast
 import numpy as np
 
 from spatial_replay.errors import TraceError
-from spatial_replay.geometry.arrays import Empty, Floats, Integers
+from spatial_replay.geometry.arrays import Empty, Floats, Integers, joined
 from spatial_replay.monitor.atoms.delays import look_back, tail
 from spatial_replay.monitor.atoms.live import SampleLeaves
 from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.monitor.instances import Instance
-from spatial_replay.monitor.online.codes import in_channels
+from spatial_replay.monitor.online.codes import joined_channels
 from spatial_replay.monitor.online.program import compile_formula
 from spatial_replay.monitor.online.step import OnlineRun
 from spatial_replay.monitor.semantics import Evaluator, Semantics
@@ -59,11 +59,10 @@ class SeriesBlock:
 
 def join_blocks(blocks: Sequence[SeriesBlock]) -> SeriesBlock:
     """Join one or more consecutive blocks of the same instance."""
-    channels = max(len(block.leaves) for block in blocks)
     return SeriesBlock(
-        np.concatenate([block.times_ns for block in blocks]),
-        np.concatenate([block.series for block in blocks], axis=2),
-        np.concatenate([in_channels(block.leaves, channels) for block in blocks], axis=2),
+        joined([block.times_ns for block in blocks]),
+        joined([block.series for block in blocks], axis=2),
+        joined_channels([block.leaves for block in blocks], axis=2),
     )
 
 

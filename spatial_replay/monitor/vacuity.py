@@ -9,7 +9,7 @@ from typing import Final, Literal, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.geometry.arrays import Floats, Integers, roomy
 from spatial_replay.monitor.offline import OfflineNodes, evaluate_offline
 from spatial_replay.monitor.online.codes import in_channels, low_and_high
 from spatial_replay.monitor.verdict import Verdict, final_verdict
@@ -382,7 +382,7 @@ def is_tested_by_nothing(evidence: Evidence, leaves: Floats, times_ns: Integers,
 def _with_unknown_leaves(order: Sequence[Atom | Quantified], leaves: Floats, evidence: Evidence) -> Floats:
     """Return leaves (2, A, T) that are unknown, but for antecedents in quantifiers and empty groups."""
     low, high = low_and_high(len(leaves), wide=True)
-    result = np.empty((2, *leaves.shape[1:]))
+    result = roomy((2, *leaves.shape[1:]), np.float64)
     result[0], result[1] = -np.inf, np.inf
     for place, leaf in enumerate(order):
         bound = evidence.bound(leaf)

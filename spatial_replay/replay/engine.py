@@ -266,7 +266,11 @@ class Replay:
             self._hashes.add(trace, own, stretches)
         for index, stretch in enumerate(stretches):
             if self._keep_series or self._keep_leaves:
-                self._kept[index].append(self._kept_part(stretch))
+                kept = self._kept[index]
+                kept.append(self._kept_part(stretch))
+                # a few large arrays lie in files, many small ones would stay in memory
+                while len(kept) > 1 and len(kept[-2].times_ns) <= len(kept[-1].times_ns):
+                    kept[-2:] = [join_blocks(kept[-2:])]
 
     def _kept_part(self, stretch: SeriesBlock) -> SeriesBlock:
         """Return a stretch without what is not to stay in memory."""

@@ -8,9 +8,10 @@ negation swaps low and high: channel ^ 1.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from types import MappingProxyType
 
-from spatial_replay.geometry.arrays import Floats
+from spatial_replay.geometry.arrays import Floats, joined
 
 SAMPLES, NANOSECONDS = 0, 1
 
@@ -117,6 +118,12 @@ _STANDS_FOR = MappingProxyType({1: (0, 0, 0, 0), 2: (0, 1, 0, 1), 4: (0, 1, 2, 3
 def in_channels(numbers: Floats, channels: int) -> Floats:
     """Expand numbers (C, …) to the given number of channels, at least C: 1, 2 or 4."""
     return numbers if len(numbers) == channels else numbers[list(_STANDS_FOR[len(numbers)][:channels])]
+
+
+def joined_channels(parts: Sequence[Floats], axis: int) -> Floats:
+    """Concatenate arrays (C, …) in as many channels as the widest has, into a `roomy` one."""
+    channels = max(map(len, parts))
+    return joined([in_channels(part, channels) for part in parts], axis)
 
 
 def low_and_high(channels: int, *, wide: bool) -> tuple[int, int]:

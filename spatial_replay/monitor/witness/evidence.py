@@ -15,7 +15,7 @@ from spatial_replay.monitor.atoms.delays import look_back, tail
 from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.monitor.instances import Instance
-from spatial_replay.monitor.online.codes import in_channels
+from spatial_replay.monitor.online.codes import joined_channels
 from spatial_replay.spec.formula import Atom, Earlier, Formula, Group, Outline, Quantified, Term, TrackedName
 from spatial_replay.spec.walks import base_of, iter_formulas, logged_signals, substitute
 from spatial_replay.trace.trace import Trace, window_of
@@ -88,14 +88,14 @@ class Evidence:
             times_ns = scene.trace.times_ns[scene.skip :]
             begin, end = window_of(times_ns, self.instance.start_ns, self.instance.end_ns)
             parts.append(self._columns(scene, formulas)[:, :, begin:end])
-        return _joined(parts, axis=2)
+        return joined_channels(parts, axis=2)
 
     def _columns(self, scene: TraceScene, formulas: Sequence[Formula]) -> Floats:
         bindings = self.instance.bindings
         if not any(isinstance(each, Quantified) for each in formulas):
             return leaf_values(scene, formulas, bindings)
         # how many bindings there may be is limited for one formula, and these are variants of one
-        return _joined([leaf_values(scene, [each], bindings) for each in formulas], axis=1)
+        return joined_channels([leaf_values(scene, [each], bindings) for each in formulas], axis=1)
 
     def first_ns(self) -> int:
         """Return the time of the first sample, those looked back at included."""
@@ -175,11 +175,6 @@ def _object_names(base: Term) -> tuple[str, ...]:
         left_out = {each.name for each in base.excluded}
         return tuple(name for name in base.members or () if name not in left_out)
     return (base.name,) if isinstance(base, TrackedName) else ()
-
-
-def _joined(parts: Sequence[Floats], axis: int) -> Floats:
-    channels = max(map(len, parts))
-    return np.concatenate([in_channels(part, channels) for part in parts], axis=axis)
 
 
 def is_missing(trace: Trace, part: NamedPart) -> NDArray[np.bool_]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.offline import evaluate_offline, new_leaves
-from spatial_replay.monitor.online.codes import in_channels
+from spatial_replay.monitor.online.codes import joined_channels
 from spatial_replay.monitor.verdict import Verdict, final_verdict, online_verdict
 from spatial_replay.monitor.witness.atom import DecidingAtom
 from spatial_replay.monitor.witness.evidence import Evidence
@@ -376,7 +376,7 @@ class _Search:
         ]
         sizes = np.sort(np.concatenate(moves))
         sizes = sizes[np.isfinite(sizes) & (sizes >= self._least * (1.0 - 1e-9))]
-        listed = [self._least, *sizes.tolist()]
+        listed = np.concatenate([[self._least], sizes])
 
         def flips(size: float) -> bool:
             return self._flips([size], direction)[0]
@@ -385,8 +385,7 @@ class _Search:
         step = max(stop // _AT_FIRST, 1) if len(self._directions) > 1 else stop
         for end in (0, *range(step, stop, step), stop - 1):
             if flips(listed[end]):
-                found: float = listed[bisect_left(listed, True, begin, end, key=flips)]
-                return found
+                return float(listed[bisect_left(listed, True, begin, end, key=flips)])
             begin = end + 1
         return None
 
@@ -464,8 +463,7 @@ class _Search:
         return self._evidence.columns(formulas)[:, :, : len(self._times)]
 
     def _evaluated(self, formula: Formula, added: Sequence[Atom | Quantified], columns: Floats) -> Verdict:
-        channels = max(len(columns), len(self._leaves))
-        leaves = np.concatenate([in_channels(self._leaves, channels), in_channels(columns, channels)], axis=1)
+        leaves = joined_channels([self._leaves, columns], axis=1)
         done = self._evaluate(formula, (*self._order, *added), leaves, self._times)
         low, high = done.ends(self._node)
         return self._verdict_of(float(low[0]), float(high[0]))
