@@ -295,7 +295,8 @@ def tune(
     else:
         (file,) = load_specifications([local_copy(specification)], constants=constants)
     refuse_unknown(reading, Reading.__annotations__)
-    if not isinstance(vary or {}, Mapping):
+    ranges = vary.values() if isinstance(vary, Mapping) else [vary]
+    if any(each is not None and not (isinstance(each, tuple | list) and len(each) == 2) for each in ranges):
         raise UsageError(f"vary is {shortened(vary)}; give ranges by name, as in {{'near': (40, 100)}}")
     runs = load_runs(_logs(good), _logs(bad), lambda path: read_trace(path, **reading))
     return tune_runs(file, runs, dict(vary or {}), each=each, seed=seed)

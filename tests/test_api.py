@@ -111,6 +111,7 @@ def test_an_argument_that_does_not_exist_names_the_nearest_and_what_is_no_object
         ("parse_specification", (("true",), {"const": {}}), "did you mean 'constants'"),
         ("read_trace", (("a.jsonl",), {"maping": "m.yaml"}), "did you mean 'mapping'"),
         ("tune", ((specification, "a.jsonl"), {"vary": ["near"]}), "give ranges by name"),
+        ("tune", ((specification, "a.jsonl"), {"vary": {"near": "0:1"}}), "give ranges by name"),
         ("Sample", ((0, {"mode": "on"}), {}), "numbers and texts are signals: Sample"),
         ("Sample", ((0, {"battery": 0.5}), {}), "numbers and texts are signals: Sample"),
     ):

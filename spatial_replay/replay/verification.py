@@ -350,7 +350,7 @@ class Verified:
     def differences(self) -> tuple[str, ...]:
         """The differences in words; none if everything is equal."""
         if not self.recorded:
-            return ("the log has no certificate: it was not written to its end",)
+            return ("the log has no certificate: it is not annotated, or was not written to its end",)
         found = [
             f"{what}: {self.computed.get(key, 'nothing')} now, {self.recorded.get(key, 'nothing')} recorded"
             for key, what in _HASHES.items()
