@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import hashlib
+import json
 import math
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping
@@ -115,7 +116,23 @@ def number_text(number: float) -> str:
 
 def with_unit(number: float, unit: str) -> str:
     """Return a number with its unit, as in "0.05 m"; neither infinity nor a number of unit "1" has one."""
+    if names := names_from_unit(unit):
+        called = [f" ({json.dumps(name, ensure_ascii=False)})" for name in names if names[name] == number]
+        return number_text(number) + "".join(called[:1])
     return number_text(number) if unit in ("", "1") or math.isinf(number) else f"{number_text(number)} {unit}"
+
+
+def names_from_unit(unit: str) -> dict[str, float]:
+    """Return the numbers by name that stand, as a JSON object, in place of a unit; none for a unit."""
+    try:
+        return {name: float(number) for name, number in json.loads(unit).items()} if unit[:1] == "{" else {}
+    except (ValueError, TypeError, OverflowError, RecursionError):
+        return {}
+
+
+def plain_unit(unit: str) -> str:
+    """Return a unit; "" for names in place of one."""
+    return "" if names_from_unit(unit) else unit
 
 
 def json_number(number: float) -> float | str | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from operator import attrgetter
@@ -15,29 +15,19 @@ from spatial_replay.errors import SpecificationError
 from spatial_replay.logs.messages import Attachment
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.spec import format_specification, parse_specification
+from spatial_replay.spec.checks import with_numbers
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import (
     Atom,
-    Equality,
-    Expression,
     Formula,
-    Maximum,
-    Minimum,
-    Misalignment,
-    Negative,
-    Number,
-    Rate,
-    Scaled,
-    Signal,
     Specification,
-    Sum,
     iter_nodes,
     operator_of,
 )
 from spatial_replay.spec.relations import RELATION_NAMES, used_modules
 from spatial_replay.spec.tokens import written_name
-from spatial_replay.spec.walks import per_second
-from spatial_replay.text import names_of
+from spatial_replay.spec.walks import Unit, per_second, units_of
+from spatial_replay.text import names_of, plain_unit
 
 if TYPE_CHECKING:
     from spatial_replay.automata.automaton import Automaton
@@ -205,7 +195,7 @@ def unit_of(formula: Formula, units: Mapping[str, str]) -> str:
         units: those that are declared, of signals by their names, of lengths by "".
     """
     atoms = [node for node in iter_subformulas(formula) if isinstance(node, Atom)]
-    found = {unit for node in atoms for unit in _units(node.expression, units)}
+    found = {_declared(unit, units) for node in atoms for unit in units_of(node)}
     if len(found) > 1:
         return MIXED
     if not found and atoms:  # comparisons of modes alone are infinite
@@ -260,38 +250,28 @@ def _add_automaton(result: SpecificationResult, tree: ReportedTree, automaton: A
         result.automaton.moves.add(source=move.source, target=move.target, guard=guard, label=label)
 
 
-def _units(expression: Expression, units: Mapping[str, str]) -> Iterator[str]:
-    """Yield the units of everything measured in an expression; constants have none of their own."""
-    stack = [expression]
-    while stack:
-        match stack.pop():
-            case Sum(first, second):
-                stack += [first, second]
-            case Scaled():
-                yield DIMENSIONLESS
-            case Negative(operand):
-                stack.append(operand)
-            case Minimum(operands) | Maximum(operands):
-                stack.extend(operands)
-            case Rate(signal=signal):
-                name = FOOTPRINT_UNITS if signal is None else signal.name
-                yield per_second(units.get(name) or f"units of {name or 'lengths'}")
-            case Signal(name):
-                yield units.get(name) or f"units of {name}"
-            case Misalignment():
-                yield DIMENSIONLESS
-            case Number() | Equality():
-                pass
-            case _:
-                yield units.get(FOOTPRINT_UNITS, FOOTPRINT_UNITS)
+def _declared(unit: Unit, units: Mapping[str, str]) -> str:
+    """Return the words for a unit of an atom's number."""
+    if unit.divisor is not None or unit.kind == "orientation":
+        return DIMENSIONLESS
+    declared = plain_unit(units.get(unit.signal or FOOTPRINT_UNITS, ""))
+    if unit.kind == "rate":
+        return per_second(declared or f"units of {unit.signal or 'lengths'}")
+    return declared if unit.kind == "length" else declared or f"units of {unit.signal}"
 
 
-def logged_specifications(files: Sequence[Specification]) -> list[Specification]:
+def logged_specifications(files: Sequence[Specification], units: Mapping[str, str]) -> list[Specification]:
     """Return the specifications as a log stores them, so that reading it gives equal ones of equal names.
 
     Each has a file name with a stem of its own. Constants given from outside are written into the text. One
     that still does not parse to the same specification (it was parsed with another profile) is replaced by
     the canonical text.
+
+    Args:
+        units: those of the log, see `with_numbers`.
+
+    Raises:
+        SpecificationError: what that raises.
     """
     logged: list[Specification] = []
     stems: set[str] = set()
@@ -303,7 +283,8 @@ def logged_specifications(files: Sequence[Specification]) -> list[Specification]
             count += 1
             stem = f"{own}-{count}"
         stems.add(stem)
-        logged.append(replace(_self_contained(_Same(file)), filename=f"{stem}{suffix}"))
+        own = replace(_self_contained(_Same(file)), filename=f"{stem}{suffix}")
+        logged.append(with_numbers(own, units))
     return logged
 
 

@@ -63,10 +63,6 @@ class BagFolder(MessageReader):
 
     kind = "ROS 2 bag"
 
-    def __init__(self, path: Path) -> None:
-        super().__init__(path)
-        self._remarks = FaultList()
-
     @cached_property
     def _metadata(self) -> BagMetadata | None:
         path = self._path / METADATA_FILE

@@ -324,7 +324,7 @@ class MessageReader(ABC):
     def __init__(self, path: LogFile) -> None:
         # readers that open paths get none of a remote file
         self._path = path if isinstance(path, Path) else Path(path.name)
-        self._faults = FaultList()
+        self._faults, self._remarks = FaultList(), FaultList()
 
     @property
     @abstractmethod
@@ -434,7 +434,7 @@ class MessageReader(ABC):
 
     def take_remarks(self) -> tuple[str, ...]:
         """Return what is wrong since the last call without a loss on the topics that were read."""
-        return ()
+        return self._remarks.take()
 
     def _counted(self, columns: Columns, topics: Collection[str], name: str | None = None) -> Columns:
         """Yield all messages of some topics, then compare their number with what the log declares."""

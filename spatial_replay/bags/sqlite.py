@@ -287,10 +287,6 @@ class SqliteBag(MessageReader):
 
     kind = "ROS 2 bag"
 
-    def __init__(self, path: Path) -> None:
-        super().__init__(path)
-        self._remarks = FaultList()
-
     @cached_property
     def _whole(self) -> Path:
         """The file; if it was cut, a copy of its whole pages: the rest of a page would read as zeros."""
@@ -326,9 +322,6 @@ class SqliteBag(MessageReader):
             return self._path
         self._remarks.add(f"{self.name}: its recorder was interrupted; {log.name} was read, too")
         return copy
-
-    def take_remarks(self) -> tuple[str, ...]:
-        return self._remarks.take()
 
     @cached_property
     def _tables(self) -> BagTables:

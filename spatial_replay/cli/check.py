@@ -30,6 +30,7 @@ from spatial_replay.cli.terminal import PROGRAM, progress, show, show_diagnostic
 from spatial_replay.errors import Diagnosis, NoAutomatonError, OutputError, SpecificationError, UsageError
 from spatial_replay.logs.remote import LogFile, local_files
 from spatial_replay.spec import format_formula
+from spatial_replay.spec.checks import with_numbers
 from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.format import iter_branches, label_of, title_text
 from spatial_replay.spec.formula import Formula, NamedSpec, Specification, iter_nodes, operator_of
@@ -238,13 +239,14 @@ def _compare_with_log(
 ) -> _Compared:
     """Compare names, thresholds, regions and windows with what a log has."""
     # only needed with --log: log readers load the numerical libraries
-    from spatial_replay.logs.source import reading_only
+    from spatial_replay.logs.source import axes_of, reading_only
     from spatial_replay.monitor.plausibility import LogNumbers, plausibility_warnings, window_lines
     from spatial_replay.replay import LogNames
     from spatial_replay.sources.open_log import open_source
 
-    numbers, names = LogNumbers(specification), LogNames()
     source = open_source(log, **reading)
+    specification = with_numbers(specification, axes_of(source).units)
+    numbers, names = LogNumbers(specification), LogNames()
     faults: list[str] = []
     first_ns: int | None = None
     with progress("samples") as advance:
@@ -323,8 +325,8 @@ def _document(
             {
                 "atom": each.atom.text,
                 "objects": each.objects,
-                "least": json_number(each.least) if each.known else None,
-                "greatest": json_number(each.greatest) if each.known else None,
+                "least": json_number(each.least) if each.least <= each.greatest else None,
+                "greatest": json_number(each.greatest) if each.least <= each.greatest else None,
                 "known": each.known,
                 "holding": each.holding,
                 "failing": each.failing,

@@ -370,8 +370,8 @@ def _document(
 
 
 def _declared(axes: dict[str, object]) -> dict[str, object]:
-    """Return axes as JSON, without a unit where none is declared."""
-    return {name: value for name, value in axes.items() if name != "unit" or value}
+    """Return axes as JSON, without units where none are declared."""
+    return {name: value for name, value in axes.items() if value or name not in ("unit", "signals")}
 
 
 def _topics(container: LogSummary) -> Mapping[tuple[str, str, str], Sequence[int]]:

@@ -179,7 +179,7 @@ def _below(result: SpecResult, first_ns: int) -> Iterator[str]:
             yield f"{label}{cause.verdict}, robustness {_shown(cause.robustness)}"
     witness = result.worst
     for gap in () if witness is None else witness.gaps:
-        if gap.window is not None:
+        if gap.missing < gap.samples:
             yield gap_sentence(gap, first_ns)
     cut = result.untested if result.tested == "cut" else ()
     for label, parts in (("vacuous", result.vacuous), ("cut", cut)):

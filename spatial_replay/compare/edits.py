@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from difflib import SequenceMatcher
@@ -15,6 +15,7 @@ from typing import Any, Final, Literal, NamedTuple, TypeAlias
 from lark import Token
 
 from spatial_replay.errors import SpecificationError, UsageError
+from spatial_replay.spec.checks import with_numbers
 from spatial_replay.spec.diagnostics import Faults, SourceText
 from spatial_replay.spec.format import format_bound, format_formula, format_term
 from spatial_replay.spec.formula import (
@@ -40,7 +41,14 @@ from spatial_replay.spec.load import parse_specification
 from spatial_replay.spec.parser import split_statements
 from spatial_replay.spec.relations import RELATION_NAMES
 from spatial_replay.spec.tokens import span_of, tokenize
-from spatial_replay.spec.walks import base_of, changed_leaf, iter_terms, map_leaves, without_variables
+from spatial_replay.spec.walks import (
+    base_of,
+    changed_leaf,
+    iter_terms,
+    map_leaves,
+    rewritten,
+    without_variables,
+)
 
 
 def unify_regions(
@@ -62,7 +70,13 @@ def unify_regions(
         joined[renamed.get(name, name)] = outline
     if not renamed:
         return list(formulas), joined
-    return [_with_terms(formula, partial(_with_region, renamed=renamed)) for formula in formulas], joined
+    change = partial(_with_region, renamed=renamed)
+
+    def changed(atom: Atom) -> Atom:
+        expression = map_leaves(atom.expression, partial(changed_leaf, change=change))
+        return replace(atom, expression=expression, terms=tuple(map(change, atom.terms)))
+
+    return [rewritten(formula, changed) for formula in formulas], joined
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,19 +108,6 @@ class SharedNames:
         if not isinstance(term, DerivedTerm):
             return term
         return replace(term, term=self.term(term.term))
-
-
-def _with_terms(formula: Formula, change: Callable[[Term], Term]) -> Formula:
-    match formula:
-        case Truth():
-            return formula
-        case Atom():
-            expression = map_leaves(formula.expression, partial(changed_leaf, change=change))
-            return replace(formula, expression=expression, terms=tuple(map(change, formula.terms)))
-        case Quantified():
-            return replace(formula, body=_with_terms(formula.body, change))
-        case _:
-            return replace(formula, operands=tuple([_with_terms(each, change) for each in formula.operands]))
 
 
 def _with_region(term: Term, renamed: Mapping[str, str]) -> Term:
@@ -167,12 +168,13 @@ class TextVersions:
     Holds what was parsed, for one diff.
 
     Attributes:
-        old, new: the specifications.
+        old, new: the specifications, with numbers instead of their names.
         changes: the declarations that differ by more than blanks and comments; of very many, the first.
     """
 
-    def __init__(self, old: Specification, new: Specification) -> None:
-        self.old, self.new = old, new
+    def __init__(self, old: Specification, new: Specification, units: Mapping[str, str]) -> None:
+        self._units = units
+        self.old, self.new = with_numbers(old, units), with_numbers(new, units)
         self._statements = statements_of(old), statements_of(new)
         one, other = self._statements
         # specs are compared node by node
@@ -249,7 +251,9 @@ class TextVersions:
         file, other = (self.old, self.new) if is_old else (self.new, self.old)
         profile = other.profile if any(word == "USE" for word, _ in keys) else file.profile
         with suppress(SpecificationError, UsageError):
-            return parse_specification(text, filename=file.filename, profile=profile)
+            return with_numbers(
+                parse_specification(text, filename=file.filename, profile=profile), self._units
+            )
         return None
 
 

@@ -28,10 +28,20 @@ from spatial_replay.monitor.sentences import cause_reason
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.planning.read import read_decisions
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, LogNames, ReplayOptions, Selection
+from spatial_replay.spec.checks import with_numbers
 from spatial_replay.spec.diagnostics import Diagnostic, nearest_hint
 from spatial_replay.spec.formula import Atom, Specification, iter_nodes
 from spatial_replay.spec.walks import other_names
-from spatial_replay.text import Instant, Sentence, counted, counted_from, json_number, with_unit
+from spatial_replay.text import (
+    TEXTS,
+    Instant,
+    Sentence,
+    counted,
+    counted_from,
+    json_number,
+    names_from_unit,
+    with_unit,
+)
 from spatial_replay.trace.sample import FOREVER
 from spatial_replay.trace.trace import Trace
 from spatial_replay.trace.units import OTHER_UNITS, require_same_units
@@ -239,7 +249,8 @@ def _path(result: SpecResult, files: Sequence[Specification]) -> list[_Visit] | 
     if file is None:
         return None
     try:
-        machine = automaton(file, result.spec.name)
+        # of the very formula that was evaluated
+        machine = automaton(replace(file, specs=(result.spec,)), result.spec.name)
     except NoAutomatonError:
         return None
     run = AutomatonRun(
@@ -259,7 +270,8 @@ def _path(result: SpecResult, files: Sequence[Specification]) -> list[_Visit] | 
 
 def file_of(files: Sequence[Specification], result: SpecResult) -> Specification | None:
     """Return the file that a result comes from; None if it is another one."""
-    pairs = [(file, each.formula) for file in files for each in file.specs]
+    as_evaluated = [with_numbers(file, result.evidence.units) for file in files]
+    pairs = [(file, each.formula) for file in as_evaluated for each in file.specs]
     same = (file for file, formula in pairs if formula is result.formula)
     # one that was parsed by another profile is evaluated as it is logged: equal, and another object
     equal = (file for file, formula in pairs if formula == result.formula)
@@ -307,7 +319,7 @@ class SignalDiff:
 
     Attributes:
         first_ns: the first sample of A in which its value is not that in B.
-        greatest: the greatest difference of two known values, at `greatest_ns`; NaN where there are none.
+        greatest: the greatest difference of two known numbers, at `greatest_ns`; NaN where there are none.
         ratio: how many times as large the median of its magnitudes is in B; NaN if one of them is 0.
     """
 
@@ -332,7 +344,8 @@ def compare_signals(a: Trace, b: Trace, alignment: Alignment) -> tuple[SignalDif
         differs = (one != other) & ~(np.isnan(one) & np.isnan(other))
         if not differs.any():
             continue
-        known = np.flatnonzero(~(np.isnan(one) | np.isnan(other)))
+        # texts are not apart by an amount
+        known = np.flatnonzero((one > TEXTS) & (other > TEXTS))
         apart = np.abs(other - one)
         farthest = int(known[apart[known].argmax()]) if len(known) else None
         sizes = [float(np.median(np.abs(each[known]))) if len(known) else 0.0 for each in (one, other)]
@@ -491,7 +504,7 @@ def movement_sentence(each: ObjectDiff, start_ns: int, unit: str) -> Sentence:
 def signal_sentence(each: SignalDiff, start_ns: int, unit: str) -> Sentence:
     """Return since when a signal has other values, by how much, and whether its unit may be another."""
     parts: list[str | Instant] = ["differs since ", Instant(each.first_ns, start_ns)]
-    if each.greatest > 0.0:
+    if each.greatest > 0.0 and not names_from_unit(unit):
         parts += [f", by up to {with_unit(each.greatest, unit)} at ", Instant(each.greatest_ns, start_ns)]
     if each.has_other_unit:
         times, which = (each.ratio, "B") if each.ratio > 1.0 else (1.0 / each.ratio, "A")

@@ -434,6 +434,8 @@ def compare_specifications(
     Raises:
         UsageError: no spec has a counterpart, another parameter of a template, or what `evaluate` raises.
     """
+    versions = TextVersions(old, new, trace.units)
+    old, new = versions.old, versions.new
     pairs, removed, added = _paired(old, new)
     formulas, regions = unify_regions([one.formula for one, _ in pairs], old.regions, new.regions)
     olds = [replace(one, formula=formula) for (one, _), formula in zip(pairs, formulas, strict=True)]
@@ -453,7 +455,6 @@ def compare_specifications(
         )
 
     before, after = evaluated(olds, old), evaluated(news, new)
-    versions = TextVersions(old, new)
     names = {spec.name for spec in old.specs}, {spec.name for spec in new.specs}
     trees = {
         id(other.formula): compare_trees(

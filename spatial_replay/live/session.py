@@ -251,7 +251,7 @@ class LiveSession:
         self._logs = [each for each in recorders if isinstance(each, Recorder)]
         self._topics = tuple(topics)
         self._max_delay_s, self._topic_timeout_s = max_delay_s, topic_timeout_s
-        units = {} if self._mapping is None else self._mapping.axes.units_with(self._mapping.signal_units)
+        units = {} if self._mapping is None else self._mapping.axes.units
         self._monitors = [Monitor(file, units=units) for file in self.files]
         self._changes = VerdictChanges(self.files)
         rehearse()
@@ -668,7 +668,7 @@ def _about(mapping: LogMapping | None) -> Mapping[str, str]:
     if mapping is None:
         return {"source": "live"}
     named = {"mapping": mapping.name, "mapping_sha256": mapping.sha256}
-    return {"source": "live", **named, **mapping.metadata()}
+    return {"source": "live", **named, **mapping.axes.metadata()}
 
 
 async def monitor(
@@ -880,4 +880,4 @@ def layout_of_run(files: Sequence[Specification], mapping: LogMapping | None) ->
 
 
 def _axes(mapping: LogMapping | None) -> Mapping[str, str]:
-    return {} if mapping is None else mapping.metadata()
+    return {} if mapping is None else mapping.axes.metadata()

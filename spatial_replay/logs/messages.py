@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import wraps
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 import numpy as np
 
@@ -198,6 +198,8 @@ class MemorySink:
         self.messages.append(messages)
 
 
+SAMPLES_A_GAP: Final = 10
+"""Samples that fill a gap of the length that is allowed."""
 _MOST_IN_GAP = 10_000
 """Samples that fill one gap."""
 
@@ -217,7 +219,7 @@ def noting_pauses(iter_blocks: IterBlocks) -> IterBlocks:
                 block = replace(block, trace=_without_gaps(before, trace, self.max_gap_ns))
                 before = trace.slice(len(trace) - 1, len(trace))
             yield block
-        remark = pauses.remark("samples")
+        remark = pauses.remark("samples", self.max_gap_ns)
         if remark is not None:
             yield Block(Trace.empty(), remarks=(Sentence(f"{self.name}: ", remark),))
 
@@ -236,10 +238,10 @@ def _without_gaps(before: Trace, trace: Trace, max_gap_ns: int) -> Trace:
     for gap in gaps:
         begin = gap + 1 - len(before)
         last = trace.slice(begin - 1, begin) if begin else before
-        first_ns, step_ns = int(times[gap]), int(times[gap + 1] - times[gap]) // _MOST_IN_GAP
-        steps = np.arange(first_ns, int(times[gap + 1]), max(max_gap_ns, step_ns), dtype=np.int64)
-        # right after the last sample, too
-        steps[0] += 1
+        first_ns, next_ns = times[gap : gap + 2].tolist()
+        step_ns = max(max_gap_ns // SAMPLES_A_GAP, (next_ns - first_ns) // _MOST_IN_GAP, 1)
+        # right after the last sample, and right before the next one
+        steps = np.union1d(np.arange(first_ns + step_ns, next_ns, step_ns), [first_ns + 1, next_ns - 1])
         rows = np.repeat(np.where(last.rows >= 0, -2 - last.rows, last.rows), len(steps), axis=0)
         signals = {name: np.full(len(steps), np.nan) for name in last.signals}
         unknown = replace(last, times_ns=steps, rows=rows, signals=signals, faults=(), remarks=())

@@ -17,7 +17,7 @@ from spatial_replay.logs.read_options import FaultList, gap_ns
 from spatial_replay.text import encodable
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace, within
-from spatial_replay.trace.units import OUR_AXES, Axes, signal_units_metadata
+from spatial_replay.trace.units import OUR_AXES, Axes
 
 _Read = TypeVar("_Read")
 
@@ -72,13 +72,8 @@ class MemorySource(_Bare):
 
     @property
     def axes(self) -> Axes:
-        """Ours, with the unit that the trace declares."""
-        return Axes(unit=self.trace.units.get("", ""))
-
-    @property
-    def signal_units(self) -> Mapping[str, str]:
-        """The units that the trace declares, by signal."""
-        return {name: unit for name, unit in self.trace.units.items() if name}
+        """Ours, with the units that the trace declares."""
+        return Axes.of_units(self.trace.units)
 
     @classmethod
     def from_samples(cls, samples: Iterable[Sample], name: str = "memory") -> MemorySource:
@@ -160,10 +155,6 @@ class SourceOf:
     def axes(self) -> Axes:
         return axes_of(self.source)
 
-    @property
-    def signal_units(self) -> Mapping[str, str]:
-        return {name: unit for name, unit in units_of(self.source).items() if name}
-
     def attachments(self) -> tuple[Attachment, ...]:
         """See `Source.attachments`."""
         return self.source.attachments()
@@ -210,16 +201,6 @@ def axes_of(source: Source) -> Axes:
     """Return the axes of a source, or of what a log was recorded from; its samples have ours."""
     axes = getattr(source, "axes", None)
     return axes if isinstance(axes, Axes) else OUR_AXES
-
-
-def units_of(source: Source) -> Mapping[str, str]:
-    """Return the units that a source declares: for its signals by their names, for lengths by ""."""
-    return axes_of(source).units_with(getattr(source, "signal_units", {}))
-
-
-def units_metadata(source: Source) -> dict[str, str]:
-    """Return the entries for the metadata of a log with the axes and units of its source."""
-    return axes_of(source).metadata() | signal_units_metadata(units_of(source))
 
 
 def reading_options(source: Source) -> dict[str, object]:

@@ -74,11 +74,6 @@ class MappedSource:
         return self.mapping.axes
 
     @property
-    def signal_units(self) -> Mapping[str, str]:
-        """The units that the mapping declares, by signal."""
-        return self.mapping.signal_units
-
-    @property
     def options(self) -> Mapping[str, object]:
         """The options of reading, for the metadata of a copy."""
         mapping = {"mapping": self.mapping.name, "mapping_sha256": self.mapping.sha256}

@@ -24,7 +24,7 @@ from spatial_replay.logs.remote import log_file
 from spatial_replay.mapping.field_paths import FieldPath, NameTemplate
 from spatial_replay.mapping.yaml_document import Document, Place, checked_document, read_yaml_text, schema_of
 from spatial_replay.text import nearest_hint
-from spatial_replay.trace.units import OUR_AXES, Axes, signal_units_metadata
+from spatial_replay.trace.units import OUR_AXES, Axes
 
 Clock: TypeAlias = Literal["log", "publish", "header"]
 """Which time of a message counts: when it was recorded, when it was sent, or the stamp inside it."""
@@ -84,16 +84,15 @@ class Uncertainty:
 
 @dataclass(frozen=True, slots=True)
 class SignalMapping:
-    """A numeric signal: the path of its field, and its unit for readers.
+    """A signal: the path of its field, and its unit for readers.
 
     Attributes:
-        table: the numbers of texts; other texts are unknown. Empty for a field with numbers.
+        unit: or the names of its numbers, see `names_from_unit`.
     """
 
     name: str
     field: str
     unit: str = ""
-    table: Table[str, float] = value_of(default_factory=lambda: MappingProxyType({}), hash=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,16 +187,6 @@ class LogMapping:
     axes: Axes = OUR_AXES
     origin: tuple[float, float] | None = None
 
-    @property
-    def signal_units(self) -> Table[str, str]:
-        """The units that are declared, by signal."""
-        signals = [signal for topic in self.topics for signal in topic.signals]
-        return {signal.name: signal.unit for signal in signals if signal.unit}
-
-    def metadata(self) -> dict[str, str]:
-        """Return the entries for the metadata of a log of these messages: axes and units."""
-        return self.axes.metadata() | signal_units_metadata(self.signal_units)
-
 
 UNITS_NS = {"ns": 1, "us": 10**3, "ms": 10**6, "s": 10**9}
 _DURATION = re.compile(r"([0-9]{1,9}(?:\.[0-9]{1,9})?)(ns|us|ms|s)", re.ASCII)
@@ -266,10 +255,12 @@ def _mapping(document: Document, name: str) -> LogMapping:
     # the hash ignores layout and comments: the same mapping has the same hash
     canonical = json.dumps(value, ensure_ascii=False, separators=(",", ":"), allow_nan=True)
     fixed_frame = value.get("fixed_frame")
+    topics = tuple(_topic_mapping(topic, entry or {}, shapes) for topic, entry in value["topics"].items())
+    units = {signal.name: signal.unit for topic in topics for signal in topic.signals if signal.unit}
     return LogMapping(
         name=name,
         sha256=hashlib.sha256(canonical.encode("utf-8", "surrogatepass")).hexdigest(),
-        topics=tuple(_topic_mapping(topic, entry or {}, shapes) for topic, entry in value["topics"].items()),
+        topics=topics,
         fixed_frame=None if fixed_frame is None else fixed_frame.removeprefix("/"),
         clock=value.get("clock", "log"),
         sampling=Sampling(sample.get("topic"), duration_ns(sample["every"]) if "every" in sample else None),
@@ -277,7 +268,10 @@ def _mapping(document: Document, name: str) -> LogMapping:
         max_gap_ns=duration_ns(value["max_gap"]) if "max_gap" in value else None,
         origin=_origin(value.get("origin")),
         axes=Axes(
-            value.get("axes", {}).get("y", "up"), float(value.get("scale", 1.0)), value.get("unit", "")
+            value.get("axes", {}).get("y", "up"),
+            float(value.get("scale", 1.0)),
+            value.get("unit", ""),
+            units,
         ),
     )
 
@@ -414,7 +408,18 @@ def _stamp(value: Any) -> Stamp | None:
 
 
 def _signal(name: str, value: Any) -> SignalMapping:
-    if isinstance(value, dict):
-        table = {text: float(number) for text, number in value.get("names", {}).items()}
-        return SignalMapping(name, value["field"], value.get("unit", ""), MappingProxyType(table))
-    return SignalMapping(name, value)
+    """Return the mapping of a signal.
+
+    Raises:
+        UsageError: two numbers have one name.
+    """
+    if not isinstance(value, dict):
+        return SignalMapping(name, value)
+    names: dict[str, float] = {}
+    for key, other in value.get("names", {}).items():
+        text, number = (other, float(key)) if isinstance(other, str) else (key, float(other))
+        if names.setdefault(text, number) != number:
+            raise UsageError(
+                f"names of the signal {name!r}: two numbers are called {text!r}; give each its own name"
+            )
+    return SignalMapping(name, value["field"], value.get("unit", json.dumps(names) if names else ""))

@@ -74,7 +74,7 @@ from spatial_replay.mapping.message_types import (
     short_type,
 )
 from spatial_replay.mapping.transforms import HISTORY_NS, TransformReader
-from spatial_replay.text import counted, nearest_hint, text_number
+from spatial_replay.text import counted, names_from_unit, nearest_hint, text_number
 from spatial_replay.trace.sample import LATEST_NS
 
 
@@ -772,32 +772,33 @@ class TopicReader:
     def _bind_signal(self, signal: SignalMapping, message: object) -> Get:
         path = FieldPath.of(signal.field)
         value = walk(path, message)
-        get, table = getter(path, style_of(message)), signal.table
-        if names := enum_names(path, message):
+        get, numbers = getter(path, style_of(message)), names_from_unit(signal.unit)
+        names = enum_names(path, message)
+        if names and not (numbers and numbers.keys().isdisjoint(names.values())):
             number = get
 
             def get(message: object) -> object:
                 # as in JSON, whose enums are texts; a number without a name stays one
-                return names.get(number(message), number(message))
+                code = number(message)
+                return names.get(code, str(code) if numbers else code)
 
             value = get(message)
-        if table:
-
-            def number_of(message: object) -> float:
-                text = str(get(message))
-                if (
-                    text not in table
-                    and len(known := self.unnamed.setdefault(signal.name, {})) < _MOST_UNNAMED
-                ):
-                    known.setdefault(text[:_LONGEST_UNNAMED])
-                return table.get(text, nan)
-
-            return number_of
         try:
             _number(value)
         except (TypeError, OverflowError):
             raise FieldError(f"{signal.field}: its value is neither a number nor a text") from None
-        return lambda message: _number(get(message))
+
+        def number_of(message: object) -> float:
+            value = get(message)
+            if not (numbers and isinstance(value, str)):
+                return _number(value)
+            if value not in numbers:
+                known = self.unnamed.setdefault(signal.name, {})
+                if len(known) < _MOST_UNNAMED:
+                    known.setdefault(value[:_LONGEST_UNNAMED])
+            return numbers.get(value, nan)
+
+        return number_of
 
     def _stamp(self, message: object) -> int | None:
         if self.transforms is not None and self.extractor is None:

@@ -683,7 +683,8 @@ class Remarks:
             is_common = all(
                 any(at < start + length and start < at + long for at, long in pauses) for start, length in own
             )
-            if not is_common and (remark := messages.remark(f"{topic}: messages")) is not None:
+            remark = messages.remark(f"{topic}: messages", self._mapping.max_gap_ns)
+            if not is_common and remark is not None:
                 self.add(remark)
 
     def add(self, text: str) -> None:

@@ -18,7 +18,7 @@ from spatial_replay.monitor.vacuity import UntestedPart, no_instances
 from spatial_replay.monitor.verdict import Verdict, worst_verdict
 from spatial_replay.monitor.witness.evidence import Evidence
 from spatial_replay.monitor.witness.witness import Witness
-from spatial_replay.spec.checks import check_names
+from spatial_replay.spec.checks import check_names, with_numbers
 from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import require_specification
@@ -179,7 +179,8 @@ def evaluate(
             template has no result for a class, and `Evaluation.remarks` warns of them.
 
     Raises:
-        SpecificationError: with `strict_names`, names that the trace never has.
+        SpecificationError: with `strict_names`, names that the trace never has; a name that no number of a
+            signal has, if the trace declares such names.
         UsageError: no sample in the window, a template without its objects, unknown semantics, an
             operator without a meaning, an argument of another type.
     """
@@ -192,6 +193,7 @@ def evaluate(
     begin, end = window_of(trace.times_ns, *window)
     if begin >= end:
         raise UsageError(_nothing_in_window(trace, start_ns, end_ns))
+    specification = with_numbers(specification, trace.units)
     if strict_names:
         _require_names(specification, trace, each or {})
     stream = EvaluationStream(

@@ -122,6 +122,11 @@ def check_choices(templates: list[NamedSpec], each: Mapping[str, str]) -> None:
                 f"--each {spec.parameter}=class:NAME, --each {spec.parameter}=OBJECT or"
                 f" --each {spec.parameter}=all"
             )
+    check_parameters(templates, each)
+
+
+def check_parameters(templates: list[NamedSpec], each: Mapping[str, str]) -> None:
+    """Check that every choice of objects is for the parameter of some template."""
     for parameter in each:
         if parameter not in {spec.parameter for spec in templates}:
             known = ", ".join(f"{spec.name}({spec.parameter})" for spec in templates) or "none"

@@ -18,7 +18,7 @@ from spatial_replay.monitor.semantics import checked_semantics
 from spatial_replay.monitor.stream import LiveStream
 from spatial_replay.monitor.verdict import Verdict, final_verdict, online_verdict, worst_verdict
 from spatial_replay.monitor.violation import Settled, Violation, ViolationLog, rehearse
-from spatial_replay.spec.checks import check_names, object_names, signal_names
+from spatial_replay.spec.checks import check_names, object_names, signal_names, with_numbers
 from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.formula import NamedSpec, Specification, iter_nodes
 from spatial_replay.spec.load import require_specification
@@ -223,6 +223,7 @@ class Monitor:
         checked = checked_semantics(semantics, [specification])
         require_time(start_ns, "start_ns")
         known = checked_units(units)
+        specification = with_numbers(specification, known)
         templates = [spec for spec in specification.results if spec.parameter is not None]
         if templates:
             names = ", ".join(f"{spec.name}({spec.parameter})" for spec in templates)

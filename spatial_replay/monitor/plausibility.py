@@ -55,7 +55,7 @@ class ThresholdRange:
         atom: with one distance or signal in it.
         bound: what binds its variables, from the outside in: open quantifiers, and the objects of a template.
         least, greatest: of the distance or signal, whatever objects the variables stand for; least > greatest
-            if it is never known.
+            if it is never known, or a text.
         known, holding, failing: samples in which it is known, in which the atom holds, and in which it fails,
             whatever objects the variables stand for.
         samples: how many there are.
@@ -94,16 +94,18 @@ class ThresholdRange:
     def __str__(self) -> str:
         if not self.known:
             return f"{self.text}: unknown in every sample"
-        span = f"{self.text}: goes from {self.least:.4g} to {self.greatest:.4g}"
-        unknown = self.samples - self.known
-        if unknown:
-            span += f", is unknown in {unknown:,} of {counted(self.samples, 'sample')}"
-        if self.holds != "sometimes":
-            return f"{span}, {self.holds} holds{' in the others' if unknown else ''}"
+        is_number = self.least <= self.greatest
+        parts = [f"goes from {self.least:.4g} to {self.greatest:.4g}"] if is_number else []
+        if unknown := self.samples - self.known:
+            parts.append(f"is unknown in {unknown:,} of {counted(self.samples, 'sample')}")
         samples = counted(self.known, "sample")
-        if self.bound:
-            return f"{span}, holds for all in {self.holding:,} and for none in {self.failing:,} of {samples}"
-        return f"{span}, holds in {self.holding:,} of {samples}"
+        if self.holds != "sometimes":
+            parts.append(f"{self.holds} holds{' in the others' if unknown else ''}")
+        elif self.bound:
+            parts.append(f"holds for all in {self.holding:,} and for none in {self.failing:,} of {samples}")
+        else:
+            parts.append(f"holds in {self.holding:,} of {samples}")
+        return f"{self.text}: {', '.join(parts)}"
 
 
 class LogNumbers:
@@ -168,15 +170,17 @@ class LogNumbers:
                 for quantifier in ("forall", "exists")
             )
             # low and high ends differ where something is unknown; without any object they are infinite
-            known = np.isfinite(least[0]) & np.isfinite(greatest[0])
-            for ends in (least, greatest):
+            is_text = isinstance(seen.atom.parameters[-1], str)
+            known = is_text | (np.isfinite(least[0]) & np.isfinite(greatest[0]))
+            for ends in (all_hold, any_holds) if is_text else (least, greatest):
                 known &= ends[0] == ends[min(1, len(ends) - 1)]
             if not known.any():
                 continue
+            numbers = known & (not is_text)
             self._ranges[key] = replace(
                 seen,
-                least=min(seen.least, float(least[0, known].min())),
-                greatest=max(seen.greatest, float(greatest[0, known].max())),
+                least=min(seen.least, float(least[0, numbers].min(initial=inf))),
+                greatest=max(seen.greatest, float(greatest[0, numbers].max(initial=-inf))),
                 known=seen.known + int(known.sum()),
                 holding=seen.holding + int((all_hold[0, known] >= 0.0).sum()),
                 failing=seen.failing + int((any_holds[0, known] < 0.0).sum()),
@@ -302,6 +306,10 @@ def _doubts(atom: Atom, log: LogNumbers, taken: ThresholdRange | None) -> Iterat
         elif 0.0 < log.extent * _FAR < abs(length):
             message = f"{format_number(length)} is far more than anything in the log is apart"
             yield message, f"all that it has lies within {log.extent:.4g}; is the unit the same?"
+    is_there = all(log.missing.get(part, (0, 0))[0] < log.samples for part in named_parts(atom))
+    if taken is not None and not taken.known and atom.relation == "signal" and is_there:
+        hint = "put a text in quotes; `names` of a mapping give texts numbers, and numbers texts"
+        yield f"`{taken.text}` compares a text with a number, so it is unknown", hint
     if taken is None or taken.holds not in ("always", "never"):
         return
     for limit in limits:
@@ -350,14 +358,11 @@ def _distance(outline: Outline, box: tuple[float, float, float, float]) -> float
 
 
 def _compared(atom: Atom) -> Expression | None:
-    """Return the signal or distance that an atom compares with a number; None if that is not one."""
+    """Return the signal or distance that an atom compares with something; None if that is not one."""
     parts = {each for each in iter_expressions(atom.expression) if isinstance(each, (Signal, Measurement))}
     part = parts.pop() if len(parts) == 1 else None
-    if not isinstance(part, (Signal, SignedDistance)) or not any(
-        isinstance(x, float) for x in atom.parameters
-    ):
-        return None
-    return part
+    has_limit = atom.relation == "signal" or any(isinstance(each, float) for each in atom.parameters)
+    return part if isinstance(part, (Signal, SignedDistance)) and has_limit else None
 
 
 def _key(atom: Atom, bound: tuple[Quantified, ...]) -> tuple[str, ...]:

@@ -415,10 +415,14 @@ def gap_sentence(gap: Gap, first_ns: int) -> Sentence:
                 options.append(f"{option} {(at_ns - first_ns) // 10**6 / 1e3:.3f}s")
         on = " on" if gap.window[1] is not None else ""
         return Sentence(f"{many}, all ", *parts, f"{on}: {' '.join(options)} leaves them out.")
-    first, last = Instant(gap.first_ns, first_ns), Instant(gap.last_ns, first_ns)
-    if first == last:
-        return Sentence(f"{many}, at ", first, ".")
-    return Sentence(f"{many}, the first at ", first, ", the last at ", last, ".")
+    begin_ns, end_ns = gap.longest_ns
+    if gap.first_ns == gap.last_ns:
+        return Sentence(f"{many}, at ", Instant(begin_ns, first_ns), ".")
+    how = "all" if begin_ns <= gap.first_ns and gap.last_ns <= end_ns else "the longest time"
+    length = f" ({(end_ns - begin_ns) / 1e9:.3f} s)."
+    return Sentence(
+        f"{many}, {how} from ", Instant(begin_ns, first_ns), " to ", Instant(end_ns, first_ns), length
+    )
 
 
 def open_text(witness: Witness) -> str:

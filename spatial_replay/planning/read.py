@@ -371,6 +371,13 @@ def recompute_decisions(source: Source, advance: Callable[[int], None] = lambda 
     return Recomputed(comparison.decisions, comparison.maps, tuple(comparison.differences), tuple(faults))
 
 
+def _iter_blocks(source: Source, faults: list[str], advance: Callable[[int], None]) -> Iterator[Block]:
+    for block in read_blocks(source):
+        faults.extend(block.trace.faults)
+        yield block
+        advance(len(block.trace))
+
+
 class _Comparison:
     """The recorded and the recomputed messages of one run.
 

@@ -36,7 +36,7 @@ from spatial_replay.spec.formula import Specification, iter_nodes
 from spatial_replay.text import counted, named_arguments, nearest_hint
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
-from spatial_replay.trace.units import units_from_metadata
+from spatial_replay.trace.units import Axes
 
 MOST_BYTES: Final = 256 * 2**20
 """The most bytes that a ring holds by default."""
@@ -318,9 +318,7 @@ class _Open:
                 "held_before_s": repr(held_s),
             }
             self._writer.add_metadata(TRIGGER, record)
-            self._recording.end(
-                interrupted=end.interrupted, dropped=end.dropped, messages_dropped=end.messages_dropped
-            )
+            self._recording.end(**end._asdict())
             self._writer.close()
         finally:
             self._stream.close()
@@ -350,7 +348,7 @@ class ClipLog:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise OutputError(f"{folder}: {system_reason(error)}") from None
-        units = units_from_metadata(self._about)
+        units = Axes.from_metadata(self._about).units
         self._monitors = [Monitor(file, units=units) for file in files]
         self._changes = VerdictChanges(files)
         warm_up(files, ())

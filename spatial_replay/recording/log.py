@@ -61,7 +61,7 @@ from spatial_replay.spec.walks import declared_unit
 from spatial_replay.text import requirement_text
 from spatial_replay.trace.sample import FOREVER, Sample
 from spatial_replay.trace.trace import Trace
-from spatial_replay.trace.units import Axes, units_from_metadata
+from spatial_replay.trace.units import Axes
 
 if TYPE_CHECKING:
     from spatial_replay.planning.planner import Planner
@@ -102,14 +102,14 @@ class Recording:
             UsageError: a template, since its objects are not known yet.
         """
         refuse_templates(files)
-        self._files = files = logged_specifications(files)
-        self._sink = sink
         self._axes = Axes.from_metadata(about or {})
+        self._files = files = logged_specifications(files, self._axes.units)
+        self._sink = sink
         self._evaluation = AnnotatedEvaluation(
             files,
             [find_instances(file, {}, (), 0, FOREVER) for file in files],
             known=known,
-            units=units_from_metadata(about or {}),
+            units=self._axes.units,
         )
         self._samples = self._messages = self._end_ns = 0
         self._topics: set[str] = set()
@@ -438,9 +438,7 @@ class FileLog:
         """See `RecorderLog`."""
         while self._unevaluated:
             self._evaluate_some()
-        self._recording.end(
-            interrupted=end.interrupted, dropped=end.dropped, messages_dropped=end.messages_dropped
-        )
+        self._recording.end(**end._asdict())
         self._writer.close()
 
     def break_off(self, end: RunEnd) -> None:

@@ -29,7 +29,7 @@ from spatial_replay.errors import LogError, OutputError, SpatialReplayError, Tra
 from spatial_replay.logs.mcap.write import LogWriter
 from spatial_replay.logs.messages import Channel, Messages, Schema
 from spatial_replay.logs.output_file import Durability, open_output, refuse_inputs
-from spatial_replay.logs.source import Source, axes_of, read_blocks, reading_options, units_of
+from spatial_replay.logs.source import Source, axes_of, read_blocks, reading_options
 from spatial_replay.logs.topics import GRADIENT_MAP, PLAN_DECISION, PLAN_PATH, protobuf_channel
 from spatial_replay.recording.clips import ClipLog, Trigger, TriggeredClip
 from spatial_replay.recording.log import (
@@ -48,7 +48,7 @@ from spatial_replay.spec.load import listed_specifications
 from spatial_replay.text import counted_from, named_arguments, times_apart
 from spatial_replay.trace.sample import LATEST_NS, Sample
 from spatial_replay.trace.trace import Trace
-from spatial_replay.trace.units import checked_units, signal_units_metadata, units_metadata
+from spatial_replay.trace.units import Axes, checked_units
 
 if TYPE_CHECKING:
     from spatial_replay.planning.decision_log import BlackBox
@@ -848,7 +848,7 @@ class Recorder(SampleWriter):
         if planner is not None and planner.specification not in files:
             files.insert(0, planner.specification)
         refuse_templates(files)
-        about = {**(about or {}), **units_metadata(units)}
+        about = {**(about or {}), **Axes.of_units(checked_units(units)).metadata()}
         self._path = Path(path)
         self._clips: ClipLog | None = None
         if trigger is None:
@@ -1096,7 +1096,7 @@ def _units_metadata(source: Source, unit: str) -> dict[str, str]:
     if unit and axes.unit not in ("", unit):
         raise UsageError(f"{source.name} declares lengths in {axes.unit}, and not in {unit}; leave that out")
     unit = checked_units({"": unit})[""] if unit else axes.unit
-    return replace(axes, unit=unit).metadata() | signal_units_metadata(units_of(source))
+    return replace(axes, unit=unit).metadata()
 
 
 def _traces(source: Source, tally: _Tally) -> Iterator[Trace]:

@@ -154,6 +154,7 @@ def witness_document(witness: Witness, first_ns: int) -> dict[str, Any]:
                 "of": gap.samples,
                 "first_ns": gap.first_ns,
                 "last_ns": gap.last_ns,
+                "longest_ns": list(gap.longest_ns),
             }
             for gap in witness.gaps
         ],

@@ -21,7 +21,7 @@ from spatial_replay.annotate.specification import (
 )
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.messages import Attachment, Block, Messages, Sink, merge
-from spatial_replay.logs.source import Source, axes_of, read_ahead, reading_options, units_metadata, units_of
+from spatial_replay.logs.source import Source, axes_of, read_ahead, reading_options
 from spatial_replay.logs.topics import (
     AUTOMATA,
     AUTOMATA_PREFIX,
@@ -156,7 +156,7 @@ class Replay:
         self._source = source
         self._written_files = files
         self._selection = Selection(source, files, options)
-        self.files = logged_specifications(files)
+        self.files = logged_specifications(files, axes_of(source).units)
         self._evaluation = AnnotatedEvaluation(
             self.files,
             [self._selection.instances(file) for file in self.files],
@@ -164,7 +164,7 @@ class Replay:
             source.attachments,
             show=show,
             arrow=options.arrow,
-            units=units_of(source),
+            units=axes_of(source).units,
         )
         self.trees = self._evaluation.trees
         self._keep_series, self._keep_leaves = keep_series, keep_leaves
@@ -523,7 +523,7 @@ def _begin(sink: Sink, source: Source, replay: Replay, options: ReplayOptions, *
         "specifications": specifications_json(replay.files),
         "options": json.dumps(_recorded_options(source, options, layer=layer)),
     }
-    about |= units_metadata(source)
+    about |= axes_of(source).metadata()
     recorded = {key: value for key, value in before.items() if key not in about and key != "source"}
     if not is_replayed and "options" in before:
         recorded["recorded_options"] = before["options"]

@@ -28,7 +28,7 @@ from spatial_replay.annotate.specification import logged_specifications
 from spatial_replay.errors import SpecificationError, UsageError
 from spatial_replay.geometry.arrays import Integers, select
 from spatial_replay.logs.messages import Attachment, Block, Channel, Messages, join, merge
-from spatial_replay.logs.source import MemorySource, Source, read_blocks, units_of
+from spatial_replay.logs.source import MemorySource, Source, axes_of, read_blocks
 from spatial_replay.monitor.result import SpecResult, worst_first
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.monitor.verdict import Verdict, worst_verdict
@@ -44,6 +44,7 @@ from spatial_replay.replay.selection import (
 )
 from spatial_replay.replay.specification_files import SpecificationFiles
 from spatial_replay.spec import parse_specification
+from spatial_replay.spec.checks import with_numbers
 from spatial_replay.spec.diagnostics import Diagnostic, nearest_hint
 from spatial_replay.spec.format import format_duration, format_specification
 from spatial_replay.spec.formula import Constant, Specification, iter_nodes
@@ -260,7 +261,7 @@ class LoadedLog:
         self._source, self._saved = source, saved
         self._looks_back = look_before(files)
         self._attachments = source.attachments
-        self._files, self._kept = tuple(files), logged_specifications(files)
+        self._files, self._kept = tuple(files), logged_specifications(files, axes_of(source).units)
         self.own = OwnMessages(selection)
         traces: list[Trace] = []
         remarks: list[str] = []
@@ -269,7 +270,7 @@ class LoadedLog:
             remarks += block.remarks
             self.own.add(block)
             advance(len(trace))
-        self.trace = Trace.concatenate(traces)
+        self.trace = replace(Trace.concatenate(traces), units=axes_of(source).units)
         self.faults, self.remarks = tuple(self.trace.faults), tuple(dict.fromkeys(remarks))
         self.inside = selection.inside(self.trace)
         if not len(self.inside):
@@ -293,7 +294,7 @@ class LoadedLog:
             options = replace(self.options, keep=self._keep)
             return LoadedLog(self._source, files, options, saved=self._saved)
         other = copy(self)
-        other._files, other._kept = tuple(files), logged_specifications(files)
+        other._files, other._kept = tuple(files), logged_specifications(files, self.trace.units)
         other.missing = other._missing(Selection(self._source, tuple(files), self.options))
         other._places = _places(other._files)
         other.constants = other._constants(other._files)
@@ -344,7 +345,7 @@ class LoadedLog:
         edits = self._by_file(values)
         edited = [_edited(file, own) for file, own in zip(self._files, edits, strict=True)]
         stored = [
-            kept if file is written else _stored(file, written, kept)
+            kept if file is written else with_numbers(_stored(file, written, kept), self.trace.units)
             for file, written, kept in zip(edited, self._files, self._kept, strict=True)
         ]
         return EditedFiles(self, tuple(stored), MappingProxyType(dict(values)), self._constants(edited))
@@ -365,7 +366,7 @@ class LoadedLog:
         selection = Selection(MemorySource(self.trace, self.name), edited.files, options)
         instances = [selection.instances(file) for file in edited.files]
         evaluation = AnnotatedEvaluation(
-            edited.files, instances, options.semantics, self._attachments, units=units_of(self._source)
+            edited.files, instances, options.semantics, self._attachments, units=self.trace.units
         )
         self._check_size(evaluation)
         blocks = evaluation.extend(self.trace)

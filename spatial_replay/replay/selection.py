@@ -16,7 +16,7 @@ from spatial_replay.bags.decoders import Topic, decoder_of, full_type_name
 from spatial_replay.errors import LogError, SpecificationError, UsageError
 from spatial_replay.geometry.arrays import select
 from spatial_replay.logs.mcap.read import McapSource
-from spatial_replay.logs.messages import Block, Channel, Messages, merge, messages_of
+from spatial_replay.logs.messages import SAMPLES_A_GAP, Block, Channel, Messages, merge, messages_of
 from spatial_replay.logs.objects import encode_objects
 from spatial_replay.logs.remote import LogFile
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
@@ -24,20 +24,22 @@ from spatial_replay.logs.source import (
     MemorySource,
     Source,
     SourceOf,
+    axes_of,
     read_ahead,
     read_blocks,
     reading_only,
-    units_of,
 )
 from spatial_replay.logs.topics import ALL, MAPPED, OBJECTS, is_kept, protobuf_channel
 from spatial_replay.mapping.field_paths import get_field
 from spatial_replay.mapping.message_types import TRANSFORM_TYPES, short_type
 from spatial_replay.monitor.atoms.delays import look_back
-from spatial_replay.monitor.instances import Instance, find_instances
+from spatial_replay.monitor.instances import Instance, check_parameters, find_instances
 from spatial_replay.monitor.semantics import Semantics, checked_semantics
 from spatial_replay.spec import check_names
 from spatial_replay.spec.diagnostics import Diagnostic
-from spatial_replay.spec.formula import Specification
+from spatial_replay.spec.format import format_bound, format_duration
+from spatial_replay.spec.formula import Specification, Temporal
+from spatial_replay.spec.walks import iter_formulas
 from spatial_replay.text import time_text
 from spatial_replay.trace.sample import FOREVER
 from spatial_replay.trace.trace import Trace, window_of, within
@@ -223,7 +225,8 @@ class Selection:
         files: the specifications; samples before the window that they look back at are read, too.
 
     Raises:
-        UsageError: objects for a parameter that no template has, an operator that the semantics lacks.
+        UsageError: objects for a parameter that no template has, an operator that the semantics lacks, a
+            window that may lie between two samples of a pause (`max_gap`).
     """
 
     source: Source
@@ -232,7 +235,9 @@ class Selection:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "source", source_keeping(self.source, self.options.keep))
-        _check_parameters(self.files, self.options.each)
+        templates = [spec for file in self.files for spec in file.results if spec.parameter is not None]
+        check_parameters(templates, self.options.each)
+        _check_windows(self.files, getattr(self.source, "max_gap_ns", None) or 0)
         checked_semantics(self.options.semantics, self.files)
 
     @property
@@ -281,7 +286,7 @@ class Selection:
         for trace in self.iter_traces():
             traces.append(trace)
             advance(len(trace))
-        return replace(Trace.concatenate(traces), units=units_of(self.source))
+        return replace(Trace.concatenate(traces), units=axes_of(self.source).units)
 
     def inside(self, trace: Trace) -> Trace:
         """Return those samples that are in the window."""
@@ -364,13 +369,18 @@ def _objects_channel() -> Channel:
     return protobuf_channel(OBJECTS, ObjectStates)
 
 
-def _check_parameters(files: Sequence[Specification], each: Mapping[str, str]) -> None:
-    """Check that every choice of objects is for the parameter of some template."""
-    templates = [spec for file in files for spec in file.results if spec.parameter is not None]
-    for parameter in each:
-        if parameter not in {spec.parameter for spec in templates}:
-            known = ", ".join(f"{spec.name}({spec.parameter})" for spec in templates) or "none"
-            raise UsageError(f"no template has a parameter {parameter!r}; templates here: {known}")
+def _check_windows(files: Sequence[Specification], max_gap_ns: int) -> None:
+    """Check that no window lies between two of the samples that fill a pause."""
+    step_ns = max_gap_ns // SAMPLES_A_GAP
+    nodes = (node for file in files for spec in file.results for node in iter_formulas(spec.formula))
+    for bound in (node.bound for node in nodes if isinstance(node, Temporal) and node.bound is not None):
+        is_apart = bound.unit == "ns" and bound.lower > 0 and bound.upper is not None
+        if is_apart and (bound.upper or 0) - bound.lower < step_ns:
+            what = (
+                f"the window {format_bound(bound)} is too narrow for max_gap: it may lie between two samples"
+            )
+            remedy = f"make it {format_duration(step_ns)} long, or max_gap shorter"
+            raise UsageError(f"{what} of a pause, {format_duration(step_ns)} apart; {remedy}")
 
 
 CLIP_METADATA: Final = "spatial_replay_clip"

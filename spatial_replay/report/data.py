@@ -146,7 +146,6 @@ class RunReport:
         vacuous: templates that no object fits.
         gaps: sentences on what unknown results lack before or after a time.
         unreadable: how many observations have no finite numbers.
-        declared_units: those of signals by their names, and of lengths by "".
         planned_for: the file that decisions were made for, if another one is evaluated; else "".
     """
 
@@ -159,7 +158,6 @@ class RunReport:
     faults: tuple[str, ...]
     remarks: tuple[str, ...]
     unreadable: int
-    declared_units: Mapping[str, str]
     semantics: Semantics
     certificate: Mapping[str, str]
     files: tuple[Specification, ...]
@@ -299,7 +297,7 @@ def page_data(report: RunReport) -> PageData:
     decisions = decisions_value(report.decisions, report.first_ns, packing)
     facts = {
         "settles": report.semantics == "ltlf",
-        "lengths": report.declared_units.get("", ""),
+        "lengths": report.axes.unit,
         "is_thinned": len(kept) < len(times_ns),
         "times": packing.add((kept - report.first_ns) / 1e9, "f8"),
         "palette": {
@@ -364,7 +362,7 @@ def _result_value(
         "name": each.result.name,
         "object": each.result.object,
         "verdict": str(each.result.verdict),
-        "pointer": _pointer_value(each, first_ns, report.declared_units.get("", "")),
+        "pointer": _pointer_value(each, first_ns, report.axes.unit),
         "fault": None if each.fault_ns is None else (each.fault_ns - first_ns) / 1e9,
         "first": int(np.searchsorted(kept, here[0])) if len(here) else 0,
         "samples": len(here),
@@ -376,7 +374,7 @@ def _result_value(
             each.result.values,
             each.result.final,
             each.relations,
-            report.declared_units,
+            report.axes.units,
             each.tree.calls(each.source),
         ),
         "requirements": requirement_values(each.result, samples, packing),

@@ -24,7 +24,6 @@ from spatial_replay.logs.messages import Messages
 from spatial_replay.logs.output_file import refuse_inputs, replacing
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.source import Source, axes_of
-from spatial_replay.logs.source import units_of as declared_units
 from spatial_replay.monitor.sentences import divisor_of, gap_sentence, open_text
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.monitor.witness.witness import Witness, WitnessStep
@@ -174,11 +173,10 @@ def _report(source: Source, replay: Replay, replayed: Replayed, collector: Colle
         faults=replayed.faults,
         remarks=replayed.remarks,
         unreadable=replayed.unreadable,
-        declared_units=declared_units(source),
         semantics=replayed.semantics,
         certificate=replayed.certificate,
         files=tuple(replay.files),
-        results=tuple(_results(replay, replayed, collector, declared_units(source))),
+        results=tuple(_results(replay, replayed, collector, axes_of(source).units)),
         vacuous=replayed.vacuous,
         gaps=_gaps(replayed),
         scene=collector.scene.scene,

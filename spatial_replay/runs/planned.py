@@ -298,7 +298,7 @@ def record_plan(
         OutputError: the output cannot be written.
     """
     files = [default_specification(scenario) if file is None else file, *also]
-    kept, *others = logged_specifications(files)
+    kept, *others = logged_specifications(files, {})
     _refuse_missing(kept, name)
     for planned in [name] if name else [spec.name for spec in kept.results if len(kept.results) == 1]:
         refuse_unsatisfiable(kept, planned)

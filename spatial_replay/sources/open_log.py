@@ -40,7 +40,7 @@ from spatial_replay.logs.remote import (
     is_web,
     log_file,
 )
-from spatial_replay.logs.source import IterTraces, Source, TrackSource, reading_only, units_of
+from spatial_replay.logs.source import IterTraces, Source, TrackSource, axes_of, reading_only
 from spatial_replay.logs.topics import MAGIC
 from spatial_replay.text import counted_from, printable
 from spatial_replay.trace.trace import Trace
@@ -112,7 +112,7 @@ def read_trace(path: str | PathLike[str], *, allow_damage: bool = False, **readi
         others = count_of(trace.faults) - 1
         more = f"\n… and {others} more" if others else ""
         raise LogError(f"{faults[0]}{more}; allow_damage=True reads the rest")
-    return replace(trace, remarks=remarks, faults=faults, units=units_of(source))
+    return replace(trace, remarks=remarks, faults=faults, units=axes_of(source).units)
 
 
 def _require_path(value: object) -> None:

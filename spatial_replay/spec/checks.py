@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from types import MappingProxyType
 
@@ -16,9 +16,11 @@ from spatial_replay.spec.formula import (
     FUTURE_OPERATORS,
     PAST_OPERATORS,
     Atom,
+    Equality,
     Formula,
     Group,
     NamedSpec,
+    Negative,
     Span,
     Specification,
     Temporal,
@@ -34,10 +36,12 @@ from spatial_replay.spec.walks import (
     base_of,
     iter_formulas,
     logged_signals,
+    rewritten,
     substitute,
     terms_of,
     units_of,
 )
+from spatial_replay.text import is_text_number, names_from_unit, text_number
 
 _NO_CHOICE: Mapping[str, str] = MappingProxyType({})
 _LISTED = 12
@@ -276,6 +280,39 @@ def check_names(
             message = f"the {where} has an object {name!r}, which this definition hides"
             found.append(source.diagnostic("warning", span, message, "give the definition another name"))
     return tuple(sorted(found, key=lambda each: (each.line, each.column)))
+
+
+def with_numbers(specification: Specification, units: Mapping[str, str]) -> Specification:
+    """Return a specification that compares signals with numbers, not with the names that these have.
+
+    Raises:
+        SpecificationError: it compares a signal with a name that none of its numbers has.
+    """
+    tables = {signal: names for signal, unit in units.items() if (names := names_from_unit(unit))}
+    faults = Faults(SourceText.of(specification.source, specification.filename))
+
+    def compared(atom: Atom) -> Equality | None:
+        part = atom.expression.operand if isinstance(atom.expression, Negative) else atom.expression
+        is_named = isinstance(part, Equality) and part.signal.name in tables and is_text_number(part.value)
+        return part if is_named else None
+
+    def change(atom: Atom) -> Atom:
+        if (part := compared(atom)) is None:
+            return atom
+        names = tables[part.signal.name]
+        numbers = {text_number(name): number for name, number in names.items()}
+        if part.value not in numbers:
+            what = f"no number of {part.signal.name} is called {atom.parameters[-1]}"
+            faults.add(atom.span, what, f"its names are {', '.join(map(quoted, names))}")
+            return atom
+        exact = replace(part, value=numbers[part.value])
+        return replace(atom, expression=exact if part is atom.expression else -exact)
+
+    if not any(map(compared, _atoms(specification))):
+        return specification
+    specs = tuple(replace(spec, formula=rewritten(spec.formula, change)) for spec in specification.specs)
+    faults.raise_if_any()
+    return replace(specification, specs=specs)
 
 
 def _class_hint(name: str, kind: str, classes: Iterable[str]) -> str:

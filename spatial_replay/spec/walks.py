@@ -48,6 +48,7 @@ from spatial_replay.spec.formula import (
 )
 from spatial_replay.spec.relations import RELATION_NAMES
 from spatial_replay.spec.tokens import written_name
+from spatial_replay.text import plain_unit
 
 
 def base_of(term: Term) -> TrackedName | Variable | RegionName | Group:
@@ -247,6 +248,19 @@ def substitute(formula: Formula, names: Names, relations: frozenset[str] = RELAT
             return replace(formula, operands=operands)
 
 
+def rewritten(formula: Formula, change: Callable[[Atom], Atom]) -> Formula:
+    """Return a formula of the same shape with some of its atoms changed."""
+    match formula:
+        case Atom():
+            return change(formula)
+        case Truth():
+            return formula
+        case Quantified():
+            return replace(formula, body=rewritten(formula.body, change))
+        case Boolean() | Temporal():
+            return replace(formula, operands=tuple([rewritten(each, change) for each in formula.operands]))
+
+
 def without_variables(formula: Quantified) -> Formula:
     """Return the body of a quantifier with variables that are known by their place alone."""
     inner = sum(isinstance(each, Quantified) for each in iter_formulas(formula.body))
@@ -369,7 +383,7 @@ def declared_unit(formula: Formula, declared: Mapping[str, str], *, is_scaled: b
         if each.kind == "orientation" or (is_scaled and each.divisor is not None)
         else per_second(declared.get(each.signal or "", ""))
         if each.kind == "rate"
-        else declared.get(each.signal or "", "")
+        else plain_unit(declared.get(each.signal or "", ""))
         for each in units_of(formula)
     }
     return found.pop() if len(found) == 1 else ""
@@ -377,7 +391,7 @@ def declared_unit(formula: Formula, declared: Mapping[str, str], *, is_scaled: b
 
 def per_second(unit: str) -> str:
     """Return the unit of a rate of change; "" where that of its numbers is not declared."""
-    return unit and ("1/s" if unit == "1" else f"{unit}/s")
+    return plain_unit(unit) and ("1/s" if unit == "1" else f"{unit}/s")
 
 
 def is_mixed(units: Sequence[Unit]) -> bool:

@@ -541,7 +541,7 @@ class Pauses:
         intervals = [each for each in self._intervals if len(each)]
         return int(np.median(np.concatenate(intervals))) if intervals else 0
 
-    def remark(self, what: str) -> Sentence | None:
+    def remark(self, what: str, max_gap_ns: int | None) -> Sentence | None:
         """Return a sentence about the pauses of `what`; None without any."""
         found = self.found()
         if not found:
@@ -553,4 +553,7 @@ class Pauses:
         more = len(found) - _MOST_LISTED
         others = f", and {counted(more, 'more time')}" if more > 0 else ""
         usual = f", where one usually comes every {self.usual_ns / 1e9:.3g} s"
-        return Sentence(f"{what} pause ", *parts, f"{others}{usual}; `max_gap` makes what lies there unknown")
+        unknown = "`max_gap` makes what lies there unknown"
+        if max_gap_ns is not None and found[0][1] > max_gap_ns:
+            unknown = f"what lies in a pause of more than {max_gap_ns / 1e9:g} s is unknown (`max_gap`)"
+        return Sentence(f"{what} pause ", *parts, f"{others}{usual}; {unknown}")

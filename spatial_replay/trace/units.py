@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from reprlib import repr as shortened
 from typing import TYPE_CHECKING, Final, Literal
 
@@ -17,49 +17,61 @@ import numpy as np
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.geometry.footprint import FootprintBatch
-from spatial_replay.text import is_encodable
+from spatial_replay.text import is_encodable, names_from_unit
 
 if TYPE_CHECKING:
     from spatial_replay.trace.trace import Trace
 
 AXES_KEY = "source_axes"
 """The entry of a log's metadata that says what the axes of its source were."""
+SIGNAL_UNITS_KEY = "signal_units"
+"""The entry of a log's metadata with the units of its signals; that of lengths is among the axes."""
 
 
 @dataclass(frozen=True, slots=True)
 class Axes:
-    """The axes of a source, as opposed to those of samples.
+    """The axes and units of a source, as opposed to those of samples.
 
     Attributes:
         y: where its y points.
         scale: footprint units per unit of the source.
         unit: what a footprint unit is, for readers: "m"; "" where nothing declares it.
+        signals: units of signals, by their names; or names of their numbers, see `names_from_unit`.
     """
 
     y: Literal["up", "down"] = "up"
     scale: float = 1.0
     unit: str = ""
+    signals: Mapping[str, str] = field(default_factory=dict, compare=False)
+
+    @classmethod
+    def of_units(cls, units: Mapping[str, str]) -> Axes:
+        """Return our axes with units: of signals by their names, of lengths by ""."""
+        return cls(unit=units.get("", ""), signals={name: unit for name, unit in units.items() if name})
 
     @classmethod
     def from_metadata(cls, about: Mapping[str, str]) -> Axes:
         """Return the axes that a log's metadata say its source had; ours, where they say nothing."""
         try:
-            found = json.loads(about.get(AXES_KEY, "{}"))
+            found, signals = (json.loads(about.get(key, "{}")) for key in (AXES_KEY, SIGNAL_UNITS_KEY))
             y: Literal["up", "down"] = "down" if found.get("y") == "down" else "up"
-            return cls(y, float(found.get("scale", 1.0)), str(found.get("unit", "")))
-        except (ValueError, TypeError, AttributeError):
+            declared = {name: unit for name, unit in signals.items() if name and isinstance(unit, str)}
+            return cls(y, float(found.get("scale", 1.0)), str(found.get("unit", "")), declared)
+        except (ValueError, TypeError, AttributeError, RecursionError):
             return cls()
 
     def metadata(self) -> dict[str, str]:
-        """Return the entry for the metadata of a log; none where the source has our axes."""
-        if self == OUR_AXES:
-            return {}
+        """Return the entries for the metadata of a log; none where the source has our axes and no units."""
         unit = {"unit": self.unit} if self.unit else {}
-        return {AXES_KEY: json.dumps({"scale": self.scale, **unit, "y": self.y})}
+        axes = {AXES_KEY: json.dumps({"scale": self.scale, **unit, "y": self.y})} if self != OUR_AXES else {}
+        return axes | (
+            {SIGNAL_UNITS_KEY: json.dumps(dict(sorted(self.signals.items())))} if self.signals else {}
+        )
 
-    def units_with(self, of_signals: Mapping[str, str]) -> dict[str, str]:
-        """Return all that is declared: the units of signals by their names, and that of lengths by ""."""
-        return {**of_signals, **({"": self.unit} if self.unit else {})}
+    @property
+    def units(self) -> dict[str, str]:
+        """All that is declared: the units of signals by their names, and that of lengths by ""."""
+        return {**self.signals, **({"": self.unit} if self.unit else {})}
 
     def __str__(self) -> str:
         turned = " (down in the source)" if self.y == "down" else ""
@@ -108,24 +120,6 @@ OUR_AXES = Axes()
 """Axes of samples: y up."""
 
 
-def units_metadata(units: Mapping[str, str] | None) -> dict[str, str]:
-    """Return the entries for the metadata of a log whose samples have these units.
-
-    Raises:
-        UsageError: units that are not texts by names.
-    """
-    units = checked_units(units)
-    return Axes(unit=units.get("", "")).metadata() | signal_units_metadata(units)
-
-
-def units_from_metadata(about: Mapping[str, str]) -> dict[str, str]:
-    """Return the units that a log's metadata declare: of signals by their names, of lengths by ""."""
-    return Axes.from_metadata(about).units_with(signal_units_from_metadata(about))
-
-
-SIGNAL_UNITS_KEY = "signal_units"
-"""The entry of a log's metadata with the units of its signals; that of lengths is among the axes."""
-
 _LONGEST_UNIT = 64
 
 
@@ -141,25 +135,11 @@ def checked_units(units: Mapping[str, str] | None) -> dict[str, str]:
         remedy = 'give them by the names of signals, and that of lengths by "": {"": "m"}'
         raise UsageError(f"units are {shortened(units)}; {remedy}")
     for name, unit in units.items():
-        if not isinstance(unit, str) or not 0 < len(unit) <= _LONGEST_UNIT or not is_encodable(unit):
+        is_text = isinstance(unit, str) and is_encodable(unit)
+        if not is_text or not (0 < len(unit) <= _LONGEST_UNIT or names_from_unit(unit)):
             what = f"of signal {name!r}" if name else "of lengths"
             raise UsageError(f"the unit {what} is {shortened(unit)}; give a short text, such as 'm'")
     return dict(sorted(units.items()))
-
-
-def signal_units_metadata(units: Mapping[str, str]) -> dict[str, str]:
-    """Return the entry for the metadata of a log; none where no signal has a unit."""
-    of_signals = {name: unit for name, unit in sorted(units.items()) if name}
-    return {SIGNAL_UNITS_KEY: json.dumps(of_signals)} if of_signals else {}
-
-
-def signal_units_from_metadata(about: Mapping[str, str]) -> dict[str, str]:
-    """Return the units of signals that a log's metadata declare, by their names."""
-    try:
-        found = json.loads(about.get(SIGNAL_UNITS_KEY, "{}"))
-        return {name: unit for name, unit in found.items() if name and isinstance(unit, str)}
-    except (ValueError, AttributeError, RecursionError):
-        return {}
 
 
 OTHER_UNITS: Final = 8.0

@@ -20,6 +20,7 @@ from spatial_replay.geometry.arrays import Floats
 from spatial_replay.lazy import Displayed
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.spec import parse_specification
+from spatial_replay.spec.checks import with_numbers
 from spatial_replay.spec.diagnostics import nearest_hint
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import constant_writer
@@ -926,7 +927,7 @@ def tune_runs(
         raise UsageError(
             f"{len(varied)} constants are more than the {MOST_CONSTANTS} that are tuned together"
         )
-    parse = partial(_with_values, specification, constant_writer(specification))
+    parse = partial(_with_values, specification, constant_writer(specification), runs[0].trace.units)
     margins = Margins(runs, parse, varied, each or {}, advance=advance)
     search = Search(margins, seed)
     found = search.best()
@@ -967,12 +968,19 @@ def _check(specification: Specification, runs: Sequence[LabelledRun]) -> None:
         raise UsageError(f"the runs have {samples} samples, more than {MOST_SAMPLES}; tune on some of them")
     for run in runs[1:]:
         require_same_units(runs[0].trace, run.trace, (runs[0].name, run.name))
+        if with_numbers(specification, run.trace.units) != with_numbers(specification, runs[0].trace.units):
+            what = f"{run.name} and {runs[0].name} name the numbers of a signal differently"
+            raise UsageError(f"{what}; read both by one mapping")
 
 
 def _with_values(
-    specification: Specification, write: Callable[[Mapping[str, Value]], str], values: Mapping[str, Value]
+    specification: Specification,
+    write: Callable[[Mapping[str, Value]], str],
+    units: Mapping[str, str],
+    values: Mapping[str, Value],
 ) -> Specification:
-    return parse_specification(write(values), filename=specification.filename, profile=specification.profile)
+    text, filename = write(values), specification.filename
+    return with_numbers(parse_specification(text, filename=filename, profile=specification.profile), units)
 
 
 def _tuning(

@@ -14,6 +14,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from annotate.layouts import layout_of
+from bags.bag_files import SECOND, write_json_mcap
 from spatial_replay import read_trace
 from spatial_replay.cli import run
 from spatial_replay.logs.schemas.Robustness_pb2 import StandingUpdate
@@ -260,3 +261,36 @@ def test_an_invalid_option_of_reading_names_the_valid_ones(
     log.write_text('1 0 0 10 10 0 0 0 0 "Biker"\n')
     assert run(["info", str(log), "--read", given]) == 2
     assert message in capsys.readouterr().err
+
+
+def test_names_of_numbers_are_compared_in_every_log_of_a_run(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_json_mcap(folder / "run.mcap", [("/m", second * SECOND, {"code": second}) for second in (1, 2, 3)])
+    (folder / "m.yaml").write_text(
+        "topics: {/m: {signals: {mode: {field: code, names: {1: MANUAL, 2: AUTO, 3: HOLD}}}}}"
+    )
+    (folder / "m.spatial").write_text('spec drives = F (mode == "AUTO")\nspec calm = G (mode != "HOLD")\n')
+    mapped = ["run.mcap", "--mapping", "m.yaml", "--spec", "m.spatial"]
+    assert run(["replay", *mapped, "-o", "annotated.mcap"]) == 1
+    first = capsys.readouterr().out.splitlines()
+    assert 'mode is 3 ("HOLD")' in first[2]
+    # the names are in the new log
+    for again in (["annotated.mcap"], ["annotated.mcap", "--spec", "m.spatial"]):
+        assert run(["replay", *again]) == 1
+        assert capsys.readouterr().out.splitlines()[1:] == first[1:-1]
+    for same in (["verify", "annotated.mcap"], ["diff", *mapped, "--spec", "m.spatial"]):
+        assert run(same) == 0
+    assert run(["diff", "annotated.mcap", "annotated.mcap", "--align", "progress"]) == 0
+    capsys.readouterr()
+    (folder / "m.spatial").write_text('spec drives = F (mode == "AUTOMATIC")')
+    for command in (
+        ["replay", *mapped],
+        ["explain", *mapped],
+        ["report", *mapped, "-o", "r.html"],
+        ["check", "m.spatial", "--log", *mapped[:3]],
+    ):
+        assert run(command) == 2
+        said = capsys.readouterr().err
+        assert 'no number of mode is called "AUTOMATIC"' in said
+        assert 'its names are "MANUAL", "AUTO", "HOLD"' in said

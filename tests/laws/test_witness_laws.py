@@ -19,8 +19,8 @@ from spatial_replay.monitor.offline import evaluate_offline
 from spatial_replay.monitor.online.program import compile_formula
 from spatial_replay.monitor.sentences import sentences_of
 from spatial_replay.monitor.witness.path import End, deciding_path
-from spatial_replay.monitor.witness.threshold import rewritten
 from spatial_replay.spec.formula import Number, Sum, iter_nodes
+from spatial_replay.spec.walks import rewritten
 
 SIGNALS = Vocabulary(objects=(), signals=("p", "q"), max_depth=4, delays=False)
 NUMBER = re.compile(r"(?<![\w.])-?\d+(\.\d+)?(?![\w.])")
@@ -257,8 +257,10 @@ def with_margin(specification, witness, margin):
     """The specification with an atom that has to hold by a margin."""
 
     def change(atom):
+        if atom.span != witness.deciding.atom.span:
+            return atom
         return replace(atom, expression=Sum(atom.expression, Number(-margin)))
 
     (spec,) = specification.specs
-    formula = rewritten(spec.formula, lambda atom: atom.span == witness.deciding.atom.span, change)
+    formula = rewritten(spec.formula, change)
     return Specification((replace(spec, formula=formula),), "paper", regions=specification.regions)

@@ -617,6 +617,18 @@ def test_a_recorded_run_is_not_replaced_unasked(tmp_path: Path, capsys: pytest.C
     assert run([*command, "--overwrite"]) == 3
 
 
+def test_a_mode_is_compared_by_its_name_and_the_log_keeps_the_names(tmp_path: Path) -> None:
+    keys = "signals: {mode: {field: mode, names: {0: MANUAL, 1: AUTO}}}"
+    mapping = f"topics: {{/robot: {{{keys}}}, /vase: {{position: [x, y]}}}}\nsample: {{topic: /robot}}"
+    mapped, spec = files(tmp_path, mapping, 'spec drives = F (mode == "AUTO")')
+    log = tmp_path / "live.mcap"
+    modes = [frame(1, tick * 10 * MS, b'{"mode": %d}' % (tick > 1)) for tick in range(4)]
+    with rude_server(pose(2, 0), *modes) as address:
+        command = ["monitor", address, "--mapping", str(mapped), "--spec", str(spec), "-o", str(log)]
+        assert run([*command, "--until", "satisfied"]) == 0
+    assert run(["replay", str(log), "--spec", str(spec)]) == 0
+
+
 def test_a_name_that_the_robot_does_not_report_is_noted_once(tmp_path: Path) -> None:
     mapped, spec = files(tmp_path, MAPPING, "spec clear = G (robto dist vase >= 0.5)")
     with robot() as own:

@@ -211,3 +211,14 @@ def test_a_topic_can_be_read_as_a_built_in_type() -> None:
     with pytest.raises(UsageError, match="has no field 'orientation'"):
         make("topics: {/p: {type: geometry_msgs/PoseStamped}}", feed)
     assert make("topics: {/p: {}}", feed).centre(0, "p") == (1.0, 2.0)
+
+
+def test_a_signal_has_a_unit_or_names_that_differ() -> None:
+    def fault(keys: str) -> str:
+        with pytest.raises(UsageError) as raised:
+            parse_mapping(f"topics: {{/m: {{signals: {{mode: {{field: m, {keys}}}}}}}}}")
+        return str(raised.value)
+
+    assert "two numbers are called 'AUTO'; give each its own name" in fault("names: {1: AUTO, 2: AUTO}")
+    assert "with unit: TEXT or names: {NUMBER: NAME}" in fault("unit: m, names: {1: AUTO}")
+    assert 'expected a number; got "one"' in fault("names: {AUTO: one}")

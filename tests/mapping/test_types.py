@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
 from math import cos, pi, sin
 from typing import Any
 
@@ -14,7 +17,16 @@ from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 from mapping.feeding import SECOND, Feed, Made, header, make, pose, pose_stamped, ros, tf, transform
-from spatial_replay import Footprint, TrackedObject, UsageError, evaluate, parse_specification
+from spatial_replay import (
+    Footprint,
+    Monitor,
+    SpecificationError,
+    TrackedObject,
+    UsageError,
+    evaluate,
+    parse_specification,
+)
+from spatial_replay.mapping.mapping_file import parse_mapping
 from spatial_replay.text import text_number
 
 QUARTER = (0.0, 0.0, sin(pi / 4), cos(pi / 4))
@@ -417,6 +429,45 @@ def test_texts_become_signals_by_their_names() -> None:
         evaluate(parse_specification('G (mode == "AUTO" or mode == "HOLD")'), compared).verdict == "violated"
     )
     assert evaluate(parse_specification('F[3, 3] mode == "AUTO"'), compared).verdict == "satisfied"
+
+
+NUMBERED = "{0: NO, 1: INFO, 4: ERROR}"
+
+
+@pytest.mark.parametrize(
+    ("contents", "names"),
+    [
+        ([{"m": "INFO"}, {"m": "ERROR"}], "{NO: 0, INFO: 1, ERROR: 4}"),
+        ([{"m": 1}, {"m": 4}], NUMBERED),
+        ([{"m": 1}, {"m": 4}], "{INFO: 1, ERROR: 4}"),
+        ([ros("std_msgs/UInt8", data=1), ros("std_msgs/UInt8", data=4)], NUMBERED),
+        ([ros("std_msgs/String", data="INFO"), ros("std_msgs/String", data="ERROR")], NUMBERED),
+        ([Log(level=Log.Level.INFO), Log(level=Log.Level.ERROR)], NUMBERED),
+        ([Log(level=Log.Level.INFO), Log(level=Log.Level.ERROR)], "{2: info, 4: error}"),
+    ],
+)
+def test_numbers_are_compared_by_their_names(contents: Sequence[object], names: str) -> None:
+    feed = Feed(types={"/m": "a/Mode"} if isinstance(contents[0], dict) else {})
+    for second, content in enumerate(contents):
+        feed.add("/m", second * SECOND, content)
+    field = next(each for each in ("level", "data", "m") if hasattr(contents[0], each) or each == "m")
+    mapping = f"topics: {{/m: {{signals: {{mode: {{field: {field}, names: {names}}}}}}}}}"
+    units = parse_mapping(mapping).axes.units
+    trace = replace(make(mapping, feed).trace, units=units)
+    info, error = ("info", "error") if "info" in names else ("INFO", "ERROR")
+    number = trace.signals["mode"][0]
+    for text in (f'mode == "{info}" and X mode == "{error}"', f"mode == {number} and X mode >= 4"):
+        specification = parse_specification(text)
+        assert evaluate(specification, trace).verdict == "satisfied"
+        monitor = Monitor(specification, units=units)
+        assert [monitor.update(each) for each in trace.samples()][-1].verdict == "satisfied"
+    never = evaluate(parse_specification(f'G (mode != "{error}")'), trace)
+    assert f'mode is 4 ("{error}")' in never.explain()
+    other = parse_specification('F (mode == "HOLD")')
+    for compare in (partial(evaluate, other, trace), partial(Monitor, other, units=units)):
+        with pytest.raises(SpecificationError, match='no number of mode is called "HOLD"') as raised:
+            compare()
+        assert f'"{info}", "{error}"' in str(raised.value)
 
 
 def test_objects_that_only_places_distinguish_are_remarked() -> None:

@@ -182,7 +182,7 @@ def test_a_reason_about_a_mode_has_no_margin():
         ('F ("HOLD" == mode)', "violated", "mode is another text"),
         ("G (mode == 2)", "unknown", "signal 'mode' is a text, not a number"),
         ("G (mode >= 2)", "unknown", "signal 'mode' is a text, not a number"),
-        ('G (gap == "AUTO")', "unknown", "signal 'gap' is a number, not a text; leave out `names`"),
+        ('G (gap == "AUTO")', "unknown", "signal 'gap' is a number, not a text; `names` of its mapping"),
     ],
 )
 def test_texts_are_compared_with_texts_alone(formula, verdict, reason):

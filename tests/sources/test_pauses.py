@@ -35,14 +35,33 @@ def test_a_pause_is_remarked_with_its_place_and_length(log: Path) -> None:
 def test_everything_in_a_longer_pause_is_unknown(log: Path, tmp_path: Path) -> None:
     trace = read_trace(log, max_gap="2s")
     inside = [time_ns / 1e9 for time_ns in trace.times_ns.tolist() if 1.9e9 < time_ns < 7e9]
-    assert inside == [1.900000001, 3.9, 5.9]
-    assert len(trace) == 43
-    assert (trace.rows[20:23] <= -2).all()
+    assert inside == [1.900000001, *(round(1.9 + 0.2 * step, 1) for step in range(1, 26)), 6.999999999]
+    assert (trace.rows[20:-20] <= -2).all()
+    assert "; what lies in a pause of more than 2 s is unknown (`max_gap`)" in trace.remarks[0]
     assert read_trace(log, max_gap="6s") == read_trace(log)
     spec = tmp_path / "far.spatial"
     spec.write_text("region wall = box(50, 0, 51, 1)\nspec far = G (cup dist wall >= 1)\n")
     verdicts = [replay_log(log, spec, max_gap=each).results[0].verdict for each in (None, "2s")]
     assert verdicts == ["satisfied", "unknown"]
+    worst = replay_log(log, spec, max_gap="2s").results[0].explain()
+    assert "the position of cup is unknown" in worst
+    assert "cup is missing in 27 of 67 samples, all from 1.900 s to 7.000 s (5.100 s)." in worst
+
+
+@pytest.mark.parametrize("body", ["F[1s, 1.2s]", "G[1s, 1.2s]", "O[1s, 1.2s]", "H[0s, 0.1s]", "F[0s, 0s]"])
+def test_no_verdict_rests_on_a_window_in_a_pause(log: Path, tmp_path: Path, body: str) -> None:
+    spec = tmp_path / "far.spatial"
+    holds = f"{body} cup dist wall >= 1"
+    spec.write_text(f"region wall = box(50, 0, 51, 1)\nspec far = G[1.5s, 7s] ({holds})\n")
+    assert replay_log(log, spec, max_gap="2s").results[0].verdict == "unknown"
+
+
+def test_a_window_that_may_miss_what_fills_a_pause_is_refused(log: Path, tmp_path: Path) -> None:
+    spec = tmp_path / "far.spatial"
+    spec.write_text("region wall = box(50, 0, 51, 1)\nspec far = F[1s, 1.1s] cup dist wall >= 1\n")
+    with pytest.raises(UsageError, match=r"\[1s, 1.1s\] is too narrow for max_gap.*; make it 0.2s long"):
+        replay_log(log, spec, max_gap="2s")
+    assert replay_log(log, spec, max_gap="1s").results[0].verdict == "satisfied"
 
 
 def test_a_limit_has_a_unit(log: Path) -> None:

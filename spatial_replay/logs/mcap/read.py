@@ -61,7 +61,7 @@ from spatial_replay.logs.topics import ALL, DERIVED, METADATA, OBJECTS, RECOVERY
 from spatial_replay.text import Instant, Sentence, counted, encodable
 from spatial_replay.trace.sample import LATEST_NS
 from spatial_replay.trace.trace import Trace
-from spatial_replay.trace.units import Axes, signal_units_from_metadata
+from spatial_replay.trace.units import Axes
 
 ALWAYS_ALLOWED, MOST_TIMES_LARGER = 2**26, 1_000
 """Bytes, and times its own size, that a chunk or a message may decompress to: no recorder's needs more."""
@@ -398,11 +398,6 @@ class McapSource:
     def axes(self) -> Axes:
         """Axes of the original source; samples are always y-up."""
         return Axes.from_metadata(dict(self.metadata()).get(METADATA, {}))
-
-    @property
-    def signal_units(self) -> Mapping[str, str]:
-        """The units that are declared, by signal."""
-        return signal_units_from_metadata(dict(self.metadata()).get(METADATA, {}))
 
     @property
     def begin_ns(self) -> int | None:

@@ -84,7 +84,7 @@ def _reasons(scene: TraceScene, part: Expression) -> Iterator[str]:
             elif is_text_number(compared) != is_text_number(value):
                 kinds = "a text, not a number; `names` of its mapping give texts numbers"
                 if is_text_number(compared):
-                    kinds = "a number, not a text; leave out `names` of its mapping to compare texts"
+                    kinds = "a number, not a text; `names` of its mapping give numbers names"
                 yield f"signal {name!r} is {kinds}"
         case Number() | Sum() | Negative() | Minimum() | Maximum() | Scaled():
             return
@@ -117,7 +117,7 @@ def _missing(scene: TraceScene, term: Term) -> Iterator[str]:
     for name, row in zip(members or [format_term(term)] * len(rows), rows.tolist(), strict=True):
         when = " then" if isinstance(term, Earlier) else ""
         if row < ABSENT:
-            yield f"{name} has no readable position{when}"
+            yield f"the position of {name} is unknown{when}"
         elif row == ABSENT and members:
             yield f"{name} is not in the sample{when and f' that {format_term(term)} looks at'}"
 

@@ -31,6 +31,7 @@ class Gap:
         first_ns, last_ns: the first and the last of these.
         window: the start, and the end (not included), of the samples between missing ones at the ends of a
             log; None if others are missing.
+        longest_ns: the first sample of the longest stretch without it, and the first one after, if any.
     """
 
     name: str
@@ -39,6 +40,7 @@ class Gap:
     first_ns: int
     last_ns: int
     window: tuple[int | None, int | None] | None
+    longest_ns: tuple[int, int]
 
 
 class Evidence:
@@ -189,12 +191,21 @@ def is_missing(trace: Trace, part: NamedPart) -> NDArray[np.bool_]:
 
 
 def _gap(name: str, missing: NDArray[np.bool_], times_ns: Integers) -> Gap:
-    at = np.flatnonzero(missing)
-    first, last = int(at[0]), int(at[-1])
+    last = len(missing) - 1
+    turns = np.flatnonzero(np.diff(missing, prepend=False, append=False))
+    starts, ends = turns[::2], turns[1::2]
     # leading and trailing samples, without another one between
-    begin, end = int(np.argmin(missing)), len(missing) - int(np.argmin(missing[::-1]))
-    is_at_ends = 0 < begin + len(missing) - end == len(at) < len(missing)
-    window = (int(times_ns[begin]) if begin else None, int(times_ns[end]) if end < len(missing) else None)
+    is_at_ends = bool(((starts == 0) | (ends > last)).all()) and not missing.all()
+    before = int(times_ns[ends[0]]) if starts[0] == 0 and is_at_ends else None
+    after = int(times_ns[starts[-1]]) if ends[-1] > last else None
+    spans = np.stack((times_ns[starts], times_ns[np.minimum(ends, last)]))
+    longest = spans[:, np.diff(spans, axis=0).argmax()]
     return Gap(
-        name, len(at), len(missing), int(times_ns[first]), int(times_ns[last]), window if is_at_ends else None
+        name,
+        int(missing.sum()),
+        len(missing),
+        int(times_ns[starts[0]]),
+        int(times_ns[ends[-1] - 1]),
+        (before, after) if is_at_ends else None,
+        (int(longest[0]), int(longest[1])),
     )

@@ -41,10 +41,16 @@ from spatial_replay.spec.formula import (
     Sum,
     Temporal,
     Term,
-    Truth,
     iter_nodes,
 )
-from spatial_replay.spec.walks import iter_expressions, iter_formulas, map_leaves, map_terms, operand_signs
+from spatial_replay.spec.walks import (
+    iter_expressions,
+    iter_formulas,
+    map_leaves,
+    map_terms,
+    operand_signs,
+    rewritten,
+)
 from spatial_replay.text import DIGITS
 
 
@@ -146,20 +152,6 @@ class Dial:
 
     def _radii_in(self, term: Term) -> int:
         return sum(self.is_at("radius", each) for each in _radii_of(term))
-
-
-def rewritten(formula: Formula, is_meant: Callable[[Atom], bool], change: Callable[[Atom], Atom]) -> Formula:
-    """Return a formula of the same shape with some of its atoms changed."""
-    match formula:
-        case Atom():
-            return change(formula) if is_meant(formula) else formula
-        case Truth():
-            return formula
-        case Quantified():
-            return replace(formula, body=rewritten(formula.body, is_meant, change))
-        case Boolean() | Temporal():
-            operands = tuple([rewritten(each, is_meant, change) for each in formula.operands])
-            return replace(formula, operands=operands)
 
 
 def _radii(expression: Expression) -> list[float]:
@@ -350,7 +342,7 @@ class _Search:
         def change(atom: Atom) -> Atom:
             return replace(atom, expression=Sum(atom.expression, Number(far)))
 
-        formula = rewritten(self._formula, self._is_meant, change)
+        formula = self._changed(change)
         added = new_leaves(formula, self._order)
         return self._is_flipped(self._evaluated(formula, added, self._columns(added)))
 
@@ -446,7 +438,10 @@ class _Search:
         return (atom.span, atom.relation, atom.parameters) == (meant.span, meant.relation, meant.parameters)
 
     def _turned(self, number: float) -> Formula:
-        return rewritten(self._formula, self._is_meant, lambda atom: self._turned_atom(atom, number))
+        return self._changed(lambda atom: self._turned_atom(atom, number))
+
+    def _changed(self, change: Callable[[Atom], Atom]) -> Formula:
+        return rewritten(self._formula, lambda atom: change(atom) if self._is_meant(atom) else atom)
 
     def _turned_atom(self, atom: Atom, number: float) -> Atom:
         return replace(atom, expression=self._dial.turned(atom.expression, number))
