@@ -58,6 +58,7 @@ from spatial_replay.mapping.field_paths import (
 from spatial_replay.mapping.mapping_file import (
     DEFAULT_MAX_AGE_NS,
     FOREVER_NS,
+    UNITS_NS,
     Clock,
     LogMapping,
     SignalMapping,
@@ -655,7 +656,14 @@ class TopicReader:
         has_stamp = np.array([time_ns is not None for time_ns in times], np.bool_)
         self.unstamped += int(np.count_nonzero(good & ~has_stamp))
         good &= has_stamp
-        self._is_stamped = self._is_stamped or bool(good.any())
+        if not self._is_stamped and good.any():
+            self._is_stamped = True
+            first = int(good.argmax())
+            unit = _unit_of_stamp(times[first] or 0, log_times_ns[first])
+            if unit != "ns":
+                raise self._misfit_error(
+                    f"stamps in {unit} are read as ns; write `stamp: {{field: PATH, unit: {unit}}}`"
+                )
         return np.array([time_ns or 0 for time_ns in times], np.int64)
 
     def read(self, log_times_ns: Integers, contents: Sequence[Any]) -> TopicColumns:
@@ -837,6 +845,12 @@ class TopicReader:
 
     def _misfit_error(self, reason: str) -> UsageError:
         return UsageError(f"{self._mapping_name}: topics.{self.name}: {reason}")
+
+
+def _unit_of_stamp(stamp: int, log_time_ns: int) -> str:
+    """Return the unit in which a stamp is within an hour of when its message was recorded, else ns."""
+    near = (unit for unit, ns in UNITS_NS.items() if abs(stamp * ns - log_time_ns) < 3600 * 10**9)
+    return next(near, "ns")
 
 
 class ClockStep(NamedTuple):

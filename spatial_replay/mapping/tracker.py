@@ -23,7 +23,7 @@ from spatial_replay.mapping.detections import EVERY_OBJECT, Detections, Solids, 
 from spatial_replay.mapping.mapping_file import FOREVER_NS, LogMapping
 from spatial_replay.mapping.topic_reader import ReadingPlan, ReportFault, TopicReader
 from spatial_replay.mapping.transforms import FrameTree, Transforms
-from spatial_replay.text import Instant, Sentence
+from spatial_replay.text import Instant, Sentence, counted
 from spatial_replay.trace.observations import Observations, check_observations
 from spatial_replay.trace.trace import ABSENT, Pauses, Trace, renumbered
 from spatial_replay.trace.units import Axes
@@ -625,17 +625,24 @@ class Tracker:
 
     def _signal_columns(self, times_ns: Integers, newest_ns: int) -> dict[str, Floats]:
         columns: dict[str, Floats] = {}
+        old: list[tuple[str, str, Booleans]] = []
         for (topic, index), (reported_ns, values) in self._signals.items():
             planned = self._readers[topic].planned
             if planned.mapping is None:
                 continue
             at = np.searchsorted(reported_ns, times_ns, "right") - 1
-            is_old = (at < 0) | (times_ns - reported_ns[at] > planned.max_age_ns)
-            column = np.where(is_old | self._in_gap(topic, times_ns, newest_ns), np.nan, values[at])
+            is_old = times_ns - reported_ns[at] > planned.max_age_ns
+            in_gap = self._in_gap(topic, times_ns, newest_ns)
+            column = np.where((at < 0) | is_old | in_gap, np.nan, values[at])
             name = planned.mapping.signals[index].name
+            old.append((topic, name, (at >= 0) & is_old))
             # several topics may report one signal: the first that has a value counts
             first = columns.get(name, column)
             columns[name] = np.where(np.isnan(first), column, first)
+        for topic, name, is_old in old:
+            stale = is_old & np.isnan(columns[name])
+            if stale.any():
+                self._remarks.stale.add((topic, name), times_ns[stale])
         return columns
 
 
@@ -737,12 +744,13 @@ class Remarks:
         for topic, stale in by_topic.items():
             names = ", ".join(name for name, _, _ in stale[:_MOST_NAMES])
             more = f" and {len(stale) - _MOST_NAMES} more" if len(stale) > _MOST_NAMES else ""
+            are = "is" if len(stale) == 1 else "are"
             most = max(count for _, count, _ in stale)
             first_ns = min(first for _, _, first in stale)
             yield Sentence(
-                f"{topic}: {names}{more} are unknown in up to {most} samples, the first at ",
+                f"{topic}: {names}{more} {are} unknown in up to {counted(most, 'sample')}, the first at ",
                 Instant(first_ns, 0),
-                ": the topic was silent for longer than max_age",
+                ": the topic was silent for longer than max_age; `max_age: forever` keeps its last message",
             )
 
 

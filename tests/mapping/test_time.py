@@ -68,7 +68,7 @@ def test_an_object_with_an_old_observation_exists_but_is_unknown() -> None:
         feed.add("/a", tick * SECOND // 2, point(tick))
     made = make("max_age: 1500ms\ntopics: {/a: {}, /b: {}}", feed)
     assert made.states("b") == "++++????"
-    assert "/b: b are unknown in up to 4 samples, the first at 2.000 s" in made.remarks[0]
+    assert "/b: b is unknown in up to 4 samples, the first at 2.000 s" in made.remarks[0]
     assert make("topics: {/a: {}, /b: {max_age: forever}}", feed).states("b") == "++++++++"
     assert make("topics: {/a: {}, /b: {}}", feed).states("b") == "+++?????"
 
@@ -298,6 +298,16 @@ def test_stamps_may_be_numbers_of_any_unit() -> None:
     assert seconds(made.trace.times_ns) == [2.5]
 
 
+def test_stamps_in_another_unit_than_the_mapping_says_are_refused() -> None:
+    start_ns = 1_700_000_000 * SECOND
+    for unit, ns in (("us", 10**3), ("ms", 10**6), ("s", 10**9)):
+        feed = Feed().add("/p", start_ns + SECOND, point(0, at=start_ns // ns))
+        with pytest.raises(
+            UsageError, match=rf"topics\./p: stamps in {unit} are read as ns; write .*unit: {unit}"
+        ):
+            make("clock: header\ntopics: {/p: {stamp: at}}", feed)
+
+
 def test_a_topic_without_stamps_needs_another_clock() -> None:
     feed = Feed().add("/p", 7, point(0))
     with pytest.raises(
@@ -315,9 +325,15 @@ def test_signals_follow_the_same_rules() -> None:
     text = (
         "sample: {topic: /p}\ntopics: {/p: {}, /battery: {signals: {charge: {field: percentage, unit: '1'}}}}"
     )
-    charge = make(text, feed).trace.signals["charge"].tolist()
+    made = make(text, feed)
+    charge = made.trace.signals["charge"].tolist()
     assert charge[:5] == [0.5, 0.5, 0.25, 0.25, 0.25]
     assert charge[5] != charge[5]
+    (remark,) = made.remarks
+    assert (
+        "/battery: charge is unknown in up to 1 sample, the first at 2.500 s: the topic was silent" in remark
+    )
+    assert remark.endswith("`max_age: forever` keeps its last message")
 
 
 def test_a_topic_may_have_objects_and_signals() -> None:
