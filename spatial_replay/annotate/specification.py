@@ -277,11 +277,11 @@ def logged_specifications(files: Sequence[Specification], units: Mapping[str, st
     stems: set[str] = set()
     for file in files:
         path = PurePath(file.filename)
-        own, suffix = path.stem.strip("<>"), path.suffix or ".spatial"
-        stem, count = own, 1
+        first, suffix = path.stem.strip("<>"), path.suffix or ".spatial"
+        stem, count = first, 1
         while stem in stems:
             count += 1
-            stem = f"{own}-{count}"
+            stem = f"{first}-{count}"
         stems.add(stem)
         own = replace(_self_contained(_Same(file)), filename=f"{stem}{suffix}")
         logged.append(with_numbers(own, units))

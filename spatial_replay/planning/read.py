@@ -696,13 +696,6 @@ def redo_decisions(
     return redoing.redone(tuple(faults))
 
 
-def _iter_blocks(source: Source, faults: list[str], advance: Callable[[int], None]) -> Iterator[Block]:
-    for block in read_blocks(source):
-        faults.extend(block.trace.faults)
-        yield block
-        advance(len(block.trace))
-
-
 def _specification_changes(old: Planner, new: Planner) -> Iterator[str]:
     texts = [format_specification(each.specification) for each in (old, new)]
     names = [f"{each.specification.filename}, {each.automaton.name}" for each in (old, new)]

@@ -293,8 +293,9 @@ def with_numbers(specification: Specification, units: Mapping[str, str]) -> Spec
 
     def compared(atom: Atom) -> Equality | None:
         part = atom.expression.operand if isinstance(atom.expression, Negative) else atom.expression
-        is_named = isinstance(part, Equality) and part.signal.name in tables and is_text_number(part.value)
-        return part if is_named else None
+        if isinstance(part, Equality) and part.signal.name in tables and is_text_number(part.value):
+            return part
+        return None
 
     def change(atom: Atom) -> Atom:
         if (part := compared(atom)) is None:

@@ -38,11 +38,12 @@ def test_verdicts_are_printed_on_standard_output(folder: Path) -> None:
     done = run_program(*REPLAY, "-o", "out.mcap", cwd=folder)
     assert (done.returncode, done.stderr) == (4, "")
     # the worst first, whatever the order in the file
-    head, apart, reason, reach, wrote = done.stdout.splitlines()
+    head, apart, reason, gap, reach, wrote = done.stdout.splitlines()
     assert head == "run.jsonl: 12 samples over 2.750 s"
     assert reach.split()[:2] == ["reach", "satisfied"]
     assert apart.split()[:2] == ["apart", "unknown"]
     assert "cup 物" in reason
+    assert gap.strip().startswith("cup 物 is missing in 2 of 12 samples, the longest time from 0.750 s")
     assert wrote == "wrote out.mcap"
 
 

@@ -46,7 +46,7 @@ def test_a_verdict_settles_as_samples_come():
 @pytest.mark.parametrize(
     ("text", "at", "reason"),
     [
-        ("F (robot dist vase <= 1)", 3, "`robot dist vase <= 1` holds by 0 at 3.000 s"),
+        ("F (robot dist vase <= 1)", 3, "`robot dist vase <= 1` just holds at 3.000 s"),
         ("G[0s,2s] (robot dist vase >= 1.5)", 2, "`robot dist vase >= 1.5` holds by 0.5 at 2.000 s"),
         (
             "F (robot dist vase <= 2.5 and robot dist vase >= 0)",

@@ -436,11 +436,24 @@ def _content(
     styles[is_present] = 4 * _levels(sizes, before.scale or _UNSCALED) + 2 * failed + (has_label | failed)
     was_pointing = np.append(before.is_pointing, found.is_shown[:-1])
     witness = np.where(found.is_shown, FIRST_FORM + arrows.cause, np.where(was_pointing, DELETED, ABSENT))
-    said = witness, arrows.causes, arrows.numbers
     letters = np.broadcast_to(list(map(len, names)), rows.shape)[is_present]
-    drawn = observations, footprints, rings, _name_places(low, high, letters, before.line)
-    label = _label_places(found, observations, (low, high), before)
-    return SceneContent(names, rows, forms, styles, *missing, *drawn, found, label, *said, *banners)
+    return SceneContent(
+        names,
+        rows,
+        forms,
+        styles,
+        *missing,
+        observations,
+        footprints,
+        rings,
+        _name_places(low, high, letters, before.line),
+        found,
+        _label_places(found, observations, (low, high), before),
+        witness,
+        arrows.causes,
+        arrows.numbers,
+        *banners,
+    )
 
 
 def _name_places(low: Floats, high: Floats, letters: Integers, line: float) -> Floats:
