@@ -35,7 +35,6 @@ from spatial_replay.spec.formula import (
     Atom,
     Axis,
     Boolean,
-    Bound,
     ComputedSignal,
     Earlier,
     Enlarged,
@@ -75,7 +74,6 @@ from spatial_replay.spec.resolve import MAX_SIZE, Anything, Namespace, Resolver,
 from spatial_replay.spec.syntax import (
     Arithmetic,
     BooleanSyntax,
-    BoundSyntax,
     BrokenStatement,
     Call,
     ComparisonSyntax,
@@ -625,24 +623,10 @@ class Elaborator:
         if written.operator in _UNBOUNDED and written.bound is not None:
             hint = f"F and G take windows; {written.operator} means one sample"
             self.resolver.fault(written.bound.span, scope, f"{written.operator!r} takes no window", hint)
-        bound = self.resolver.bound(written.bound, scope)
-        if written.bound is not None and bound is not None:
-            self._check_unit(written, written.bound, bound, scope)
+        bound = self.resolver.bound(written, scope)
         inner = scope.deeper()
         operands = tuple([self.formula(operand, inner) for operand in written.operands])
         return Temporal(written.operator, operands, bound, span=span)  # type: ignore[arg-type]
-
-    def _check_unit(self, written: TemporalSyntax, window: BoundSyntax, bound: Bound, scope: Scope) -> None:
-        """Refuse a window without a unit in the spelling of tools whose windows are seconds."""
-        text = self.faults.source.text
-        word, ends = (text[each.start : each.end] for each in (written.keyword, window.span))
-        is_ours = word == written.operator and ":" not in ends
-        if is_ours or bound.unit != "samples" or (bound.lower, bound.upper) in ((0, 0), (0, None)):
-            return
-        last, end = ("inf", "inf") if bound.upper is None else (bound.upper, f"{bound.upper}s")
-        samples, seconds = f"[{bound.lower}, {last}]", f"[{bound.lower}s, {end}]"
-        hint = f"write {written.operator}{samples} for samples, {written.operator}{seconds} for seconds"
-        self.resolver.fault(window.span, scope, "a window needs its unit in this spelling", hint)
 
     # -------------------------------------------------------------------------------- names and calls
 

@@ -45,6 +45,7 @@ from spatial_replay.spec.syntax import (
     ScaleStatement,
     SpecStatement,
     Statement,
+    TemporalSyntax,
     TermSyntax,
     UseStatement,
 )
@@ -583,8 +584,9 @@ class Resolver:
 
     # --------------------------------------------------------------------------------------- windows
 
-    def bound(self, written: BoundSyntax | None, scope: Scope) -> Bound | None:
+    def bound(self, operator: TemporalSyntax, scope: Scope) -> Bound | None:
         """Return the window of a temporal operator; None for none, and after a fault."""
+        written = operator.bound
         if written is None:
             return None
         lower = self._end(written.lower, scope)
@@ -603,6 +605,8 @@ class Resolver:
             self.fault(written.span, scope, "a window from samples to time, or from time to samples", hint)
             return None
         unit: Literal["samples", "ns"] = "ns" if "ns" in known else "samples"
+        if known == {"samples"} and self._lacks_unit(operator, written, scope):
+            return None
         first = self._whole(lower, written.lower, scope)
         last = None if upper is None else self._whole(upper, written.upper, scope)
         if last is not None and last < first:
@@ -611,6 +615,27 @@ class Resolver:
             self.fault(written.span, scope, f"the window {text} is empty: its ends are reversed", hint)
             return None
         return Bound(first, last, unit)
+
+    def _lacks_unit(self, operator: TemporalSyntax, written: BoundSyntax, scope: Scope) -> bool:
+        """Refuse a window in samples that is decimal, or written as in tools whose windows are seconds."""
+        text, ends = self.faults.source.text, (written.lower, written.upper)
+        word, window = (text[each.start : each.end] for each in (operator.keyword, written.span))
+        values = [self._end(each, scope) for each in ends]
+        numbers = [each for each in values if isinstance(each, float)]
+        is_whole = all(each.is_integer() for each in numbers)
+        is_decimal = not is_whole or any("." in text[each.span.start : each.span.end] for each in ends)
+        is_ours = word == operator.operator and ":" not in window
+        if (is_ours and not is_decimal) or numbers[0] < 0.0 or numbers != sorted(numbers):
+            return False
+
+        def remedy(unit: str) -> str:
+            shown = [format_number(each) + unit if isinstance(each, float) else "inf" for each in values]
+            return f"{operator.operator}[{', '.join(shown)}] for {'seconds' if unit else 'samples'}"
+
+        kind = "needs its unit in this spelling" if not is_ours else "of decimal numbers needs its unit"
+        remedies = [remedy(unit) for unit in (["", "s"] if is_whole else ["s"])]
+        self.fault(written.span, scope, f"a window {kind}", f"write {', '.join(remedies)}")
+        return True
 
     def _end(self, written: Quantity, scope: Scope) -> float | Duration | None:
         """Return an end of a window; None for inf."""

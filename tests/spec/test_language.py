@@ -175,7 +175,7 @@ def test_a_template_is_instantiated_with_its_object() -> None:
         ("[0, 500ms]", Bound(0, 500_000_000, "ns")),
         ("[2s, inf]", Bound(2_000_000_000, None, "ns")),
         ("[0, inf]", Bound(0, None, "samples")),
-        ("[3, 3.0]", Bound(3, 3, "samples")),
+        ("[3, 3]", Bound(3, 3, "samples")),
         ("[1e-9s, 1e2ms]", Bound(1, 100_000_000, "ns")),
     ],
 )
