@@ -31,7 +31,7 @@ from spatial_replay.errors import Diagnosis, NoAutomatonError, OutputError, Spec
 from spatial_replay.logs.remote import LogFile, local_files
 from spatial_replay.spec import format_formula
 from spatial_replay.spec.checks import with_numbers
-from spatial_replay.spec.diagnostics import Diagnostic
+from spatial_replay.spec.diagnostics import Diagnostic, SourceText
 from spatial_replay.spec.format import iter_branches, label_of, title_text
 from spatial_replay.spec.formula import Formula, NamedSpec, Specification, iter_nodes, operator_of
 from spatial_replay.spec.tokens import quoted
@@ -39,8 +39,11 @@ from spatial_replay.text import counted, counted_from, json_number
 
 if TYPE_CHECKING:
     from spatial_replay.logs.read_options import Reading
+    from spatial_replay.logs.source import Source
     from spatial_replay.monitor.plausibility import ThresholdRange
+    from spatial_replay.monitor.stream import SeriesBlock
     from spatial_replay.sanity.examine import Examination
+    from spatial_replay.trace.trace import Trace
 
 
 Form: TypeAlias = Literal["text", "github", "sarif"]
@@ -247,12 +250,14 @@ def _compare_with_log(
     source = open_source(log, **reading)
     specification = with_numbers(specification, axes_of(source).units)
     numbers, names = LogNumbers(specification), LogNames()
+    evaluation = _CutResults(specification)
     faults: list[str] = []
     first_ns: int | None = None
     with progress("samples") as advance:
         for block in reading_only(source).iter_blocks():
             names.add(block.trace)
             numbers.add(block.trace)
+            evaluation.add(block.trace)
             faults += block.trace.faults
             if first_ns is None and len(block.trace):
                 first_ns = int(block.trace.times_ns[0])
@@ -262,7 +267,7 @@ def _compare_with_log(
     missing = sum(each.severity == "error" for each in unknown)
     if not strict_names:
         unknown = tuple(replace(each, severity="warning") for each in unknown)
-    doubtful = plausibility_warnings(specification, numbers)
+    doubtful = (*plausibility_warnings(specification, numbers), *evaluation.warnings(source))
     found = [counted(missing, "name") + " that it never has"] if missing else []
     others = len(unknown) - missing + len(doubtful)
     found += [counted(others, "other warning" if missing else "warning")] if others else []
@@ -275,6 +280,50 @@ def _compare_with_log(
         numbers.ranges,
         summary + (" and ".join(found) or "all names, thresholds and windows fit"),
     )
+
+
+class _CutResults:
+    """The results that a window decides which the end of the log cuts; templates are left out."""
+
+    def __init__(self, specification: Specification) -> None:
+        # only needed with --log: the monitor loads the numerical libraries
+        from spatial_replay.monitor.instances import find_instances
+        from spatial_replay.monitor.stream import EvaluationStream
+        from spatial_replay.trace.sample import FOREVER
+
+        self._specification = specification
+        plain = tuple(each for each in specification.specs if each.parameter is None)
+        instances = find_instances(replace(specification, specs=plain), {}, [], 0, FOREVER)
+        self._stream = EvaluationStream(instances, specification.regions)
+        self._kept: list[list[SeriesBlock]] = [[] for _ in instances]
+
+    def add(self, trace: Trace) -> None:
+        """Evaluate the next samples."""
+        for kept, block in zip(self._kept, self._stream.extend(trace), strict=True):
+            kept.append(replace(block, series=block.series[..., :0].copy()))
+
+    def warnings(self, source: Source) -> Iterator[Diagnostic]:
+        """Yield a warning for each result, at its window."""
+        from spatial_replay.logs.source import axes_of, reading_only
+        from spatial_replay.monitor.result import SpecResult
+        from spatial_replay.monitor.stream import join_blocks
+        from spatial_replay.monitor.witness.evidence import Evidence
+
+        def traces() -> Iterator[Trace]:
+            return (block.trace for block in reading_only(source).iter_blocks())
+
+        own, units = self._specification, axes_of(source).units
+        text = SourceText.of(own.source, own.filename)
+        for stream, kept in zip(self._stream.streams, self._kept, strict=True):
+            if not len(stream):
+                continue
+            evidence = Evidence(stream.instance, own.regions, traces, units)
+            result = SpecResult.from_stream(stream, evidence, join_blocks(kept), has_series=False)
+            for part in result.untested if result.tested == "cut" else ():
+                node = next(each for number, _, each in iter_nodes(result.formula) if number == part.node)
+                message = f"{result.name} would be {result.verdict}: {str(part.message).removesuffix('.')}"
+                hint = "record a longer log; `replay --fail-on cut` fails such a result"
+                yield text.diagnostic("warning", node.span, message, hint)
 
 
 def _heading(spec: NamedSpec) -> str:

@@ -453,12 +453,17 @@ def _cut(step: PathNode, node: Formula, times_ns: Integers, evidence: Evidence) 
     bound = node.bound if isinstance(node, Temporal) else None
     if bound is None or bound.upper is None:
         beyond = "the log has no next sample"
-    elif bound.unit == "samples":
-        left = sample + bound.upper - (len(times_ns) - 1)
-        beyond = f"its window ends {counted(left, 'sample')} after the log"
     else:
-        left_ns = int(times_ns[sample]) + bound.upper - int(times_ns[-1])
-        beyond = f"its window ends {time_text(left_ns)} after the log"
+        is_time = bound.unit == "ns"
+        # places in time or in samples: of the window's begin and end, and of the log's end
+        place, last = (int(times_ns[sample]), int(times_ns[-1])) if is_time else (sample, len(times_ns) - 1)
+        left = place + bound.upper - last
+        whole = bound.upper - bound.lower + (not is_time)
+        seen = max(whole - left, 0)
+        left_text, whole_text = (time_text(n) if is_time else counted(n, "sample") for n in (left, whole))
+        seen_text = time_text(seen) if is_time else f"{seen:,}"
+        beyond = f"its window ends {left_text} after the log"
+        beyond += f" ({seen_text} of {whole_text} seen)" if whole else ""
     return _Idle(
         identifier,
         "cut window",

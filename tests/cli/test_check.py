@@ -130,6 +130,26 @@ def test_with_a_log_windows_in_samples_are_shown_in_seconds(
     assert output.err == ""
 
 
+def test_with_a_log_a_result_that_its_end_cuts_is_warned_of(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log, spec = tmp_path / "slow.jsonl", tmp_path / "s.spatial"
+    log.write_text(SLOW)
+    spec.write_text(
+        "spec full = F (G[0s, 1s] (battery <= 0.85))\nspec late = F (G[0s, 1s] (battery <= 0.65))\n"
+        "spec counted = F (G[0, 4] (battery <= 0.75))\nspec about(x) = F (G[0s, 1s] (x ovlp cube))"
+    )
+    assert run(["check", str(spec), "--log", str(log)]) == 0
+    output = capsys.readouterr()
+    assert output.err.count("warning") == 3 and "full" not in output.err.replace("spec full", "")
+    assert (
+        "s.spatial:2:15: warning: late would be satisfied: `G[0s, 1s] (battery <= 0.65)` decides at 1.500 s, "
+        "where its window ends 1.000 s after the log (0.000 s of 1.000 s seen)"
+    ) in output.err
+    assert "window ends 3 samples after the log (2 of 5 samples seen)" in output.err
+    assert "all names, thresholds and windows fit" not in output.out
+
+
 def test_windows_within_each_other_are_added(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log, spec = tmp_path / "slow.jsonl", tmp_path / "s.spatial"
     log.write_text(SLOW)
