@@ -109,43 +109,37 @@ class PackedPlan(NamedTuple):
 
 
 @inlined
-def _own(whole, numbers, number):  # type: ignore[no-untyped-def]
-    """Return an array of a plan."""
-    return numbers[whole[2 * number] : whole[2 * number + 1]]
-
-
-@inlined
 def plan_at(whole: Integers, real: Floats) -> PlanArrays:
     """Return the arrays of a plan."""
     return PlanArrays(
-        extent=_own(whole, whole, 0),
-        region_parts=_own(whole, whole, 1),
-        region_sizes=_own(whole, whole, 2),
-        region_radius=_own(whole, real, 3),
-        region_vertices=_own(whole, real, 4),
-        region_heights=_own(whole, real, 5).reshape((-1, 2)),
-        operand_start=_own(whole, whole, 6),
-        operand_rows=_own(whole, whole, 7),
-        operand_classes=_own(whole, whole, 8),
-        enlargement=_own(whole, real, 9),
-        geometric=_own(whole, whole, 10),
-        quantity=_own(whole, whole, 11),
-        first=_own(whole, whole, 12),
-        second=_own(whole, whole, 13),
-        yaws=_own(whole, whole, 14).reshape((-1, 3)),
-        required_start=_own(whole, whole, 15),
-        required=_own(whole, whole, 16),
-        closest_start=_own(whole, whole, 17),
-        closest_rows=_own(whole, whole, 18),
-        closest_classes=_own(whole, whole, 19),
-        closest_enlargement=_own(whole, real, 20),
-        member_start=_own(whole, whole, 21),
-        member_rows=_own(whole, whole, 22),
-        member_classes=_own(whole, whole, 23),
-        is_group=_own(whole, whole, 24),
-        code=_own(whole, whole, 25).reshape((-1, 4)),
-        constants=_own(whole, real, 26),
-        outputs=_own(whole, whole, 27),
+        extent=whole[whole[0] : whole[1]],
+        region_parts=whole[whole[2] : whole[3]],
+        region_sizes=whole[whole[4] : whole[5]],
+        region_radius=real[whole[6] : whole[7]],
+        region_vertices=real[whole[8] : whole[9]],
+        region_heights=real[whole[10] : whole[11]].reshape((-1, 2)),
+        operand_start=whole[whole[12] : whole[13]],
+        operand_rows=whole[whole[14] : whole[15]],
+        operand_classes=whole[whole[16] : whole[17]],
+        enlargement=real[whole[18] : whole[19]],
+        geometric=whole[whole[20] : whole[21]],
+        quantity=whole[whole[22] : whole[23]],
+        first=whole[whole[24] : whole[25]],
+        second=whole[whole[26] : whole[27]],
+        yaws=whole[whole[28] : whole[29]].reshape((-1, 3)),
+        required_start=whole[whole[30] : whole[31]],
+        required=whole[whole[32] : whole[33]],
+        closest_start=whole[whole[34] : whole[35]],
+        closest_rows=whole[whole[36] : whole[37]],
+        closest_classes=whole[whole[38] : whole[39]],
+        closest_enlargement=real[whole[40] : whole[41]],
+        member_start=whole[whole[42] : whole[43]],
+        member_rows=whole[whole[44] : whole[45]],
+        member_classes=whole[whole[46] : whole[47]],
+        is_group=whole[whole[48] : whole[49]],
+        code=whole[whole[50] : whole[51]].reshape((-1, 4)),
+        constants=real[whole[52] : whole[53]],
+        outputs=whole[whole[54] : whole[55]],
     )
 
 
@@ -278,25 +272,13 @@ def _measure(plan: PlanArrays, rows: SampleRows, values: Floats, spreads: Floats
                 members[k] = row
                 spread = max(spread, rows.uncertainty[row])
         of_operands[operand] = spread
-    measure_rows(
-        rows.part_start,
-        rows.vertex_start,
-        rows.vertices,
-        rows.radius,
-        rows.bottom,
-        rows.top,
-        members,
-        plan.operand_start,
-        widths,
-        plan.enlargement,
-        plan.quantity,
-        plan.first,
-        plan.second,
-        rows.edges,
-        measured,
-        0,
-        1,
-    )
+    # a literal 0 has a type of its own, for which all of it would be compiled once more
+    for sample in range(1):
+        measure_rows(
+            rows.part_start, rows.vertex_start, rows.vertices, rows.radius, rows.bottom, rows.top,
+            members, plan.operand_start, widths, plan.enlargement, plan.quantity, plan.first, plan.second,
+            rows.edges, measured, sample, sample + 1,
+        )  # fmt: skip
     for g in range(len(plan.geometric)):
         k = plan.geometric[g]
         values[k, 0] = np.nan if hidden[plan.first[g]] or hidden[plan.second[g]] else measured[g, 0]
@@ -410,10 +392,11 @@ def measure_sample(whole: Integers, real: Floats, sample: Floats, leaves: Floats
     _measure(plan, rows, values, spreads)
     signals = sample[plan.extent[0] : plan.extent[0] + plan.extent[3]].reshape((-1, 1))
     channels = _channels_of(values, spreads, signals, closest, members, plan.constants)
-    run_instructions(
-        plan.code, plan.constants, values, spreads, signals, closest, members, plan.outputs,
-        leaves[:channels], 0, 1,
-    )  # fmt: skip
+    for t in range(1):  # as in `_measure`
+        run_instructions(
+            plan.code, plan.constants, values, spreads, signals, closest, members, plan.outputs,
+            leaves[:channels], t, t + 1,
+        )  # fmt: skip
     return channels
 
 
