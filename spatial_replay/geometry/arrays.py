@@ -67,6 +67,19 @@ def read_only_integers(values: ArrayLike) -> Integers:
     return view
 
 
+def writable(values: NDArray[_Number]) -> NDArray[_Number]:
+    """Return a contiguous, writable view, or a copy where a view is not possible.
+
+    A kernel would be compiled once more for arrays that are read-only.
+    """
+    view = np.ascontiguousarray(values).view()
+    try:
+        view.flags.writeable = True
+    except ValueError:  # of memory that nobody may write to
+        return view.copy()
+    return view
+
+
 def starts_from_counts(counts: Sequence[int] | Integers) -> Integers:
     """Return where each of n rows of the given lengths begins and the last one ends, (n + 1,)."""
     start = np.zeros(len(counts) + 1, np.int64)

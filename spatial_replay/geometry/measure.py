@@ -19,7 +19,7 @@ import numpy as np
 from spatial_replay.compiled import elementwise, inlined, kernel, long_kernel
 from spatial_replay.cores import over_cores
 from spatial_replay.errors import GeometryError
-from spatial_replay.geometry.arrays import Floats, Integers, read_only_floats
+from spatial_replay.geometry.arrays import Floats, Integers, writable
 from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.geometry.kernels import NOTHING, Rows, fill_row, measure_rows, rows_distance
 
@@ -113,7 +113,7 @@ class Remeasured:
             vertices: (V or more, 2), in the places of the batch's.
         """
         values, room = self._values, (self._edges, self._values)
-        arguments: Any = (*self._before, read_only_floats(vertices), *self._after, *room, 0, values.shape[1])
+        arguments: Any = (*self._before, writable(vertices), *self._after, *room, 0, values.shape[1])
         measure_rows(*arguments)
         return values
 
@@ -142,12 +142,7 @@ def _prepared(
             values[still] = measure(batch, once, [requests[k] for k in still])
             codes[still] = NOTHING
     return values, (
-        batch.part_start,
-        batch.vertex_start,
-        batch.vertices,
-        batch.radius,
-        batch.bottom,
-        batch.top,
+        *_arrays_of(batch),
         members,
         np.concatenate([[0], np.cumsum(size)]),
         width,
@@ -156,6 +151,12 @@ def _prepared(
         np.array([request.first for request in requests], dtype=np.int64),
         np.array([request.second for request in requests], dtype=np.int64),
     )
+
+
+def _arrays_of(batch: FootprintBatch) -> tuple[Any, ...]:
+    """Return what kernels take first."""
+    starts = (writable(batch.part_start), writable(batch.vertex_start))
+    return (*starts, *map(writable, (batch.vertices, batch.radius, batch.bottom, batch.top)))
 
 
 def _rests(operand: Operand) -> bool:
@@ -222,14 +223,9 @@ def closest_pairs(batch: FootprintBatch, rows: Integers, uncertainty: Floats, en
     """
     result = np.empty((len(rows), 3))
     closest_rows(
-        batch.part_start,
-        batch.vertex_start,
-        batch.vertices,
-        batch.radius,
-        batch.bottom,
-        batch.top,
+        *_arrays_of(batch),
         np.ascontiguousarray(rows),
-        uncertainty,
+        writable(uncertainty),
         float(enlargement),
         np.empty((len(batch.vertices), 4)),
         result,

@@ -14,7 +14,7 @@ from types import MappingProxyType
 import numpy as np
 
 from spatial_replay.errors import UsageError
-from spatial_replay.geometry.arrays import Floats, Integers, roomy
+from spatial_replay.geometry.arrays import Floats, Integers, roomy, writable
 from spatial_replay.monitor.offline_kernel import run_offline, run_windows
 from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.codes import OFFLINE_TARGET, low_and_high
@@ -105,7 +105,8 @@ class OfflineFormula:
         """Evaluate every node over all samples; see `evaluate_offline`."""
         columns = roomy((len(leaves), self.width, len(times_ns)), np.float64)
         extrema = np.empty(len(times_ns))
-        run_offline(self.table, np.ascontiguousarray(leaves), times_ns, 0, len(times_ns), columns, extrema)
+        stamps = writable(times_ns)
+        run_offline(self.table, writable(leaves), stamps, 0, len(stamps), columns, extrema)
         return OfflineNodes(columns[:, : self.nodes])
 
 
@@ -147,7 +148,7 @@ def window_signal(
     starts = np.searchsorted(times_ns, times_ns - width_ns, side="right").astype(np.int64)
     columns = np.empty((len(leaves), compiled.width, len(times_ns)))
     result = np.empty((len(leaves), compiled.nodes, len(times_ns)))
-    run_windows(compiled.table, leaves, times_ns, starts, columns, np.empty(len(times_ns)), result)
+    run_windows(compiled.table, leaves, writable(times_ns), starts, columns, np.empty(len(times_ns)), result)
     return _determined(result)
 
 
