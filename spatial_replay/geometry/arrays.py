@@ -75,7 +75,7 @@ def writable(values: NDArray[_Number]) -> NDArray[_Number]:
     view = np.ascontiguousarray(values).view()
     try:
         view.flags.writeable = True
-    except ValueError:  # of memory that nobody may write to
+    except ValueError:  # the owner of the memory is read-only
         return view.copy()
     return view
 
