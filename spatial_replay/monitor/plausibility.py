@@ -137,7 +137,8 @@ class LogNumbers:
         }
 
     def add(self, trace: Trace) -> None:
-        """Add the next samples."""
+        """Add the next samples; those that fill a pause do not count."""
+        trace = trace.without_filling()
         if not len(trace):
             return
         vertices = trace.footprints.vertices

@@ -401,7 +401,16 @@ def _unknown(witness: Witness, deciding: DecidingAtom, first_ns: int) -> Sentenc
 
 
 def gap_sentence(gap: Gap, first_ns: int) -> Sentence:
-    """Return in how many samples an object or a signal is missing, and which samples leave that out."""
+    """Return in how many samples an object or a signal is missing, or where the samples pause.
+
+    If the window of a replay can leave that out, name the window.
+    """
+    begin_ns, end_ns = gap.longest_ns
+    length = f" ({(end_ns - begin_ns) / 1e9:.3f} s)"
+    if gap.name is None:
+        place = (Instant(begin_ns, first_ns), " to ", Instant(end_ns, first_ns), length)
+        others = "" if (gap.first_ns, gap.last_ns) == (begin_ns, end_ns - 1) else ", and at other times"
+        return Sentence("The samples pause from ", *place, f"{others}: `max_gap` makes that unknown.")
     if gap.missing == gap.samples:
         return Sentence(f"{gap.name} is missing in every sample.")
     many = f"{gap.name} is missing in {gap.missing:,} of {counted(gap.samples, 'sample')}"
@@ -415,14 +424,11 @@ def gap_sentence(gap: Gap, first_ns: int) -> Sentence:
                 options.append(f"{option} {(at_ns - first_ns) // 10**6 / 1e3:.3f}s")
         on = " on" if gap.window[1] is not None else ""
         return Sentence(f"{many}, all ", *parts, f"{on}: {' '.join(options)} leaves them out.")
-    begin_ns, end_ns = gap.longest_ns
     if gap.first_ns == gap.last_ns:
         return Sentence(f"{many}, at ", Instant(begin_ns, first_ns), ".")
     how = "all" if begin_ns <= gap.first_ns and gap.last_ns <= end_ns else "the longest time"
-    length = f" ({(end_ns - begin_ns) / 1e9:.3f} s)."
-    return Sentence(
-        f"{many}, {how} from ", Instant(begin_ns, first_ns), " to ", Instant(end_ns, first_ns), length
-    )
+    begin, end = Instant(begin_ns, first_ns), Instant(end_ns, first_ns)
+    return Sentence(f"{many}, {how} from ", begin, " to ", end, f"{length}.")
 
 
 def open_text(witness: Witness) -> str:

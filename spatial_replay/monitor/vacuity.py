@@ -111,7 +111,7 @@ def find_vacuous(
     nodes = [node for _, _, node in iter_nodes(instance.formula)]
     scopes = _scopes(instance.formula, times_ns)
     found = [
-        *_empty_windows(nodes, scopes, times_ns),
+        *_empty_windows(nodes, scopes, times_ns, evidence),
         *_idle_implications(leaves, times_ns, evidence),
         *_idle_bodies(nodes, scopes, evidence),
         *_empty_groups(nodes, scopes, evidence),
@@ -216,17 +216,23 @@ def windows_of(formula: Temporal, times_ns: Integers) -> tuple[Integers, Integer
 
 
 def _empty_windows(
-    nodes: Sequence[Formula], scopes: Sequence[_Samples], times_ns: Integers
+    nodes: Sequence[Formula], scopes: Sequence[_Samples], times_ns: Integers, evidence: Evidence
 ) -> Iterator[_Idle]:
     for identifier, (node, scope) in enumerate(zip(nodes, scopes, strict=True)):
         if not isinstance(node, Temporal) or not scope.any():
             continue
         begin, end = windows_of(node, times_ns)
         if not (begin < end)[scope].any():
-            what = "no sample of the log lies in its window"
+            what: tuple[str | Instant, ...] = ("no sample of the log lies in its window",)
+            after = int(begin[scope][0])
             if node.operator in _NEXT:
-                what = f"the log has no {_NEXT[node.operator]}"
-            yield _Idle(identifier, "empty window", (f"was never tested: {what}.",))
+                what = (f"the log has no {_NEXT[node.operator]}",)
+            elif 0 < after < len(times_ns):
+                between = (
+                    Instant(int(each), evidence.first_ns()) for each in times_ns[after - 1 : after + 1]
+                )
+                what += (", between those at ", next(between), " and ", next(between))
+            yield _Idle(identifier, "empty window", ("was never tested: ", *what, "."))
 
 
 def _idle_implications(leaves: Floats, times_ns: Integers, evidence: Evidence) -> Iterator[_Idle]:

@@ -88,7 +88,7 @@ class Replayed:
 
     Attributes:
         log: base name of the log.
-        samples: how many samples were evaluated.
+        samples: how many samples were evaluated, without those that fill pauses.
         first_ns: time of the log's first sample, evaluated or not.
         start_ns, end_ns: times of the first and the last of those evaluated.
         faults: what was lost while reading, each with its place.
@@ -253,17 +253,18 @@ class Replay:
             for block, trace in blocks:
                 yield block, trace, self._evaluation.extend(trace)
 
-    def _add(self, trace: Trace, own: Messages, stretches: Sequence[SeriesBlock]) -> None:
+    def _add(self, trace: Trace, messages: Messages, stretches: Sequence[SeriesBlock]) -> None:
         self._faults += trace.faults
         self._names.add(trace)
-        self._samples += len(trace)
-        self._unreadable += trace.unreadable_count
+        own = trace.without_filling()
+        self._samples += len(own)
+        self._unreadable += own.unreadable_count
         if len(trace):
             self._times = [*self._times[:1], int(trace.times_ns[0]), int(trace.times_ns[-1])]
-        if len(own):
-            self._end_ns = max(self._end_ns, int(own.log_time_ns[-1]))
+        if len(messages):
+            self._end_ns = max(self._end_ns, int(messages.log_time_ns[-1]))
         if self._hashes is not None:
-            self._hashes.add(trace, own, stretches)
+            self._hashes.add(trace, messages, stretches)
         for index, stretch in enumerate(stretches):
             if self._keep_series or self._keep_leaves:
                 kept = self._kept[index]

@@ -14,6 +14,7 @@ from types import MappingProxyType
 from typing import Final, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from spatial_replay.errors import TraceError, UsageError
 from spatial_replay.geometry.arrays import Floats, Integers, read_only_floats, read_only_integers
@@ -237,6 +238,24 @@ class Trace(Displayed):
     def unreadable_count(self) -> int:
         """Count the observations with a number that is not finite."""
         return int(np.count_nonzero(self.rows < ABSENT))
+
+    @property
+    def filling(self) -> NDArray[np.bool_]:
+        """Return (T,), which samples fill a pause: nothing is known, right after a sample or before one."""
+        unknown = (self.rows < 0).all(axis=1)
+        for values in self.signals.values():
+            unknown &= np.isnan(values)
+        turns = np.flatnonzero(np.diff(unknown, prepend=False, append=False))
+        is_close = np.concatenate([[False], np.diff(self.times_ns) == 1, [False]])
+        found = np.zeros(len(self), np.bool_)
+        for start, end in turns.reshape(-1, 2)[is_close[turns].reshape(-1, 2).any(axis=1)].tolist():
+            found[start:end] = True
+        return found
+
+    def without_filling(self) -> Trace:
+        """Return the samples that the log has."""
+        filling = self.filling
+        return self.take(np.flatnonzero(~filling)) if filling.any() else self
 
     @classmethod
     def empty(cls) -> Trace:

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from spatial_replay import UsageError, read_trace, replay_log
+from spatial_replay.cli import run
 
 
 @pytest.fixture
@@ -41,11 +42,33 @@ def test_everything_in_a_longer_pause_is_unknown(log: Path, tmp_path: Path) -> N
     assert read_trace(log, max_gap="6s") == read_trace(log)
     spec = tmp_path / "far.spatial"
     spec.write_text("region wall = box(50, 0, 51, 1)\nspec far = G (cup dist wall >= 1)\n")
-    verdicts = [replay_log(log, spec, max_gap=each).results[0].verdict for each in (None, "2s")]
-    assert verdicts == ["satisfied", "unknown"]
-    worst = replay_log(log, spec, max_gap="2s").results[0].explain()
-    assert "the position of cup is unknown" in worst
-    assert "cup is missing in 27 of 67 samples, all from 1.900 s to 7.000 s (5.100 s)." in worst
+    whole, paused = (replay_log(log, spec, max_gap=each) for each in (None, "2s"))
+    assert [whole.verdict, paused.verdict] == ["satisfied", "unknown"]
+    assert [paused.samples, paused.unreadable] == [40, 0]
+    worst = paused.results[0].explain()
+    assert "is unknown at 1.900 s, where it could decide (within `far`): the samples pause there." in worst
+    assert "The samples pause from 1.900 s to 7.000 s (5.100 s): `max_gap` makes that unknown." in worst
+    assert "missing" not in worst
+
+
+def test_samples_that_only_fill_a_pause_do_not_count(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    spec = tmp_path / "far.spatial"
+    spec.write_text("region wall = box(50, 0, 51, 1)\nspec far = G (cup dist wall >= 1 and cap ovlp cup)\n")
+    assert run(["check", str(spec), "--log", str(log), "--max-gap", "2s"]) == 0
+    assert "compared with 40 samples of run.jsonl" in capsys.readouterr().out
+    assert run(["explain", str(log), "--spec", str(spec), "--max-gap", "2s"]) == 4
+    assert "cap is missing in every sample" in capsys.readouterr().out
+
+
+def test_a_window_without_a_sample_names_the_samples_around_it(log: Path, tmp_path: Path) -> None:
+    spec = tmp_path / "far.spatial"
+    spec.write_text("spec far = F[3s, 4s] (cup ovlp cup)\n")
+    (result,) = replay_log(log, spec).results
+    assert str(result.untested[0].message).endswith(
+        "no sample of the log lies in its window, between those at 1.900 s and 7.000 s."
+    )
 
 
 @pytest.mark.parametrize("body", ["F[1s, 1.2s]", "G[1s, 1.2s]", "O[1s, 1.2s]", "H[0s, 0.1s]", "F[0s, 0s]"])

@@ -23,10 +23,10 @@ from spatial_replay.trace.trace import Trace, window_of
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """An object or a signal that some samples lack.
+    """An object or a signal that some samples lack, or a pause of all samples (`max_gap`).
 
     Attributes:
-        name: of the object, or the signal in quotes.
+        name: of the object, or the signal in quotes; None for a pause, whose samples only fill it.
         missing, samples: in how many of how many samples it is missing.
         first_ns, last_ns: the first and the last of these.
         window: the start, and the end (not included), of the samples between missing ones at the ends of a
@@ -34,7 +34,7 @@ class Gap:
         longest_ns: the first sample of the longest stretch without it, and the first one after, if any.
     """
 
-    name: str
+    name: str | None
     missing: int
     samples: int
     first_ns: int
@@ -110,18 +110,25 @@ class Evidence:
         begin, end = window_of(times_ns, self.instance.start_ns, self.instance.end_ns)
         return times_ns[begin:end]
 
-    def gaps(self, formula: Formula) -> tuple[Gap, ...]:
-        """Return when each object and signal that a formula names is missing, for those that ever are."""
+    def gaps(self, formula: Formula, time_ns: int = -1) -> tuple[Gap, ...]:
+        """Return when each object and signal that a formula names is missing, for those that ever are.
+
+        Args:
+            time_ns: if a pause of the samples contains it, that one is the longest.
+        """
         kinds = named_parts(formula)
         parts: list[NDArray[np.bool_]] = []
         for scene in self._scenes():
             trace = scene.trace.slice(scene.skip, len(scene.trace))
             inside = slice(*window_of(trace.times_ns, self.instance.start_ns, self.instance.end_ns))
-            columns = [is_missing(trace, each)[inside] for each in kinds]
-            parts.append(np.stack(columns) if columns else np.empty((0, 0), np.bool_))
+            columns = [trace.filling, *(is_missing(trace, each) for each in kinds)]
+            parts.append(np.stack(columns)[:, inside])
         times_ns = self.times_ns()
-        found = zip(kinds, np.concatenate(parts, axis=1), strict=True)
-        return tuple(_gap(part.shown, missing, times_ns) for part, missing in found if missing.any())
+        filling, *columns = np.concatenate(parts, axis=1)
+        own = ~filling
+        pauses = [_gap(None, filling, times_ns, time_ns)] if filling.any() else []
+        found = [(part.shown, each[own]) for part, each in zip(kinds, columns, strict=True)]
+        return (*pauses, *(_gap(name, each, times_ns[own]) for name, each in found if each.any()))
 
     def members(self, groups: Sequence[Group | Earlier]) -> NDArray[np.bool_]:
         """Return (G, T), in which samples each open group has a member, or may have had one."""
@@ -190,7 +197,7 @@ def is_missing(trace: Trace, part: NamedPart) -> NDArray[np.bool_]:
     return np.asarray(trace.rows[:, trace.names.index(name)] < 0)
 
 
-def _gap(name: str, missing: NDArray[np.bool_], times_ns: Integers) -> Gap:
+def _gap(name: str | None, missing: NDArray[np.bool_], times_ns: Integers, time_ns: int = -1) -> Gap:
     last = len(missing) - 1
     turns = np.flatnonzero(np.diff(missing, prepend=False, append=False))
     starts, ends = turns[::2], turns[1::2]
@@ -199,7 +206,8 @@ def _gap(name: str, missing: NDArray[np.bool_], times_ns: Integers) -> Gap:
     before = int(times_ns[ends[0]]) if starts[0] == 0 and is_at_ends else None
     after = int(times_ns[starts[-1]]) if ends[-1] > last else None
     spans = np.stack((times_ns[starts], times_ns[np.minimum(ends, last)]))
-    longest = spans[:, np.diff(spans, axis=0).argmax()]
+    around = (spans[0] <= time_ns) & (time_ns < spans[1])
+    longest = spans[:, (around if around.any() else np.diff(spans, axis=0)).argmax()]
     return Gap(
         name,
         int(missing.sum()),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.instances import Instance
@@ -152,6 +152,12 @@ def find_witness(
         return found, path, deciding_atom(evidence.scene(path[-1].time_ns), leaf, found.end)
 
     found, path, deciding = follow(end)
+    at_ns = path[-1].time_ns
+    gaps: tuple[Gap, ...] = ()
+    if deciding is not None and deciding.unknown:
+        gaps = evidence.gaps(deciding.atom, at_ns)
+        if any(gap.name is None and gap.longest_ns[0] <= at_ns < gap.longest_ns[1] for gap in gaps):
+            deciding = replace(deciding, unknown=("the samples pause there",))
     threshold = None
     if deciding is not None and flips:
         over, open_ended = (whole, False) if whole is not None else ((leaves, times_ns), goes_on)
@@ -181,7 +187,7 @@ def find_witness(
         open_end,
         int(times_ns[-1]) if goes_on else None,
         missed,
-        evidence.gaps(deciding.atom) if deciding is not None and deciding.unknown else (),
+        gaps,
         closest,
         closest_path,
         evidence.units,
