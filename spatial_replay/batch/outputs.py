@@ -229,7 +229,17 @@ def _lines(
 ) -> Iterator[str]:
     suites: dict[tuple[str, ...], list[Values]] = {}
     wanted = ("case", "file", "spec", "requirement", "title", "log", "object", "failure", "error")
-    texts = ("explanation", "vacuous", "seconds", "error_kind", "verdict", "line", "faults", "untested")
+    texts = (
+        "explanation",
+        "vacuous",
+        "seconds",
+        "error_kind",
+        "verdict",
+        "line",
+        "faults",
+        "untested",
+        "tested",
+    )
     for row in table.select([*wanted, *texts]).to_pylist():
         suites.setdefault((row["case"], row["file"], row["spec"]), []).append(row)
     failures, errors = _counts(row for rows in suites.values() for row in rows)
@@ -248,6 +258,9 @@ def _lines(
         )
         properties = {"specification": f"{file}:{rows[0]['line']}"}
         properties |= {key: rows[0][key] for key in ("requirement", "title") if rows[0][key]}
+        tested = Counter(row["tested"] for row in rows if row["tested"])
+        if tested:
+            properties["tested"] = ", ".join(f"{count} {kind}" for kind, count in sorted(tested.items()))
         for key, value in properties.items():
             yield f"<property name={_quoted(key)} value={_quoted(value)}/>\n"
         yield "</properties>\n"
@@ -267,19 +280,20 @@ def _case(
 ) -> Iterator[str]:
     name = row["log"] if row["object"] is None else f"{row['log']}[{row['object']}]"
     yield f'<testcase classname={_quoted(class_name)} name={_quoted(name)} time="{row["seconds"]:.3f}">\n'
+    tested = [f"tested: {row['tested']}"] if row["tested"] in ("cut", "nothing") else []
     if row["failure"] is not None:
         # errors are about the test, failures about what it tests
         tag = "failure" if row["error"] is None else "error"
         kind = row["error_kind"] or f"{verdict_word(row)}{damage_word(row)}"
         texts = [*dict.fromkeys([*row["explanation"], *row["vacuous"]])] or [row["failure"]]
-        text = "\n".join(filter(None, [requirement_of(row), *texts]))
+        text = "\n".join(filter(None, [requirement_of(row), *texts, *tested]))
         text = text if limit is None or len(text) <= limit else text[: limit - 1] + "…"
         message = printable(row["failure"], limit or 1_000)
         yield f"<{tag} type={_quoted(kind)} message={_quoted(message)}>{_text(text)}</{tag}>\n"
         if (row["case"], row["log"]) in reports:
             yield f"<system-out>[[ATTACHMENT|{_text(reports[row['case'], row['log']])}]]</system-out>\n"
     elif row["untested"] and limit is None:
-        own = _text("\n".join(row["untested"]))
+        own = _text("\n".join([*tested, *row["untested"]]))
         yield f"<system-out>{own}</system-out>\n"
     yield "</testcase>\n"
 

@@ -602,30 +602,26 @@ class Tracker:
         after = np.searchsorted(known, times_ns, "right")
         before_ns = known[np.maximum(after - 1, 0)]
         next_ns = np.append(known, following)[after]
-        return np.asarray((after > 0) & (next_ns - before_ns > most_ns))
+        return np.asarray((after > 0) & (next_ns - before_ns > most_ns) & (times_ns > before_ns))
 
     def _states(self, times_ns: Integers, newest_ns: int) -> tuple[Integers, Integers, Integers]:
         """Return the states of the objects of all topics, as `Events.state` does."""
         states = []
         for topic, events in self._events.items():
             state = events.state(times_ns, self._readers[topic].planned.max_age_ns)
-            self._count_stale(topic, times_ns, state[0], state[1])
-            rows = state[1]
-            rows[self._in_gap(topic, times_ns, newest_ns)[:, None] & (rows >= 0)] = STALE
+            rows, in_gap = state[1], self._in_gap(topic, times_ns, newest_ns)
+            rows[in_gap[:, None] & (rows >= 0)] = STALE
+            for column in np.flatnonzero((rows == STALE).any(axis=0)).tolist():
+                name = self._names.by_code[int(state[0][column])]
+                self._remarks.count_stale(topic, name, times_ns, rows[:, column] == STALE, in_gap)
             self._place_following(topic, times_ns, state[1])
             states.append(state)
         codes, states_of, classes = zip(*states, strict=True)
         return np.concatenate(codes), np.concatenate(states_of, axis=1), np.concatenate(classes, axis=1)
 
-    def _count_stale(self, topic: str, times_ns: Integers, codes: Integers, rows: Integers) -> None:
-        stale = rows == STALE
-        for column in np.flatnonzero(stale.any(axis=0)).tolist():
-            name = self._names.by_code[int(codes[column])]
-            self._remarks.stale.add((topic, name), times_ns[stale[:, column]])
-
     def _signal_columns(self, times_ns: Integers, newest_ns: int) -> dict[str, Floats]:
         columns: dict[str, Floats] = {}
-        old: list[tuple[str, str, Booleans]] = []
+        unknown: list[tuple[str, str, Booleans, Booleans]] = []
         for (topic, index), (reported_ns, values) in self._signals.items():
             planned = self._readers[topic].planned
             if planned.mapping is None:
@@ -635,14 +631,12 @@ class Tracker:
             in_gap = self._in_gap(topic, times_ns, newest_ns)
             column = np.where((at < 0) | is_old | in_gap, np.nan, values[at])
             name = planned.mapping.signals[index].name
-            old.append((topic, name, (at >= 0) & is_old))
+            unknown.append((topic, name, (at >= 0) & (is_old | in_gap), in_gap))
             # several topics may report one signal: the first that has a value counts
             first = columns.get(name, column)
             columns[name] = np.where(np.isnan(first), column, first)
-        for topic, name, is_old in old:
-            stale = is_old & np.isnan(columns[name])
-            if stale.any():
-                self._remarks.stale.add((topic, name), times_ns[stale])
+        for topic, name, is_stale, in_gap in unknown:
+            self._remarks.count_stale(topic, name, times_ns, is_stale & np.isnan(columns[name]), in_gap)
         return columns
 
 
@@ -659,7 +653,8 @@ class Remarks:
 
     Attributes:
         missing: observations without a transform, by topic, frame, and whether the frame is known.
-        stale: samples in which an object is unknown because its topic was silent, by topic and name.
+        stale: samples in which an object is unknown because its topic was silent, by topic, whether for
+            longer than `max_gap`, and name.
         replaced: messages that have the time of a later one, by topic.
         skipped: objects without solids, by topic.
     """
@@ -681,6 +676,15 @@ class Remarks:
         """Note when messages of a topic came; the pauses of the one that is sampled are those of samples."""
         if not is_sampled:
             self._messages.setdefault(topic, Pauses()).add(times_ns)
+
+    def count_stale(
+        self, topic: str, name: str, times_ns: Integers, stale: Booleans, in_gap: Booleans
+    ) -> None:
+        """Count the samples in which an object or a signal is unknown since its topic was silent."""
+        for is_gap in (False, True):
+            own = times_ns[stale & (in_gap == is_gap)]
+            if len(own):
+                self.stale.add((topic, is_gap, name), own)
 
     def add_pauses(self) -> None:
         """Remark pauses of topics, but for those in which there are no samples either."""
@@ -738,10 +742,11 @@ class Remarks:
             )
 
     def _stale_texts(self) -> Iterator[Sentence]:
-        by_topic: dict[str, list[tuple[str, int, int]]] = {}
-        for (topic, name), (count, first_ns) in sorted(self.stale.items()):
-            by_topic.setdefault(topic, []).append((name, count, first_ns))
-        for topic, stale in by_topic.items():
+        by_topic: dict[tuple[str, bool], list[tuple[str, int, int]]] = {}
+        for (topic, is_gap, name), (count, first_ns) in sorted(self.stale.items()):
+            by_topic.setdefault((topic, is_gap), []).append((name, count, first_ns))
+        for (topic, is_gap), stale in by_topic.items():
+            remedy = "max_age; `max_age: forever` keeps its last message"
             names = ", ".join(name for name, _, _ in stale[:_MOST_NAMES])
             more = f" and {len(stale) - _MOST_NAMES} more" if len(stale) > _MOST_NAMES else ""
             are = "is" if len(stale) == 1 else "are"
@@ -750,7 +755,7 @@ class Remarks:
             yield Sentence(
                 f"{topic}: {names}{more} {are} unknown in up to {counted(most, 'sample')}, the first at ",
                 Instant(first_ns, 0),
-                ": the topic was silent for longer than max_age; `max_age: forever` keeps its last message",
+                f": the topic was silent for longer than {'`max_gap`' if is_gap else remedy}",
             )
 
 

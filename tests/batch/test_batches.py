@@ -144,6 +144,9 @@ def test_a_cut_window_is_said_and_can_fail(fleet: Path) -> None:
     done = batch("logs/run-0.jsonl", "--spec", "hold.spatial", "--junit", "junit.xml")
     assert (done.code, "1 result decided by a window that the end of the log cut" in done.out) == (0, True)
     (said,) = ElementTree.parse("junit.xml").getroot().iter("system-out")
+    tested = ElementTree.parse("junit.xml").find(".//property[@name='tested']")
+    assert tested is not None and tested.get("value") == "1 cut"
+    assert str(said.text).startswith("tested: cut\n")
     assert "`G[0s, 60s] (cart dist person >= 0.3)` decides at 0.000 s" in str(said.text)
     assert batch("logs/run-0.jsonl", "--spec", "hold.spatial", "--fail-on", "cut").code == 1
 

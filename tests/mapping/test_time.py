@@ -442,10 +442,22 @@ def test_what_lies_in_a_pause_longer_than_max_gap_is_unknown(batch: int) -> None
     text, feed = paused()
     made = make(text + "max_gap: 2s", feed, batch=batch)
     assert made.states("q") == "-" + "+" * 19 + "?" * 31 + "+" * 29
+    assert made.remarks[-1].endswith(
+        "q is unknown in up to 31 samples, the first at 3.000 s: the topic was silent for longer than"
+        " `max_gap`"
+    )
     part = make(text + "max_gap: 2s", feed, batch=batch, start_ns=4 * SECOND, end_ns=7 * SECOND)
     inside = (made.trace.times_ns >= 4 * SECOND) & (made.trace.times_ns < 7 * SECOND)
     assert part.states("q") == "".join(np.array(list(made.states("q")))[inside])
     assert "?" not in make(text + "max_gap: 4s", feed, batch=batch).states("q")
+
+
+def test_the_last_message_before_a_pause_is_known_at_its_own_time() -> None:
+    feed = Feed()
+    for tick in range(40):
+        feed.add("/p", tick * SECOND // 10 + (5 * SECOND if tick >= 20 else 0), point(0))
+    made = make("topics: {/p: {}}\nmax_gap: 1s", feed)
+    assert made.states("p") == "+" * 40
 
 
 def test_what_comes_irregularly_does_not_pause() -> None:
