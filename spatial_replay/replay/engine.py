@@ -55,8 +55,9 @@ from spatial_replay.replay.selection import (
 from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import SpecificationText, load_specifications
-from spatial_replay.text import counted, counted_from
-from spatial_replay.trace.trace import Trace
+from spatial_replay.text import Instant, Sentence, counted, counted_from
+from spatial_replay.trace.sample import FOREVER
+from spatial_replay.trace.trace import LONG_PAUSE, Trace
 
 if TYPE_CHECKING:
     from spatial_replay.annotate.automaton_state import SpecAutomaton
@@ -293,7 +294,11 @@ class Replay:
             start_ns=self._times[0],
             end_ns=self._times[-1],
             faults=counted_from(self._faults, first_ns),
-            remarks=(*counted_from(self._remarks, first_ns), *filter(None, [dropped.text])),
+            remarks=(
+                *counted_from(self._remarks, first_ns),
+                *filter(None, [dropped.text]),
+                *self._empty_ends(first_ns),
+            ),
             missing=missing,
             dropped=dropped,
             unreadable=self._unreadable,
@@ -313,6 +318,15 @@ class Replay:
             ),
             semantics=options.semantics,
         )
+
+    def _empty_ends(self, first_ns: int) -> Iterator[Sentence]:
+        """Remark that the window goes on where there is no sample: the log pauses, or has ended."""
+        window, begin_ns, last_ns = self._selection.window, self._times[0], self._times[-1]
+        usual_ns = (last_ns - begin_ns) / max(self._samples - 1, 1)
+        for start_ns, end_ns in ((max(window.start_ns, first_ns), begin_ns), (last_ns, window.end_ns)):
+            if 0 < LONG_PAUSE * usual_ns < end_ns - start_ns and end_ns != FOREVER:
+                begin, end = Instant(start_ns, first_ns), Instant(end_ns, first_ns)
+                yield Sentence("the window has no sample from ", begin, " to ", end)
 
 
 class _KeptTraces:

@@ -354,9 +354,10 @@ class Selection:
         if not spans:
             return LogError("; ".join([f"{name} has no sample", *faults[:1]]))
         first_ns, last_ns = spans[0][0], spans[-1][1]
+        pauses = " and pause there" if first_ns < self.window.start_ns < last_ns else ""
         return UsageError(
             f"{name} has no sample in the requested window; its samples are from 0.000 s to "
-            f"{time_text(last_ns, first_ns)} ({first_ns} to {last_ns} ns on its clock)"
+            f"{time_text(last_ns, first_ns)} ({first_ns} to {last_ns} ns on its clock){pauses}"
         )
 
     def _missing_names(self, names: LogNames) -> list[Diagnostic]:

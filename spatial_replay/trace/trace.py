@@ -521,7 +521,7 @@ def _joined_floats(arrays: Iterable[Floats]) -> Floats:
     return np.concatenate([np.empty(0, np.float64), *arrays])
 
 
-_LONG: Final = 5
+LONG_PAUSE: Final = 5
 """A pause is longer than so many usual periods."""
 _FEWEST: Final = 10
 """Intervals that show which period is usual."""
@@ -548,7 +548,7 @@ class Pauses:
     def found(self) -> list[tuple[int, int]]:
         """Return the start and the length of each pause, the longest first."""
         intervals = np.concatenate([np.empty(0, np.int64), *self._intervals])
-        is_long = intervals > _LONG * self.usual_ns
+        is_long = intervals > LONG_PAUSE * self.usual_ns
         if len(intervals) < _FEWEST or np.count_nonzero(is_long) > max(1, len(intervals) // _RARE):
             return []
         starts = np.concatenate(self._starts)[is_long].tolist()

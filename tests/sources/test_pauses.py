@@ -62,6 +62,22 @@ def test_samples_that_only_fill_a_pause_do_not_count(
     assert "cap is missing in every sample" in capsys.readouterr().out
 
 
+def test_a_replay_that_begins_or_ends_in_a_pause_is_remarked(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    spec = tmp_path / "far.spatial"
+    spec.write_text("spec far = G (cup ovlp cup)\n")
+    replay = ["replay", str(log), "--spec", str(spec)]
+    assert run([*replay, "--from", "3s"]) == 0
+    assert "the window has no sample from 3.000 s to 7.000 s" in capsys.readouterr().err
+    assert run([*replay, "--from", "0.5s", "--to", "6s"]) == 0
+    assert "the window has no sample from 1.900 s to 6.000 s" in capsys.readouterr().err
+    assert run([*replay, "--from", "0.5s", "--to", "9s"]) == 0
+    assert "the window has no sample" not in capsys.readouterr().err
+    assert run([*replay, "--from", "3s", "--to", "6s"]) == 2
+    assert "on its clock) and pause there" in capsys.readouterr().err
+
+
 def test_a_window_without_a_sample_names_the_samples_around_it(log: Path, tmp_path: Path) -> None:
     spec = tmp_path / "far.spatial"
     spec.write_text("spec far = F[3s, 4s] (cup ovlp cup)\n")
