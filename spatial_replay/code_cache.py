@@ -14,7 +14,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import Final
@@ -75,8 +75,23 @@ def remove_damaged(folder: Path) -> None:
     fcntl.flock(descriptor, fcntl.LOCK_SH)
 
 
-def _opened_lock(folder: Path) -> int:
-    return os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o600)
+@contextmanager
+def turn(folder: Path | None, kernel: str) -> Iterator[None]:
+    """Wait for other processes that compile the same kernel: what they wrote is then loaded."""
+    if folder is None:
+        yield
+        return
+    descriptor = _opened_lock(folder, f"{kernel}.lock")
+    try:
+        with suppress(OSError):  # a file system without locks
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _opened_lock(folder: Path, name: str = "lock") -> int:
+    return os.open(folder / name, os.O_RDWR | os.O_CREAT, 0o600)
 
 
 def seal(folder: Path) -> None:

@@ -15,7 +15,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
-from spatial_replay.code_cache import cache_folder, remove_damaged, seal
+from spatial_replay.code_cache import cache_folder, remove_damaged, seal, turn
 from spatial_replay.errors import UsageError
 
 _PATIENCE_S: Final = 1.0
@@ -52,7 +52,7 @@ class Compiler:
 
     def holds(self, function: Any) -> bool:
         """Say whether the cache has machine code of a function."""
-        return f"{Path(function.__code__.co_filename).stem}.{function.__qualname__}" in self._cached
+        return _name(function) in self._cached
 
     def compile(self, function: Callable[..., Any], options: dict[str, Any]) -> Any:
         """Return a function that is compiled for the types of its arguments when it is called."""
@@ -88,14 +88,20 @@ class Compiler:
         timer.daemon = True
         timer.start()
         try:
-            yield
+            with turn(self._folder, _name(function)):
+                yield
+                if self._folder is not None:
+                    seal(self._folder)
         finally:
             timer.cancel()
-        if self._folder is not None:
-            seal(self._folder)
 
     def _announce(self) -> None:
         if not self.listeners and not self._is_announced:
             self._is_announced = True
             remedy = "`spatial-replay warmup` does it beforehand"
             sys.stderr.write(f"spatial-replay: compiling, once on this machine; {remedy}\n")
+
+
+def _name(function: Any) -> str:
+    """Return how the compiler names the files of a function."""
+    return f"{Path(function.__code__.co_filename).stem}.{function.__qualname__}"

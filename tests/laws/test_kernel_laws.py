@@ -100,6 +100,17 @@ def test_machine_code_lies_in_a_folder_of_its_own_sources(tmp_path):
     assert (stale / "step.nbi").read_bytes() == b"code of another version"
 
 
+def test_of_processes_that_need_a_kernel_at_once_one_compiles_it(tmp_path):
+    program = tmp_path / "program.py"
+    program.write_text(_ONE_KERNEL + "print(sum(doubled.compiled().stats.cache_hits.values()))")
+    environment = os.environ | {"SPATIAL_REPLAY_CACHE": str(tmp_path / "cache"), "SPATIAL_REPLAY_KERNELS": ""}
+    begun = [
+        subprocess.Popen([sys.executable, program], env=environment, stdout=subprocess.PIPE, text=True)
+        for _ in range(4)
+    ]
+    assert sorted(process.communicate()[0] for process in begun) == ["4\n0\n"] + 3 * ["4\n1\n"]
+
+
 def replay(*arguments, **environment):
     command = [sys.executable, "-m", "spatial_replay", "replay", *map(str, arguments)]
     done = subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, check=False)
