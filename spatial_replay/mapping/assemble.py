@@ -44,6 +44,9 @@ _STEP_BYTES: Final = 2**23
 _MOST_STEPS = 100_000
 """Samples between two messages; more are not a pause, but a clock that jumped."""
 
+_ANOTHER_CLOCK_NS: Final = 366 * 86_400 * 10**9
+"""No clock jumps back so far: one counts from a start, such as that of a simulation, and one from 1970."""
+
 _MOST_AT_ONCE = 1_000_000
 """Samples between the messages of one step: all are in memory at once."""
 
@@ -373,7 +376,10 @@ class Assembler:
             f", at a message of {arrived.topics[place]}",
         )
         if self._on_time_jump == "error":
-            raise LogError(f"{self._name}: {where}; {JUMP_REMEDY}, and another clock may not jump")
+            remedy = f"{JUMP_REMEDY}, and another clock may not jump"
+            if int(newest[at]) - int(times_ns[at]) > _ANOTHER_CLOCK_NS:
+                remedy = "its stamps and those before are of two clocks; `clock: log` uses one for all"
+            raise LogError(f"{self._name}: {where}; {remedy}")
         self.jump = where
         return place
 

@@ -21,6 +21,7 @@ from spatial_replay.text import (
     Sentence,
     counted,
     is_text_number,
+    names_from_unit,
     number_text,
     requirement_text,
     shortened_formula,
@@ -347,7 +348,10 @@ def _measured(measured: Measured, units: Mapping[str, str]) -> str:
                 f"{'rises' if value > 0.0 else 'falls'} by {size}" if of else f"moves at {size}"
             )
         case "signal":
-            return f"{names[0]} is {with_unit(value, units.get(names[0], ''))}"
+            unit = units.get(names[0], "")
+            called = names_from_unit(unit)
+            lacks = ", which has no name" if called and value not in called.values() else ""
+            return f"{names[0]} is {with_unit(value, unit)}{lacks}"
     if math.isinf(value):
         return f"no object is in {names[0]}"
     axis = measured.quantity[-1]

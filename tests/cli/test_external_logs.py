@@ -283,6 +283,12 @@ def test_names_of_numbers_are_compared_in_every_log_of_a_run(
         assert run(same) == 0
     assert run(["diff", "annotated.mcap", "annotated.mcap", "--align", "progress"]) == 0
     capsys.readouterr()
+    (folder / "two.yaml").write_text(
+        "topics: {/m: {signals: {mode: {field: code, names: {1: MANUAL, 2: AUTO}}}}}"
+    )
+    (folder / "m.spatial").write_text('spec drives = G (mode == "AUTO" or mode == "MANUAL")')
+    assert run(["replay", "run.mcap", "--mapping", "two.yaml", "--spec", "m.spatial"]) == 1
+    assert "mode is 3, which has no name" in capsys.readouterr().out
     (folder / "m.spatial").write_text('spec drives = F (mode == "AUTOMATIC")')
     for command in (
         ["replay", *mapped],

@@ -242,6 +242,18 @@ def test_a_longer_jump_back_is_an_error_that_says_where() -> None:
         make("topics: {/p: {}}", restarted())
 
 
+def test_topics_with_stamps_of_two_clocks_are_an_error_that_names_another_clock() -> None:
+    feed = Feed()
+    for tick in range(3):
+        for topic, start in (("/p", 0), ("/q", 1_700_000_000)):
+            stamp = {"sec": start + tick, "nanosec": 1}
+            feed.add(topic, tick * SECOND, {"header": {"stamp": stamp}, **point(tick)})
+    with pytest.raises(
+        LogError, match=r"at a message of /p; its stamps .* two clocks; `clock: log` uses one"
+    ):
+        make("clock: header\ntopics: {/p: {}, /q: {}}", feed)
+
+
 @pytest.mark.parametrize("batch", [1, 4, 1000])
 def test_or_the_log_ends_there_if_asked(batch: int) -> None:
     made = make("topics: {/p: {}}", restarted(), batch=batch, on_time_jump="split")
