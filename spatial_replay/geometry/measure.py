@@ -153,7 +153,7 @@ def _prepared(
     )
 
 
-def _arrays_of(batch: FootprintBatch) -> tuple[Any, ...]:
+def _arrays_of(batch: FootprintBatch) -> Any:
     """Return what kernels take first."""
     starts = (writable(batch.part_start), writable(batch.vertex_start))
     return (*starts, *map(writable, (batch.vertices, batch.radius, batch.bottom, batch.top)))
@@ -222,14 +222,9 @@ def closest_pairs(batch: FootprintBatch, rows: Integers, uncertainty: Floats, en
         +inf where there are fewer than two.
     """
     result = np.empty((len(rows), 3))
-    closest_rows(
-        *_arrays_of(batch),
-        np.ascontiguousarray(rows),
-        writable(uncertainty),
-        float(enlargement),
-        np.empty((len(batch.vertices), 4)),
-        result,
-    )
+    members = np.ascontiguousarray(rows), writable(uncertainty), float(enlargement)
+    arguments: Any = (*_arrays_of(batch), *members, np.empty((len(batch.vertices), 4)), result)
+    closest_rows(*arguments)
     return result
 
 
