@@ -228,19 +228,10 @@ def _lines(
     table: pa.Table, name: str, reports: Mapping[tuple[str, str], str], limit: int | None, keeps: bool
 ) -> Iterator[str]:
     suites: dict[tuple[str, ...], list[Values]] = {}
-    wanted = ("case", "file", "spec", "requirement", "title", "log", "object", "failure", "error")
-    texts = (
-        "explanation",
-        "vacuous",
-        "seconds",
-        "error_kind",
-        "verdict",
-        "line",
-        "faults",
-        "untested",
-        "tested",
-    )
-    for row in table.select([*wanted, *texts]).to_pylist():
+    keys = ("case", "file", "spec", "line", "requirement", "title", "log", "object", "seconds")
+    found = ("verdict", "tested", "untested", "vacuous", "explanation", "faults")
+    faults = ("failure", "error", "error_kind")
+    for row in table.select([*keys, *found, *faults]).to_pylist():
         suites.setdefault((row["case"], row["file"], row["spec"]), []).append(row)
     failures, errors = _counts(row for rows in suites.values() for row in rows)
     yield '<?xml version="1.0" encoding="utf-8"?>\n'

@@ -12,7 +12,7 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
@@ -82,14 +82,14 @@ class LocalProcesses:
         rest = iter(tasks)
         while True:
             suspects: list[_Task] = []
-            with _pool(self._count) as pool:
+            with _pool(self._count, suspects) as pool:
                 yield from _results(pool, work, rest, self._count * _AHEAD, suspects)
             if not suspects:
                 return
             # one of them ended its process, so each gets one for itself
             for task in suspects:
                 again: list[_Task] = []
-                with _pool(1) as pool:
+                with _pool(1, again) as pool:
                     yield from _results(pool, work, iter([task]), 1, again)
                 if again:
                     yield task, WorkerLost(f"its process ended while it was evaluated by itself{_MEMORY}")
@@ -132,8 +132,8 @@ def _results(
 
 
 @contextmanager
-def _pool(count: int) -> Iterator[Executor]:
-    """Start processes; they are ended at once when the block ends early."""
+def _pool(count: int, suspects: Sequence[object]) -> Iterator[Executor]:
+    """Start processes; they are ended at once when the block ends early, or with suspects."""
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([_PRELOADED])
     _start_server()
@@ -150,6 +150,9 @@ def _pool(count: int) -> Iterator[Executor]:
                 for process in set(multiprocessing.active_children()) - others:
                     process.kill()
                 raise
+            if suspects:
+                # the executor would wait for a process that it was starting as another one died
+                theirs.close()
     finally:
         theirs.close()
         ours.close()

@@ -111,6 +111,9 @@ def _built(expression: Expression, regions: Mapping[str, Outline]) -> Tree:
             return Linear(((expression, Fraction(1)),))
         case Sum():
             return _added(_built(expression.first, regions), _built(expression.second, regions))
+        case Negative(Equality()):
+            # `!=` excludes a number, and no inequality that holds at its limit can say so
+            raise OverflowError("an excluded number")
         case Negative():
             return _times(_built(expression.operand, regions), Fraction(-1))
         case Equality(signal, value):

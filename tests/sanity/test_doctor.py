@@ -118,6 +118,7 @@ def test_what_can_hold_is_not_excluded() -> None:
     )
     # marginal by its nature, and meant
     assert findings("spec s = F (mode == 2 and mode >= 2)\nspec t = F (a touch[0] b)\n") == []
+    assert findings("spec s = G (fault != 1)") == findings("spec s = F (fault != 1)") == []
 
 
 @pytest.mark.parametrize(
