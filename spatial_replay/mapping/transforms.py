@@ -233,7 +233,7 @@ class FrameTree:
         self.newest_stamp_ns = 0
         """Of the last transform that is not static."""
         self._ignored: dict[str, tuple[int, _Entry, str]] = {}
-        self._contradictions: dict[str, Sentence] = {}
+        self._contradictions: dict[tuple[str, bool], Sentence] = {}
         self._jumps: dict[str, tuple[int, float, _Entry, _Entry]] = {}
         self._holes: dict[str, tuple[int, int]] = {}
         self._loops: dict[tuple[str, ...], None] = {}
@@ -273,7 +273,7 @@ class FrameTree:
             if stamp_ns == 0 or stamp_ns < last_ns:
                 entry = entry._replace(stamp_ns=max(clock_ns, last_ns))
         entries = known.static if is_static else known.moving
-        if entries and (entries[-1].parent != parent or is_static) and child not in self._contradictions:
+        if entries and (is_static or entries[-1].parent != parent):
             self._contradict(child, entries[-1], entry)
         if not is_static:
             self.newest_stamp_ns = stamp_ns
@@ -473,14 +473,16 @@ class FrameTree:
         return bisect_right(self._restarts, entry.log_ns, key=lambda each: each.new.log_ns)
 
     def _contradict(self, child: str, old: _Entry, new: _Entry) -> None:
-        """Note, once for each frame, a static transform that changes, or another parent."""
+        """Note a static transform that changes or another parent, each once for each frame."""
+        key = child, old.parent == new.parent
+        if key in self._contradictions:
+            return
         what = f"frame {child!r} has two parents, {old.parent!r} at {_place(old)} and {new.parent!r} at"
         if old.parent == new.parent:
             what = f"the static transform of {child!r} in {new.parent!r} changes from {_place(old)} to"
         since = Instant(new.clock_ns, 0)
-        self._contradictions[child] = Sentence(
-            f"{what} {_place(new)}, the second from ", since, " on: the newest counts"
-        )
+        found = Sentence(f"{what} {_place(new)}, the second from ", since, " on: the newest counts")
+        self._contradictions[key] = found
 
     def _look_for_jumps(self, name: str, entries: list[_Entry]) -> None:
         """Count the transforms of a child that lie far from the one before and the one after, which agree."""

@@ -313,6 +313,18 @@ def test_two_parents_are_remarked_with_both_places() -> None:
     )
 
 
+def test_a_second_parent_that_reaches_nothing_is_remarked_after_a_place_that_changed() -> None:
+    feed = static(2 * SECOND, 4 * SECOND)
+    feed.add("/tf_static", 5 * SECOND, tf(transform("drift", "odom", (9, 0, 0), time_ns=5 * SECOND)))
+    for tick in range(1, 7):
+        feed.add("/p", tick * SECOND, pose_stamped(0, 0, "odom", time_ns=tick * SECOND))
+    feed.messages.sort(key=lambda message: message[1])
+    made = make("fixed_frame: map\ntopics: {/p: {}}", feed)
+    assert any("'odom' in 'map' changes from" in each for each in made.remarks)
+    assert any("'odom' has two parents, 'map' at (15, 0, 0) and 'drift'" in each for each in made.remarks)
+    assert any("no transform from 'odom' to 'map'" in each for each in made.remarks)
+
+
 def test_two_publishers_of_a_frame_are_remarked_with_both_places() -> None:
     feed = Feed()
     for tick in range(20):
