@@ -12,7 +12,7 @@ from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import compress
-from math import hypot, isfinite
+from math import hypot, inf, isfinite
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -206,12 +206,16 @@ class _Child:
 
     @property
     def entries(self) -> list[_Entry]:
-        return self.static or self.moving
+        return [*self.static, *self.moving]
 
 
 class _Series(NamedTuple):
-    """The transforms of one child frame, ordered by stamp or by clock; parents by number."""
+    """The transforms of one child frame, ordered by stamp or by clock; parents by number.
 
+    The first ones are static, so that nothing is interpolated between them; `still` is their number.
+    """
+
+    still: int
     times_ns: Integers
     clock_ns: Integers
     parents: list[str]
@@ -233,7 +237,7 @@ class FrameTree:
         self.newest_stamp_ns = 0
         """Of the last transform that is not static."""
         self._ignored: dict[str, tuple[int, _Entry, str]] = {}
-        self._contradictions: dict[tuple[str, bool], Sentence] = {}
+        self._contradictions: dict[tuple[str, bool, bool], Sentence] = {}
         self._jumps: dict[str, tuple[int, float, _Entry, _Entry]] = {}
         self._holes: dict[str, tuple[int, int]] = {}
         self._loops: dict[tuple[str, ...], None] = {}
@@ -272,9 +276,11 @@ class FrameTree:
             last_ns = known.static[-1].stamp_ns if known.static else -1
             if stamp_ns == 0 or stamp_ns < last_ns:
                 entry = entry._replace(stamp_ns=max(clock_ns, last_ns))
-        entries = known.static if is_static else known.moving
+        entries, others = (known.static, known.moving)[:: 1 if is_static else -1]
         if entries and (is_static or entries[-1].parent != parent):
             self._contradict(child, entries[-1], entry)
+        if others and not entries:
+            self._contradict(child, others[-1], entry, is_mixed=True)
         if not is_static:
             self.newest_stamp_ns = stamp_ns
             if known.moving:
@@ -422,16 +428,17 @@ class FrameTree:
     def _step(self, frame: str, ask: _Question) -> Transforms:
         """Return parent_from_child at each time."""
         series, times_ns = self._series_of(frame, ask)
-        last = len(series.times_ns) - 1
-        if self._children[frame].static:
-            poses = series.poses[series.at(times_ns)]
-            return _transforms(poses[:, :3], poses[:, 3:], np.ones(len(times_ns), np.bool_))
+        last, newest = len(series.times_ns) - 1, series.at(times_ns)
+        is_still = newest < series.still
+        if is_still.all():
+            poses = series.poses[newest]
+            return _transforms(poses[:, :3], poses[:, 3:], is_still)
         after = np.searchsorted(series.times_ns, times_ns, "left")
         inside = after <= last
         after = np.minimum(after, last)
         before = np.where(inside & (series.times_ns[after] == times_ns), after, after - inside)
-        known = before >= 0
-        before = np.maximum(before, 0)
+        known = (before >= 0) | is_still
+        before, after = np.where(is_still, newest, np.maximum(before, 0)), np.where(is_still, newest, after)
         start, end = series.times_ns[before], series.times_ns[after]
         is_hole = end - start > ask.longest_ns
         if (known & inside & is_hole).any():
@@ -455,34 +462,43 @@ class FrameTree:
         """Return the transforms of a child that a question is about, in order, and the times to look for.
 
         Static transforms of all runs count. If stamps are not times of the log, these count from when they
-        were recorded.
+        were recorded. Of a frame that moves, too, they count before it first moves.
         """
         child = self._children.get(frame, _Child())
         clock, run, times_ns = "stamp_ns" if ask.by_stamp else "clock_ns", ask.run, ask.times_ns
-        if child.static:
+        if not child.moving:
             run = None
             if ask.is_apart and ask.log_ns is not None:
                 clock, times_ns = "log_ns", ask.log_ns
         known = self._series.setdefault(frame, {})
         if (clock, run) not in known:
-            entries = [each for each in child.entries if run is None or self._run_of(each) == run]
-            known[clock, run] = _series(entries, clock)
+            moving = [each for each in child.moving if run is None or self._run_of(each) == run]
+            first_ns = min((getattr(each, clock) for each in moving), default=inf)
+            static = [each for each in child.static if getattr(each, clock) < first_ns]
+            known[clock, run] = _series([*static, *moving], clock, first_ns)
         return known[clock, run], times_ns
 
     def _run_of(self, entry: _Entry) -> int:
         return bisect_right(self._restarts, entry.log_ns, key=lambda each: each.new.log_ns)
 
-    def _contradict(self, child: str, old: _Entry, new: _Entry) -> None:
-        """Note a static transform that changes or another parent, each once for each frame."""
-        key = child, old.parent == new.parent
+    def _contradict(self, child: str, old: _Entry, new: _Entry, *, is_mixed: bool = False) -> None:
+        """Note two kinds or parents or a static transform that changes, each once for each frame."""
+        key = child, is_mixed, old.parent == new.parent
         if key in self._contradictions:
             return
-        what = f"frame {child!r} has two parents, {old.parent!r} at {_place(old)} and {new.parent!r} at"
-        if old.parent == new.parent:
-            what = f"the static transform of {child!r} in {new.parent!r} changes from {_place(old)} to"
+        places, counts = (
+            f"{old.parent!r} at {_place(old)} and {new.parent!r} at {_place(new)}",
+            "newest counts",
+        )
+        if is_mixed:
+            what, counts = f"frame {child!r} is sent static and moving, in {places}", "moving ones count"
+        elif old.parent == new.parent:
+            places = f"from {_place(old)} to {_place(new)}"
+            what = f"the static transform of {child!r} in {new.parent!r} changes {places}"
+        else:
+            what = f"frame {child!r} has two parents, {places}"
         since = Instant(new.clock_ns, 0)
-        found = Sentence(f"{what} {_place(new)}, the second from ", since, " on: the newest counts")
-        self._contradictions[key] = found
+        self._contradictions[key] = Sentence(f"{what}, the second from ", since, f" on: the {counts}")
 
     def _look_for_jumps(self, name: str, entries: list[_Entry]) -> None:
         """Count the transforms of a child that lie far from the one before and the one after, which agree."""
@@ -577,8 +593,8 @@ class _Question(NamedTuple):
         return self._replace(places=self.places[chosen], times_ns=self.times_ns[chosen], log_ns=log_ns)
 
 
-def _series(entries: Sequence[_Entry], clock: str) -> _Series:
-    """Return transforms in order of a clock; of equal times, the later one counts."""
+def _series(entries: Sequence[_Entry], clock: str, first_ns: float) -> _Series:
+    """Return transforms in order of a clock, static before a time; of equal times, the later one counts."""
     times = np.array([getattr(entry, clock) for entry in entries], np.int64)
     order = np.argsort(times, kind="stable")
     ordered = times[order]
@@ -586,6 +602,7 @@ def _series(entries: Sequence[_Entry], clock: str) -> _Series:
     kept = [entries[i] for i in keep.tolist()]
     number = {parent: index for index, parent in enumerate(dict.fromkeys(e.parent for e in kept))}
     return _Series(
+        int(np.count_nonzero(times[keep] < first_ns)),
         times[keep],
         np.array([entry.clock_ns for entry in kept], np.int64),
         list(number),

@@ -325,6 +325,21 @@ def test_a_second_parent_that_reaches_nothing_is_remarked_after_a_place_that_cha
     assert any("no transform from 'odom' to 'map'" in each for each in made.remarks)
 
 
+def test_moving_transforms_count_beside_a_static_one_of_the_same_frame() -> None:
+    feed = static(SECOND, places=(10.0,))
+    for tick in range(1, 7):
+        feed.add("/p", tick * SECOND, pose_stamped(0, 0, "odom", time_ns=tick * SECOND))
+    for tick in (3, 4, 5, 6):
+        feed.add("/tf", tick * SECOND, tf(transform("map", "odom", (tick, 0, 0), time_ns=tick * SECOND)))
+    feed.messages.sort(key=lambda message: message[1])
+    made = make("fixed_frame: map\ntopics: {/p: {}}", feed)
+    assert [made.centre(tick, "p")[0] for tick in range(6)] == [10, 10, 3, 4, 5, 6]
+    assert made.remarks == (
+        "test.bag: frame 'odom' is sent static and moving, in 'map' at (10, 0, 0) and 'map' at (3, 0, 0),"
+        " the second from 3.000 s on: the moving ones count",
+    )
+
+
 def test_two_publishers_of_a_frame_are_remarked_with_both_places() -> None:
     feed = Feed()
     for tick in range(20):
