@@ -462,7 +462,7 @@ class FrameTree:
         """Return the transforms of a child that a question is about, in order, and the times to look for.
 
         Static transforms of all runs count. If stamps are not times of the log, these count from when they
-        were recorded. Of a frame that moves, too, they count before it first moves.
+        were recorded. They count before the frame first moves, if it does.
         """
         child = self._children.get(frame, _Child())
         clock, run, times_ns = "stamp_ns" if ask.by_stamp else "clock_ns", ask.run, ask.times_ns
