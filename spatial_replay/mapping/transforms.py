@@ -482,23 +482,21 @@ class FrameTree:
         return bisect_right(self._restarts, entry.log_ns, key=lambda each: each.new.log_ns)
 
     def _contradict(self, child: str, old: _Entry, new: _Entry, *, is_mixed: bool = False) -> None:
-        """Note two kinds or parents or a static transform that changes, each once for each frame."""
+        """Note, once for each frame, two kinds, two parents, or a static transform that changes."""
         key = child, is_mixed, old.parent == new.parent
         if key in self._contradictions:
             return
-        places, counts = (
-            f"{old.parent!r} at {_place(old)} and {new.parent!r} at {_place(new)}",
-            "newest counts",
-        )
+        what, counting = f"frame {child!r} has two parents,", "newest counts"
+        places = " and ".join(f"{each.parent!r} at {_place(each)}" for each in (old, new))
         if is_mixed:
-            what, counts = f"frame {child!r} is sent static and moving, in {places}", "moving ones count"
+            what, counting = f"frame {child!r} is sent static and moving, in", "moving ones count"
         elif old.parent == new.parent:
+            what = f"the static transform of {child!r} in {new.parent!r} changes"
             places = f"from {_place(old)} to {_place(new)}"
-            what = f"the static transform of {child!r} in {new.parent!r} changes {places}"
-        else:
-            what = f"frame {child!r} has two parents, {places}"
         since = Instant(new.clock_ns, 0)
-        self._contradictions[key] = Sentence(f"{what}, the second from ", since, f" on: the {counts}")
+        self._contradictions[key] = Sentence(
+            f"{what} {places}, the second from ", since, f" on: the {counting}"
+        )
 
     def _look_for_jumps(self, name: str, entries: list[_Entry]) -> None:
         """Count the transforms of a child that lie far from the one before and the one after, which agree."""
