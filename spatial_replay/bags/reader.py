@@ -126,14 +126,6 @@ def one_by_one(columns: Columns) -> Iterator[Message]:
         yield from piece.messages()
 
 
-def unnumbered(
-    topics: Sequence[str], times_ns: Integers, payloads: Sequence[bytes], place: Integers, channel: Integers
-) -> MessageColumns:
-    """Return messages of a container with one time and no sequence."""
-    sequence = np.zeros(len(times_ns), np.int64)
-    return MessageColumns(topics, times_ns, times_ns, sequence, payloads, place, channel)
-
-
 def places_in(part: int, within: Integers) -> Integers:
     """Return places in a log of several parts, such as chunks, in the order of the parts."""
     return (np.int64(part) << 28) + within

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import bz2
 import os
+import re
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -21,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from spatial_replay.bags.decoders import Topic, channel_of, full_type_name, topics_by_name
-from spatial_replay.bags.reader import Columns, MessageColumns, MessageReader, in_order, places_in, unnumbered
+from spatial_replay.bags.reader import Columns, MessageColumns, MessageReader, in_order, places_in
 from spatial_replay.compiled import kernel, piece
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.mcap.index import LARGEST_CHUNK, DamageError
@@ -36,6 +37,7 @@ LONGEST_HEAD = 2**20
 _SECOND_NS = 1_000_000_000
 # op=, conn=, time= begin with these
 _C, _I, _O, _P, _T = b"ciopt"
+_HEADER_FIRST = re.compile(rb"(?:[ \t]*(?:#[^\n]*)?\n|[^\n=#]*=[^\n]*\n)*[ \t]*(?:std_msgs/)?Header[ \t]")
 
 
 class RecordTable(NamedTuple):
@@ -216,6 +218,10 @@ class Connection:
     @property
     def is_latched(self) -> bool:
         return self.data.get("latching") == b"1"
+
+    @property
+    def begins_with_header(self) -> bool:
+        return _HEADER_FIRST.match(self.data.get("message_definition", b"")) is not None
 
 
 @dataclass(frozen=True, slots=True)
@@ -549,10 +555,20 @@ class Ros1Bag(MessageReader):
         rows = is_message & np.isin(table.connection, list(wanted))
         rows &= (table.time_ns >= first) & (table.time_ns < last)
         bounds = zip(table.begin[rows].tolist(), table.end[rows].tolist(), strict=True)
-        return unnumbered(
-            [wanted[number].topic for number in table.connection[rows].tolist()],
+        payloads = [content[begin:end] for begin, end in bounds]
+        numbers = table.connection[rows].tolist()
+        # a header begins with the number that its publisher has given it
+        headed = {number for number, each in wanted.items() if each.begins_with_header}
+        sequence = [
+            int.from_bytes(payload[:4], "little") if number in headed else 0
+            for number, payload in zip(numbers, payloads, strict=True)
+        ]
+        return MessageColumns(
+            [wanted[number].topic for number in numbers],
             table.time_ns[rows],
-            [content[begin:end] for begin, end in bounds],
+            table.time_ns[rows],
+            np.array(sequence, np.int64),
+            payloads,
             places_in(rank, np.flatnonzero(rows)),
             np.searchsorted(self._numbers, table.connection[rows]),
         )

@@ -33,7 +33,7 @@ from spatial_replay.bags.decoders import (
     is_latched,
     topics_by_name,
 )
-from spatial_replay.bags.reader import Columns, MessageColumns, MessageReader, unnumbered
+from spatial_replay.bags.reader import Columns, MessageColumns, MessageReader
 from spatial_replay.errors import LogError, OutputError
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.mcap.index import LARGEST_CHUNK
@@ -436,8 +436,8 @@ class SqliteBag(MessageReader):
         places, numbers, times, payloads = zip(*rows, strict=True)
         topics = [wanted[number] for number in numbers]
         channel = np.searchsorted(self._numbers, np.array(numbers, np.int64))
-        place = np.array(places, np.int64)
-        return unnumbered(topics, np.array(times, np.int64), payloads, place, channel)
+        times_ns, place = np.array(times, np.int64), np.array(places, np.int64)
+        return MessageColumns(topics, times_ns, times_ns, np.zeros_like(place), payloads, place, channel)
 
 
 @dataclass(frozen=True, slots=True)

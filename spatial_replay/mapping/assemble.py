@@ -250,17 +250,13 @@ class Assembler:
                 what = f"`names` of the signal {signal!r} lacks {listed}; it is unknown there"
                 self._remarks.add(f"{reader.name}: {what}")
             if (step := reader.pending.first_step) is not None:
-                steps = counted(reader.pending.steps, "time")
-                since = Instant(step.from_ns, 0)
-                self._remarks.add(
-                    Sentence(
-                        f"{reader.name}: the clock steps back {steps} though its messages are numbered on,"
-                        f" first by {(step.from_ns - step.to_ns) / 1e9:.3f} s at ",
-                        since,
-                        ": those recorded after a step count right after those before; cut the log there, or"
-                        " take another `clock`",
-                    )
-                )
+                how = "are sorted by time; if that clock was set back, cut the log there"
+                if not step.is_sorted:
+                    how = "are numbered on, so those recorded later count later; cut the log there"
+                back = f"{(step.from_ns - step.to_ns) / 1e9:.3f} s"
+                what = f"{reader.name}: the clock steps back between messages, first by {back} at "
+                how = f": its messages {how}, or take another `clock`"
+                self._remarks.add(Sentence(what, Instant(step.from_ns, 0), how))
             if reader.unstamped:
                 were = "message was" if reader.unstamped == 1 else "messages were"
                 self._remarks.add(

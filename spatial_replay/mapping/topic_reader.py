@@ -854,22 +854,25 @@ def _unit_of_stamp(stamp: int, log_time_ns: int) -> str:
 
 
 class ClockStep(NamedTuple):
-    """Where the clock of a topic steps back."""
+    """Where the times of a topic step back in the order of recording.
+
+    Attributes:
+        is_sorted: whether the messages are sorted by time there, since none says that it follows another.
+    """
 
     from_ns: int
     to_ns: int
+    is_sorted: bool
 
 
 class PendingMessages:
     """Messages of one topic that wait until no earlier message can arrive.
 
     Attributes:
-        steps: how often the time steps back between messages whose sequence goes on.
-        first_step: where it does so the first time.
+        first_step: where times step back the first time.
     """
 
     def __init__(self, *, has_own_clock: bool) -> None:
-        self.steps = 0
         self.first_step: ClockStep | None = None
         self._has_own_clock = has_own_clock
         self._columns: list[tuple[Integers, Integers, Integers, Integers]] = []
@@ -910,8 +913,8 @@ class PendingMessages:
         columns = zip((none, none, none, none), *self._columns, strict=True)
         times, sequences, log_times, recorded = map(np.concatenate, columns)
         contents = self._contents
-        if not self._has_own_clock:
-            times = self._without_steps(times, sequences, recorded)
+        if not (recorded[1:] > recorded[:-1]).all() or not (times[1:] >= times[:-1]).all():
+            times = self._without_steps(times, sequences, recorded, upto_ns)
         if len(times) and not (times[1:] > times[:-1]).all():
             order = np.lexsort((sequences, times))
             times, sequences, log_times = times[order], sequences[order], log_times[order]
@@ -921,18 +924,25 @@ class PendingMessages:
         self._contents = contents[count:]
         return times[:count], log_times[:count], contents[:count]
 
-    def _without_steps(self, times_ns: Integers, sequences: Integers, recorded: Integers) -> Integers:
-        """Return times that do not step back, if the sequence goes on where they do."""
-        if (recorded[1:] > recorded[:-1]).all() and (times_ns[1:] >= times_ns[:-1]).all():
-            return times_ns
+    def _without_steps(
+        self, times_ns: Integers, sequences: Integers, recorded: Integers, upto_ns: int
+    ) -> Integers:
+        """Return times that do not step back, if the sequence of the log's clock goes on where they do."""
         order = np.argsort(recorded, kind="stable")
         times = times_ns[order]
         back = np.flatnonzero(times[1:] < times[:-1])
-        if not len(back) or not (np.diff(sequences[order]) > 0).all():
+        # the log's sequence says nothing of the sender's clock
+        is_sorted = self._has_own_clock or not (np.diff(sequences[order]) > 0).all()
+        if is_sorted:
+            # all that was recorded before a message has arrived when it is taken
+            back = back[times[back + 1] <= upto_ns]
+            back = back[np.argsort(times[back + 1], kind="stable")]
+        if not len(back):
             return times_ns
-        self.steps += len(back)
         at = int(back[0])
-        self.first_step = self.first_step or ClockStep(int(times[at]), int(times[at + 1]))
+        self.first_step = self.first_step or ClockStep(int(times[at]), int(times[at + 1]), is_sorted)
+        if is_sorted:
+            return times_ns
         # strictly increasing: what was recorded later counts later
         number = np.arange(len(times))
         moved = np.empty_like(times)

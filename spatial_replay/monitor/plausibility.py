@@ -313,6 +313,10 @@ def _doubts(atom: Atom, log: LogNumbers, taken: ThresholdRange | None) -> Iterat
         yield f"`{taken.text}` compares a text with a number, so it is unknown", hint
     if taken is None or taken.holds not in ("always", "never"):
         return
+    if not limits and atom.relation == "signal" and (taken.holds == "never") == ("==" in atom.parameters):
+        name, _, text = atom.parameters
+        hint = "is it spelt so? with `names` in a mapping, a misspelt text is an error"
+        yield f"{name} is never {text} in this log", hint
     for limit in limits:
         if _is_far(limit, taken, is_length=bool(lengths)):
             below = limit < taken.least

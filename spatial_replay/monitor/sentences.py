@@ -144,10 +144,13 @@ def verdict_sentence(
     return Sentence(f"{title} is {how}: {_robustness(*ends, unit)}", *since, *at, f"{of}.")
 
 
-def verdict_text(verdict: Verdict, robustness: float, unit: str) -> str:
+_TESTED = {"nothing": ", tested by nothing", "cut": ", cut by the end of the log"}
+
+
+def verdict_text(verdict: Verdict, robustness: float, unit: str, tested: str = "full") -> str:
     """Return a verdict with its number, as metadata of a log has it: "violated, robustness -0.03 m"."""
     number = "not determined" if math.isnan(robustness) else with_unit(robustness, unit)
-    return f"{verdict}, robustness {number}"
+    return f"{verdict}{_TESTED.get(tested, '')}, robustness {number}"
 
 
 def divisor_of(atom: Formula) -> float:

@@ -476,7 +476,7 @@ def run_replay(
         layout = replay.layout()
         sink.add_attachment(layout.name, layout.media_type, layout.data)
         texts = {
-            each.title: verdict_text(each.verdict, each.robustness, each.unit)
+            each.title: verdict_text(each.verdict, each.robustness, each.unit, each.tested)
             for each in (replayed.results[place] for place in worst_first(replayed.results))
         }
         sink.add_metadata(VERDICTS, texts)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 import shutil
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,8 @@ from mcap.writer import CompressionType
 from bags.bag_files import (
     MAPPING,
     POINT,
+    POSE,
+    ROS1,
     ROS2,
     SECOND,
     START_NS,
@@ -378,3 +380,31 @@ def test_objects_are_where_their_messages_say(tmp_path: Path, mapping: Path) -> 
     found = {name: each.footprint for name, each in sample.objects.items() if not isinstance(each, Footprint)}
     assert found["a"].parts[0].vertices.tolist() == [[1.0, 2.0]]
     assert found["b"].parts[0].vertices.mean(axis=0).tolist() == [3.0, 4.0]
+
+
+def test_a_clock_that_steps_back_is_remarked_in_every_container(tmp_path: Path, mapping: Path) -> None:
+    """Headers of ROS 1 are numbered by their publisher; nothing numbers the rows of a database."""
+    mapping.write_text("topics: {/p: {}}")
+    sent = {False: list[Sent](), True: list[Sent]()}
+    for tick in range(40):
+        time_ns = START_NS + tick * SECOND // 10 - (SECOND * 3 // 4 if tick >= 20 else 0)
+        for is_ros1, messages in sent.items():
+            types = (ROS1 if is_ros1 else ROS2).types
+            stamp = types["builtin_interfaces/msg/Time"](0, 0)
+            head = types["std_msgs/msg/Header"](*([tick] if is_ros1 else []), stamp, "map")
+            place = types["geometry_msgs/msg/Point"](float(tick), 0.0, 0.0)
+            pose = types["geometry_msgs/msg/Pose"](
+                place, types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
+            )
+            messages.append(Sent("/p", POSE, time_ns, types[POSE](head, pose)))
+    said = "/p: the clock steps back between messages, first by 0.650 s at 1700000001.900 s: its messages are"
+    for log, how in (
+        (write_ros1(tmp_path / "a.bag", sent[True]), "numbered on"),
+        (write_ros2(tmp_path / "b", sent[False], storage="sqlite3"), "sorted by time"),
+    ):
+        blocks = list(open_source(log, mapping=mapping).iter_blocks())
+        points = (each.trace.footprints.vertices[each.trace.rows[:, 0], 0].tolist() for each in blocks)
+        x = list(chain.from_iterable(points))
+        (remark,) = (remark for each in blocks for remark in each.remarks)
+        assert (x == sorted(x)) == (how == "numbered on")
+        assert f"{said} {how}" in remark

@@ -111,7 +111,7 @@ def test_the_profile_of_a_file_without_a_use_line_can_be_chosen(tmp_path: Path) 
 SLOW = "".join(
     f'{{"time_ns": {500_000_000 * n}, "objects": [{{"name": "cube", "polygon": [[0, 0], [1, 0], [1, 1]]}}, '
     f'{{"name": "crate", "polygon": [[{2 + n / 10}, 0], [3, 0], [3, 1]]}}], '
-    f'"signals": {{"battery": 0.{9 - n}}}}}\n'
+    f'"signals": {{"battery": 0.{9 - n}, "state": "OK"}}}}\n'
     for n in range(4)
 )
 
@@ -172,6 +172,7 @@ def test_windows_within_each_other_are_added(tmp_path: Path, capsys: pytest.Capt
         ("spec s = G (crate dist cube >= -5)", "always holds in this log: the distance is never below 1"),
         ("spec s = F (crate dist cube < 0.05)", "never holds in this log: the distance is never below 1"),
         ("spec s = F[0s, 60s] (battery <= 0.7)", "F[0s, 60s] is longer than this log"),
+        ('spec s = G (state != "FUAL")', 'state is never "FUAL" in this log'),
         ("spec s = G[7, 9] (battery >= 0.7)", "no sample of this log lies in the window G[7, 9]"),
     ],
 )

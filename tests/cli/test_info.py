@@ -78,6 +78,26 @@ def test_an_annotated_log_shows_its_verdicts(log: Path, capsys: pytest.CaptureFi
     assert list(metadata["spatial_replay_verdicts"]) == ["charged", "alone"]
 
 
+@pytest.mark.parametrize(
+    ("formula", "said"),
+    [
+        ("F (cube dist cube <= 1)", "satisfied, robustness"),
+        ("G (cube dist cube >= 9 -> cube dist cube >= 10)", "satisfied, tested by nothing, robustness"),
+        ("G[0s, 60s] (cube dist cube <= 1)", "satisfied, cut by the end of the log, robustness"),
+    ],
+)
+def test_the_verdicts_of_an_annotated_log_say_how_they_were_tested(
+    formula: str, said: str, log: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    spec, annotated = log.with_name("s.spatial"), log.with_name("out.mcap")
+    log.write_text(f"{SAMPLES[0]}\n{SAMPLES[0].replace('1000000000', '3500000000')}\n")
+    spec.write_text(f"spec s = {formula}")
+    run(["replay", str(log), "--spec", str(spec), "-o", str(annotated)])
+    capsys.readouterr()
+    assert run(["info", str(annotated)]) == 0
+    assert f"verdicts\n  s  {said}" in capsys.readouterr().out
+
+
 def test_the_verdicts_of_a_log_say_which_requirements_they_are_about(
     log: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

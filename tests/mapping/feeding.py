@@ -126,6 +126,7 @@ class Feed:
     latched: frozenset[str] = frozenset()
     types: dict[str, str] = field(default_factory=dict)
     counts: dict[str, int] = field(default_factory=dict)
+    is_numbered: bool = True
 
     def add(self, topic: str, time_ns: int, content: Any) -> Feed:
         self.messages.append((topic, time_ns, content))
@@ -143,7 +144,7 @@ class Feed:
 
     def raw(self) -> list[Message]:
         return [
-            Message(topic, time_ns, time_ns, number, str(number).encode())
+            Message(topic, time_ns, time_ns, number * self.is_numbered, str(number).encode())
             for number, (topic, time_ns, _) in enumerate(self.messages)
         ]
 

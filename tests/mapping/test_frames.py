@@ -352,11 +352,27 @@ def test_two_publishers_of_a_frame_are_remarked_with_both_places() -> None:
     assert "from (0, 0, 0) to (50, 0, 0) at 0.000 s" in remark
 
 
-def test_a_frame_that_trembles_has_one_publisher() -> None:
+@pytest.mark.parametrize("every", [1, 2, 5])
+def test_publishers_a_few_steps_apart_are_remarked(every: int) -> None:
+    """A second publisher, whose place is only four steps of the robot away."""
+    feed = Feed()
+    for tick in range(200):
+        at = tick * SECOND // 10
+        for apart in (0, 0.8)[: 1 + (tick % every == 0)]:
+            moved = transform("map", "base", (0.1 * tick + apart, 0, 0), time_ns=at + int(apart > 0))
+            feed.add("/tf", at + int(apart > 0), tf(moved))
+        feed.add("/p", at + 1, pose_stamped(0, 0, "base", time_ns=at))
+    (remark,) = make("fixed_frame: map\ntopics: {/p: {}}", feed).remarks
+    assert "frame 'base' jumps in 'map' by up to 0." in remark
+
+
+@pytest.mark.parametrize("noise", [0.05, 0.2, 1.0])
+@pytest.mark.parametrize("step", [0.0, 0.1])
+def test_a_frame_that_trembles_has_one_publisher(noise: float, step: float) -> None:
     feed, numbers = Feed(), np.random.default_rng(1)
     for tick in range(300):
         at = tick * SECOND // 10
-        place = (0.1 * tick, *(0.2 * numbers.normal(size=2)))
+        place = (step * tick, *(noise * numbers.normal(size=2)))
         feed.add("/tf", at, tf(transform("map", "base", place, time_ns=at)))
         feed.add("/p", at, pose_stamped(0, 0, "base", time_ns=at))
     assert make("fixed_frame: map\ntopics: {/p: {}}", feed).remarks == ()

@@ -148,9 +148,23 @@ def test_a_clock_that_steps_back_between_numbered_messages_is_remarked(batch: in
     made = make("topics: {/p: {}}", feed, batch=batch)
     assert [made.centre(n, "p")[0] for n in range(40)] == list(range(40))
     assert made.remarks == (
-        "test.bag: /p: the clock steps back 1 time though its messages are numbered on, first by 0.650 s at"
-        " 11.900 s: those recorded after a step count right after those before; cut the log there, or take"
-        " another `clock`",
+        "test.bag: /p: the clock steps back between messages, first by 0.650 s at 11.900 s: its messages are"
+        " numbered on, so those recorded later count later; cut the log there, or take another `clock`",
+    )
+
+
+@pytest.mark.parametrize("batch", [1, 7, 1000])
+@pytest.mark.parametrize("clock", ["log", "header"])
+def test_times_that_step_back_without_numbers_are_sorted_and_remarked(batch: int, clock: str) -> None:
+    feed = Feed(is_numbered=clock == "header")
+    for tick in range(40):
+        time_ns = 10 * SECOND + tick * 100 * MS - (750 * MS if tick >= 20 else 0)
+        feed.add("/p", time_ns if clock == "log" else tick, pose_stamped(tick, 0, time_ns=time_ns))
+    made = make(f"clock: {clock}\ntopics: {{/p: {{}}}}", feed, batch=batch)
+    assert (np.diff(made.trace.times_ns) >= 0).all()
+    assert made.remarks == (
+        "test.bag: /p: the clock steps back between messages, first by 0.650 s at 11.900 s: its messages are"
+        " sorted by time; if that clock was set back, cut the log there, or take another `clock`",
     )
 
 
