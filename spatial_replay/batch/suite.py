@@ -90,6 +90,7 @@ class Outcome(Protocol):
 
 
 UNTESTED: Final = "tested by nothing"
+VACUOUS: Final = "vacuous"
 DROPPED: Final = "the recorder dropped"
 DAMAGED: Final = "the log is damaged"
 """Beginnings of failures that are no violations."""
@@ -128,10 +129,11 @@ class Expectation:
             fail_on: "vacuous", "cut" and "unknown": what fails although the case allows it.
         """
         failure = self._unexpected(outcome)
-        if failure is None and "unknown" in fail_on and outcome.verdict == Verdict.UNKNOWN:
+        is_unknown = outcome.verdict == Verdict.UNKNOWN
+        if failure is None and "unknown" in fail_on and is_unknown:
             failure = "unknown"
-        elif failure is None and "vacuous" in fail_on and outcome.vacuous:
-            failure = f"vacuous: {outcome.vacuous[0]}"
+        elif (failure is None or is_unknown) and "vacuous" in fail_on and outcome.vacuous:
+            failure = f"{VACUOUS}: {outcome.vacuous[0]}"
         elif failure is None and "cut" in fail_on and outcome.tested == "cut":
             failure = f"cut: {outcome.untested[0]}"
         elif failure is None and "vacuous" not in self.allow and outcome.tested == "nothing":

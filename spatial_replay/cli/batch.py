@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 
 import click
 
-from spatial_replay.batch.suite import DAMAGED, DROPPED, UNTESTED
+from spatial_replay.batch.suite import DAMAGED, DROPPED, UNTESTED, VACUOUS
 from spatial_replay.cli.application import ExitCode, most_severe
 from spatial_replay.cli.options import (
     ConditionArguments,
@@ -146,7 +146,9 @@ def exit_code_from_table(table: pa.Table, fail_on: frozenset[str]) -> ExitCode:
             continue
         if kind is not None:
             codes.add(_KIND_CODES[kind])
-        elif (verdict == "unknown" and "unknown" not in fail_on) or failure.startswith((UNTESTED, DROPPED)):
+        elif failure.startswith(VACUOUS) or (verdict == "unknown" and "unknown" in fail_on):
+            codes.add(ExitCode.VIOLATED)
+        elif verdict == "unknown" or failure.startswith((UNTESTED, DROPPED)):
             codes.add(ExitCode.UNKNOWN)
         else:
             codes.add(ExitCode.VIOLATED)

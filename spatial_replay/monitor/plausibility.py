@@ -93,7 +93,7 @@ class ThresholdRange:
 
     def __str__(self) -> str:
         if not self.known:
-            return f"{self.text}: unknown in every sample"
+            return f"{self.text}: {'without an object or ' if self.bound else ''}unknown in every sample"
         is_number = self.least <= self.greatest
         parts = [f"goes from {self.least:.4g} to {self.greatest:.4g}"] if is_number else []
         if unknown := self.samples - self.known:

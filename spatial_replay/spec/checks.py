@@ -13,6 +13,7 @@ from spatial_replay.errors import UsageError
 from spatial_replay.spec.diagnostics import Diagnostic, Faults, SourceText, nearest_hint
 from spatial_replay.spec.format import format_relation
 from spatial_replay.spec.formula import (
+    ANY_CLASS,
     FUTURE_OPERATORS,
     PAST_OPERATORS,
     Atom,
@@ -21,9 +22,11 @@ from spatial_replay.spec.formula import (
     Group,
     NamedSpec,
     Negative,
+    Quantified,
     Span,
     Specification,
     Temporal,
+    Term,
     TrackedName,
     operands_of,
 )
@@ -202,6 +205,19 @@ def object_names(specification: Specification) -> tuple[str, ...]:
     return tuple(found)
 
 
+def _group_classes(specification: Specification) -> tuple[str, ...]:
+    """Return the classes of open groups, in the order of the text."""
+    groups: list[Term] = []
+    for spec in specification.results:
+        for formula in iter_formulas(spec.formula):
+            if isinstance(formula, Quantified):
+                groups.append(formula.group)
+            elif isinstance(formula, Atom):
+                groups += terms_of(formula.expression)
+    bases = [base for term in groups if isinstance(base := base_of(term), Group)]
+    return tuple(dict.fromkeys(name for each in bases if (name := each.class_name) and name != ANY_CLASS))
+
+
 def signal_names(specification: Specification) -> tuple[str, ...]:
     """Return the numeric signals that the specs compare, in the order of the text."""
     found: dict[str, None] = {}
@@ -275,6 +291,13 @@ def check_names(
             found.append(
                 source.diagnostic("error", spec.span, f"the {where} never has the class {name!r}", hint)
             )
+    taken = {each.casefold() for each in known_classes}
+    for name in _group_classes(specification):
+        # a log may lack a class; one that is nearly spelt like another is taken for a mistake
+        if name.casefold() not in taken and (hint := nearest_hint(name, known_classes)):
+            hint += f" {_listing('class', known_classes)}"
+            message = f"the {where} never has the class {name!r}"
+            found.append(source.diagnostic("error", places.get(name, Span(0, 0)), message, hint))
     for name, span in defined.items():
         if name in objects:
             message = f"the {where} has an object {name!r}, which this definition hides"

@@ -113,6 +113,8 @@ def test_what_nothing_tested_passes_nowhere_unless_it_is_allowed(fleet: Path) ->
     page = Path("pages/index.html").read_text()
     assert ("number is-untested fails" in page, 'class="number is-satisfied' in page) == (True, False)
     assert batch("logs/run-0.jsonl", "--spec", "late.spatial", "--fail-on", "vacuous").code == 1
+    paper = batch("logs/run-0.jsonl", "--spec", "late.spatial", "--semantics", "paper", "--fail-on", "vacuous")
+    assert (paper.code, "vacuous: `G[60s, 90s]" in paper.out) == (1, True)
     assert batch("logs/run-0.jsonl", "--spec", "late.spatial", "--allow", "vacuous").code == 0
     Path("suite.yaml").write_text(
         "specs: late.spatial\nallow: vacuous\ncases: [{name: all, logs: logs/run-0.jsonl}]"
@@ -130,6 +132,12 @@ def test_a_misspelt_class_of_a_template_passes_nowhere_and_names_the_nearest(fle
     assert (done.code, "did you mean 'pedestrian'?" in done.out) == (4, True)
     assert "the log never has the class 'pedestrain'; did you mean 'pedestrian'? (in walk.jsonl)" in done.err
     assert ElementTree.parse("junit.xml").getroot().get("failures") == "1"
+    Path("people.spatial").write_text(
+        'group people = class "pedestrain"\nspec clear = G (forall p in people: p dist cart >= 0)'
+    )
+    group = batch("walk.jsonl", "--spec", "people.spatial")
+    assert "the log never has the class 'pedestrain'; did you mean 'pedestrian'?" in group.err
+    assert batch("walk.jsonl", "--spec", "people.spatial", "--strict-names").code == 2
     # each reason once, and one point after it
     idle = batch("logs/run-0.jsonl", "--spec", "idle.spatial", "--junit", "idle.xml", "--html", "pages")
     assert idle.code == 4
