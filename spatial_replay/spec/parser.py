@@ -320,8 +320,11 @@ class TreeBuilder:
             raise StatementError(span_of(token), "a distance is hardly ever exactly a number", hint)
         return DistanceSyntax(first, second, ((token.value, limit),), _cover(children))
 
-    def distance_within(self, children: list[Any]) -> DistanceSyntax:
-        lower, below, first, _, second, above, upper = children
+    def turned_distance(self, children: list[Any]) -> DistanceSyntax:
+        lower, below, first, dist, second, above, upper = children
+        if above is None:
+            turned = below.update(value=MIRRORED[below.value])
+            return self.distance([first, dist, second, turned, lower])._replace(span=_cover(children))
         return DistanceSyntax(first, second, _chain(lower, below, above, upper), _cover(children))
 
     def rate(self, children: list[Any]) -> RateSyntax:
@@ -449,7 +452,7 @@ def _split_bare_formula(tokens: Sequence[Token], faults: Faults) -> Iterator[Tok
 
 
 def _begins_statement(token: Token, last: Token, in_bracket: bool, continues: bool, faults: Faults) -> bool:
-    if token.type in STATEMENT_TYPES:
+    if token.type in STATEMENT_TYPES and not (last.type == "MINUS" and last.end_pos == token.start_pos):
         if token.line == last.line:
             message = f"{token.value!r} begins a statement within a line"
             faults.add(span_of(token), message, "begin a new line")

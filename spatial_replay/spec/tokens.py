@@ -105,7 +105,20 @@ _SHAPES: Mapping[str, str] = MappingProxyType(
     }
 )
 _TYPES = frozenset(
-    {"float", "float64", "double", "int", "bool", "real", "string", "input", "output", "signal"}
+    {
+        "float",
+        "float32",
+        "float64",
+        "double",
+        "int",
+        "int32",
+        "bool",
+        "real",
+        "string",
+        "input",
+        "output",
+        "signal",
+    }
 )
 """Words that declare signals elsewhere."""
 _AT_TIMES: Mapping[str, str] = MappingProxyType(
@@ -116,6 +129,9 @@ _AT_TIMES: Mapping[str, str] = MappingProxyType(
     }
 )
 """Operators that words of time stand for, given that time."""
+_QUANTIFYING: Mapping[str, str] = MappingProxyType(
+    {**dict.fromkeys(("for", "all", "every", "each"), "forall"), **dict.fromkeys(("any", "some"), "exists")}
+)
 _DEFINING = frozenset({"let", "var", "val", "define", "param", "parameter", "constant", "set"})
 _WITH_NUMBER = frozenset({"closeto", "farfrom", "touch", "oriented", "moved"})
 _STATEMENTS = frozenset({"CONST", "REGION", "GROUP", "DEF", "SPEC"})
@@ -301,8 +317,18 @@ def meant(tokens: Sequence[Token], position: int, accepted: Collection[str]) -> 
         return found, f"members stand without brackets: group {tokens[1].value} = a, b"
     if shape := _meant_shape(tokens, position, accepted):
         return found, shape
-    if token.type == "RPAR" and last.type == "NUMBER" and before.value == "=>":
+    if (token.value == "=>" and "COMPARE" in accepted) or (
+        before.value == "=>" and token.type in ("RPAR", "$END")
+    ):
         return "'=>' means implies", "at least is written >="
+    if token.value == "=" and (
+        sign := {"<": "<=", ">": ">="}.get(after.value if "COMPARE" in accepted else last.value)
+    ):
+        return found, f"it is written {sign}, without a blank"
+    if token.type == "TRUTH" and last.type == "COMPARE":
+        return found, f"a flag is a number: {before.value} {last.value} {int(token.value == 'true')}"
+    if token.value == "dist" and _is_quoted(token):
+        return found, f"a relation stands without quotes: {last.value} dist {after.value or 'b'}"
     if token.type == "NUMBER" and (operator := _AT_TIMES.get(last.value.lower())):
         return found, f"a window stands behind its operator: {operator.format(token.value)} (...)"
     if last.type in _STATEMENTS and token.type != "NAME" and token.value.isidentifier():
@@ -321,8 +347,12 @@ def meant(tokens: Sequence[Token], position: int, accepted: Collection[str]) -> 
             "'not' cannot stand within a relation",
             f"write it in front: not {last.value} {after.value} ...",
         )
-    if token.type in ("NAME", "IN"):
+    if token.type in ("NAME", "IN", "ALL"):
         return _meant_word(token, last, after, accepted)
+    if token.type == "DIST" and before.type == "COMPARE":
+        return "a distance is compared with a number", "of two, write which is less: a closer b than c"
+    if token.type == "DIST" and before.type in ("STAR", "PLUS"):
+        return f"a distance has no {before.value!r}", "it is compared as it is: put the number into its limit"
     if token.type in _OPPOSITE and before.type == "DIST" and "COMPARE" in accepted:
         return f"a distance has no {token.value!r}", "it is compared as it is: put the number into its limit"
     if last.type == "NAME" and before.type == token.type == "COMPARE":
@@ -382,6 +412,8 @@ def _meant_window(tokens: Sequence[Token], position: int) -> str:
             | ["LSQB", "NUMBER", "COMMA", "NUMBER", "RPAR"]
         ):
             return f"{operator}[{numbers[0]}, {numbers[1]}]"
+        case ["LSQB", "NUMBER", "COMMA", "NAME", "RPAR"]:
+            return f"{operator}[{numbers[0]}, {inner[3].value}]"
     return ""
 
 
@@ -424,9 +456,14 @@ def _meant_definition(tokens: Sequence[Token], position: int) -> tuple[str, str]
 
 def _meant_word(token: Token, last: Token, after: Token, accepted: Collection[str]) -> tuple[str, str] | None:
     word = str(token.value).lower()
+    found = f"{token.value!r} cannot stand here"
     if "RELATION" in accepted:
-        if word in ("is", "are") and after.type in _RELATIONS:
-            return f"{token.value!r} cannot stand here", f"leave it out: {last.value} {after.value} ..."
+        if word in ("is", "are"):
+            relation = after.value if after.type in _RELATIONS else "leftof"
+            text = f'; a text is compared as {last.value} == "AUTO"' if after.type not in _RELATIONS else ""
+            return found, f"leave it out: {last.value} {relation} ...{text}"
+        if quantifier := _QUANTIFYING.get(str(last.value).lower()):
+            return found, f"write {quantifier} {token.value if token.type == 'NAME' else 'x'} in GROUP: ..."
         if word in _MEANT_RELATIONS and after.type == "NAME":
             hint = f"write {last.value} {_MEANT_RELATIONS[word]} {after.value or 'b'}"
             return f"unknown relation {token.value!r}", hint
@@ -434,7 +471,7 @@ def _meant_word(token: Token, last: Token, after: Token, accepted: Collection[st
         return f"{token.value!r} is not an operator", f"the operator is written {_MEANT_BETWEEN[word]}"
     if "AND" in accepted and word in _AT_TIMES:
         window = _AT_TIMES[word].format(after.value or "5s")
-        return f"{token.value!r} cannot stand here", f"a window stands behind its operator: {window} (...)"
+        return found, f"a window stands behind its operator: {window} (...)"
     return None
 
 
@@ -453,7 +490,9 @@ def meant_statement(tokens: Sequence[Token]) -> str:
         return "signals are not declared: leave the line out"
     if line[0].value.lower() in _DEFINING:
         del line[0]
-    if len(line) < 3 or line[1].type not in ("EQUAL", "COLON"):
+    elif (word := line[0].value.lower()) in KEYWORDS and line[0].value != word:
+        return f"words of the language have their own case: write {word}"
+    if len(line) < 3 or line[1].type not in ("EQUAL", "COLON") or line[2].type == "COMPARE":
         return ""
     is_number = all(each.type in ("NUMBER", "NAME", *_OPPOSITE) for each in line[2:])
     definition = f"{line[0].value} = {_as_written(line[2:])}"
@@ -477,10 +516,8 @@ def _meant_shape(tokens: Sequence[Token], position: int, accepted: Collection[st
     shape = _SHAPES.get(tokens[called].value.lower())
     if called and shape and tokens[0].type != "REGION" and tokens[called - 1].type not in _STATEMENTS:
         return f"a shape gets a name first: region goal = {shape}"
-    start = next(
-        (n for n in range(position - 1, max(-1, position - 5), -1) if tokens[n].type in _SHAPE), None
-    )
-    if start is None or "HEIGHT" in accepted:
+    start = next((n for n, each in enumerate(tokens[:position]) if each.type in _SHAPE), None)
+    if start is None or "HEIGHT" in {*accepted, *(each.type for each in tokens[:position])}:
         return ""
     numbers = _numbers(tokens[start:])
     pairs = [f"({x}, {y})" for x, y in zip(numbers[::2], numbers[1::2], strict=False)]
@@ -491,7 +528,7 @@ def _meant_shape(tokens: Sequence[Token], position: int, accepted: Collection[st
             return f"the centre stands in brackets: circle({pairs[0]}, {numbers[2]})"
         case "POLYGON" if len(numbers) > 3:
             return f"each corner stands in brackets: polygon({', '.join(pairs)})"
-    return ""
+    return f"it is written {_SHAPES[tokens[start].value]}; decimals have a point"
 
 
 def is_called(tokens: Sequence[Token], position: int) -> bool:
@@ -531,6 +568,10 @@ def function_hint(name: str, argument: str) -> str:
             return f"a falling edge is written (Y {argument}) and not {argument}"
         case "abs" | "fabs" | "norm" | "magnitude" if " dist " in argument:
             return f"a distance is compared as it is: leave {name} out"
+        case "until":
+            return "it stands between its formulas: (p) U (q)"
+        case word if word in _MEANT_RELATIONS:
+            return f"it stands between its objects: a {_MEANT_RELATIONS[word]} b"
     return ""
 
 
@@ -663,10 +704,14 @@ def tokenize(text: str, relations: frozenset[str], faults: Faults) -> list[Token
             unit = found.group("unit")
             if unit is not None and unit not in ("s", "ms"):
                 per = _PER.match(text, found.end())
-                hint = unit_hint(value.removesuffix(unit), unit, per.group(1) if per else "")
+                is_window = unit == "m" and {"PREFIX", "INFIX"} & {each.type for each in tokens[-4:-1]}
+                meant_unit = "min" if is_window and "LSQB" in {each.type for each in tokens[-3:]} else unit
+                hint = unit_hint(value.removesuffix(unit), meant_unit, per.group(1) if per else "")
                 hint = hint or f"units of time are s and ms; a name is written in quotes: {quoted(value)}"
                 faults.add(span, f"{value!r} is neither a number, nor a duration, nor a name", hint)
                 value = value[: -len(unit)]
+                # what is behind the sign is the rest of the unit
+                token_type = "ERROR" if per else token_type
         tokens.append(Token(token_type, value, span.start, line, None, line, None, span.end))
     return read_spellings(_with_scales(_join_published_spellings(tokens)), faults)
 
@@ -719,6 +764,10 @@ def _report_unknown(text: str, span: Span, faults: Faults, before: Sequence[Toke
             f"compare places by relations, such as {owner} leftof b; a name with a dot is written in quotes"
         )
         faults.add(span, message, hint)
+        return
+    if text[0] == "{" and [each.type for each in before[-3:]] == ["GROUP", "NAME", "EQUAL"]:
+        hint = f"members stand without brackets: group {before[-2].value} = a, b"
+        faults.add(span, "'{' cannot stand here", hint)
         return
     if text.startswith('"'):
         faults.add(span, "a quoted name does not end on its line", 'close it with "')

@@ -113,7 +113,9 @@ def test_what_nothing_tested_passes_nowhere_unless_it_is_allowed(fleet: Path) ->
     page = Path("pages/index.html").read_text()
     assert ("number is-untested fails" in page, 'class="number is-satisfied' in page) == (True, False)
     assert batch("logs/run-0.jsonl", "--spec", "late.spatial", "--fail-on", "vacuous").code == 1
-    paper = batch("logs/run-0.jsonl", "--spec", "late.spatial", "--semantics", "paper", "--fail-on", "vacuous")
+    paper = batch(
+        "logs/run-0.jsonl", "--spec", "late.spatial", "--semantics", "paper", "--fail-on", "vacuous"
+    )
     assert (paper.code, "vacuous: `G[60s, 90s]" in paper.out) == (1, True)
     assert batch("logs/run-0.jsonl", "--spec", "late.spatial", "--allow", "vacuous").code == 0
     Path("suite.yaml").write_text(

@@ -327,6 +327,7 @@ def test_spellings_of_other_tools_get_the_one_that_is_meant(
     ("text", "title"),
     [
         ("G (0.1 <= charge)", "charge >= 0.1"),
+        ("G (0.1 <= cup dist plate)", "cup dist plate >= 0.1"),
         ("G (2 == mode)", "mode == 2"),
         ("const low = 3\nspec s = G (low < charge)", "charge > 3"),
         ("always[0s:5s] (charge >= 1)", "G[0s, 5s]"),
