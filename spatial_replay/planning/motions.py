@@ -391,6 +391,8 @@ class Expectations:
         self.settings, self.attempts, self.budget = settings, attempts, budget
         self._movables: dict[tuple[tuple[str, Pose], ...], Movables] = {}
         self._symbols: dict[tuple[tuple[str, Pose], ...], Symbol] = {}
+        self._relations: dict[Cubes, list[tuple[Demand, ...]]] = {}
+        self._about: dict[tuple[str, Cubes], tuple[list[Formula], Cubes]] = {}
 
     def begin(self, movables: Movables) -> PredictedState:
         """Return the scene of the newest sample, of which some maps are known."""
@@ -437,6 +439,20 @@ class Expectations:
         lower, upper = self.values(sample)
         return max(min((lower[n] if w else -upper[n] for n, w in cube), default=0.0) for cube in cubes)
 
+    def relations(self, constraints: Cubes) -> list[tuple[Demand, ...]]:
+        """Return relations of which no conjunction must hold."""
+        if constraints not in self._relations:
+            each_cube = (demands_of(cube, self.formulas, 0.0) for cube in constraints)
+            self._relations[constraints] = [each for demands in each_cube for each in demands]
+        return self._relations[constraints]
+
+    def relations_about(self, name: str, constraints: Cubes) -> tuple[list[Formula], Cubes]:
+        """Return relations, and the conjunctions of them about an object of which none must hold."""
+        if (name, constraints) not in self._about:
+            about = [each for each in self.relations(constraints) if _concerned(each, [name])]
+            self._about[name, constraints] = _cubes_of(about)
+        return self._about[name, constraints]
+
     def traps(self, state: int) -> Cubes:
         """Return the guards of the transitions by which acceptance is lost."""
         lost = (self.automaton.transition(state, each) for each in self.automaton.successors[state])
@@ -454,6 +470,10 @@ _MOST_PARKED: Final = 2
 """The most objects that stand aside for others at once."""
 _MOST_PLACES: Final = 4
 """The most places that are tried for an object that is brought aside."""
+_LOST: Final = -1
+"""Instead of a state: acceptance is lost, or may be."""
+_ASTRAY: Final = -2
+"""Instead of a state: another edge is taken."""
 
 
 class Ordered(NamedTuple):
@@ -493,14 +513,16 @@ class MotionOrder:
         self._idle = set(expected.idle(scene, aims[0].source).states)
         self._targets: dict[tuple[tuple[tuple[str, Pose], ...], int, str], Target | None] = {}
         self._most_parked = _MOST_PARKED
+        self._has_parked = False
         self._least = least
 
     def found(self) -> Ordered | None:
         """Return the first order found, with as few objects brought aside as possible; None without one."""
         for self._most_parked in range(_MOST_PARKED + 1):
             self._dead.clear()
+            self._has_parked = self._most_parked == 0
             found = self._motions(self._begin, self._aims[0].source, frozenset(self._places))
-            if found is not None:
+            if found is not None or not self._has_parked:
                 return found
         return None
 
@@ -517,16 +539,20 @@ class MotionOrder:
             key = scene.moved, state, name
             if key not in self._targets:
                 # where the automaton goes is known sooner than how the object gets there
-                leads_on = self._reached(self._with(scene, name), state, is_first) is not None
+                leads_on = self._reached(self._with(scene, name), state, is_first) >= 0
                 self._targets[key] = self._target(scene, state, name, is_first) if leads_on else None
             target = self._targets[key]
             still = tuple(each for each in parked if each != name)
             if (found := self._on(scene, state, target, left - {name}, still, is_first)) is not None:
                 return found
         if len(parked) < self._most_parked:
-            for name in sorted(left):
+            # what stands elsewhere does not keep an object from taking another edge
+            able = (
+                each for each in left if self._reached(self._with(scene, each), state, is_first) != _ASTRAY
+            )
+            for name in sorted(able):
                 for other, target in self._aside(scene, state, name, left, parked, is_first):
-                    more = (*parked, other)
+                    more, self._has_parked = (*parked, other), True
                     if other not in parked and (
                         found := self._on(scene, state, target, left, more, is_first)
                     ):
@@ -547,7 +573,7 @@ class MotionOrder:
         if target is None:
             return None
         after = scene.after(target)
-        if (reached := self._reached(after, state, is_first)) is None:
+        if (reached := self._reached(after, state, is_first)) < 0:
             return None
         rest = self._motions(after, reached, left, parked)
         return None if rest is None else Ordered((target, *rest.motions), rest.scene, rest.state)
@@ -558,16 +584,16 @@ class MotionOrder:
             return state in automaton.accepting
         return state == self._aims[0].target or (state in automaton.can_accept and state not in self._idle)
 
-    def _reached(self, scene: PredictedState, state: int, is_first: bool) -> int | None:
-        """Return the state after a motion; None if that is not one on the way."""
+    def _reached(self, scene: PredictedState, state: int, is_first: bool) -> int:
+        """Return the state after a motion; `_LOST` or `_ASTRAY` if that is not one on the way."""
         aim, is_strict = self._aims[0].target, is_first or len(self._aims) == 1
         for _ in range(len(self._aims)):
             states = self._expected.states_after(scene, state)
-            (after,) = states if len(states) == 1 else (-1,)
+            (after,) = states if len(states) == 1 else (_LOST,)
             if after not in self._expected.automaton.can_accept:
-                return None
+                return _LOST
             if is_strict and after != aim and after not in self._idle:
-                return None
+                return _ASTRAY
             if after == state:
                 break
             state = after
@@ -579,6 +605,13 @@ class MotionOrder:
         """Return a scene with an object at its place."""
         x, y, turn = self._place_of(scene, name)
         return scene.after(Target(name, x, y, turn, None, (), 0.0))
+
+    def _stays_done(self, scene: PredictedState, left: frozenset[str], parked: str) -> bool:
+        """Return whether the aims hold in the end if an object without a place of its own stays aside."""
+        if parked in self._places:
+            return True
+        there = with_moved(scene.sample, {name: self._place_of(scene, name) for name in left})
+        return all(self._expected.robustness(there, each.guard) >= 0.0 for each in self._aims)
 
     def _place_of(self, scene: PredictedState, name: str) -> Pose:
         """Return where an object is to go, with the turn from how it is oriented in a scene."""
@@ -668,10 +701,18 @@ class MotionOrder:
         beside = self._beside(scene, name, names)
         clearances = self._expected.clearances(with_objects(scene.sample, {name: way}), name, names)
         for other, clearance in zip(names, clearances, strict=True):
-            in_way = other in bound | beside or clearance <= settings.workspace.clearance
-            if in_way and self._spend(3):
+            in_way = other in beside or clearance <= settings.workspace.clearance
+            if (in_way or other in bound) and self._spend(3):
                 for target in self._parked(scene, state, other, {name: way}, left, is_first, other in beside):
-                    yield other, target
+                    after, movables = scene.after(target), self._expected.movables(scene)
+                    # a constraint may hold wherever the other object stands
+                    if not in_way and other in self._bound_by(after, {name: way}, constraints):
+                        continue
+                    if not self._stays_done(after, left, other):
+                        continue
+                    found = movables.with_way(target, constraints)
+                    if isinstance(found, Target) and not movables.is_repeated(found):
+                        yield other, found
 
     def _way_past(
         self, scene: PredictedState, name: str, others: Sequence[str], constraints: Cubes
@@ -684,8 +725,8 @@ class MotionOrder:
         if settings.skill == "place":
             return moved_object(tracked, *place)
         workspace = settings.workspace
-        ways = [each for each in self._ways_to_hold(constraints) if not _concerned(each, others)]
-        formulas, constraints = _cubes_of(ways)
+        kept = [each for each in self._expected.relations(constraints) if not _concerned(each, others)]
+        formulas, constraints = _cubes_of(kept)
         free = replace(workspace, supports=workspace.supports.union(others))
         about = formulas, self._expected.regions, scene.sample, name, free
         maps = proposition_maps(*about, self._expected.movables(scene).maps_of(name).grid)
@@ -703,26 +744,23 @@ class MotionOrder:
         parts += moved_object(tracked, target.x, target.y, target.turn).footprint.parts
         return replace(tracked, footprint=Footprint(tuple(parts)))
 
-    def _ways_to_hold(self, constraints: Cubes) -> list[tuple[Demand, ...]]:
-        """Return relations of which no conjunction must hold."""
-        return [each for cube in constraints for each in demands_of(cube, self._expected.formulas, 0.0)]
-
     def _bound_by(
         self, scene: PredictedState, covered: Mapping[str, TrackedObject], constraints: Cubes
     ) -> set[str]:
         """Return the objects because of which a constraint would hold with another one where it is to go."""
         ((name, way),) = covered.items()
-        ways = [each for each in self._ways_to_hold(constraints) if _concerned(each, [name])]
-        relations = list(dict.fromkeys(each.formula for one in ways for each in one))
+        relations, cubes = self._expected.relations_about(name, constraints)
         lower, upper = self._expected.values(with_objects(scene.sample, {name: way}), relations)
         first = len(self._expected.formulas)
-        numbers = {each: first + place for place, each in enumerate(relations)}
         bound: set[str] = set()
-        for one in ways:
-            ends = ((numbers[each.formula], each.wanted) for each in one)
-            danger = min((upper[n] if wanted else -lower[n] for n, wanted in ends), default=0.0)
+        for cube in cubes:
+            danger = min((upper[first + n] if w else -lower[first + n] for n, w in cube), default=0.0)
             if danger >= -self._expected.settings.constraint_margin:
-                bound |= _concerned(one, scene.sample.objects)
+                bound |= {
+                    each
+                    for each in scene.sample.objects
+                    if any(concerns(relations[n], each) for n, _ in cube)
+                }
         return bound
 
     def _beside(self, scene: PredictedState, name: str, others: Sequence[str]) -> set[str]:
@@ -733,10 +771,6 @@ class MotionOrder:
         near = BESIDE * radius_of(tracked)
         clearances = zip(others, self._expected.clearances(scene.sample, name, others), strict=True)
         return {each for each, clearance in clearances if clearance <= near}
-
-    def _formulas_about(self, name: str, constraints: Cubes) -> tuple[Sequence[Formula], Cubes]:
-        """Return relations with an object, and the conjunctions of them that must not hold."""
-        return _cubes_of([each for each in self._ways_to_hold(constraints) if _concerned(each, [name])])
 
     def _is_kept(
         self, sample: Sample, name: str, grid: Grid, formulas: Sequence[Formula], constraints: Cubes
@@ -771,7 +805,7 @@ class MotionOrder:
         gradient = gradient_map(now, self._aims[0].guard, constraints, workspace, settings.constraint_margin)
         places = {each: self._place_of(scene, each) for each in left if each != name}
         there = with_moved(scene.sample, places)
-        later = self._formulas_about(name, self._constraints_at(state, is_first=False))
+        later = self._expected.relations_about(name, self._constraints_at(state, is_first=False))
         clear, maps = self._is_kept(with_objects(there, covered), name, now.grid, *later)
         good = (gradient.blocked == FREE) & clear
         after = np.ones_like(good)
@@ -806,9 +840,7 @@ class MotionOrder:
                 target = nearest_target(gradient, among, tracked, settings, movables.failed_here(name))
                 if isinstance(target, str):
                     break
-                found = movables.with_way(target, constraints)
-                if isinstance(found, Target) and not movables.is_repeated(found):
-                    yield found
+                yield target
                 away = distance_to([(target.x, target.y)], gradient.grid) > 2.0 * radius_of(tracked)
                 free = free & away
                 good, roomy = good & away, roomy & away
