@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import sys
+from collections import Counter
 from dataclasses import replace
 from importlib.machinery import SourceFileLoader
 from importlib.util import module_from_spec, spec_from_loader
@@ -349,6 +350,22 @@ def test_the_tasks_of_the_paper_are_satisfied_without_physics(worlds, title):
     nothing = worlds.Mishaps(np.random.default_rng(0), failing=0.0, jitter=0.0)
     loop, reason = worlds.run_without_physics(name, 0, file, nothing)
     assert worlds.is_satisfied(file, loop), reason
+
+
+def test_a_decision_with_many_movable_objects_computes_few_maps(worlds):
+    settings, objects = worlds.scene_of("table-setting", 0)
+    file = worlds.default_specification("table-setting")
+    planner = Planner(file, replace(settings, movable=None))
+    planner.observe(sr.Sample(0, objects))
+    called = Counter()
+    previous = sys.getprofile()
+    sys.setprofile(lambda frame, event, _: called.update([frame.f_code.co_name] if event == "call" else ()))
+    try:
+        step = planner.next_step()
+    finally:
+        sys.setprofile(previous)
+    assert step.kind == "execute"
+    assert 0 < called["proposition_maps"] < 100
 
 
 @pytest.mark.parametrize("name", ["push", "table-setting"])
