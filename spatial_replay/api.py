@@ -385,6 +385,9 @@ def evaluate_logs(
         checked_kinds("allow", allow, ALLOWED_KINDS),
     )
     named = [logs] if isinstance(logs, str | PathLike) else list(logs)
+    for log in named:
+        if not isinstance(log, str | PathLike):
+            raise UsageError(f"logs holds {shortened(log)}; give paths; evaluate takes a trace")
     mapping = reading.get("mapping")
     conditions = Conditions(
         mapping=None if mapping is None else sendable(mapping),

@@ -226,7 +226,7 @@ def named_arguments(called: _Called) -> _Called:
         try:
             return function(*values, **named)
         except TypeError:
-            refuse_unknown(named, signature(called).parameters)
+            refuse_unknown(named, [name for name in signature(called).parameters if name != "cls"])
             raise
 
     if not isinstance(called, type):

@@ -118,3 +118,22 @@ def test_an_argument_that_does_not_exist_names_the_nearest_and_what_is_no_object
         values, named = given
         with pytest.raises((sr.UsageError, sr.TraceError), match=said):
             getattr(sr, name)(*values, **named)
+    with pytest.raises(sr.UsageError, match=r"radus=1 is no argument; did you mean 'radius'"):
+        sr.Footprint.disc(0, 0, radus=1)  # type: ignore[call-arg]
+    with pytest.raises(sr.UsageError, match=r"angle=1 is no argument; there are xmin, ymin"):
+        sr.Footprint.box(0, 0, 1, 1, angle=1)  # type: ignore[call-arg]
+
+
+def test_a_log_a_file_a_text_and_a_trace_in_the_place_of_another_are_told_apart(tmp_path: Path) -> None:
+    trace = sr.read_trace(LOG)
+    assert [sample.time_ns for sample in trace] == trace.times_ns.tolist()
+    for call, said in (
+        (lambda: sr.load_specification(LOG), "table.jsonl is a log, not a specification"),
+        (lambda: sr.load_specification("G (a dist b >= 1)"), r"is a formula; parse_specification\(text\)"),
+        (lambda: sr.parse_specification("table.spatial"), r"load_specification\(path\) reads a file"),
+        (lambda: sr.read_trace(SPEC), "table.spatial is a specification, not a log; give it by --spec"),
+        (lambda: sr.Trace.from_samples([{"time_ns": 0}]), "is not a sample; give a Sample"),  # type: ignore[list-item]
+        (lambda: sr.evaluate_logs([trace], SPEC, output=tmp_path), "give paths; evaluate takes a trace"),  # type: ignore[list-item]
+    ):
+        with pytest.raises(sr.UsageError, match=said):
+            call()

@@ -163,6 +163,7 @@ class Footprint:
         return hash(frozenset(self.parts))
 
     @classmethod
+    @named_arguments
     def box(cls, xmin: float, ymin: float, xmax: float, ymax: float) -> Footprint:
         """Return an axis-aligned box; equal limits make a segment or a point.
 
@@ -175,6 +176,7 @@ class Footprint:
         return cls.polygon([(xmin, ymin), (xmax, ymin), (xmax, ymax), (xmin, ymax)])
 
     @classmethod
+    @named_arguments
     def disc(cls, x: float, y: float, radius: float) -> Footprint:
         """Return the disc around (x, y); with radius 0, a point.
 
@@ -184,6 +186,7 @@ class Footprint:
         return cls((ConvexPart(np.array([(x, y)]), radius),))
 
     @classmethod
+    @named_arguments
     def capsule(cls, start: ArrayLike, end: ArrayLike, radius: float) -> Footprint:
         """Return all points within `radius` of the segment between two points (x, y).
 
@@ -193,6 +196,7 @@ class Footprint:
         return cls((ConvexPart(np.array([start, end]), radius),))
 
     @classmethod
+    @named_arguments
     def polygon(cls, vertices: ArrayLike, *, concave: Concave = "decompose") -> Footprint:
         """Return the polygon with the given corners (n, 2), in either order.
 
@@ -212,6 +216,7 @@ class Footprint:
         return cls(tuple(piece for piece in pieces if len(piece.vertices) > 2))
 
     @classmethod
+    @named_arguments
     def union(cls, footprints: Iterable[Footprint]) -> Footprint:
         """Join all parts of some footprints.
 

@@ -24,7 +24,7 @@ from spatial_replay.spec.formula import NamedSpec, Specification, iter_nodes
 from spatial_replay.spec.load import require_specification
 from spatial_replay.spec.walks import declared_unit
 from spatial_replay.text import counted, named_arguments, time_text, times_apart
-from spatial_replay.trace.sample import Sample, require_time
+from spatial_replay.trace.sample import Sample, require_sample, require_time
 from spatial_replay.trace.trace import duration_ns_from_text
 from spatial_replay.trace.units import checked_units
 
@@ -260,8 +260,7 @@ class Monitor:
             UsageError: not a sample; more objects in open groups than can be bound.
             SpecificationError: with `strict_names`, a name that is missing for too long.
         """
-        if not isinstance(sample, Sample):
-            raise UsageError(f"{sample!r} is not a sample; give a Sample(time_ns, objects)")
+        require_sample(sample)
         time_ns = sample.time_ns
         if time_ns <= self._last_ns:
             at, last = times_apart(time_ns, self._last_ns)

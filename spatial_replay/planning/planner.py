@@ -43,7 +43,7 @@ from spatial_replay.planning.motions import Movables, with_choice
 from spatial_replay.planning.settings import Settings, Workspace, kind_faults, refuse_faults
 from spatial_replay.spec.formula import Specification
 from spatial_replay.text import counted, named_arguments, times_apart
-from spatial_replay.trace.sample import Sample
+from spatial_replay.trace.sample import Sample, require_sample
 
 
 @named_arguments
@@ -178,8 +178,7 @@ class Planner:
             UsageError: not a sample; or, at the first one, the settings name unknown objects, or there are
                 neither settings nor objects.
         """
-        if not isinstance(sample, Sample):
-            raise UsageError(f"{sample!r} is not a sample; give a Sample(time_ns, objects)")
+        require_sample(sample)
         if self._sample is not None and sample.time_ns <= self._sample.time_ns:
             at, last = times_apart(sample.time_ns, self._sample.time_ns)
             raise TraceError(f"a sample at {at} follows one at {last}; give times that increase")

@@ -46,7 +46,7 @@ from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import listed_specifications
 from spatial_replay.text import counted_from, named_arguments, times_apart
-from spatial_replay.trace.sample import LATEST_NS, Sample
+from spatial_replay.trace.sample import LATEST_NS, Sample, require_sample
 from spatial_replay.trace.trace import Trace
 from spatial_replay.trace.units import Axes, checked_units
 
@@ -622,8 +622,7 @@ class SampleWriter:
             OutputError: an earlier sample could not be written.
             UsageError: not a sample, or the recorder is closed.
         """
-        if not isinstance(sample, Sample):
-            raise UsageError(f"{sample!r} is not a sample; give a Sample(time_ns, objects)")
+        require_sample(sample)
         self._messages.require_open()
         self._raise_failure()
         if sample.time_ns <= self._last_ns:

@@ -83,6 +83,8 @@ def open_source(path: str | PathLike[str], **reading: Unpack[Reading]) -> Source
         raise LogError(
             f"{path.name} is a compressed file of a ROS 2 bag; give its folder, {path.absolute().parent}"
         )
+    if path.name.endswith(".spatial"):
+        raise UsageError(f"{path.name} is a specification, not a log; give it by --spec, behind the log")
     raise LogError(
         f"{path.name} is not a log in a known format; known formats are {', '.join(FORMATS)}; "
         "a video becomes a log by `record video`"
@@ -297,6 +299,13 @@ def _open_scenario(path: LogFile, kind: str, options: ReadOptions) -> Source:
 def _open_messages(path: LogFile, kind: str, options: ReadOptions) -> Source:
     """Open an external log of messages."""
     if options.mapping is None:
+        if isinstance(path, Path) and path.is_dir() and not (path / BAG_METADATA).exists():
+            first = min(each.name for each in path.iterdir() if _BAG_FILE.search(each.name))
+            raise UsageError(
+                f"{path.name} is a folder without {BAG_METADATA}; give one of its logs, such as "
+                f"{printable(str(path / first))}, or all of them to `spatial-replay batch`; "
+                "a ROS 2 bag needs a mapping file, too: --mapping FILE or mapping=FILE"
+            )
         raise UsageError(
             f"{path.name} is a {kind}, which does not say what its objects are; give a mapping file that"
             " does, with --mapping FILE or mapping=FILE; for a first one, see: spatial-replay info "

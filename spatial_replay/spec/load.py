@@ -824,6 +824,10 @@ def parse_specification(
     )
 
 
+_FILE = re.compile(r"[^\s\"]+\.spatial")
+_LOG_ENDINGS = frozenset({".mcap", ".bag", ".db3", ".jsonl", ".csv", ".gz"})
+
+
 @named_arguments
 def load_specification(
     path: str | Path,
@@ -841,6 +845,14 @@ def load_specification(
     """
     _require_path(path)
     path = Path(path)
+    if path.suffix in (".yaml", ".yml"):
+        raise UsageError(
+            f"{path.name} is YAML, not a specification; give a mapping by --mapping, a tags file by --tags"
+        )
+    if path.suffix in _LOG_ENDINGS:
+        raise UsageError(f"{path.name} is a log, not a specification; a log stands in front of --spec")
+    if is_formula(path):
+        raise UsageError(f"{shortened(str(path))} is a formula; parse_specification(text) takes it")
     try:
         with path.open("rb") as file:
             content = file.read(4 * MAX_LENGTH + 4)
@@ -885,7 +897,7 @@ def listed_specifications(value: object) -> list[Specification]:
 
 
 def _require_text(value: object) -> None:
-    if not isinstance(value, str):
+    if not isinstance(value, str) or _FILE.fullmatch(value):
         remedy = "give the text as a str; load_specification(path) reads a file"
         raise UsageError(f"text is {shortened(value)}; {remedy}")
 
@@ -1031,10 +1043,6 @@ def _parsed(
         )
     if is_formula(source):
         return parse_specification(str(source), filename="<formula>", profile=profile, constants=constants)
-    if source.suffix in (".yaml", ".yml"):
-        raise UsageError(
-            f"{source.name} is YAML, not a specification; give a mapping by --mapping, a tags file by --tags"
-        )
     return load_specification(source, profile=profile, constants=constants)
 
 

@@ -125,3 +125,13 @@ class Sample:
         object.__setattr__(self, "objects", MappingProxyType(objects))
         object.__setattr__(self, "unknown", MappingProxyType(dict(self.unknown)))
         object.__setattr__(self, "signals", MappingProxyType(signals))
+
+
+def require_sample(value: object) -> None:
+    """Refuse anything but a sample.
+
+    Raises:
+        UsageError: it is something else.
+    """
+    if not isinstance(value, Sample):
+        raise UsageError(f"{shortened(value)} is not a sample; give a Sample(time_ns, objects)")

@@ -21,7 +21,7 @@ from spatial_replay.geometry.arrays import Floats, Integers, read_only_floats, r
 from spatial_replay.geometry.footprint import Footprint, FootprintBatch, TrackedObject
 from spatial_replay.lazy import Displayed
 from spatial_replay.text import Instant, Sentence, counted, times_apart
-from spatial_replay.trace.sample import FOREVER, LATEST_NS, Sample
+from spatial_replay.trace.sample import FOREVER, LATEST_NS, Sample, require_sample
 from spatial_replay.trace.units import checked_units
 
 MOST_NAMES = 20_000
@@ -210,6 +210,9 @@ class Trace(Displayed):
     def __len__(self) -> int:
         return len(self.times_ns)
 
+    def __iter__(self) -> Iterator[Sample]:
+        return self.samples()
+
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Trace):
             return NotImplemented
@@ -275,6 +278,8 @@ class Trace(Displayed):
             UsageError: units that are not texts.
         """
         listed = list(samples)
+        for each in listed:
+            require_sample(each)
         names = tuple(sorted({name for each in listed for name in (*each.objects, *each.unknown)}))
         signals = sorted({name for sample in listed for name in sample.signals})
         require_few(names, signals)

@@ -22,7 +22,15 @@ from bags.bag_files import (
     write_ros1,
     write_ros2,
 )
-from spatial_replay import LogError, MissingFileError, read_trace
+from spatial_replay import (
+    Footprint,
+    LogError,
+    MissingFileError,
+    Recorder,
+    Sample,
+    UsageError,
+    read_trace,
+)
 from spatial_replay.bags import MessageReader, Topic, open_messages
 from spatial_replay.cli import run
 
@@ -347,6 +355,13 @@ def test_folders_and_files_that_are_no_logs_say_what_to_give(tmp_path: Path) -> 
     (tmp_path / "other" / "notes.txt").write_text("words")
     with pytest.raises(MissingFileError, match="no file of a ROS 2 bag"):
         read_trace(tmp_path / "other")
+    several = tmp_path / "several"
+    several.mkdir()
+    for name in ("a.mcap", "b.mcap"):
+        with Recorder(several / name) as recorder:
+            recorder.write(Sample(0, {"cup": Footprint.disc(0, 0, 1)}))
+    with pytest.raises(UsageError, match=r"without metadata.yaml; give one of its logs, .*a\.mcap"):
+        read_trace(several)
     packed = next(write_ros2(tmp_path / "drive", drive(5), compression="file").glob("*.zstd"))
     with pytest.raises(LogError, match="compressed file of a ROS 2 bag; give its folder"):
         read_trace(packed)
