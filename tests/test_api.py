@@ -124,7 +124,7 @@ def test_an_argument_that_does_not_exist_names_the_nearest_and_what_is_no_object
         sr.Footprint.box(0, 0, 1, 1, angle=1)  # type: ignore[call-arg]
 
 
-def test_a_log_a_file_a_text_and_a_trace_in_the_place_of_another_are_told_apart(tmp_path: Path) -> None:
+def test_a_log_a_file_a_text_and_a_trace_in_the_place_of_another_are_named(tmp_path: Path) -> None:
     trace = sr.read_trace(LOG)
     assert [sample.time_ns for sample in trace] == trace.times_ns.tolist()
     for call, said in (
