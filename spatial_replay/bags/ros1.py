@@ -557,8 +557,13 @@ class Ros1Bag(MessageReader):
         bounds = zip(table.begin[rows].tolist(), table.end[rows].tolist(), strict=True)
         payloads = [content[begin:end] for begin, end in bounds]
         numbers = table.connection[rows].tolist()
-        # a header begins with the number that its publisher has given it
-        headed = {number for number, each in wanted.items() if each.begins_with_header}
+        # a header begins with the number that its publisher has given it; those of two mean nothing together
+        publishers = Counter(each.topic for each in wanted.values())
+        headed = {
+            number
+            for number, each in wanted.items()
+            if publishers[each.topic] == 1 and each.begins_with_header
+        }
         sequence = [
             int.from_bytes(payload[:4], "little") if number in headed else 0
             for number, payload in zip(numbers, payloads, strict=True)

@@ -13,8 +13,9 @@ Messages wait in the first stage until none that is earlier can arrive.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from itertools import compress, repeat
+from math import pi
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -27,10 +28,10 @@ from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.read_options import FaultKinds, FaultList, OnTimeJump
 from spatial_replay.mapping.binding import BY_PLACE, Codes
 from spatial_replay.mapping.mapping_file import parse_mapping
-from spatial_replay.mapping.topic_reader import MISFITS, ReadingPlan, TopicReader
+from spatial_replay.mapping.topic_reader import MISFITS, Extractor, ReadingPlan, TopicReader
 from spatial_replay.mapping.tracker import Remarks, Tracker
 from spatial_replay.mapping.transforms import HISTORY_NS, FrameTree
-from spatial_replay.text import Instant, Sentence, counted, nearest_hint, times_apart
+from spatial_replay.text import Instant, Sentence, counted, nearest_hint, number_text, times_apart
 from spatial_replay.trace.sample import FOREVER, LATEST_NS
 from spatial_replay.trace.trace import Trace
 
@@ -245,16 +246,19 @@ class Assembler:
                 what = "other than two corners" if reader.extractor.is_bounds else "fewer than three corners"
                 hint = "" if reader.extractor.is_bounds else "; `bounds` reads two opposite corners of a box"
                 self._remarks.add(f"{reader.name}: {outlines} with {what}: objects are unknown there{hint}")
+            if reader.extractor is not None:
+                for doubt in _doubtful_turns(reader.extractor):
+                    self._remarks.add(f"{reader.name}: {doubt}")
             for signal, texts in reader.unnamed.items():
                 listed = ", ".join(map(repr, texts))
                 what = f"`names` of the signal {signal!r} lacks {listed}; it is unknown there"
                 self._remarks.add(f"{reader.name}: {what}")
             if (step := reader.pending.first_step) is not None:
-                how = "are sorted by time; if that clock was set back, cut the log there"
+                how = "are sorted by time, as if of two senders; if a clock was set back, cut the log there"
                 if not step.is_sorted:
                     how = "are numbered on, so those recorded later count later; cut the log there"
                 back = f"{(step.from_ns - step.to_ns) / 1e9:.3f} s"
-                what = f"{reader.name}: the clock steps back between messages, first by {back} at "
+                what = f"{reader.name}: times step back in the order of recording, first by {back} at "
                 how = f": its messages {how}, or take another `clock`"
                 self._remarks.add(Sentence(what, Instant(step.from_ns, 0), how))
             if reader.unstamped:
@@ -431,6 +435,23 @@ class Assembler:
 
     def _add_fault(self, topic: str, log_time_ns: int, what: str) -> None:
         self._faults.add(Sentence(f"{self._name}: {topic} at ", Instant(log_time_ns, 0), f": {what}"))
+
+
+_MOST_TURNED = 4 * pi
+"""Angles that robots reach in radians, who count whole turns."""
+
+
+def _doubtful_turns(extractor: Extractor) -> Iterator[str]:
+    if extractor.widest_turn > _MOST_TURNED:
+        yield (
+            f"its angles reach {number_text(extractor.widest_turn)} and are read as radians;"
+            " `yaw: {field: PATH, unit: deg}` reads degrees"
+        )
+    if 0 < extractor.unturned < extractor.turned:
+        yield (
+            f"{extractor.unturned:,} of {counted(extractor.turned, 'pose')} have a quaternion of zeros, as"
+            " trackers send for what they have lost; they count as poses without a turn"
+        )
 
 
 class _Stamped(NamedTuple):

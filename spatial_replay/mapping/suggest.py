@@ -49,6 +49,7 @@ from spatial_replay.mapping.message_types import (
     layout_of_topic,
     short_type,
 )
+from spatial_replay.mapping.topic_reader import doubts_of
 from spatial_replay.mapping.yaml_document import LARGEST_TEXT
 from spatial_replay.text import counted
 from spatial_replay.trace.sample import FOREVER
@@ -578,6 +579,7 @@ def suggest_mapping(
         *_frame_lines(active, transforms, examples),
         *_axes_lines(axes if active else "plane"),
         *_origin_lines(active, examples),
+        *(f"# {_comment(doubt)}" for doubt in doubts_of(topics)),
         *_time_lines(active or signals, first_ns),
         "topics:",
     ]

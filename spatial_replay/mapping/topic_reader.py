@@ -8,7 +8,7 @@ reports those that fail, and clears their flags.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, compress
 from math import nan
@@ -74,7 +74,7 @@ from spatial_replay.mapping.message_types import (
     layout_of_topic,
     short_type,
 )
-from spatial_replay.mapping.transforms import HISTORY_NS, TransformReader
+from spatial_replay.mapping.transforms import HISTORY_NS, LEAST_STEP_NS, TransformReader
 from spatial_replay.text import counted, names_from_unit, nearest_hint, text_number
 from spatial_replay.trace.sample import LATEST_NS
 
@@ -167,7 +167,10 @@ class ReadingPlan:
             sampled_topic=sampled,
             lost=tuple(lost),
             absent=tuple(topic for topic in mapped if topic not in known),
-            remarks=_slow_sampling(sampled, [known[topic] for topic in mapped if topic in known], known),
+            remarks=(
+                *_slow_sampling(sampled, [known[topic] for topic in mapped if topic in known], known),
+                *doubts_of(topics, has_frames=needs_frames, has_stamps=mapping.clock == "header"),
+            ),
         )
 
     def lookback_ns(self, topic: str) -> int | None:
@@ -259,6 +262,26 @@ def _slow_sampling(
     )
 
 
+def doubts_of(
+    topics: Iterable[Topic], *, has_frames: bool = False, has_stamps: bool = False
+) -> Iterator[str]:
+    """Yield what is doubtful about a mapping without a fixed frame, or with `clock: log`."""
+    topics = tuple(topics)
+    moving = [each.name for each in topics if short_type(each.type) in TRANSFORM_TYPES]
+    listed = [name for name in moving if not name.endswith("tf_static")]
+    if len(listed) > 1 and not has_frames:
+        yield (
+            f"transforms come on {' and '.join(listed)}, so frames of one name may be of two robots; without"
+            " `fixed_frame`, coordinates are taken to be in one frame"
+        )
+    clock = next((each.name for each in topics if short_type(each.type) == "rosgraph_msgs/Clock"), None)
+    if clock is not None and not has_stamps:
+        yield (
+            f"{clock} has simulated time, which may run at another rate than the recording; `clock: header`"
+            " takes the stamps of messages"
+        )
+
+
 def _planned(
     mapping: LogMapping, entry: TopicMapping | None, topic: Topic, needs_frames: bool
 ) -> PlannedTopic:
@@ -319,6 +342,10 @@ class Extractor:
             self.unseen = (mapping.position,) if isinstance(mapping.position, str) else mapping.position
         self.cornerless = 0
         """Outlines with too few corners, whose objects are unknown."""
+        self.widest_turn = 0.0
+        """The greatest angle that is read as radians."""
+        self.turned, self.unturned = 0, 0
+        """Poses with an orientation, and those whose quaternion is zeros."""
         self._layout = layout
         self._classes = classes
         self._namer = Namer(NameTemplate.of(layout.name), mapping.topic, names, mapping.only, mapping.without)
@@ -437,6 +464,13 @@ class Extractor:
         if binding.numbers is not None:
             rows = map(binding.numbers, values)
             chunk.numbers = rows_from_tuples(rows, len(values), binding.width, binding.style)
+            if binding.orientation:
+                is_turned = chunk.numbers[:, list(binding.orientation)].any(axis=1)
+                self.turned += len(values)
+                self.unturned += len(values) - int(is_turned.sum())
+            elif binding.yaw is not None and self._layout.angle_scale == 1.0:
+                turns = np.abs(chunk.numbers[:, binding.yaw])
+                self.widest_turn = float(np.fmax.reduce(turns, initial=self.widest_turn))
         chunk.covariance = covariances(self._layout, binding, values)
         chunk.class_code = class_codes(self._layout, binding, values, self._classes)
         chunk.frames = self._frames(binding, messages, objects)
@@ -930,10 +964,10 @@ class PendingMessages:
         """Return times that do not step back, if the sequence of the log's clock goes on where they do."""
         order = np.argsort(recorded, kind="stable")
         times = times_ns[order]
-        back = np.flatnonzero(times[1:] < times[:-1])
+        back = np.flatnonzero(times[1:] < times[:-1] - LEAST_STEP_NS)
         # the log's sequence says nothing of the sender's clock
         is_sorted = self._has_own_clock or not (np.diff(sequences[order]) > 0).all()
-        if is_sorted:
+        if is_sorted and len(back):
             # all that was recorded before a message has arrived when it is taken
             back = back[times[back + 1] <= upto_ns]
             back = back[np.argsort(times[back + 1], kind="stable")]

@@ -30,7 +30,7 @@ from spatial_replay.mapping.field_paths import (
     style_of,
     tuple_getter,
 )
-from spatial_replay.text import Instant, Sentence
+from spatial_replay.text import Instant, Sentence, counted
 from spatial_replay.trace.sample import LATEST_NS
 
 _LEAST_NORM = 1e-6
@@ -128,6 +128,10 @@ _OFF_LENGTH = 0.01
 _LEAST_JUMP = 0.1
 """Least jump of a frame, in metres and radians."""
 _MANY_JUMPS = 3
+_MOST_PUBLISHERS = 4
+"""Most poses between two of one publisher, plus one."""
+LEAST_STEP_NS = 10_000_000
+"""Least step back of a clock: recorders that write from several threads mix messages within this."""
 _MOST_RESTARTS = 1_000
 
 
@@ -237,6 +241,7 @@ class FrameTree:
         self.newest_stamp_ns = 0
         """Of the last transform that is not static."""
         self._ignored: dict[str, tuple[int, _Entry, str]] = {}
+        self._steps: dict[str, tuple[int, _Entry, _Entry]] = {}
         self._contradictions: dict[tuple[str, bool, bool], Sentence] = {}
         self._jumps: dict[str, tuple[int, float, _Entry, _Entry]] = {}
         self._holes: dict[str, tuple[int, int]] = {}
@@ -284,11 +289,11 @@ class FrameTree:
         if not is_static:
             self.newest_stamp_ns = stamp_ns
             if known.moving:
-                self._note_restart(known, entry)
+                self._note_restart(child, known, entry)
         entries.append(entry)
         self._series.pop(child, None)
 
-    def _note_restart(self, child: _Child, new: _Entry) -> None:
+    def _note_restart(self, name: str, child: _Child, new: _Entry) -> None:
         """Note that the stamps of a frame step back.
 
         If the next transform steps forward again, two programs with different clocks take turns.
@@ -298,6 +303,9 @@ class FrameTree:
             self._restarts.remove(before)
             self._series.clear()
         if new.stamp_ns >= old.stamp_ns - DISORDER_NS or new.log_ns < old.log_ns:
+            if new.stamp_ns < old.stamp_ns - LEAST_STEP_NS:
+                count, *first = self._steps.get(name, (0, old, new))
+                self._steps[name] = count + 1, first[0], first[1]
             return
         restart = child.restart = _Restart(old, new)
         if self._restarts and self._restarts[-1].new.log_ns > old.log_ns:
@@ -514,21 +522,29 @@ class FrameTree:
             turn = 2 * np.arccos(np.minimum(cosine, 1.0))
             return np.asarray(np.linalg.norm(first[:, :3] - second[:, :3], axis=1) + turn)
 
-        step, over = apart(poses[1:], poses[:-1]), apart(poses[2:], poses[:-2])
-        least = np.minimum(step[1:], step[:-1])
-        # with one publisher of twice the other's rate, a third of them lie between two of the same one
-        usual = float(np.quantile(over, 0.3))
+        # from one pose over some of others to the next of the same publisher
+        lags = range(2, min(_MOST_PUBLISHERS, len(poses) - 1) + 1)
+        aside = {lag: apart(poses[lag:], poses[:-lag]) for lag in (1, *lags)}
+        usual = min(float(np.quantile(each, 0.3)) for each in aside.values())
 
         def jumps_of(times: int) -> Integers:
-            return np.flatnonzero((least > max(_LEAST_JUMP, times * usual)) & (over * times < least))
+            found = np.zeros(len(poses), np.bool_)
+            for lag in lags:
+                over = aside[lag]
+                between = [aside[by][: len(over)] for by in range(1, lag)]
+                between += [aside[by][lag - by :][: len(over)] for by in range(1, lag)]
+                least = np.min(between, axis=0)
+                found[: len(over)] |= (least > max(_LEAST_JUMP, times * usual)) & (over * times < least)
+            return np.flatnonzero(found)
 
         # noise jumps rarely, and hardly ever by ten times the usual motion
-        jumps = jumps_of(3)
-        jumps = jumps if len(jumps) > 0.02 * len(least) else jumps_of(10)
+        jumps = jumps_of(5)
+        jumps = jumps if len(jumps) > 0.05 * len(poses) else jumps_of(10)
         if len(jumps):
+            least = aside[1][jumps]
             at = int(jumps[0])
             count, most, *example = self._jumps.get(name, (0, 0.0, entries[at], entries[at + 1]))
-            most = max(most, float(least[jumps].max()))
+            most = max(most, float(least.max()))
             self._jumps[name] = count + len(jumps), most, example[0], example[1]
 
     def remarks(self) -> list[str]:
@@ -549,6 +565,16 @@ class FrameTree:
             rule = "earlier ones do not count from there on; cut the log there to evaluate each run by itself"
             why = f", as when a simulation restarts: {rule}"
             texts.append(Sentence(f"the stamps of transforms {step}", Instant(new.clock_ns, 0), why))
+        if self._steps:
+            name, (count, old, new) = min(self._steps.items(), key=lambda each: each[1][2].clock_ns)
+            times = "" if count == 1 else f" {count} times, first"
+            others = len(self._steps) - 1
+            of = f"{name!r} and {counted(others, 'other frame')}" if others else repr(name)
+            step = f"step back{times} by {(old.stamp_ns - new.stamp_ns) / 1e9:.3f} s at "
+            why = (
+                ": they are sorted by stamp, as if of two senders; if a clock was set back, cut the log there"
+            )
+            texts.append(Sentence(f"the stamps of {of} {step}", Instant(new.clock_ns, 0), why))
         for name, (count, most, old, new) in sorted(self._jumps.items()):
             if count < _MANY_JUMPS:
                 continue
@@ -557,7 +583,7 @@ class FrameTree:
                     f"frame {name!r} jumps in {new.parent!r} by up to {most:.3g} and back, {count} times,"
                     f" such as from {_place(old)} to {_place(new)} at ",
                     Instant(new.clock_ns, 0),
-                    ": where two programs send it, the newest counts",
+                    ": if several programs send it, the newest counts",
                 )
             )
         for loop in self._loops:

@@ -148,8 +148,8 @@ def test_a_clock_that_steps_back_between_numbered_messages_is_remarked(batch: in
     made = make("topics: {/p: {}}", feed, batch=batch)
     assert [made.centre(n, "p")[0] for n in range(40)] == list(range(40))
     assert made.remarks == (
-        "test.bag: /p: the clock steps back between messages, first by 0.650 s at 11.900 s: its messages are"
-        " numbered on, so those recorded later count later; cut the log there, or take another `clock`",
+        "test.bag: /p: times step back in the order of recording, first by 0.650 s at 11.900 s: its messages"
+        " are numbered on, so those recorded later count later; cut the log there, or take another `clock`",
     )
 
 
@@ -163,9 +163,17 @@ def test_times_that_step_back_without_numbers_are_sorted_and_remarked(batch: int
     made = make(f"clock: {clock}\ntopics: {{/p: {{}}}}", feed, batch=batch)
     assert (np.diff(made.trace.times_ns) >= 0).all()
     assert made.remarks == (
-        "test.bag: /p: the clock steps back between messages, first by 0.650 s at 11.900 s: its messages are"
-        " sorted by time; if that clock was set back, cut the log there, or take another `clock`",
+        "test.bag: /p: times step back in the order of recording, first by 0.650 s at 11.900 s: its messages"
+        " are sorted by time, as if of two senders; if a clock was set back, cut the log there, or take"
+        " another `clock`",
     )
+
+
+def test_messages_that_several_threads_mix_are_no_step() -> None:
+    feed = Feed(is_numbered=False)
+    for tick in range(40):
+        feed.add("/p", 10 * SECOND + tick * MS - (8 * MS if tick % 4 else 0), point(tick))
+    assert make("topics: {/p: {}}", feed).remarks == ()
 
 
 def counted_feed(**counts: int) -> Feed:

@@ -551,3 +551,24 @@ def test_an_outline_is_given_once() -> None:
     for pair in ("polygon: a, bounds: b", "bounds: a, shape: {disc: 1}", "polygon: a, shape: {polygon: b}"):
         with pytest.raises(UsageError, match="give one of the two"):
             make(f"topics: {{/b: {{{pair}}}}}", Feed())
+
+
+def test_angles_in_degrees_and_poses_of_zeros_are_remarked() -> None:
+    def remarks(*contents: Any, keys: str = "") -> tuple[str, ...]:
+        feed = Feed()
+        for second, content in enumerate(contents):
+            feed.add("/thing", second * SECOND, content)
+        return make(f"topics: {{/thing: {{{keys}}}}}", feed).remarks
+
+    turns = [{"x": 0.0, "y": 0.0, "theta": theta} for theta in (0.0, -90.0)]
+    assert remarks(*turns, keys="yaw: theta") == (
+        "test.bag: /thing: its angles reach 90 and are read as radians; `yaw: {field: PATH, unit: deg}` reads"
+        " degrees",
+    )
+    assert remarks(*turns, keys="yaw: {field: theta, unit: deg}") == ()
+    known, lost = pose_stamped(1, 2), pose_stamped(0, 0, turn=(0.0, 0.0, 0.0, 0.0))
+    assert remarks(known, lost, known) == (
+        "test.bag: /thing: 1 of 3 poses have a quaternion of zeros, as trackers send for what they have lost;"
+        " they count as poses without a turn",
+    )
+    assert remarks(lost, lost) == remarks(known, known) == ()
