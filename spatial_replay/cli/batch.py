@@ -451,11 +451,12 @@ def _print(result: BatchResult, found: BatchResult, folder: str) -> None:
 
 
 def _warn_of_names(table: pa.Table) -> None:
-    """Warn of names that logs lack, and of samples that recorders dropped; the same is reported once."""
+    """Warn of names that logs lack, and of what is remarkable about logs; the same is reported once."""
     logs: dict[str, dict[str, None]] = {}
-    for log, missing, dropped in _columns(table, "log", "missing", "dropped"):
-        for message in (*missing, *filter(None, [dropped])):
-            logs.setdefault(message, {})[log] = None
+    for name in ("missing", "remarks"):
+        for log, messages in _columns(table, "log", name):
+            for message in messages:
+                logs.setdefault(message, {})[log] = None
     found = [f"{message} (in {_listed(list(names))})" for message, names in logs.items()]
     more = [f"… and {len(found) - _MOST_WARNINGS} more"] if len(found) > _MOST_WARNINGS else []
     warn(*found[:_MOST_WARNINGS], *more)

@@ -72,15 +72,22 @@ _KEPT_BYTES, _MOST_KEPT_BYTES = 2**22, 2**26
 
 @dataclass(frozen=True, slots=True)
 class Dropped:
-    """How many samples the recorder of a log had no time for, of how many."""
+    """How many samples the recorder of a log had no time for, of how many, and whether it was interrupted."""
 
     count: int
     of: int
+    was_interrupted: bool = False
 
     @property
     def text(self) -> str:
         """The losses in words; "" if there are none."""
         return f"the recorder dropped {self.count:,} of {counted(self.of, 'sample')}" if self.count else ""
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What a reader of the log should know of its recording."""
+        ended = "the recording was interrupted" if self.was_interrupted else ""
+        return tuple(filter(None, (self.text, ended)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -296,7 +303,7 @@ class Replay:
             faults=counted_from(self._faults, first_ns),
             remarks=(
                 *counted_from(self._remarks, first_ns),
-                *filter(None, [dropped.text]),
+                *dropped.remarks,
                 *self._empty_ends(first_ns),
             ),
             missing=missing,
@@ -352,14 +359,14 @@ class _KeptTraces:
 
 
 def dropped_samples(source: Source) -> Dropped:
-    """Return what the recorder of a log dropped, as the log says."""
+    """Return what the recorder of a log dropped, and how it ended, as the log says."""
     ending = dict(source.metadata()).get(ENDING, {})
     texts = [ending.get(name, "0") for name in ("samples", "dropped")]
     kept, count = (
         int(text) if text.isascii() and text.isdecimal() and len(text) <= _MOST_DIGITS else 0
         for text in texts
     )
-    return Dropped(count, kept + count)
+    return Dropped(count, kept + count, ending.get("interrupted") == "true")
 
 
 def idle_templates(

@@ -440,7 +440,7 @@ class Evaluated:
             start_ns=int(times_ns[0]),
             end_ns=int(times_ns[-1]),
             faults=counted_from(loaded.faults, loaded.first_ns),
-            remarks=(*counted_from(loaded.remarks, loaded.first_ns), *filter(None, [loaded.dropped.text])),
+            remarks=(*counted_from(loaded.remarks, loaded.first_ns), *loaded.dropped.remarks),
             missing=loaded.missing,
             dropped=loaded.dropped,
             unreadable=loaded.inside.unreadable_count,

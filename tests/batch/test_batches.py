@@ -6,6 +6,7 @@ import json
 import os
 import random
 import shutil
+from contextlib import suppress
 from importlib.resources import files
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -210,6 +211,15 @@ def test_samples_that_a_recorder_dropped_are_said_and_do_not_pass(fleet: Path) -
     assert (violated.code, f"warning: {said} (in lossy.mcap)" in violated.err) == (1, True)
     assert command("report", *lossy, "-o", "lossy.html").code == 0
     assert said in Path("lossy.html").read_text()
+
+
+def test_an_interrupted_recording_is_said(fleet: Path) -> None:
+    with suppress(KeyboardInterrupt), sr.Recorder("stopped.mcap") as recorder:
+        recorder.write(sr.Sample(0, {name: sr.Footprint.box(0, 0, 1, 1) for name in ("cart", "person")}))
+        raise KeyboardInterrupt
+    stopped = ("stopped.mcap", "--spec", "gate.spatial")
+    for run in ("replay", "batch", "report", "explain"):
+        assert "warning: the recording was interrupted" in command(run, *stopped).err
 
 
 def test_warnings_of_specifications_are_those_of_replay(fleet: Path) -> None:
