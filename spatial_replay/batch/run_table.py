@@ -9,6 +9,7 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeAlias, cast
 
@@ -167,7 +168,24 @@ def counts_of(rows: Sequence[Total]) -> dict[str, list[int]]:
 
 
 def worst_rows(table: pa.Table, count: int) -> list[Values]:
-    """Return the worst rows: what fails first, then violations, errors and unknown ones, by robustness."""
+    """Return the worst rows: what fails first, then violations, errors and unknown ones, by robustness.
+
+    Numbers of different units are not compared: the worst of each unit come first, then the second of each.
+    """
+    import pyarrow.compute as pc
+
+    units = pc.fill_null(table.column("unit"), "")
+    found: list[tuple[tuple[bool, int, int], Values]] = []
+    for unit in units.unique():
+        places = Counter[tuple[bool, int]]()
+        for row in _worst_of_unit(table.filter(pc.equal(units, unit)), count):
+            rank = (row["failure"] is None, RANKS[row["verdict"]])
+            found.append(((*rank, places[rank]), row))
+            places[rank] += 1
+    return [row for _, row in sorted(found, key=itemgetter(0))[:count]]
+
+
+def _worst_of_unit(table: pa.Table, count: int) -> list[Values]:
     import pyarrow as pa
     import pyarrow.compute as pc
 

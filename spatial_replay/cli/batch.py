@@ -30,7 +30,7 @@ from spatial_replay.cli.output import VERDICT_COLOURS
 from spatial_replay.cli.terminal import Coloured, progress, show, show_diagnostics, show_file, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import local_files, sendable
-from spatial_replay.text import counted, json_number
+from spatial_replay.text import counted, json_number, with_unit
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -109,7 +109,8 @@ def print_worst(table: pa.Table, count: int, *, failing: bool) -> None:
         name = row["spec"] or row["file"]
         name = result_name(name, row["object"])
         verdict = Coloured(f"{verdict_word(row)}{damage_word(row)}", _COLOURS[verdict_word(row)])
-        number = "" if math.isnan(row["robustness"]) else f", robustness {row['robustness']:.6g}"
+        robustness = with_unit(row["robustness"], row["unit"] or "")
+        number = "" if math.isnan(row["robustness"]) else f", robustness {robustness}"
         show((f"  {row['log']}: {name}: ", verdict, number))
         usual = f"{row['verdict']}, expected satisfied"
         failure = None if row["failure"] == usual else row["failure"]

@@ -213,6 +213,18 @@ def test_samples_that_a_recorder_dropped_are_said_and_do_not_pass(fleet: Path) -
     assert said in Path("lossy.html").read_text()
 
 
+def test_the_worst_results_of_several_units_take_turns(fleet: Path) -> None:
+    person = sr.Footprint.box(1, 0, 2, 1)
+    for number in range(3):
+        with sr.Recorder(f"logs/force-{number}.mcap", units={"": "m", "force": "N"}) as recorder:
+            cart = sr.Footprint.box(0, 0, 1 - number / 10, 1)
+            recorder.write(sr.Sample(0, {"cart": cart, "person": person}, {"force": 20.0 + number}))
+    Path("two.spatial").write_text("spec soft = G (force <= 5)\nspec apart = G (cart dist person >= 0.5)")
+    done = batch("logs/force-*.mcap", "--spec", "two.spatial")
+    worst = [line.split("robustness ")[1] for line in done.out.splitlines() if "violated, robustness" in line]
+    assert worst == ["-17 N", "-0.5 m", "-16 N", "-0.4 m", "-15 N", "-0.3 m"]
+
+
 def test_an_interrupted_recording_is_said(fleet: Path) -> None:
     with suppress(KeyboardInterrupt), sr.Recorder("stopped.mcap") as recorder:
         recorder.write(sr.Sample(0, {name: sr.Footprint.box(0, 0, 1, 1) for name in ("cart", "person")}))
