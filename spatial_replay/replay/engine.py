@@ -85,7 +85,7 @@ class Dropped:
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What a reader of the log should know of its recording."""
+        """The losses and an interruption in words, for readers of the log."""
         ended = "the recording was interrupted" if self.was_interrupted else ""
         return tuple(filter(None, (self.text, ended)))
 
