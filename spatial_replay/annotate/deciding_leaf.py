@@ -107,18 +107,20 @@ def find_leaf(
 
     Args:
         ends: (A,) low and high end of each of the program's leaves in that sample.
-        number: of the node; an infinite one identifies no leaf.
+        number: of the node; NaN finds the first that is unknown, an infinite one identifies no leaf.
         low: whether the number is the low end of the node's interval, or the high one.
     """
-    if not np.isfinite(number):
+    if np.isinf(number):
         return None
     lows, highs = (end[below.indices] for end in ends)
     own = np.where((below.signs > 0.0) == low, lows, highs)
-    hits = np.flatnonzero(own * below.signs == number)
+    is_unknown = (lows == -np.inf) & (highs == np.inf)
+    hits = np.flatnonzero(is_unknown if np.isnan(number) else own * below.signs == number)
     if not len(hits):
         return None
     end = End.LOW if (below.signs[hits[0]] > 0.0) == low else End.HIGH
-    return LeafValue(int(below.indices[hits[0]]), float(own[hits[0]]) + 0.0, end)
+    shown = number if np.isnan(number) else float(own[hits[0]]) + 0.0
+    return LeafValue(int(below.indices[hits[0]]), shown, end)
 
 
 def _columns(entries: Sequence[tuple[int, int]]) -> LeavesBelow:

@@ -44,8 +44,8 @@ from spatial_replay.trace.sample import LATEST_NS
 LASTING: Final = 3
 """Samples in a row that a sign must last."""
 
-START, HOLDING, FAILING, SATISFIED, VIOLATED = 0, 1, 2, 3, 4
-"""Nothing known yet; pending, with a value of at least 0; pending, below 0; and the final ones."""
+START, HOLDING, FAILING, UNKNOWN, SATISFIED, VIOLATED = 0, 1, 2, 3, 4, 5
+"""Nothing known yet; pending, with a value of at least 0, or below 0; unknown again; and the final ones."""
 
 OF_CURRENT, OF_CANDIDATE = -1, -2
 """In place of a sample of the block: the worst sample lies before it and is part of the state."""
@@ -181,21 +181,19 @@ def _track(
         for t in range(times_ns.shape[0]):
             if state[_CODE] >= SATISFIED:
                 break
-            code, number = START, value[t]
+            code, number = START if state[_CODE] == START else UNKNOWN, np.inf
             if settles and lower[t] >= 0.0:
                 code, number = SATISFIED, lower[t]
             elif settles and upper[t] < 0.0:
                 code, number = VIOLATED, upper[t]
             elif value[t] >= 0.0:
-                code = HOLDING
+                code, number = HOLDING, value[t]
             elif value[t] < 0.0:
-                code = FAILING
-            if code == state[_CODE] or code == START:
-                state[_COUNT] = 0
-                if code != START:
-                    state[_UNTIL] = times_ns[t]
-                    if number < worst[k, 0]:
-                        worst[k, 0], places[k, 0] = number, t
+                code, number = FAILING, value[t]
+            if code == state[_CODE]:
+                state[_COUNT], state[_UNTIL] = 0, times_ns[t]
+                if number < worst[k, 0]:
+                    worst[k, 0], places[k, 0] = number, t
                 continue
             if state[_COUNT] == 0 or state[_NEXT] != code:
                 state[_NEXT], state[_COUNT], state[_NEXT_SINCE] = code, 0, times_ns[t]
@@ -222,6 +220,7 @@ def _track(
 _NOW: Final[Mapping[int, str]] = {
     HOLDING: "holds so far",
     FAILING: "is pending",
+    UNKNOWN: "is unknown",
     SATISFIED: "is satisfied, whatever comes",
     VIOLATED: "is violated, whatever comes",
 }
@@ -233,6 +232,8 @@ def leaf_words(text: str, number: float, amount: str, *, past: bool = False) -> 
     Args:
         amount: the number without its sign, in words.
     """
+    if math.isnan(number):
+        return f"`{text}` {'was' if past else 'is'} unknown"
     holds, fails = ("held", "failed") if past else ("holds", "fails")
     how = holds if number >= 0.0 else fails
     if math.isinf(number):
@@ -276,22 +277,17 @@ def end_sentence(title: str, verdict: Verdict, ends: tuple[float, float], witnes
     return f"{title} is {verdict}{amount}, for the log has ended{because}."
 
 
-def past_sentence(before: Period, unknown_ns: int, until_ns: int, witness: str, unit: str) -> str:
-    """Return a sentence on the period before, until another began.
-
-    Args:
-        unknown_ns: from when on nothing was known, if that is before `until_ns`.
-    """
-    seconds = time_text(min(unknown_ns, until_ns), before.start_ns)
-    unknown = f", then unknown for {time_text(until_ns, unknown_ns)}" if unknown_ns < until_ns else ""
-    if before.code == FAILING:
-        return f"Before, it was pending for {seconds}{unknown}."
+def past_sentence(before: Period, until_ns: int, witness: str, unit: str) -> str:
+    """Return a sentence on the period before, until another began."""
+    seconds = time_text(until_ns, before.start_ns)
+    if before.code in (FAILING, UNKNOWN):
+        return f"Before, it was {'pending' if before.code == FAILING else 'unknown'} for {seconds}."
     worst = ""
     if witness:
         worst = f"; its worst was that {witness}"
     elif math.isfinite(before.worst):
         worst = f", by {with_unit(abs(before.worst), unit)} or more"
-    return f"Before, it held for {seconds}{unknown}{worst}."
+    return f"Before, it held for {seconds}{worst}."
 
 
 class ReportedNode(NamedTuple):
@@ -395,7 +391,6 @@ class EventReporter:
         self._states = NodeStates.begin(len(self._reported))
         self._carried: dict[tuple[int, int], LeafValue | None] = {}
         self._last_ns: int | None = None
-        self._unknown_ns = np.full(len(self._reported), LATEST_NS)
         self.settled: SettledViolation | None = None
         self.violated_ns = LATEST_NS
         self.over = ""
@@ -419,8 +414,6 @@ class EventReporter:
                 period = Period(code, 0, 0, float(tracked.states.worst[node, slot]), place)
                 carried[node, (OF_CURRENT, OF_CANDIDATE)[slot]] = self._deciding_leaf(node, period, block)
         self._carried = carried
-        for node in range(len(self._reported)):
-            self._unknown_ns[node] = self._after(node, tracked.states.period(node).end_ns, block)
         self._last_ns = int(block.times_ns[-1])
         return events
 
@@ -462,16 +455,9 @@ class EventReporter:
         leaves = block.leaves[:, :, period.place]
         low, high = low_and_high(len(leaves), wide=period.code in (SATISFIED, VIOLATED))
         ends = leaves[low], leaves[high]
-        found = find_leaf(self._reported[node].below, ends, period.worst, low=period.code != VIOLATED)
+        number = math.nan if period.code == UNKNOWN else period.worst
+        found = find_leaf(self._reported[node].below, ends, number, low=period.code != VIOLATED)
         return found and found._replace(time_ns=int(block.times_ns[period.place]))
-
-    def _after(self, node: int, time_ns: int, block: SeriesBlock) -> int:
-        """Return the sample after the last of a node in its state; `LATEST_NS` if there is none yet."""
-        if self._last_ns is not None and time_ns < self._last_ns:
-            return int(self._unknown_ns[node])
-        return int(
-            np.append(block.times_ns, LATEST_NS)[np.searchsorted(block.times_ns, time_ns, side="right")]
-        )
 
     def _event(self, change: Change, block: SeriesBlock) -> EncodedEvent:
         reported, after, before = self._reported[change.node], change.after, change.before
@@ -496,8 +482,7 @@ class EventReporter:
         past = None
         if before is not None:
             worst = self._words(self._deciding_leaf(change.node, before, block), time_ns, past=True)
-            unknown_ns = self._after(change.node, before.end_ns, block)
-            said = past_sentence(before, unknown_ns, after.start_ns, worst, reported.unit)
+            said = past_sentence(before, after.start_ns, worst, reported.unit)
             past = PeriodText(before, worst, said)
         return self._encoded(reported, time_ns, now, past)
 
@@ -514,9 +499,9 @@ class EventReporter:
         sentence = end_sentence(reported.title, verdict, (lower, upper), because, reported.unit)
         now = PeriodText(after, witness, sentence, decided)
         past = None
-        if before.code != START and before.start_ns < last_ns:
+        if before.code not in (START, after.code) and before.start_ns < last_ns:
             worst = self._words(self._carried[node, OF_CURRENT], time_ns, past=True)
-            said = past_sentence(before, int(self._unknown_ns[node]), last_ns, worst, reported.unit)
+            said = past_sentence(before, last_ns, worst, reported.unit)
             past = PeriodText(before, worst, said)
         return self._encoded(reported, time_ns, now, past)
 
@@ -620,8 +605,8 @@ class EventReporter:
         }
 
     def _facts_of(self, period: Period, witness: str, suffix: str) -> dict[str, str]:
-        if period.code == START:
-            return {"verdict": "unknown"}
+        if period.code in (START, UNKNOWN):
+            return {f"verdict{suffix}": "unknown"}
         sign = "positive" if period.code in (HOLDING, SATISFIED) else "negative"
         verdict = "pending"
         if not self._settles or period.code in (SATISFIED, VIOLATED):
@@ -678,7 +663,7 @@ def _stamp(time_ns: int) -> Timestamp:
 _ENDED: Final[Mapping[Verdict, int]] = {
     Verdict.SATISFIED: SATISFIED,
     Verdict.VIOLATED: VIOLATED,
-    Verdict.UNKNOWN: START,
+    Verdict.UNKNOWN: UNKNOWN,
 }
 """The state of a node when the log has ended."""
 
@@ -688,6 +673,7 @@ _LEVELS: Final[Mapping[int, Log.Level.ValueType]] = {
     START: Log.WARNING,
     HOLDING: Log.INFO,
     FAILING: Log.INFO,
+    UNKNOWN: Log.WARNING,
     SATISFIED: Log.INFO,
     VIOLATED: Log.ERROR,
 }

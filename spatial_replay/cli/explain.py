@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
@@ -24,11 +23,9 @@ from spatial_replay.cli.output import MANY, VERDICT_COLOURS, counts_text, others
 from spatial_replay.cli.terminal import (
     Coloured,
     Line,
-    fitted,
     progress,
     show,
     show_json,
-    terminal_width,
     warn,
 )
 from spatial_replay.errors import UsageError
@@ -112,20 +109,16 @@ def explain(request: EvaluationArguments, result: str, at: str | None, as_json: 
                 [others_text(others, [str(verdict_of(each, node, goes_on=goes_on)) for each in others])]
             )
         for number, lines in enumerate(texts):
-            show(*([""] if number else []), *(_lines_on_terminal(lines) if sys.stdout.isatty() else lines))
+            show(*([""] if number else []), *map(_coloured, lines))
     verdicts = [each.verdict for each in results]
     verdicts += [v for each in others if (v := verdict_of(each, node, goes_on=goes_on)) is not None]
     return exit_code_from_verdicts(verdicts, bool(replayed.faults))
 
 
-def _lines_on_terminal(lines: Sequence[str]) -> Iterator[Line]:
-    """Yield lines that fit onto the terminal, with verdicts in their colours."""
-    for part in fitted(lines, terminal_width()):
-        pieces = re.split(_VERDICT, part)
-        yield tuple(
-            Coloured(piece, VERDICT_COLOURS[piece]) if number % 2 else piece
-            for number, piece in enumerate(pieces)
-        )
+def _coloured(line: str) -> Line:
+    """Return a line with verdicts in their colours."""
+    pieces = enumerate(re.split(_VERDICT, line))
+    return tuple(Coloured(piece, VERDICT_COLOURS[piece]) if number % 2 else piece for number, piece in pieces)
 
 
 _VERDICT: Final = re.compile(r"(?<=is )(satisfied|violated|unknown)\b")

@@ -17,13 +17,11 @@ from spatial_replay.cli.application import ExitCode
 from spatial_replay.cli.options import JsonCommand, LogPath, input_files, output_option, reading_options
 from spatial_replay.cli.output import MANY, WORST_FIRST, counts_text
 from spatial_replay.cli.terminal import (
-    fitted,
     printing_to,
     progress,
     show,
     show_file,
     show_json,
-    terminal_width,
     warn,
 )
 from spatial_replay.errors import UsageError
@@ -189,7 +187,7 @@ def _print_decisions(log: LogFile, as_json: bool) -> int:
     if as_json:
         show_json(recorded.document)
     else:
-        show(*fitted(recorded.lines(), terminal_width()))
+        show(*recorded.lines())
     return ExitCode.DAMAGED if recorded.faults else ExitCode.SATISFIED
 
 

@@ -30,7 +30,7 @@ from spatial_replay.cli.record import (
     show_film,
     simulation_options,
 )
-from spatial_replay.cli.terminal import fitted, progress, show, show_json, terminal_width, warn
+from spatial_replay.cli.terminal import progress, show, show_json, terminal_width, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import LogFile, local_files
 from spatial_replay.mapping.yaml_document import schema_of
@@ -118,8 +118,7 @@ def _redo(
     if as_json:
         show_json(redone.document)
     else:
-        width = terminal_width()
-        show(*fitted(redone.lines(width), width))
+        show(*redone.lines(terminal_width()))
         if output is not None:
             show(f"wrote {output}: {shlex.join(['spatial-replay', 'report', str(output)])} shows both")
     code = ExitCode.VIOLATED if redone.is_different else ExitCode.SATISFIED

@@ -53,19 +53,31 @@ _LEAST_WIDTH: Final = 60
 def show(*lines: Line, err: bool = False) -> None:
     """Print lines, with escapes such as `\\x1b` in place of what is not printable.
 
+    Lines that are too long for a terminal are cut at spaces.
+
     Args:
         lines: each without its end; a line end within is escaped.
         err: print to standard error.
     """
     for line in lines:
         pieces = (line,) if isinstance(line, (str, Coloured)) else line
-        click.echo("".join(map(_piece, pieces)), err=err, color=False if os.environ.get("NO_COLOR") else None)
+        whole = "".join(escaped(each.text if isinstance(each, Coloured) else each) for each in pieces)
+        first, *rest = [whole]
+        if (sys.stderr if err else sys.stdout).isatty():
+            first, *rest = _fitted(whole)
+        styled = "\n".join([_styled(pieces, len(first)), *rest])
+        click.echo(styled, err=err, color=False if os.environ.get("NO_COLOR") else None)
 
 
-def _piece(piece: str | Coloured) -> str:
-    if isinstance(piece, Coloured):
-        return click.style(escaped(piece.text), fg=_HUES[piece.colour], bold=True)
-    return escaped(piece)
+def _styled(pieces: Iterable[str | Coloured], most: int) -> str:
+    """Return the first characters of a line, in colours."""
+    styled = ""
+    for piece in pieces:
+        text = escaped(piece.text if isinstance(piece, Coloured) else piece)[:most]
+        most -= len(text)
+        colour = _HUES[piece.colour] if isinstance(piece, Coloured) else None
+        styled += text if colour is None else click.style(text, fg=colour, bold=True)
+    return styled
 
 
 class StatusLine:
@@ -93,17 +105,13 @@ def terminal_width() -> int:
     return shutil.get_terminal_size((100, 24)).columns
 
 
-def fitted(lines: Iterable[str], width: int) -> Iterator[str]:
-    """Yield lines cut at spaces, so that they fit into a width; the rest of a line is indented."""
-    for line in lines:
-        indent = " " * (len(line) - len(line.lstrip(" ")) + 4)
-        yield from wrap(
-            line,
-            max(width, _LEAST_WIDTH),
-            subsequent_indent=indent,
-            break_long_words=False,
-            break_on_hyphens=False,
-        ) or [line]
+def _fitted(line: str) -> list[str]:
+    """Return a line cut at spaces, so that it fits into the terminal; the rest is indented."""
+    indent = " " * (len(line) - len(line.lstrip(" ")) + 4)
+    width = max(terminal_width(), _LEAST_WIDTH)
+    return wrap(line, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False) or [
+        line
+    ]
 
 
 def show_json(value: Any, indent: int | None = 2) -> None:
@@ -243,9 +251,16 @@ def _started(label: str, total: int | None, done: int) -> Progress | None:
     # importing rich would take a quarter of the time of `--help`
     from rich.console import Console
     from rich.errors import LiveError
-    from rich.progress import Progress
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-    shown = Progress(console=Console(stderr=True), transient=True)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        # the share or, of work whose end is not known, the steps that are done
+        TaskProgressColumn(text_format_no_percentage="{task.completed:,.0f}"),
+        TimeRemainingColumn(),
+    )
+    shown = Progress(*columns, console=Console(stderr=True), transient=True)
     shown.add_task(label, total=total, completed=done)
     try:
         shown.start()

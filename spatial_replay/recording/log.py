@@ -21,6 +21,7 @@ from spatial_replay.annotate.events import (
     FAILING,
     HOLDING,
     SATISFIED,
+    UNKNOWN,
     VIOLATED,
     NodeStates,
     change_sentence,
@@ -502,7 +503,13 @@ def _tracked(kind: int, x: float) -> TrackedObject:
     return TrackedObject(footprint, class_name="thing", yaw=x, height=(0.0, 1.0), uncertainty=0.01)
 
 
-_WORDS: Final = {HOLDING: "holds", FAILING: "pending", SATISFIED: "satisfied", VIOLATED: "violated"}
+_WORDS: Final = {
+    HOLDING: "holds",
+    FAILING: "pending",
+    UNKNOWN: "unknown",
+    SATISFIED: "satisfied",
+    VIOLATED: "violated",
+}
 
 
 class VerdictChange(NamedTuple):

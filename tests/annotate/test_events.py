@@ -354,11 +354,13 @@ def test_a_goal_that_is_still_to_come_is_neither_pointed_at_nor_red(tmp_path):
     assert ended["verdict"].texts[0].text == "delivered violated"
 
 
-def test_time_in_which_nothing_was_known_is_not_called_held(tmp_path):
-    found = events_at_end(tmp_path, "spec kept = G battery >= 0", 2.0, 1.0, None, None, None)
-    assert "Before, it held for 0.200 s, then unknown for 0.200 s;" in found[-1][2].message
-    found = events_of(tmp_path, "spec kept = G battery >= 0", 2.0, 1.0, None, -1.0)
-    assert "Before, it held for 0.200 s, then unknown for 0.100 s;" in found[-1][2].message
+def test_a_result_that_becomes_unknown_is_an_event(tmp_path):
+    values = (2.0, 1.0, None, None, None, 1.0, 3.0)
+    said = [each[2].message for each in events_of(tmp_path, "spec full = F battery >= 3", *values)]
+    assert said == [
+        "`full` is unknown: `battery >= 3` is unknown. Before, it was pending for 0.200 s.",
+        "`full` is satisfied, whatever comes: `battery >= 3` just holds. Before, it was unknown for 0.400 s.",
+    ]
 
 
 def test_an_uncertain_atom_has_one_number_everywhere(tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -235,3 +236,12 @@ def test_on_a_terminal_lines_fit_and_verdicts_have_colours_for_black_and_for_whi
     assert max(map(len, plain.splitlines())) <= 72
     piped = run_program(*EXPLAIN, cwd=folder).stdout
     assert plain.split() == piped.split()
+
+
+def test_every_command_keeps_words_and_numbers_whole_on_a_terminal(folder: Path) -> None:
+    for command in (REPLAY, ("info", "run.jsonl"), ("doctor", "run.spatial")):
+        shown = written_on_terminal((*PROGRAM, *command), folder, {"COLUMNS": "72"})
+        lines = re.sub(r"\x1b\[[\d;]*m", "", shown).splitlines()
+        assert max(map(len, lines)) <= 72
+        done = run_program(*command, cwd=folder)
+        assert not Counter((done.stdout + done.stderr).split()) - Counter(" ".join(lines).split())

@@ -19,6 +19,8 @@ from spatial_replay.annotate.events import (
     LASTING,
     SATISFIED,
     START,
+    UNKNOWN,
+    VIOLATED,
     EncodedEvent,
     EventReporter,
     NodeStates,
@@ -52,10 +54,10 @@ def _expected(series: np.ndarray) -> list[tuple[int, int, int, float]]:
     codes = []
     for value, _, lower, upper in series[0].T:
         sign = START if math.isnan(value) else 1 if value >= 0 else 2
-        codes.append(3 if lower >= 0 else 4 if upper < 0 else sign)
+        codes.append(SATISFIED if lower >= 0 else VIOLATED if upper < 0 else sign)
     current, found = START, []
     for t, code in enumerate(codes):
-        if current >= SATISFIED or code in (START, current):
+        if current >= SATISFIED or code == current or (current == UNKNOWN and code == START):
             continue
         lasts = t >= LASTING - 1 and set(codes[t - LASTING + 1 : t + 1]) == {code}
         if code >= SATISFIED:
@@ -64,7 +66,9 @@ def _expected(series: np.ndarray) -> list[tuple[int, int, int, float]]:
             pass
         elif lasts:
             since = t - LASTING + 1
-            found.append((t, code, since, float(series[0, 0, since : t + 1].min())))
+            code = code or UNKNOWN
+            worst = math.inf if code == UNKNOWN else float(series[0, 0, since : t + 1].min())
+            found.append((t, code, since, worst))
         else:
             continue
         current = code
