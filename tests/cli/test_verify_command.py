@@ -13,6 +13,7 @@ import pytest
 from click.testing import CliRunner
 
 import spatial_replay as sr
+from cli.program import PROGRAM, written_on_terminal
 from planning.plans import PUSH, record_plan_of, write_usual_run
 from spatial_replay.bags import open_messages
 from spatial_replay.cli.application import application
@@ -114,10 +115,9 @@ def test_decisions_are_printed_step_by_step(tmp_path: Path) -> None:
     assert lines[-1] == "  the specification is satisfied: hold"
 
 
-def test_decisions_fit_the_terminal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "70")
+def test_decisions_fit_the_terminal(tmp_path: Path) -> None:
     write_usual_run(tmp_path / "run.mcap")
-    _, said = call("info", tmp_path / "run.mcap", "--decisions")
+    said = written_on_terminal((*PROGRAM, "info", "run.mcap", "--decisions"), tmp_path, {"COLUMNS": "70"})
     assert max(map(len, said.splitlines())) <= 70
     _, whole = call("info", tmp_path / "run.mcap", "--decisions", "--json")
     printed = " ".join(said.split())
