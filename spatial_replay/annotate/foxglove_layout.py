@@ -52,8 +52,8 @@ _MOST_PLOTS: Final = 3
 _MOST_INDICATORS: Final = 6
 """Lights in one row."""
 
-_LEGEND_PIXELS: Final = 190
-"""The width of a legend, beside the curves so that it hides none."""
+_LEGEND_PIXELS: Final = 170
+"""The width of a legend, beside the curves so that it hides none. Numbers of all digits would not fit in."""
 
 _LONGEST_LABEL: Final = 24
 """The most characters of a label: what fits into a legend."""
@@ -318,7 +318,6 @@ def _plots(name: str, title: str, curves: Sequence[_Curve]) -> list[Panel]:
             "isSynced": True,
             "showLegend": True,
             "legendDisplay": "left",
-            "showPlotValuesInLegend": True,
             "sidebarDimension": _LEGEND_PIXELS,
             "xAxisVal": "timestamp",
             "xAxisLabel": "time [s]",
