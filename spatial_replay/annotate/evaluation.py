@@ -175,7 +175,11 @@ class AnnotatedEvaluation:
         )
 
     def layout(
-        self, topics: Collection[str] = (), axes: Axes = OUR_AXES, images: Collection[str] = ()
+        self,
+        topics: Collection[str] = (),
+        axes: Axes = OUR_AXES,
+        images: Collection[str] = (),
+        planned_for: str = "",
     ) -> Attachment:
         """Return the layout that opens the log in a viewer, once everything else is written.
 
@@ -183,10 +187,11 @@ class AnnotatedEvaluation:
             topics: those of messages that are not derived from samples.
             axes: those of the source.
             images: those of the topics that have images.
+            planned_for: the file that decisions were made for, if these results are of another one.
         """
         from spatial_replay.annotate.foxglove_layout import layout_attachment
 
-        contents = self.contents(self._extent, topics, axes, images)
+        contents = self.contents(self._extent, topics, axes, images)._replace(planned_for=planned_for)
         if not self._has_samples:
             return layout_attachment(contents._replace(has_states=[False] * len(self.trees), topics=topics))
         return layout_attachment(contents._replace(outcomes=self._annotator.standing.outcomes))

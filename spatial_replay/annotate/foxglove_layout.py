@@ -82,7 +82,9 @@ class Panel(NamedTuple):
     config: Config
 
 
-def scene_panel(camera: Mapping[str, Any], topics: Collection[str], axes: Axes = OUR_AXES) -> Panel:
+def scene_panel(
+    camera: Mapping[str, Any], topics: Collection[str], axes: Axes = OUR_AXES, planned_for: str = ""
+) -> Panel:
     """Return the scene from above, with the planner's map below it and its path above.
 
     A viewer can show the planner's redone decisions instead.
@@ -103,7 +105,8 @@ def scene_panel(camera: Mapping[str, Any], topics: Collection[str], axes: Axes =
         "scene": {"labelScaleFactor": 1, "transforms": {"showLabel": False, "axisScale": 0}},
         "transforms": {f"frame:{frame}": {"visible": False} for frame in FRAMES},
     }
-    legend = " (map: dark blue fails, grey is 0, yellow holds)" if GRADIENT_MAP in topics else ""
+    of = f" of {planned_for} as recorded" if planned_for else ""
+    legend = f" (map{of}: dark blue fails, grey is 0, yellow holds)" if GRADIENT_MAP in topics else ""
     return _titled("3D!scene", f"Scene{legend}" if axes == OUR_AXES else f"Scene{legend}, {axes}", config)
 
 
@@ -223,10 +226,11 @@ def automaton_text(tree: ReportedTree) -> Panel:
     return _titled("RawMessages!automaton", f"Automaton of {tree.title}", config)
 
 
-def decision_reason() -> Panel:
+def decision_reason(planned_for: str) -> Panel:
     """Return the reason of the planner's decision."""
     config = {"topicPath": f"{PLAN_DECISION}.reason"}
-    return _titled("RawMessages!decision", "Why the planner decided so", config)
+    of = f", for {planned_for} as recorded" if planned_for else ""
+    return _titled("RawMessages!decision", f"Why the planner decided so{of}", config)
 
 
 def image_panels(images: Sequence[str], topics: Collection[str]) -> list[Panel]:
@@ -365,6 +369,7 @@ class LayoutContents(NamedTuple):
         outcomes: of each tree, what it came to; empty while that can change.
         order: the places of the trees, the worst first; empty while that is not known.
         images: the topics with images.
+        planned_for: the file that the planner's decisions were made for, if these results are of another one.
     """
 
     trees: Sequence[ReportedTree]
@@ -376,6 +381,7 @@ class LayoutContents(NamedTuple):
     outcomes: Sequence[FinalStanding] = ()
     images: Sequence[str] = ()
     order: Sequence[int] = ()
+    planned_for: str = ""
 
     def worst_first(self) -> LayoutContents:
         """Return the same with the worst results first, which then have lights and curves if not all can."""
@@ -453,7 +459,7 @@ def _details(contents: LayoutContents) -> _Details:
     if any(contents.has_states):
         details.append(("automaton", automaton_text(trees[contents.has_states.index(True)])))
     if PLAN_DECISION in contents.topics:
-        details.append(("decision", decision_reason()))
+        details.append(("decision", decision_reason(contents.planned_for)))
     cameras = image_panels(contents.images, contents.topics)
     return details + [(each.config["foxglovePanelTitle"].lower(), each) for each in cameras]
 
@@ -472,7 +478,7 @@ def _layout(
         below: what is under the scene.
     """
     lights = indicators(contents.trees, contents.outcomes)
-    scene = scene_panel(_camera(contents.extent), contents.topics, contents.axes)
+    scene = scene_panel(_camera(contents.extent), contents.topics, contents.axes, contents.planned_for)
     panels = [*lights, scene]
     left: list[tuple[_Tree, float]] = [(scene.identifier, 7.0)]
     if below is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,7 +19,7 @@ from spatial_replay.annotate.specification import (
     logged_specifications,
     specification_attachments,
 )
-from spatial_replay.errors import UsageError
+from spatial_replay.errors import SpecificationError, UsageError
 from spatial_replay.logs.messages import Attachment, Block, Messages, Sink, merge
 from spatial_replay.logs.source import Source, axes_of, read_ahead, reading_options
 from spatial_replay.logs.topics import (
@@ -53,8 +53,9 @@ from spatial_replay.replay.selection import (
     first_sample_ns,
 )
 from spatial_replay.spec.diagnostics import Diagnostic
+from spatial_replay.spec.format import format_specification
 from spatial_replay.spec.formula import Specification
-from spatial_replay.spec.load import SpecificationText, load_specifications
+from spatial_replay.spec.load import SpecificationText, load_specifications, parse_specification
 from spatial_replay.text import Instant, Sentence, counted, counted_from
 from spatial_replay.trace.sample import FOREVER
 from spatial_replay.trace.trace import LONG_PAUSE, Trace
@@ -253,7 +254,8 @@ class Replay:
 
     def layout(self) -> Attachment:
         """Return the viewer layout of the annotated log; call it after `run`."""
-        return self._evaluation.layout(self._topics, axes_of(self._source), self._images)
+        planned = planned_for(self._source, self.files)
+        return self._evaluation.layout(self._topics, axes_of(self._source), self._images, planned)
 
     def _evaluated(self, *, messages: bool) -> Generator[tuple[Block, Trace, list[SeriesBlock]], None, None]:
         """Yield each block with its samples and their evaluation."""
@@ -423,6 +425,18 @@ def replayed_specs(
 
 _REPLACED = (REPLAYED_PREFIX, AUTOMATA_PREFIX + REPLAYED_PREFIX)
 """Prefixes of the attachments that a replay replaces."""
+
+
+def planned_for(source: Source, files: Sequence[Specification]) -> str:
+    """Return the name of the file that decisions were made for, if none of these says the same; else ""."""
+    name = dict(source.metadata()).get(PLAN_METADATA, {}).get("file", "")
+    recorded = {each.name: each.data.decode("utf-8", "replace") for each in source.attachments()}
+    text = recorded.get(RECORDED_PREFIX + name)
+    with suppress(SpecificationError):
+        evaluated = [format_specification(each) for each in files]
+        if text is not None and format_specification(parse_specification(text)) not in evaluated:
+            return name
+    return ""
 
 
 def run_replay(

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -17,7 +16,7 @@ from typing import Final
 import numpy as np
 
 from spatial_replay.annotate.specification import unit_of
-from spatial_replay.errors import SpecificationError, UsageError
+from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs import topics as log_topics
 from spatial_replay.logs.messages import Messages
@@ -27,7 +26,7 @@ from spatial_replay.logs.source import Source, axes_of
 from spatial_replay.monitor.sentences import divisor_of, gap_sentence, open_text
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.monitor.witness.witness import Witness, WitnessStep
-from spatial_replay.replay.engine import Replay, Replayed
+from spatial_replay.replay.engine import Replay, Replayed, planned_for
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions
 from spatial_replay.report.data import Pointer, ReportedResult, RunReport, worst_results
 from spatial_replay.report.page import page
@@ -40,9 +39,7 @@ from spatial_replay.report.panels import (
     event_of,
     pictures_of,
 )
-from spatial_replay.spec.format import format_specification
 from spatial_replay.spec.formula import Formula, Quantified, Specification, iter_nodes
-from spatial_replay.spec.load import parse_specification
 from spatial_replay.spec.relations import RELATION_NAMES
 from spatial_replay.spec.walks import units_of
 
@@ -182,20 +179,8 @@ def _report(source: Source, replay: Replay, replayed: Replayed, collector: Colle
         scene=collector.scene.scene,
         events=tuple(collector.events),
         decisions=collector.decisions.decisions,
-        planned_for=_planned_for(source, replay.files),
+        planned_for=planned_for(source, replay.files),
     )
-
-
-def _planned_for(source: Source, files: Sequence[Specification]) -> str:
-    """Return the name of the file that decisions were made for, if none of these says the same; else ""."""
-    name = dict(source.metadata()).get(log_topics.PLAN_METADATA, {}).get("file", "")
-    recorded = {each.name: each.data.decode("utf-8", "replace") for each in source.attachments()}
-    text = recorded.get(log_topics.RECORDED_PREFIX + name)
-    with suppress(SpecificationError):
-        evaluated = [format_specification(each) for each in files]
-        if text is not None and format_specification(parse_specification(text)) not in evaluated:
-            return name
-    return ""
 
 
 def _results(

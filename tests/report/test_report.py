@@ -298,7 +298,12 @@ def test_decisions_for_another_specification_are_marked_so(tmp_path: Path) -> No
     for name, is_marked in (("push.spatial", False), ("push_edited.spatial", True)):
         report_of_recording(tmp_path / "run.html", "push.mcap", name)
         said = "made for another specification: push.spatial" in (tmp_path / "run.html").read_text("utf-8")
-        assert said == is_marked
+        annotated = tmp_path / f"{name}.mcap"
+        source = open_source(RECORDINGS / "push.mcap")
+        run_replay(source, load_files([RECORDINGS / name], source), output=annotated)
+        layout = next(each for each in open_source(annotated).attachments() if each.name == "layout.json")
+        marked = (b"decided so, for push.spatial as recorded", b"(map of push.spatial as recorded: dark blue")
+        assert said == is_marked == all(each in layout.data for each in marked)
 
 
 def test_the_automaton_is_drawn_as_it_leads_on(planned: Page) -> None:
