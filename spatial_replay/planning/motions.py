@@ -820,6 +820,11 @@ class MotionOrder:
         # what is picked up or pushed again needs room
         room = np.minimum(maps.clearance, gradient.clearance)
         roomy = good & (room >= settings.room)
+        if settings.skill == "place":
+            # where a constraint nearly holds, the next motion may have to stop
+            spare = settings.constraint_margin + 2.0 * now.grid.cell_size
+            far = roomy & (danger_of(maps, later[1]) < -spare)
+            roomy = far if far.any() else roomy
         (blocked,) = covered
         beside = scene.sample.objects[blocked]
         if is_beside and isinstance(beside, TrackedObject):

@@ -334,6 +334,13 @@ def test_scenes_of_the_campaign_end_as_they_should(campaign, kind):
         assert campaign.is_as_wanted(task, campaign.run(task))
 
 
+@pytest.mark.parametrize("seed", [9, 15, 21])
+def test_a_swap_that_is_always_kept_apart_takes_three_motions(campaign, seed):
+    random = np.random.default_rng([seed, list(campaign.KINDS).index("swapped_apart")])
+    ended = campaign.run(campaign.KINDS["swapped_apart"](random))
+    assert (ended.motions, ended.verdict, ended.violated) == (3, "satisfied", False)
+
+
 @pytest.mark.parametrize(
     "title",
     [
