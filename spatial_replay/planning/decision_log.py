@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import re
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import accumulate, pairwise
@@ -554,12 +553,9 @@ def decision_lines(decision: PlanDecision) -> Iterator[str]:
     """Yield lines about one decision."""
     states = ", ".join(map(str, decision.states))
     yield f"step {decision.number} at {time_text(decision.time_ns)}, state {states}"
+    yield f"  {decision.reason}"
     if decision.HasField("target"):
-        yield f"  {why_text(decision)}"
-        yield f"  {choice_text(decision)}"
         yield f"  {_target_text(decision.target)}{_once_all_are_done(decision.considered[-1])}"
-    else:
-        yield f"  {decision.reason}"
     said: dict[tuple[str, ...], str] = {}
     for place, edge in enumerate(decision.considered, 1):
         yield from _edge_lines(edge, said, is_aim=place == len(decision.considered) and not edge.pruned)
@@ -573,61 +569,9 @@ def decision_lines(decision: PlanDecision) -> Iterator[str]:
         yield f"  {how} at {time_text(outcome.end_ns)}: {outcome.reason}; state {after}"
 
 
-def why_text(decision: PlanDecision) -> str:
-    """Return why an object is moved, and why this one where another could be; "" if none is."""
-    if not (decision.HasField("target") and decision.considered):
-        return ""
-    aim, name = decision.considered[-1], decision.target.object
-    later = [each.object for each in aim.motions[1:] if each.object != name]
-    wanted = [text for guard in aim.progress[:1] for text in _wanted(guard, aim.constraints)]
-    chosen = next((each for each in aim.candidates if each.chosen), PlanCandidate())
-    relations = [each.text for each in chosen.conjuncts] or wanted
-    is_named = [re.search(rf"\b{re.escape(name)}\b", each) is not None for each in relations]
-    if later and aim.joint and (name in [each.object for each in aim.motions[1:]] or not any(is_named)):
-        return f"{name} goes aside: {later[0]} has to pass"
-    own = [each for each in wanted if re.search(rf"\b{re.escape(name)}\b", each)]
-    why = f"{name} moves: {' and '.join(own or wanted) or 'a relation must not hold'}"
-    rivals = [each for each in aim.candidates if each.HasField("target") and not each.chosen]
-    if aim.joint or not rivals:
-        return f"{why} is wanted" if own or wanted else why
-    pushes, other = decision.reason.startswith("push"), rivals[0]
-    costs = [_length(each) if pushes else -each.robustness for each in (decision.target, other.target)]
-    how = "a longer way" if pushes else "less robustness"
-    if costs[0] > costs[1]:
-        how = f"{'a shorter way' if pushes else 'more robustness'}, but no motions lead on from there"
-    numbers = f"{abs(costs[1]):.3g}, here {abs(costs[0]):.3g}"
-    return f"{why} is wanted; {other.object} could do it with {how} ({numbers})"
-
-
-def _wanted(progress: PlanGuard, constraints: Iterable[PlanGuard]) -> list[str]:
-    """Return what has to hold of a conjunction, without what always has to."""
-    parts, depth = [""], 0
-    for word in progress.text.split(" "):
-        if word == "and" and not depth:
-            parts.append("")
-            continue
-        depth += word.count("(") - word.count(")")
-        parts[-1] = f"{parts[-1]} {word}".lstrip()
-    always = {
-        number
-        for each in constraints
-        if len(each.propositions) == 1
-        for number, value in zip(each.propositions, each.values, strict=False)
-        if not value
-    }
-    literals = zip(parts, progress.propositions, progress.values, strict=False)
-    return [part for part, number, value in literals if value and number not in always]
-
-
 def _once_all_are_done(edge: PlanEdge) -> str:
     """Return when a target has its robustness, of several motions for one edge."""
     return f" once all {len(edge.motions)} motions are done" if edge.joint and len(edge.motions) > 1 else ""
-
-
-def choice_text(decision: PlanDecision) -> str:
-    """Return what is done, without what has to hold next, which is in the decision's edges."""
-    aim = _either([guard.text for edge in decision.considered[-1:] for guard in edge.progress])
-    return decision.reason.removesuffix(f": {aim}")
 
 
 def _edge_lines(edge: PlanEdge, said: dict[tuple[str, ...], str], *, is_aim: bool) -> Iterator[str]:

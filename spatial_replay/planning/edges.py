@@ -24,6 +24,7 @@ from spatial_replay.planning.decisions import Consideration, Edge, Guards, Outco
 from spatial_replay.planning.maps import Cube, concerns
 from spatial_replay.planning.settings import Settings
 from spatial_replay.spec.formula import Boolean, Formula, Outline, Specification, Truth, expand
+from spatial_replay.spec.walks import iter_formulas
 from spatial_replay.trace.sample import Sample
 from spatial_replay.trace.trace import Trace
 
@@ -122,7 +123,7 @@ Symbol: TypeAlias = tuple[bool | None, ...]
 """The value of each proposition; None if it is unknown."""
 
 MOST_MOTIONS: Final = 100
-"""The most motions for an edge, successful ones included."""
+"""The most motions for an edge, successful and refused ones included."""
 _TURNED: Final = math.radians(10.0)
 """By how much an object that stands as before may be turned."""
 BESIDE: Final = 1.5
@@ -166,6 +167,15 @@ def refuse_template(specification: Specification, name: str) -> None:
                 f"{name}({spec.parameter}) in {specification.filename} is a template: its objects are not "
                 "known before the end of a log; plan for a spec that names its objects"
             )
+
+
+def specs_of(formula: Formula, propositions: Sequence[Formula]) -> list[list[str]]:
+    """Return for each proposition the names of the innermost specs in a formula that it is part of."""
+    parts = {
+        each.name: list(iter_formulas(each))[1:] for each in list(iter_formulas(formula))[1:] if each.name
+    }
+    innermost = {name: inner for name, inner in parts.items() if not any(each.name for each in inner)}
+    return [[name for name, inner in innermost.items() if each in inner] for each in propositions]
 
 
 class IdleTransitions(NamedTuple):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import replace
+from typing import Final
 
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.compile import automaton as automaton_of
@@ -21,6 +22,7 @@ from spatial_replay.planning.decisions import (
     Outcome,
     Reason,
     Step,
+    Target,
 )
 from spatial_replay.planning.edges import (
     LATER,
@@ -34,16 +36,20 @@ from spatial_replay.planning.edges import (
     loss_text,
     moved_later,
     refuse_template,
+    specs_of,
     why_no_path,
     worst_state,
 )
 from spatial_replay.planning.lookahead import MOST_MAPS, Lookahead
-from spatial_replay.planning.maps import refuse_delays, refuse_unknown
+from spatial_replay.planning.maps import concerns, refuse_delays, refuse_unknown
 from spatial_replay.planning.motions import Movables, with_choice
 from spatial_replay.planning.settings import Settings, Workspace, kind_faults, refuse_faults
 from spatial_replay.spec.formula import Specification
 from spatial_replay.text import counted, named_arguments, times_apart
 from spatial_replay.trace.sample import Sample, require_sample
+
+_LONGEST_WANTED: Final = 60
+"""The most characters of a proposition that a reason shows if it has a spec to name instead."""
 
 
 @named_arguments
@@ -105,6 +111,7 @@ class Planner:
         self._regions = specification.regions
         self._formulas = [each.formula for each in self.automaton.propositions]
         refuse_delays(self._formulas)
+        self._specs = specs_of(formula, self._formulas)
         self._states: frozenset[int] = frozenset({self.automaton.initial})
         self._sample: Sample | None = None
         self._observer = Observer(self._formulas, specification.regions)
@@ -355,10 +362,43 @@ class Planner:
             raise UsageError("the chosen object has no target")
         self._attempts.begin(aim.edge, self._newest(), self.settings)
         verb = "push" if self.settings.skill == "push" else "place"
-        edge = f"{aim.edge[0]} -> {aim.edge[1]}: {aim.progress}"
+        edge = f"{aim.edge[0]} -> {aim.edge[1]}"
         which = f", the first of {len(aim.motions)} motions," if aim.is_joint and len(aim.motions) > 1 else ""
-        reason = f"{verb} {target.name} at ({target.x:.4g}, {target.y:.4g}){which} for the edge {edge}"
+        what = f"{verb} {target.name} at ({target.x:.4g}, {target.y:.4g}){which} for the edge {edge}"
+        reason = f"{self._why(aim, target)}. {what}"
         return replace(self._decided("execute", considered, reason), target=target)
+
+    def _why(self, aim: Consideration, target: Target) -> str:
+        """Return why an object is moved, and why this one where another one could be."""
+        name, pushes = target.name, self.settings.skill == "push"
+        wrong = (
+            [each for each in cube if self._symbol[each[0]] is not each[1]] for cube in aim.progress.cubes
+        )
+        unmet = min(wrong, key=len)
+        own = [each for each in unmet if concerns(self._formulas[each[0]], name)]
+        later = [each.name for each in aim.motions[1:]]
+        others = [each for each in later if each != name]
+        if aim.is_joint and others and (name in later or not own):
+            failed = self._attempts.failed_here(others[0], self._newest(), self.settings)
+            why = "could not be moved next to it" if failed else "has to pass"
+            return f"{name} goes aside: {others[0]} {why}"
+        wanted = " and ".join(self._wanted(*each) for each in own or unmet)
+        why = f"{name} moves{wanted and f': {wanted} is wanted'}"
+        rivals = [each.target for each in aim.candidates if each.target and not each.is_chosen]
+        if aim.is_joint or not rivals:
+            return why
+        cost, (least, rival) = _cost(target, pushes), min((_cost(each, pushes), each.name) for each in rivals)
+        how = "a longer way" if pushes else "less robustness"
+        if cost > least:
+            how = f"{'a shorter way' if pushes else 'more robustness'}, but no motions lead on from there"
+        return f"{why}; {rival} could do it with {how} ({abs(least):.3g}, here {abs(cost):.3g})"
+
+    def _wanted(self, number: int, value: bool) -> str:
+        """Return a proposition that has to hold or not, with the specs that it is of; a long one by these."""
+        text, specs = self.automaton.propositions[number].literal(value), " and ".join(self._specs[number])
+        if not specs:
+            return text
+        return specs if len(text) > _LONGEST_WANTED else f"{text} ({specs})"
 
     def _decided(self, kind: Kind, considered: Iterable[Consideration], reason: str) -> Step:
         number, self._steps = self._steps, self._steps + 1
@@ -377,3 +417,7 @@ class Planner:
         propositions = self.automaton.propositions
         labels = zip(propositions, self._symbol, strict=True)
         return ", ".join(each.label for each, value in labels if value is None)
+
+
+def _cost(target: Target, pushes: bool) -> float:
+    return target.length if pushes else -target.robustness

@@ -36,7 +36,6 @@ from spatial_replay.planning.decision_log import (
     PLAN_VERSION,
     BlackBox,
     candidate_lines,
-    choice_text,
     decision_from_payload,
     decision_lines,
     decision_rows,
@@ -573,8 +572,8 @@ class Replanned(Printed):
         else:
             old = self.recorded.message
             yield f"decision {old.number} at {at} differs"
-            yield f"  recorded  {choice_text(old)}"
-        yield f"  redone    {choice_text(new)}"
+            yield f"  recorded  {old.reason}"
+        yield f"  redone    {new.reason}"
         if new.HasField("lost") and new.lost.text:
             yield f"            at {time_text(new.lost.time_ns)}: {new.lost.text}"
         yield from _maps_side_by_side(self, (width - 13) // 2)

@@ -53,7 +53,6 @@ from spatial_replay.planning.decision_log import (
     decision_from_payload,
     latest_decisions,
     map_fields,
-    why_text,
 )
 from spatial_replay.planning.decisions import Reason
 from spatial_replay.report.compact import Packing, sentence_parts, singles
@@ -843,7 +842,7 @@ def _decision_value(
         "specification": decision.specification,
         "kind": decision.Kind.Name(decision.kind).removeprefix("KIND_").lower().replace("_", " "),
         "states": list(decision.states),
-        "reason": ". ".join(filter(None, (why_text(decision), decision.reason))),
+        "reason": decision.reason,
         "edges": [
             _edge_value(edge, edge is decision.considered[-1] and not edge.pruned)
             for edge in decision.considered

@@ -31,7 +31,6 @@ from spatial_replay.planning import (
     settings_from_text,
     text_from_settings,
 )
-from spatial_replay.planning.decision_log import decision_message, why_text
 from spatial_replay.sources import open_source
 
 TABLE = Settings(
@@ -105,15 +104,26 @@ def test_a_row_that_is_narrower_than_whole_cells_is_filled():
 
 def test_the_reason_names_the_rival_and_what_is_wanted():
     _, _, steps, _ = planned("spec s = F (a rightof c)")
-    assert why_text(decision_message(steps[0])).startswith(
-        f"{steps[0].target.name} moves: a rightof c is wanted; "
-    )
+    assert steps[0].reason.startswith(f"{steps[0].target.name} moves: a rightof c is wanted; ")
 
 
 def test_the_reason_does_not_repeat_what_always_has_to_hold():
     _, _, steps, _ = planned("spec s = (F a rightof c) and G (a dist b >= 0.01 and b dist c >= 0.01)")
-    why, _, _ = why_text(decision_message(steps[0])).partition("; ")
+    why, *_ = re.split("[;.] ", steps[0].reason)
     assert why == f"{steps[0].target.name} moves: a rightof c is wanted"
+
+
+def test_the_reason_names_the_specs_that_a_relation_is_of():
+    text = """
+    def near(x, y) = (0.2 <= x dist y <= 0.5) and (x leftof y) and (y rightof x)
+    spec tidy  = F (d leftof a)
+    spec close = F near(b, c)
+    spec s     = tidy and close
+    """
+    _, _, steps, _ = planned(text)
+    first, second = (step.reason for step in steps if step.target)
+    assert re.search("^[bc] moves: close is wanted[;.] ", first)
+    assert re.search(r"^[ad] moves: d leftof a \(tidy\) is wanted[;.] ", second)
 
 
 def test_what_is_in_the_way_is_moved_first():
@@ -161,7 +171,7 @@ def test_two_objects_change_places_by_parking_one(goal, skill):
     moved, end, steps, _ = planned(f"{SWAP}spec s = {goal}", settings, PAIR)
     assert (moved[0], moved[-1], len(moved), end) == (moved[2], moved[0], 3, "hold")
     parked = steps[0].target
-    assert why_text(decision_message(steps[0])) == f"{moved[0]} goes aside: {moved[1]} has to pass"
+    assert steps[0].reason.startswith(f"{moved[0]} goes aside: {moved[1]} has to pass. ")
     assert [each.name for each in steps[0].aim.motions] == moved
     assert (parked.x, parked.y) != (steps[2].target.x, steps[2].target.y)
 
