@@ -45,6 +45,8 @@ from spatial_replay.spec.formula import (
     Sum,
     Term,
     TrackedName,
+    operands_of,
+    operator_of,
 )
 from spatial_replay.spec.walks import (
     base_of,
@@ -208,6 +210,22 @@ def deciding_atom(scene: TraceScene, leaf: Formula, end: End) -> DecidingAtom | 
     branch = () if unknown else tuple(_branch(scene, leaf.expression, end, 1))
     found = tuple(_measured(scene, part) for _, part in branch if not isinstance(part, Number))
     return DecidingAtom(leaf, end, value, lower, upper, branch, found, unknown)
+
+
+def failed_implication(scene: TraceScene, leaf: Formula, end: End) -> tuple[Formula, Formula, bool] | None:
+    """Return the condition and the response of the outermost implication that fails below a quantifier.
+
+    The third value is whether the atom that decides the leaf is in the condition.
+    """
+    while not isinstance(leaf, Atom):
+        below = _below(scene, leaf, end)
+        if below is None:
+            return None
+        if operator_of(leaf) == "->" and _intervals(scene, [leaf])[0][1] < 0.0:
+            condition, response = operands_of(leaf)
+            return condition, response, below[0] is condition
+        leaf, end = below
+    return None
 
 
 def _intervals(scene: TraceScene, formulas: Sequence[Formula], *, wide: bool = True) -> list[Interval]:

@@ -363,6 +363,11 @@ class MissedResponse:
     sample: int
 
 
+def short_title(formula: Formula) -> str:
+    """Return the name of a formula, or its text, shortened."""
+    return formula.name or shortened_formula(format_formula(formula))
+
+
 def missed_response(
     path: DecidingPath, nodes: Sequence[Formula], done: OfflineNodes | UnfinishedNodes, times_ns: Integers
 ) -> MissedResponse | None:
@@ -374,9 +379,7 @@ def missed_response(
     for step, below in pairwise(path.steps):
         node = nodes[step.node]
         if operator_of(node) == "->" and done.ends(step.node)[1][step.sample] < 0.0:
-            condition, response = (
-                each.name or shortened_formula(format_formula(each)) for each in operands_of(node)
-            )
+            condition, response = map(short_title, operands_of(node))
             # nodes are numbered in the order of the text
             first = step.node + 1
             after = first + sum(1 for _ in iter_nodes(operands_of(node)[0]))

@@ -10,7 +10,7 @@ from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.offline import evaluate_offline
 from spatial_replay.monitor.verdict import Verdict, final_verdict, online_verdict
-from spatial_replay.monitor.witness.atom import DecidingAtom, deciding_atom
+from spatial_replay.monitor.witness.atom import DecidingAtom, deciding_atom, failed_implication
 from spatial_replay.monitor.witness.evidence import Evidence, Gap
 from spatial_replay.monitor.witness.path import (
     DecidingPath,
@@ -18,6 +18,7 @@ from spatial_replay.monitor.witness.path import (
     MissedResponse,
     deciding_path,
     missed_response,
+    short_title,
 )
 from spatial_replay.monitor.witness.threshold import Obstacle, Threshold, threshold_of
 from spatial_replay.monitor.witness.unfinished import evaluate_unfinished
@@ -174,6 +175,16 @@ def find_witness(
         _, best_path, best = follow(End.HIGH, missed.node, missed.sample)
         if best is not None and not best.unknown:
             closest, closest_path = (best, best_path[-1].time_ns), best_path
+    last = nodes[path[-1].node]
+    if missed is None and verdict is Verdict.VIOLATED and isinstance(last, Quantified):
+        # an implication within the one node of an open group
+        scene = evidence.scene(at_ns)
+        if (within := failed_implication(scene, last, found.end)) is not None:
+            condition, response, is_condition = within
+            titles, place = (short_title(condition), short_title(response)), found.steps[-1]
+            missed = MissedResponse(*titles, at_ns, is_condition, place.node, place.sample)
+            best = deciding_atom(scene, response, End.HIGH) if is_condition else None
+            closest = (best, at_ns) if best is not None and not best.unknown else None
     return Witness(
         instance.name,
         instance.object,
