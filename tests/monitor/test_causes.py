@@ -299,3 +299,15 @@ def test_advice_on_a_constant_changes_every_place_that_names_it():
     (cause,) = evaluated(f"{region}{text}").result().causes
     assert cause.witness is not None and cause.witness.threshold is not None
     assert cause.witness.threshold.constant == ""
+
+
+def test_within_an_open_group_the_missed_response_is_named_and_not_its_condition() -> None:
+    text = "group people = class person\nspec slow = G (forall p in people: agv dist p <= 2 -> speed(agv) <= 0.5)"
+    person = sr.TrackedObject(box(9), class_name="person")
+    samples = [sr.Sample(k * SECOND, {"agv": box(0.8 * k), "ann": person}) for k in range(9)]
+    result = sr.evaluate(sr.parse_specification(text), sr.Trace.from_samples(samples)).result()
+    assert result.verdict == "violated"
+    assert result.reason(0).startswith(
+        "`agv dist ann <= 2` held at 8.000 s, but `speed(agv) <= 0.5` did not: `speed(agv) <= 0.5`"
+        " fails by 0.3 at 8.000 s"
+    )
