@@ -302,7 +302,8 @@ def test_advice_on_a_constant_changes_every_place_that_names_it():
 
 
 def test_within_an_open_group_the_missed_response_is_named_and_not_its_condition() -> None:
-    text = "group people = class person\nspec slow = G (forall p in people: agv dist p <= 2 -> speed(agv) <= 0.5)"
+    near = "agv dist p <= 2 -> speed(agv) <= 0.5"
+    text = f"group people = class person\nspec slow = G (forall p in people: {near})"
     person = sr.TrackedObject(box(9), class_name="person")
     samples = [sr.Sample(k * SECOND, {"agv": box(0.8 * k), "ann": person}) for k in range(9)]
     result = sr.evaluate(sr.parse_specification(text), sr.Trace.from_samples(samples)).result()
