@@ -28,7 +28,7 @@ from spatial_replay.logs.source import Source
 from spatial_replay.monitor.evaluate import Evaluation, evaluate
 from spatial_replay.monitor.offline import evaluate_offline, new_leaves
 from spatial_replay.monitor.online.codes import in_channels
-from spatial_replay.monitor.paper.evaluator import PaperRun
+from spatial_replay.monitor.paper import PaperRun
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.sentences import cause_reason

@@ -11,7 +11,7 @@ from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Empty, Floats, Integers
 from spatial_replay.monitor.online.program import Program
 from spatial_replay.monitor.online.step import ROOM, OnlineRun
-from spatial_replay.monitor.paper.evaluator import PaperRun, check_operators, left_out
+from spatial_replay.monitor.paper import PaperRun, check_operators, left_out
 from spatial_replay.spec.formula import Formula, Specification
 
 Semantics: TypeAlias = Literal["ltlf", "paper"]

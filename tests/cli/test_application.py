@@ -224,7 +224,7 @@ def test_the_bar_shows_that_code_is_being_compiled(tmp_path: Path) -> None:
 
 _LONG_COMPILED = """
 import os
-import spatial_replay.compiler as compiler
+import spatial_replay.compiled as compiled
 from spatial_replay.compiled import compile_ahead, kernel
 
 @kernel
@@ -237,7 +237,7 @@ def quadrupled(number):
 
 compile_ahead()
 if "HASTE" in os.environ:
-    compiler._PATIENCE_S = -1
+    compiled._WAIT_S = -1
 print(quadrupled(1))
 """
 
@@ -273,7 +273,7 @@ def test_damaged_machine_code_is_compiled_again(tmp_path: Path) -> None:
 _INTERRUPTED_IN_A_CALLBACK = """
 import ctypes, os, signal, sys, time
 from spatial_replay.cli.application import main
-from spatial_replay.runs import warmup
+from spatial_replay.cli import warmup
 
 def warm_up_kernels(*_, **__):
     # no exception can leave a callback, as those of the compiler

@@ -17,7 +17,7 @@ _EVERY_KERNEL = """
 import importlib, pkgutil
 import spatial_replay
 from spatial_replay.compiled import compile_ahead, kernels
-from spatial_replay.runs.warmup import TASKS
+from spatial_replay.cli.warmup import TASKS
 
 compile_ahead()
 for run in TASKS.values():

@@ -536,7 +536,7 @@ def _at_first(
 
 @inlined
 def _is_known(rows: Integers, stamps: Integers, state: Integers, mode: int, last: int) -> bool:
-    """Return whether a bound follows from the table alone (see `root_bounds`)."""
+    """Return whether a bound follows from the table alone (see `program`)."""
     part = len(rows) - 1
     known = rows[part, codes.PART_KNOWN] >> mode
     is_free = known & codes.EVEN_IF_OVER > 0 or not _is_over(rows, stamps, state, last)
