@@ -185,7 +185,8 @@ def requirement_text(identifier: str | None, title: str | None) -> str:
 
 def names_of(title: str, requirement: str | None) -> tuple[str, ...]:
     """Return what a reader may call a result or node: by its title, or with the id of its requirement."""
-    return (title,) if requirement is None else (title, f"{requirement} {title}", f"{title} [{requirement}]")
+    ids = () if requirement is None else (requirement, f"{requirement} {title}", f"{title} [{requirement}]")
+    return title, *ids
 
 
 TEXTS: Final = -(2.0**1000)

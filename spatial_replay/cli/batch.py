@@ -457,7 +457,7 @@ def _warn_of_names(table: pa.Table) -> None:
     for name in ("missing", "remarks"):
         for log, messages in _columns(table, "log", name):
             for message in messages:
-                logs.setdefault(message, {})[log] = None
+                logs.setdefault(message.removeprefix(f"{Path(log).name}: "), {})[log] = None
     found = [f"{message} (in {_listed(list(names))})" for message, names in logs.items()]
     more = [f"… and {len(found) - _MOST_WARNINGS} more"] if len(found) > _MOST_WARNINGS else []
     warn(*found[:_MOST_WARNINGS], *more)

@@ -132,11 +132,9 @@ class LogOutput(_OutputFile):
     def convert(
         self, value: str | os.PathLike[str], param: click.Parameter | None, ctx: click.Context | None
     ) -> str | bytes | os.PathLike[str]:
-        ending = Path(value).suffix
-        if ending.lower() in (".csv", ".html", ".json", ".jsonl", ".parquet"):
-            self.fail(
-                f"{value}: what is written is a log (MCAP); name it {Path(value).stem}.mcap", param, ctx
-            )
+        from spatial_replay.logs.output_file import refuse_ending
+
+        refuse_ending(Path(value))
         return super().convert(value, param, ctx)
 
 
@@ -157,9 +155,9 @@ def output_option(text: str, *, required: bool = False) -> Callable[[_Command], 
     return click.option("-o", "--output", type=_OutputFile(path_type=Path), required=required, help=text)
 
 
-def log_output_option(text: str) -> Callable[[_Command], _Command]:
-    """Return the required option `-o FILE` of a command that writes a log, with its help."""
-    return click.option("-o", "--output", type=LogOutput(path_type=Path), required=True, help=text)
+def log_output_option(text: str, *, required: bool = True) -> Callable[[_Command], _Command]:
+    """Return the option `-o FILE` of a command that writes a log, with its help."""
+    return click.option("-o", "--output", type=LogOutput(path_type=Path), required=required, help=text)
 
 
 overwrite_option = click.option("--overwrite", is_flag=True, help="Replace a log that exists already.")

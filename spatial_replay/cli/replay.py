@@ -17,9 +17,9 @@ from spatial_replay.cli.options import (
     evaluation_options,
     fail_on_option,
     keep_option,
+    log_output_option,
     naming_option,
     open_inputs,
-    output_option,
     semantics_option,
     warn_of_input,
 )
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 @click.command()
 @evaluation_options
-@output_option("Annotated log to write (MCAP).")
+@log_output_option("Annotated log to write (MCAP).", required=False)
 @click.option("--layer", is_flag=True, help="Write the derived messages only, without the log's own.")
 @keep_option("With -o: messages of the log to copy", "all; none of a ROS 2 bag")
 @click.option(
@@ -194,29 +194,11 @@ def _width_ns(text: str) -> int:
     return width_ns
 
 
-_OTHER_OUTPUTS = {
-    ".csv": "for a table, export the annotated log: spatial-replay export OUT.mcap -o {output}",
-    ".parquet": "for a table, export the annotated log: spatial-replay export OUT.mcap -o {output}",
-    ".html": "for a page, write a report: spatial-replay report LOG --spec SPEC -o {output}",
-    ".json": "for results as JSON, give --json {output}",
-}
-
-
-def _check_ending(output: Path) -> None:
-    """Refuse the name of a file of another kind."""
-    remedy = _OTHER_OUTPUTS.get(output.suffix.lower())
-    if remedy is not None:
-        raise UsageError(
-            f"-o {output}: replay writes an annotated log (MCAP); {remedy.format(output=output)}"
-        )
-
-
 def _check_outputs(output: Path | None, json_file: str | None, inputs: tuple[Path, ...]) -> None:
     """Refuse outputs that could not be written, before the work is done."""
     from spatial_replay.logs.output_file import refuse_inputs
 
     if output is not None:
-        _check_ending(output)
         refuse_inputs(output, inputs)
     if json_file is not None and json_file != "-":
         refuse_inputs(Path(json_file), inputs)

@@ -178,6 +178,19 @@ def refuse_inputs(output: Path, inputs: Iterable[Path]) -> None:
             raise UsageError(f"{output} lies in the folder {each}, which is an input; write it elsewhere")
 
 
+def refuse_ending(output: Path) -> None:
+    """Check that the name of a log is not that of a file of another kind.
+
+    Raises:
+        UsageError: it is.
+    """
+    commands = {".csv": "export", ".parquet": "export", ".html": "report", ".json": "", ".jsonl": ""}
+    command = commands.get(output.suffix.lower())
+    if command is not None:
+        remedy = f"; {output} is written by spatial-replay {command}" if command else ""
+        raise UsageError(f"{output}: what is written is a log (MCAP); name it {output.stem}.mcap{remedy}")
+
+
 def refuse_existing(output: Path) -> None:
     """Check that an output replaces no recording, which nothing could make again.
 

@@ -111,10 +111,10 @@ class Update:
     """
 
     time_ns: int
-    numbers: Sequence[Floats | None] = field(repr=False)
-    monitored: Monitored = field(repr=False)
-    settled: tuple[Settled, ...] = field(repr=False, default=())
-    satisfied: tuple[Settled, ...] = field(repr=False, default=())
+    numbers: Sequence[Floats | None]
+    monitored: Monitored
+    settled: tuple[Settled, ...] = ()
+    satisfied: tuple[Settled, ...] = ()
     remarks: tuple[Diagnostic, ...] = ()
 
     @property
@@ -156,6 +156,9 @@ class Update:
     def verdict(self) -> Verdict:
         """The worst of the specs'."""
         return worst_verdict(spec.verdict for spec in self.specs)
+
+    def __repr__(self) -> str:
+        return f"<Update: {self.verdict} at {self.time_ns} ns>"
 
     def node(self, name: str) -> NodeUpdate:
         """Return the root node of a named spec, wherever it occurs.

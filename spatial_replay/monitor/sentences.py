@@ -375,6 +375,8 @@ def _flip(
                 return f"No number in it makes that {opposite}: its robustness is never above 0; {band}."
             case "limits":
                 return f"No number that can stand in it makes that {opposite}."
+            case "unknown":
+                return f"No number in it makes that {opposite}: samples that are unknown decide, too."
         return f"No number of this atom alone makes it {opposite}: other atoms decide it, too."
     would = f"It would be {threshold.verdict}"
     if is_open:

@@ -37,7 +37,7 @@ from spatial_replay.geometry.measure import Operand
 from spatial_replay.logs.mcap.write import LogWriter
 from spatial_replay.logs.messages import Attachment, Channel, Messages, Sink, merge, messages_of
 from spatial_replay.logs.objects import encode_objects
-from spatial_replay.logs.output_file import Durability, open_output
+from spatial_replay.logs.output_file import Durability, open_output, refuse_ending
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.topics import (
     AUTOMATA,
@@ -377,6 +377,7 @@ class FileLog:
         self._unevaluated: deque[Trace] = deque()
         self._plans: deque[Mapping[str, str]] = deque()
         self._at_once = _AT_FIRST
+        refuse_ending(path)
         self._stream = open_output(path, durability, overwrite=overwrite)
         try:
             self._writer = LogWriter(self._stream, clock=time.monotonic)

@@ -249,7 +249,7 @@ class _Counter:
                 self._decoders[topic.name] = reader.decoder(topic)
                 self.examples[topic.name] = []
             except LogError as error:
-                self._remarks.append(_of_topic(topic.name, Sentence(str(error))))
+                self._remarks.append(str(error))
         self._declared = {topic.name: topic.count for topic in topics}
         self._bytes = dict.fromkeys(self._declared, 0)
 

@@ -550,6 +550,9 @@ def _parse_group(group: TokenGroup, relations: Collection[str], faults: Faults) 
     if not group.is_bare_formula and tokens[0].type not in STATEMENT_TYPES:
         words = ", ".join(_STATEMENT_WORDS)
         hint = meant_statement(tokens) or nearest_hint(tokens[0].value, _STATEMENT_WORDS)
+        for first, sign, word in zip(tokens, tokens[1:], tokens[2:], strict=False):
+            if (first.type, sign.type) == ("NAME", "MINUS") and word.type in STATEMENT_TYPES:
+                hint = f'a name with - is written in quotes: "{first.value}-{word.value}"'
         hint = hint or "a line that goes on ends in an operator"
         faults.add(span_of(tokens[0]), f"expected a statement ({words}), found {tokens[0].value!r}", hint)
         return _broken(tokens)

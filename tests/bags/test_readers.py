@@ -383,5 +383,5 @@ def test_a_survey_names_two_definitions_of_a_topic(
         writer.finish()
     run(["info", str(log)])
     said = capsys.readouterr().err
-    assert "in two definitions" in said
+    assert "warning: topic '/a' has messages of 'b/msg/P' in two definitions" in said
     assert "bytes" not in said

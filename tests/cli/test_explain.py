@@ -68,6 +68,8 @@ def test_every_result_is_explained_in_a_few_sentences(
         "cup is not in the sample.",
         "cup is missing in 2 of 4 samples, all before 1.000 s: --from 1.000s leaves them out.",
     ]
+    _, far = said(capsys, *EXPLAIN, "--spec", "G (cube dist cup >= 2)")
+    assert "No number in it makes that satisfied: samples that are unknown decide, too." in far
     assert run_in_process([*EXPLAIN, "--from", "1.000s", "--result", "apart"]) == 0
 
 
@@ -101,7 +103,7 @@ def test_any_of_many_results_is_found_by_its_name_with_the_id_of_its_requirement
     lines = [f"spec s{k} = G (battery >= {k / 100})" for k in range(24)]
     lines.append('spec respond "R-1: it responds" = F (battery >= 0)')
     (folder / "run.spatial").write_text("\n".join(lines), encoding="utf-8")
-    for name in ("respond", "R-1 respond", "respond [R-1]"):
+    for name in ("respond", "R-1", "R-1 respond", "respond [R-1]"):
         assert "`respond` is satisfied" in said(capsys, *EXPLAIN, "--result", name)[1]
     assert run_in_process([*EXPLAIN, "--result", "respnd"]) == 2
     assert "did you mean 'respond'?" in capsys.readouterr().err

@@ -171,6 +171,9 @@ def test_stale_observations_are_unknown_and_reported_but_not_damage(
     said = capsys.readouterr()
     assert remark in said.err
     assert "1,344 unknown" in said.out
+    assert run(["batch", *arguments[1:6]]) == 4
+    # the log is named once
+    assert f"warning: {remark.removeprefix(f'{bag.name}: ')} (in {bag})" in capsys.readouterr().err
 
 
 def test_a_clock_that_jumps_back_is_an_error_or_ends_the_log(

@@ -64,6 +64,7 @@ def test_a_satisfied_verdict_says_which_atom_decided_it(text: str, at: int, reas
         assert len(update.satisfied) == (second >= at)
     assert [each.reason for each in update.satisfied] == [reason]
     assert update.violations == ()
+    assert repr(update) == f"<Update: satisfied at {update.time_ns} ns>"
 
 
 def test_terms_look_back_before_the_start_of_a_monitor():

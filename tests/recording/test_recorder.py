@@ -185,6 +185,8 @@ def test_a_second_recorder_of_a_log_is_refused(tmp_path: Path) -> None:
     assert read_trace(path) == run(2)
     Recorder(path, overwrite=True).close()
     assert len(open_source(path).metadata()) > 1
+    with pytest.raises(UsageError, match=r"run\.jsonl: what is written is a log .*name it run\.mcap"):
+        Recorder(tmp_path / "run.jsonl")
 
 
 def test_one_specification_needs_no_list(tmp_path: Path) -> None:

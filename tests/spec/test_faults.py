@@ -39,6 +39,7 @@ spec template(ego) = ego ovlp goal
         ("spec s = a closeto 5 b", "5", "'5' cannot stand here", "square brackets: closeto[5]"),
         ("spec s = F[0,5]s a ovlp b", "a", "'s' cannot stand here", "each number has its unit: [0s, 5s]"),
         ("spec s = robot_1/base ovlp b", "ovlp", "needs an object", 'in quotes: "robot_1/base"'),
+        ("G (a-group ovlp b)", "G", "expected a statement", 'is written in quotes: "a-group"'),
         ("spec s = F[5s] a ovlp b", "]", "']' cannot stand here", "both of its ends: F[0, 5s]"),
         ("spec s = F<=5s a ovlp b", "<=", "'<=' cannot stand here", "both of its ends: F[0, 5s]"),
         ("spec s = G[>=2s] a ovlp b", ">=", "'>=' cannot stand here", "both of its ends: G[2s, inf]"),

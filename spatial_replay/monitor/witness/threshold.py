@@ -223,9 +223,11 @@ class Threshold:
     constant: str = ""
 
 
-Obstacle: TypeAlias = Literal["others", "limits", "infinity"]
-"""Why no number of an atom flips a verdict: other atoms decide it too; no number that can be written is large
-enough; or the atom is infinite."""
+Obstacle: TypeAlias = Literal["others", "unknown", "limits", "infinity"]
+"""Why no number of an atom flips a verdict.
+
+Other atoms, or unknown samples, decide it too; no number that can be written is large enough; or the atom is
+infinite."""
 
 
 def threshold_of(
@@ -265,10 +267,7 @@ def threshold_of(
     if found is not None:
         return found
     search = search_of(own)
-    found = search.threshold()
-    if found is not None:
-        return found
-    return "limits" if search.would_flip() else "others"
+    return search.threshold() or search.obstacle()
 
 
 class _Search:
@@ -335,8 +334,8 @@ class _Search:
                     return Threshold(dial.value, candidate, is_written, is_exact, verdict, dial.constant)
         return None
 
-    def would_flip(self) -> bool:
-        """Return whether the verdict flips if the atom is moved arbitrarily far."""
+    def obstacle(self) -> Obstacle:
+        """Return why no number flips the verdict: from the one if the atom is moved arbitrarily far."""
         far = _FAR if self._deciding.end is End.HIGH else -_FAR
 
         def change(atom: Atom) -> Atom:
@@ -344,7 +343,10 @@ class _Search:
 
         formula = self._changed(change)
         added = new_leaves(formula, self._order)
-        return self._is_flipped(self._evaluated(formula, added, self._columns(added)))
+        verdict = self._evaluated(formula, added, self._columns(added))
+        if self._is_flipped(verdict):
+            return "limits"
+        return "others" if verdict is self._verdict else "unknown"
 
     def _is_flipped(self, verdict: Verdict) -> bool:
         """Return whether a verdict is the opposite one or, of a log that goes on, another one."""
