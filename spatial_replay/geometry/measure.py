@@ -245,11 +245,21 @@ def candidate_pairs(
     radius = np.repeat(chosen.radius, np.diff(chosen.vertex_start))[:, None]
     least = np.minimum.reduceat(chosen.vertices - radius, first_vertex)
     greatest = np.maximum.reduceat(chosen.vertices + radius, first_vertex)
-    gaps = np.maximum(least[:, None] - greatest, least - greatest[:, None]).max(axis=2)
     high = closest_pairs(batch, rows[None], uncertainty, enlargement)[0, 2]
     size = max(np.abs(least).max(), np.abs(greatest).max())
     reach = high + enlargement + 2.0 * uncertainty[rows].max() + 1e-9 * size
-    return np.argwhere(np.triu(gaps <= reach, 1)).astype(np.int64)
+    # from left to right: all pairs at once would take gigabytes for some thousands
+    order = np.argsort(least[:, 0], kind="stable")
+    least, greatest = least[order], greatest[order]
+    ends = np.searchsorted(least[:, 0], greatest[:, 0] + reach, side="right").tolist()
+    pairs = []
+    for at, end in enumerate(ends):
+        low, high = least[at + 1 : end, 1], greatest[at + 1 : end, 1]
+        near = (low <= greatest[at, 1] + reach) & (least[at, 1] <= high + reach)
+        others = order[at + 1 : end][near]
+        pairs.append(np.sort(np.column_stack([np.full_like(others, order[at]), others])))
+    found = np.concatenate(pairs).astype(np.int64)
+    return found[np.lexsort(found.T[::-1])]
 
 
 @elementwise

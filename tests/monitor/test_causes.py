@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import tracemalloc
 
 import pytest
 
@@ -312,3 +313,15 @@ def test_within_an_open_group_the_missed_response_is_named_and_not_its_condition
         "`agv dist ann <= 2` held at 8.000 s, but `speed(agv) <= 0.5` did not: `speed(agv) <= 0.5`"
         " fails by 0.3 at 8.000 s"
     )
+
+
+def test_memory_to_find_the_closest_of_many_does_not_grow_with_their_pairs() -> None:
+    line = sr.Trace.from_samples([sr.Sample(0, {f"o{n}": box(2 * n - 0.5 * (n == 399)) for n in range(400)})])
+    text = "group movers = all\nspec apart = G (forall a, b in movers: a dist b >= 3)"
+    evaluation = sr.evaluate(sr.parse_specification(text), line)
+    tracemalloc.start()
+    try:
+        assert evaluation.result().causes[0].witness is not None
+        assert tracemalloc.get_traced_memory()[1] < 1.5e6
+    finally:
+        tracemalloc.stop()

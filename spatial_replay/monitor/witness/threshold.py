@@ -292,17 +292,19 @@ class _Search:
         atoms = filter(self._is_meant, _atoms_of(self._formula))
         slopes = {each.expression: dial.slopes(each.expression) for each in atoms}
         # from the formula: equal leaves share the place of the first, wherever it was written
-        self._moving = {
-            index: leaf
-            for index, leaf in enumerate(self._order)
-            if isinstance(leaf, Atom) and leaf.expression in slopes
-        }
-        self._slopes = {index: max(slopes[leaf.expression]) for index, leaf in self._moving.items()}
+        self._moving: dict[int, Atom | Quantified] = {}
+        self._slopes: dict[int, float] = {}
+        for index, leaf in enumerate(self._order):
+            bare = _bare(leaf)
+            if bare is not None and (own := slopes.get(bare[0].expression)):
+                self._moving[index], self._slopes[index] = leaf, bare[1] * max(own)
         bodies = [each for each in iter_formulas(self._formula) if isinstance(each, Quantified)]
-        # bodies of quantifiers are no leaves, and the height of a prism may decide instead of a radius
+        # a quantifier moves with the one atom of its body; a prism's height may decide, not a radius
         self._is_uniform = (
             all(len(each) == 1 for each in slopes.values())
-            and not any(self._is_meant(atom) for body in bodies for atom in _atoms_of(body))
+            and not any(
+                self._is_meant(atom) for body in bodies if not _bare(body) for atom in _atoms_of(body)
+            )
             and not any(dial.is_at("radius", radius) for each in slopes for radius in _radii_in(each))
         )
         whole = next(each for identifier, _, each in iter_nodes(self._formula) if identifier == node)
@@ -326,12 +328,14 @@ class _Search:
         found = [number for each in self._directions if (number := self._nearest(each)) is not None]
         for number in sorted(found, key=lambda number: abs(number - dial.value)):
             candidates = [each for each in _rounded(number, dial.value) if self._is_possible(each)]
-            verdicts = self._verdicts(candidates, is_shifted=False)
-            for candidate, verdict in zip(candidates, verdicts, strict=True):
-                if self._is_flipped(verdict):
-                    is_exact = dial.is_exact or len(self._directions) > 1
-                    is_written = dial.kind != "margin"
-                    return Threshold(dial.value, candidate, is_written, is_exact, verdict, dial.constant)
+            # one of the first two flips it nearly always; each measures all bindings of a quantifier again
+            for some in filter(None, (candidates[:2], candidates[2:])):
+                verdicts = self._verdicts(some, is_shifted=False)
+                for candidate, verdict in zip(some, verdicts, strict=True):
+                    if self._is_flipped(verdict):
+                        is_exact = dial.is_exact or len(self._directions) > 1
+                        is_written = dial.kind != "margin"
+                        return Threshold(dial.value, candidate, is_written, is_exact, verdict, dial.constant)
         return None
 
     def obstacle(self) -> Obstacle:
@@ -450,8 +454,11 @@ class _Search:
 
     def _shifted(self, added: Sequence[Formula], number: float) -> Floats:
         """Return columns of turned atoms, shifted from those of the original ones."""
-        indices = {self._turned_atom(atom, number).expression: index for index, atom in self._moving.items()}
-        found = [indices[leaf.expression] for leaf in added if isinstance(leaf, Atom)]
+        indices = {
+            _leaf_key(rewritten(leaf, lambda atom: self._turned_atom(atom, number))): index
+            for index, leaf in self._moving.items()
+        }
+        found = [indices[_leaf_key(leaf)] for leaf in added]
         shifts = [self._slopes[index] * (number - self._dial.value) for index in found]
         shifted: Floats = self._leaves[:, found] + np.array(shifts).reshape(1, -1, 1)
         return shifted
@@ -468,6 +475,23 @@ class _Search:
 
 def _atoms_of(formula: Formula) -> Iterator[Atom]:
     return (each for each in iter_formulas(formula) if isinstance(each, Atom))
+
+
+def _bare(formula: Formula) -> tuple[Atom, int] | None:
+    """Return the atom that a leaf consists of, but for quantifiers and negations, with its sign."""
+    sign = 1
+    while not isinstance(formula, Atom):
+        if isinstance(formula, Boolean) and formula.operator == "not":
+            (formula,), sign = formula.operands, -sign
+        elif isinstance(formula, Quantified):
+            formula = formula.body
+        else:
+            return None
+    return formula, sign
+
+
+def _leaf_key(leaf: Formula) -> object:
+    return leaf.expression if isinstance(leaf, Atom) else leaf
 
 
 def _radii_in(expression: Expression) -> list[float]:
