@@ -266,10 +266,9 @@ def explain_results(
         for identifier in _nodes_named(result, node)
     ]
     if not explanations:
-        names = sorted(
-            {each.name for result in results for _, _, each in iter_nodes(result.formula) if each.name}
-        )
-        raise UsageError(no_such_node(node or "", names))
+        names = {each.name for result in results for _, _, each in iter_nodes(result.formula)}
+        names.update(result.spec.id for result in results)
+        raise UsageError(no_such_node(node or "", sorted(name for name in names if name)))
     return explanations
 
 

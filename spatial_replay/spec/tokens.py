@@ -307,8 +307,10 @@ def meant(tokens: Sequence[Token], position: int, accepted: Collection[str]) -> 
         first = tokens[position - 3].value if position > 2 else ""
         hint = f'a name with {before.value} is written in quotes: "{first}{before.value}{last.value}"'
         return f"{token.value!r} needs an object, region or group on its left", hint
-    if token.type == "MINUS" and before.type in _RELATIONS - {"COMPARE"} and after.type == "NAME":
+    if token.type == "MINUS" and before.type in _RELATIONS - {"COMPARE"} and after.value.isidentifier():
         return found, f'a name with - is written in quotes: "{last.value}-{after.value}"'
+    if (before.type, last.type) == ("NAME", "MINUS") and token.value[1:].isidentifier():
+        return found, f'a name with - is written in quotes: "{before.value}-{token.value}"'
     if token.type in _RELATIONS and before.type == "LPAR" and last.type == "NAME" and position > 2:
         name = tokens[position - 3]
         if name.type == "NAME" and (hint := function_hint(name.value, _argument(tokens, position - 1))):

@@ -305,6 +305,8 @@ def test_errors_are_marked_at_their_lines_for_github_and_for_code_scanning(
         (r"\A p \in people : p ovlp b", r"\A", "write forall p in people: ..."),
         ("G (base-link dist cup >= 1)", "dist", '"base-link"'),
         ("G (cup dist base-link >= 1)", "-", '"base-link"'),
+        ("spec s = G (cup dist base-group >= 1)", "-", '"base-group"'),
+        ("spec s = a-group ovlp b", "group", '"a-group"'),
         ("G (a ovlp b) -- comment", "-- comment", "a comment begins with #"),
         ("battery and G (a ovlp b)", "battery", "battery >= 1.0"),
         ("after 5s (a ovlp b)", "5s", "G[5s, inf]"),

@@ -105,8 +105,9 @@ def test_any_of_many_results_is_found_by_its_name_with_the_id_of_its_requirement
     (folder / "run.spatial").write_text("\n".join(lines), encoding="utf-8")
     for name in ("respond", "R-1", "R-1 respond", "respond [R-1]"):
         assert "`respond` is satisfied" in said(capsys, *EXPLAIN, "--result", name)[1]
-    assert run_in_process([*EXPLAIN, "--result", "respnd"]) == 2
-    assert "did you mean 'respond'?" in capsys.readouterr().err
+    for slip, name in (("respnd", "respond"), ("r-1", "R-1"), ("R-2", "R-1")):
+        assert run_in_process([*EXPLAIN, "--result", slip]) == 2
+        assert f"did you mean '{name}'?" in capsys.readouterr().err
 
 
 def test_options_that_cannot_be_explained_are_refused_by_name(
