@@ -339,15 +339,18 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
         faults.append((("cameras",), "give either camera, of one or of all, or cameras, one for each"))
     plane = value.get("plane")
     references = plane.get("tags") if isinstance(plane, dict) else None
-    reach = _reach(references)
+    reach = _reach(references or (camera.get("pose") if isinstance(camera, dict) else None))
     if large := _beyond(value.get("size"), reach):
         faults.append((("size",), large))
+    if large := _beyond(plane.get("height") if isinstance(plane, dict) else None, reach):
+        faults.append((("plane", "height"), large))
     for name, entry in cast("dict[str, Any]", value["objects"]).items():
         if not isinstance(entry, dict):
             continue
         place: Place = ("objects", name)
         shapes = [key for key in ("box", "disc", "polygon") if key in entry]
-        faults += [((*place, key), large) for key in shapes if (large := _beyond(entry[key], reach))]
+        lengths = [key for key in (*shapes, "height") if key in entry]
+        faults += [((*place, key), large) for key in lengths if (large := _beyond(entry[key], reach))]
         if len(shapes) != 1:
             faults.append(
                 (place, "give one of box, disc and polygon, the footprint around the object's centre")
@@ -391,10 +394,11 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
     return faults
 
 
-def _reach(references: Any) -> float:
-    """Return the diagonal of the box around reference tags in metres; inf where it is not known."""
+def _reach(known: Any) -> float:
+    """Return the diagonal of the box around reference tags, or a camera and the point that it looks at, in
+    metres; inf where it is not known."""
     try:
-        entries = [each["at"] if isinstance(each, dict) else each for each in references.values()]
+        entries = [each["at"] if isinstance(each, dict) else each for each in known.values()]
         places = np.array([[_length(number) for number in entry] for entry in entries])
         return float(np.linalg.norm(np.ptp(places, axis=0))) or math.inf
     except (AttributeError, KeyError, TypeError, ValueError, UsageError):
@@ -407,8 +411,8 @@ def _beyond(value: Any, reach: float) -> str:
     if number <= reach:
         return ""
     return (
-        f"{number:g} is {number:g} m, and the reference tags are within {reach:.3g} m; write {number:g}mm,"
-        f" or {number:g}m if that is meant"
+        f"{number:g} is {number:g} m, and the table that the camera sees is within {reach:.3g} m; write"
+        f" {number:g}mm, or {number:g}m if that is meant"
     )
 
 

@@ -66,11 +66,21 @@ MISTAKES = {
     ),
     "the size of tags without a unit": (
         TABLE.replace("size: 48mm", "size: 48", 1),
-        "size: 48 is 48 m, and the reference tags are within 0.488 m; write 48mm, or 48m if that is meant",
+        "size: 48 is 48 m, and the table that the camera sees is within 0.488 m; write 48mm, or 48m if that is",
     ),
     "millimetres without a unit": (
         TABLE.replace("box: [50mm, 50mm]", "box: [50, 50]", 1),
-        "objects.red.box: 50 is 50 m, and the reference tags are within 0.488 m; write 50mm, or 50m if",
+        "objects.red.box: 50 is 50 m, and the table that the camera sees is within 0.488 m; write 50mm, or",
+    ),
+    "a height in millimetres without a unit": (
+        TABLE.replace("height: [0, 40mm]", "height: [0, 40]", 1),
+        "objects.red.height: 40 is 40 m, and",
+    ),
+    "a plane's height without a unit": (TABLE.replace("plane: {", "plane: {height: 40, "), "write 40mm"),
+    "millimetres without a unit or reference tags": (
+        BLOCKS.replace("[50mm, 50mm]", "[50, 50]", 1)
+        + CAMERA.replace("}", ", pose: {position: [1, 0, 0.75], look_at: [0.6, 0, 0]}}"),
+        "objects.red.box: 50 is 50 m, and the table that the camera sees is within 0.85 m; write 50mm, or",
     ),
     "a height in an image": (
         "size: 40\nobjects: {red: {tags: [{id: 0, z: 3}], box: [40, 30]}}\nplane: image",
