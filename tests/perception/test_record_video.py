@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from perception.filmed import TABLE, approaching, film, write_approach
+from perception.filmed import CAMERA, TABLE, approaching, film, write_approach
 from spatial_replay import Monitor, Recorder, load_specification, read_trace, replay_log
 from spatial_replay.cli import run
 from spatial_replay.perception import Frame
@@ -63,6 +63,18 @@ def test_a_name_that_the_tags_file_lacks_is_said_before_the_run(
     said = capsys.readouterr().err
     assert "warning: the tags file never has the object 'rde'" in said
     assert "did you mean 'red'?" in said
+
+
+def test_without_a_calibration_tags_above_the_plane_decide_nothing_and_the_remedy_is_said(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "flat.yaml").write_text(TABLE.replace(CAMERA, ""))
+    arguments = ["--tags", f"{folder}/flat.yaml", "--spec", f"{folder}/apart.spatial"]
+    assert run(["record", "video", f"{folder}/table.mp4", *arguments, "-o", f"{folder}/flat.mcap"]) == 4
+    said = capsys.readouterr().err
+    assert "tags on objects are up to 40 mm above the reference tags, and no camera is calibrated" in said
+    assert "calibrate the camera (tags calibrate), or fix the reference tags as high" in said
+    assert "lifted" not in said
 
 
 def test_the_log_holds_truth_within_its_uncertainty_and_a_replay_gives_the_same_bytes(folder: Path) -> None:

@@ -66,7 +66,7 @@ MISTAKES = {
     ),
     "the size of tags without a unit": (
         TABLE.replace("size: 48mm", "size: 48", 1),
-        "size: 48 is 48 m, and the table that the camera sees is within 0.488 m; write 48mm, or 48m if that is",
+        "size: 48 is 48 m, and the table that the camera sees is within 0.488 m; write 48mm, or",
     ),
     "millimetres without a unit": (
         TABLE.replace("box: [50mm, 50mm]", "box: [50, 50]", 1),
