@@ -223,6 +223,36 @@ def test_a_cluster_evaluates_a_batch_outlives_a_worker_and_ends_with_its_schedul
     assert sr.evaluate_logs("logs", "gate.spatial", output="results").evaluated < LOGS
 
 
+def test_a_cluster_without_workers_says_so_and_goes_on_with_the_first(fleet: Path) -> None:
+    pytest.importorskip("distributed")
+    late = CLUSTER.replace("n_workers=2", "n_workers=0").replace("stdin.read()", "stdin.readline()")
+    words = ["batch", "logs/run-1*.jsonl", "--spec", "gate.spatial", "--dask"]
+    with subprocess.Popen(
+        [sys.executable, "-c", f"{late}\ncluster.scale(1)\nsys.stdin.read()"],
+        env=environment(),
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    ) as cluster:
+        assert cluster.stdin is not None and cluster.stdout is not None
+        address = cluster.stdout.readline().strip()
+        with subprocess.Popen(
+            [sys.executable, "-m", "spatial_replay", *words, address],
+            env=environment(),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        ) as gate:
+            assert gate.stderr is not None
+            said = gate.stderr.readline()
+            assert "the scheduler has no workers" in said and f"`dask worker {address}`" in said
+            cluster.stdin.write("start\n")
+            cluster.stdin.flush()
+            assert gate.wait(60) == 1, gate.stderr.read()
+        cluster.stdin.close()
+
+
 def test_a_scheduler_that_does_not_answer_is_an_error(fleet: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed")
     done = command("batch", "logs", "--spec", "gate.spatial", "--dask", "tcp://nowhere")
