@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from foxglove_schemas_protobuf.Event_pb2 import Event
@@ -38,6 +39,7 @@ from spatial_replay.logs.topics import (
     EVENT_LOG,
     EVENTS,
     FRAME,
+    RECENT_EVENTS,
     ROBUSTNESS,
     SCENE,
     SPECIFICATION,
@@ -49,6 +51,7 @@ from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.spec.formula import Outline, Specification, iter_nodes
+from spatial_replay.text import time_text
 from spatial_replay.trace.sample import LATEST_NS
 from spatial_replay.trace.trace import Trace
 
@@ -56,6 +59,10 @@ if TYPE_CHECKING:
     from spatial_replay.annotate.automaton_state import SpecAutomaton
     from spatial_replay.annotate.scene.scene_frames import SceneFrames
     from spatial_replay.annotate.scene.scene_update import SceneState
+
+
+_MOST_RECENT: Final = 20
+"""The most events in a message on recent ones."""
 
 
 class Annotator:
@@ -130,6 +137,8 @@ class Annotator:
         self._scene = scene or SceneState()
         self._show = show
         self._written = dict.fromkeys(DERIVED, 0)
+        self._first_ns = self._scene.first_ns
+        self._lines = deque[str](maxlen=_MOST_RECENT)
 
     @property
     def scene(self) -> SceneState:
@@ -153,6 +162,7 @@ class Annotator:
         """
         if not len(trace):
             return []
+        self._begin(trace)
         messages = []
         if not self._written[FRAME]:
             messages.append(
@@ -165,7 +175,7 @@ class Annotator:
                 self._units,
                 [() if run is None else run.propositions for run in self._runs],
                 self._automata,
-                int(trace.times_ns[0]) if self._scene.first_ns is None else self._scene.first_ns,
+                self._first_ns,
             )
             messages.append(self._messages(_SPECIFICATION, trace.times_ns[:1], [specification]))
         messages.append(self._robustness(blocks))
@@ -187,6 +197,7 @@ class Annotator:
         """Take in the next samples and return only their events."""
         if not len(trace):
             return []
+        self._begin(trace)
         for run, block in zip(self._runs, blocks, strict=True):
             if run is not None:
                 run.pass_over(block)
@@ -242,6 +253,10 @@ class Annotator:
         times_ns = np.full(len(scene), time_ns)
         return [numbers, standing, replace(scene, log_time_ns=times_ns, publish_time_ns=times_ns)]
 
+    def _begin(self, trace: Trace) -> None:
+        if self._first_ns is None:
+            self._first_ns = int(trace.times_ns[0])
+
     def _remember(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> None:
         """Keep the last sample, and the last one of each result, for the end."""
         before = [None] * len(blocks) if self._latest is None else self._latest[1]
@@ -277,10 +292,20 @@ class Annotator:
 
     def _events(self, events: Sequence[EncodedEvent]) -> list[Messages]:
         times_ns = np.array([each.time_ns for each in events], np.int64)
+        logs = [each.log.SerializeToString(deterministic=True) for each in events]
+        recent = [self._recent(each) for each in events]
         return [
             self._messages(_EVENTS, times_ns, [each.event for each in events]),
-            self._messages(_EVENT_LOG, times_ns, [each.log for each in events]),
+            self._messages(_EVENT_LOG, times_ns, logs),
+            self._messages(_RECENT_EVENTS, times_ns, recent),
         ]
+
+    def _recent(self, event: EncodedEvent) -> bytes:
+        """Return the newest events as one message: after a seek, viewers get no more of a topic of a file."""
+        first_ns = event.time_ns if self._first_ns is None else self._first_ns
+        self._lines.appendleft(f"{time_text(event.time_ns, first_ns)}  {event.log.message}")
+        recent = Log(timestamp=event.log.timestamp, level=event.log.level, message="\n".join(self._lines))
+        return recent.SerializeToString(deterministic=True)
 
     def _automaton_states(self, blocks: Sequence[SeriesBlock]) -> Messages:
         """Return one message per sample and result that has an automaton."""
@@ -369,10 +394,12 @@ _AUTOMATON = protobuf_channel(AUTOMATON, AutomatonState)
 _SCENE = protobuf_channel(SCENE, SceneUpdate)
 _EVENTS = protobuf_channel(EVENTS, Event)
 _EVENT_LOG = protobuf_channel(EVENT_LOG, Log)
+_RECENT_EVENTS = protobuf_channel(RECENT_EVENTS, Log)
 
 
 def channels_of_results(trees: Sequence[ReportedTree]) -> tuple[Channel, ...]:
     """Return the channels of the messages that annotate a sample with results."""
     specification = [_SPECIFICATION] if trees else []
     standing = [_STANDING] if trees else []
-    return (_FRAME, *specification, _ROBUSTNESS, _AUTOMATON, *standing, _EVENTS, _EVENT_LOG, _SCENE)
+    events = (_EVENTS, _EVENT_LOG, _RECENT_EVENTS)
+    return (_FRAME, *specification, _ROBUSTNESS, _AUTOMATON, *standing, *events, _SCENE)

@@ -329,11 +329,11 @@ class PeriodText(NamedTuple):
 
 
 class EncodedEvent(NamedTuple):
-    """One change, encoded for both topics, and the time at which it is confirmed."""
+    """One change, the time at which it is confirmed, and its message for a list of events."""
 
     time_ns: int
     event: bytes
-    log: bytes
+    log: Log
 
 
 def encoded_occurrence(time_ns: int, what: str, sentence: str) -> EncodedEvent:
@@ -345,7 +345,7 @@ def encoded_occurrence(time_ns: int, what: str, sentence: str) -> EncodedEvent:
     for key, text in facts.items():
         event.metadata.add(key=key, value=text)
     log = Log(timestamp=at, level=Log.WARNING, message=sentence, name=what)
-    return EncodedEvent(time_ns, *(each.SerializeToString(deterministic=True) for each in (event, log)))
+    return EncodedEvent(time_ns, event.SerializeToString(deterministic=True), log)
 
 
 class EventReporter:
@@ -541,7 +541,7 @@ class EventReporter:
             file=self._filename,
             line=reported.line,
         )
-        return EncodedEvent(time_ns, *(each.SerializeToString(deterministic=True) for each in (event, log)))
+        return EncodedEvent(time_ns, event.SerializeToString(deterministic=True), log)
 
     def _remember(self, node: int, found: DecidingLeaf | LeafValue | None, now_ns: int) -> None:
         """Keep what decided the root's verdict, if it is one over all continuations."""

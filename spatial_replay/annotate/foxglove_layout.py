@@ -26,11 +26,11 @@ from spatial_replay.logs.topics import (
     CAMERA_CALIBRATION,
     CAMERA_VIDEO,
     CURVES_TOPIC,
-    EVENT_LOG,
     GRADIENT_MAP,
     LAYOUT,
     PLAN_DECISION,
     PLAN_PATH,
+    RECENT_EVENTS,
     REDONE_MAP,
     REDONE_PATH,
     SCENE,
@@ -208,9 +208,8 @@ def violation_table() -> Panel:
 
 
 def event_list() -> Panel:
-    """Return the list of events."""
-    config = {"minLogLevel": 1, "searchTerms": [], "topicToRender": EVENT_LOG}
-    return _titled("RosOut!events", "Events", config)
+    """Return the list of recent events, which stays complete after a seek."""
+    return _titled("RawMessages!events", "Events", {"topicPath": f"{RECENT_EVENTS}.message"})
 
 
 def specification_text() -> Panel:
@@ -452,7 +451,7 @@ def _details(contents: LayoutContents) -> _Details:
     """Return the panels that are in tabs, those of violations first."""
     trees = contents.trees
     details = [("violated", violation_table())] if trees else []
-    if trees and EVENT_LOG in contents.topics:
+    if trees and RECENT_EVENTS in contents.topics:
         details.append(("events", event_list()))
     if trees:
         details.append(("specification", specification_text()))

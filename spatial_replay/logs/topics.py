@@ -24,8 +24,11 @@ ROBUSTNESS = "/spatial/robustness"
 AUTOMATON = "/spatial/automaton"
 EVENTS = "/spatial/events"
 EVENT_LOG = "/spatial/log"
+RECENT_EVENTS = "/spatial/recent_events"
 
-DERIVED = frozenset({SCENE, FRAME, SPECIFICATION, STANDING, ROBUSTNESS, AUTOMATON, EVENTS, EVENT_LOG})
+DERIVED = frozenset(
+    {SCENE, FRAME, SPECIFICATION, STANDING, ROBUSTNESS, AUTOMATON, EVENTS, EVENT_LOG, RECENT_EVENTS}
+)
 """Topics computed from the samples and a specification: a replay replaces them."""
 
 CURVES_TOPIC = "/spatial/curves"

@@ -56,6 +56,17 @@ def written(tmp_path: Path, text: str, samples: list[sr.Sample], **options: obje
     return found
 
 
+def test_a_viewer_that_seeks_gets_the_newest_events_in_one_message(tmp_path):
+    charges = [charge for _ in range(25) for charge in (1.0, 1.0, 1.0, -1.0, -1.0, -1.0)]
+    found = written(tmp_path, "spec last = F G battery >= 0", batteries(*charges))
+    recent = _messages(tmp_path / "annotated.mcap", "/spatial/recent_events")
+    assert [each.log_time for each in recent] == [line.timestamp.ToNanoseconds() for *_, line in found]
+    listed = Log.FromString(recent[30].data).message.split("\n")
+    newest = [line for *_, line in found[30:10:-1]]
+    seconds = [(line.timestamp.ToNanoseconds() - 10**9) / 1e9 for line in newest]
+    assert listed == [f"{s:.3f} s  {line.message}" for s, line in zip(seconds, newest, strict=True)]
+
+
 def _messages(log: Path, topic: str) -> list[Message]:
     with log.open("rb") as stream:
         return [message for *_, message in make_reader(stream).iter_messages([topic])]

@@ -73,7 +73,7 @@ def test_every_path_of_a_layout_finds_something_in_its_log(tmp_path, specificati
     run_replay(open_source(RECORDINGS / "table.jsonl"), files, output=output)
     layout = check_layout(output)
     kinds = {panel.partition("!")[0] for panel in layout["configById"]}
-    assert kinds == {"3D", "Indicator", "Plot", "RawMessages", "RosOut", "StateTransitions", "Tab", "Table"}
+    assert kinds == {"3D", "Indicator", "Plot", "RawMessages", "StateTransitions", "Tab", "Table"}
 
 
 def test_a_layout_shows_nothing_that_its_log_has_not(tmp_path):

@@ -81,7 +81,7 @@ def test_a_viewer_sees_the_run_and_a_service_fires_the_trigger(
     # all that the layout draws is there
     capsys.readouterr()
     assert run([*command, "--layout"]) == 0
-    drawn = set(re.findall(r'"(/spatial/[a-z]+)', capsys.readouterr().out))
+    drawn = set(re.findall(r'"(/spatial/[a-z_]+)', capsys.readouterr().out))
     assert {STANDING, SCENE} <= drawn <= offered
     assert [each.name for each in sorted(clips.iterdir())][:2] == [
         "0001-looked-odd.mcap",

@@ -55,6 +55,7 @@ def test_samples_are_read_back_as_they_were_written(tmp_path: Path) -> None:
         "/spatial/frame",
         "/spatial/log",
         "/spatial/objects",
+        "/spatial/recent_events",
         "/spatial/robustness",
         "/spatial/scene",
         "/spatial/specification",

@@ -31,6 +31,7 @@ from spatial_replay.logs.topics import (
     EVENT_LOG,
     EVENTS,
     OBJECTS,
+    RECENT_EVENTS,
     ROBUSTNESS,
     SCENE,
     SPECIFICATION,
@@ -199,7 +200,7 @@ def test_a_playback_starts_at_the_first_sample_with_the_messages_before_it(tmp_p
 def test_the_end_of_the_log_comes_last_and_once(tmp_path: Path) -> None:
     source = open_source(talking(tmp_path / "talking.mcap"))
     expected = apart(annotated(source, tmp_path / "annotated.mcap"))
-    ended = (EVENTS, EVENT_LOG, ROBUSTNESS, ROBUSTNESS, SCENE, STANDING)
+    ended = (EVENTS, EVENT_LOG, RECENT_EVENTS, ROBUSTNESS, ROBUSTNESS, SCENE, STANDING)
     count = len(ended)
     assert [(topic, time_ns) for topic, time_ns, _ in expected[-count - 1 :]] == [
         (topic, COUNT * STEP_NS) for topic in ("/words", *ended)

@@ -47,6 +47,7 @@ ANNOTATION = {
     "/spatial/automaton",
     "/spatial/events",
     "/spatial/log",
+    "/spatial/recent_events",
 }
 
 
@@ -105,10 +106,10 @@ def test_messages_are_in_order_of_time_then_topic_and_those_of_the_end_come_last
     assert [time_ns for time_ns, _ in read] == sorted(time_ns for time_ns, _ in read)
     # in chunks of their own, so that others come before or after them at the same time
     every = [each for each in read if each[1].startswith("/spatial/")]
-    ours, ended = every[:-6], every[-6:]
+    ours, ended = every[:-7], every[-7:]
     theirs = [each for each in read if not each[1].startswith("/spatial/")]
     assert ours == sorted(ours) and theirs == sorted(theirs)
-    topics = ("events", "log", "robustness", "robustness", "scene", "standing")
+    topics = ("events", "log", "recent_events", "robustness", "robustness", "scene", "standing")
     assert ended == [(ours[-1][0], f"/spatial/{topic}") for topic in topics]
 
 
