@@ -233,6 +233,7 @@ def _first_failure(settled: Witness, first_ns: int) -> Sentence:
     amount, deciding = with_unit(abs(settled.upper), settled.unit), settled.deciding
     if deciding is not None and math.isfinite(deciding.value):
         amount = amount_text(abs(deciding.value), deciding.atom, settled.units)
+        amount = amount if without_residue(deciding.value, deciding.atom) else "a rounding error"
     return Sentence(
         "It was violated first at ", Instant(settled.settled_ns or 0, first_ns), f", by {amount}."
     )

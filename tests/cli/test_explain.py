@@ -192,12 +192,15 @@ def test_a_rounding_error_is_no_amount(folder: Path, capsys: pytest.CaptureFixtu
     (folder / "run.spatial").write_text(
         "spec close = G (left dist right <= 0.1)\nspec far = G (left dist right >= 0.3)\n"
     )
-    objects = ", ".join(
-        f'{{"name": "{name}", "polygon": [[{x}, 0], [{x + 1}, 0], [{x + 1}, 1]]}}'
-        for name, x in (("left", 0.2), ("right", 1.3))
-    )
-    (folder / "run.jsonl").write_text(f'{{"time_ns": 0, "objects": [{objects}]}}\n')
-    _, text = said(capsys, *EXPLAIN)
+    with (folder / "run.jsonl").open("w") as log:
+        for time_ns, right in ((0, 1.3), (1, 1.5)):
+            objects = ", ".join(
+                f'{{"name": "{name}", "polygon": [[{x}, 0], [{x + 1}, 0], [{x + 1}, 1]]}}'
+                for name, x in (("left", 0.2), ("right", right))
+            )
+            log.write(f'{{"time_ns": {time_ns}, "objects": [{objects}]}}\n')
+    assert "first at 0.000 s, by a rounding error." in said(capsys, *REPLAY)[1]
+    _, text = said(capsys, *EXPLAIN, "--to", "1ns")
     assert "`left dist right <= 0.1`, which just fails at 0.000 s" in text
     assert "`left dist right >= 0.3`, which fails by 0.2 at" in text
 
