@@ -11,6 +11,7 @@ import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import accumulate
 from typing import Final, Literal, NamedTuple
 
 import numpy as np
@@ -588,13 +589,13 @@ def _places(layout: SceneLayout, regions: int) -> tuple[list[_Places], int]:
     """Return where the numbers of each object begin, and where those of the arrow."""
     counts = [2 * sum(drawn.form.rings) for drawn in layout.objects]
     points = len(_STAMP_WORDS) + 3 * regions
-    colours = points + sum(counts)
+    *begins, colours = accumulate(counts, initial=points)
     middles = colours + 3 * len(counts)
     heights = middles + 2 * len(counts)
     end = heights + (4 * len(counts) if layout.has_heights else 0)
     return [
-        _Places(points + sum(counts[:index]), colours + 3 * index, middles + 2 * index, heights + 4 * index)
-        for index in range(len(counts))
+        _Places(begin, colours + 3 * index, middles + 2 * index, heights + 4 * index)
+        for index, begin in enumerate(begins)
     ], end
 
 

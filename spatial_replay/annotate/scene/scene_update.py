@@ -405,7 +405,7 @@ def _scale_of(trace: Trace, rows: Integers) -> float:
 def _rows_of(names: Sequence[str], trace: Trace, rows: Integers) -> Integers:
     """Return (S, names), rows of the trace; below 0 where an object is absent."""
     of_all = np.full((len(rows), len(names)), -1, np.int64)
-    of_all[:, [names.index(name) for name in trace.names]] = rows
+    of_all[:, list(map(set(trace.names).__contains__, names))] = rows
     return of_all
 
 
