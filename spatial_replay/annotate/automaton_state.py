@@ -130,10 +130,10 @@ class AutomatonRun:
         title = f"state {numbers}" if len(states) == 1 else f"one of the states {numbers}"
         accepting, can_accept, can_reject = self._about[states].T
         possible = {
-            "satisfied, whatever comes": ~can_reject,
+            "permanently satisfied": ~can_reject,
             "satisfied if nothing more came": accepting & can_reject,
             "not satisfied yet": ~accepting & can_accept & can_reject,
-            "violated, whatever comes": ~can_accept,
+            "permanently violated": ~can_accept,
         }
         *others, last = [meaning for meaning, holds in possible.items() if holds.any()]
         if others:

@@ -301,7 +301,7 @@ class LeafHistory:
         return self._samples <= self._most
 
     def settled(self, node: int, series: Floats, time_ns: int, verdict: Verdict) -> DecidingLeaf | None:
-        """Return what settled a node's verdict at a sample, whatever comes; None beyond the bound.
+        """Return what settled a node's verdict at a sample; None beyond the bound.
 
         For a violated conjunction it settled the first violated conjunct.
 

@@ -221,8 +221,8 @@ _NOW: Final[Mapping[int, str]] = {
     HOLDING: "holds so far",
     FAILING: "is pending",
     UNKNOWN: "is unknown",
-    SATISFIED: "is satisfied, whatever comes",
-    VIOLATED: "is violated, whatever comes",
+    SATISFIED: "is permanently satisfied",
+    VIOLATED: "is permanently violated",
 }
 
 

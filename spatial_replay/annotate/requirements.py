@@ -6,7 +6,7 @@ or left of an implication, low robustness is what is wanted. A requirement count
 largest temporal subformula around it, is fulfilled: no later sample can undo that.
 
 A requirement that fails now is violated only if that is certain: its obligation, and the conjunct of the
-specification that this is in, are violated whatever comes. A goal that is not reached yet is pending.
+specification that this is in, are permanently violated. A goal that is not reached yet is pending.
 """
 
 from __future__ import annotations

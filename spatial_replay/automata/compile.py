@@ -535,7 +535,7 @@ class _Joining:
         self._machines = first, second
         self._both = both
         self._left, self._right = first.decisions.tolist(), second.decisions.tolist()
-        # a trap of one loses for both, and what accepts whatever comes wins for either
+        # a trap of one loses for both, and a state that always accepts wins for either
         self._decided = _decided(first, not both), _decided(second, not both)
         self._rows: list[tuple[int, int, int]] = []
         self._known: dict[tuple[int, int], int] = {}
@@ -595,7 +595,7 @@ class _Joining:
 
 
 def _decided(machine: Machine, accepts: bool) -> frozenset[int]:
-    """Return the places of states that accept, or never accept, whatever comes."""
+    """Return the places of states that accept permanently, or never."""
     stays = machine.moves == ~np.arange(len(machine.moves))
     return frozenset((~np.flatnonzero(stays & (machine.accepting == accepts))).tolist())
 

@@ -243,11 +243,11 @@ def batch(
     """Evaluate many logs (a suite file, or logs with specifications) and show what fails.
 
     LOG is a file, a folder, a pattern such as 'nightly/**/*.mcap', or an address. Results are kept in a
-    folder; another run evaluates only what is new. A log that cannot be read is a result, too: its error.
+    folder; another run evaluates only what is new. A log that cannot be read has a row with its error.
 
-    Exits as replay does over all logs: 0 if everything is as expected, 1 if anything fails, 2 if an option
-    does not fit a log. It exits with 3 if logs are damaged or unfit, with 70 if the machine failed. It exits
-    with 4 if results are unknown, tested by nothing, or from logs with dropped samples.
+    One exit code covers all logs, with the meanings of replay. It is 0 if everything is as expected, 1 if
+    anything fails, 2 if an option does not fit a log. It is 3 if logs are damaged or unfit, 70 if the machine
+    failed. It is 4 if results are unknown, tested by nothing, or from logs with dropped samples.
 
     \b
     Examples:

@@ -140,7 +140,7 @@ _AUTOMATON_FILES = (".dot", ".hoa", ".svg")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of text.")
 @finding_format_option
 @click.option(
-    "--dfa", metavar="FILE|-", help="Automaton to write, as .dot, .hoa or .svg; - prints it as text."
+    "--dfa", metavar="FILE|-", help="File for the automaton: .dot, .hoa or .svg; '-' prints it as text."
 )
 @click.option("--result", "of", metavar="NAME", help="With --dfa: which result, if SPEC has several.")
 @click.option(

@@ -37,8 +37,9 @@ if TYPE_CHECKING:
     metavar="time|progress[:NAME]|NAME",
     default="time",
     show_default=True,
-    help="How to align two logs. time: since the first sample; progress: by states of the automaton of NAME,"
-    " or of the one with most states in common; NAME: by that spec's first change of sign.",
+    help="How to align two logs. time: by time since the first sample. progress:NAME: by states of the"
+    " automaton of NAME. progress: by those of the spec with most states in common. NAME: by the moment when"
+    " that spec's robustness first changes its sign.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
 @output_option("HTML page to write: both sides under one time cursor.")
@@ -53,14 +54,15 @@ def diff(
 ) -> int:
     """Compare two versions of a specification over a log, or two logs.
 
-    Two specifications (--spec OLD --spec NEW; with one --spec, OLD is that of the log): which verdicts and
-    numbers changed, at which sample first, and by which edit. The cause is checked: OLD with this edit alone,
-    and NEW without it, are evaluated.
+    With two specifications (--spec OLD --spec NEW), it shows which verdicts and numbers changed, which sample
+    differs first, and which edit is the cause. With one --spec, OLD is the specification in the log. The
+    cause is checked: OLD with this edit alone, and NEW without it, are evaluated.
 
-    Two logs: objects that moved differently and since when, the effect on each spec, and the planner's first
-    different decision.
+    With two logs, it shows which objects moved differently and since when, the effect on each spec, and the
+    planner's first different decision.
 
-    Exits with 0 if nothing but names of specs differs, otherwise with 1; with 3 after a damaged log.
+    Exits with 0 if nothing differs, or only names of specs, and otherwise with 1. If a log is damaged, it
+    exits with 3.
 
     \b
     Examples:

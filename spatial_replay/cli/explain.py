@@ -53,9 +53,9 @@ def explain(request: EvaluationArguments, result: str, at: str | None, as_json: 
     For each result: which sample, objects and relation decided it, by how much, since when, and which change
     of a constant would flip it. For an unknown verdict: the missing parts.
 
-    A time T is 12.5s or 1500ms after the first sample, 5250000000ns on the log's clock, or
-    2026-01-31T12:00:00Z. Exits with the code of the explained verdicts, as `replay` does, and with 4 if one
-    is undecided at --at.
+    Write a time T as 12.5s or 1500ms after the first sample, 5250000000ns on the log's clock, or
+    2026-01-31T12:00:00Z. Exits with the code of the explained verdicts, as `replay` does. A verdict
+    that is still pending at the time --at counts as unknown (4).
 
     \b
     Examples:

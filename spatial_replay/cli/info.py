@@ -53,7 +53,7 @@ _OF_MESSAGES = frozenset({"mapping", "on_time_jump", "max_lateness", "max_gap"})
 @click.option(
     "--fit",
     is_flag=True,
-    help="Print rates, gaps and known objects instead, in the form of `requires` in a suite.",
+    help="Print rates, gaps and known objects instead, as the section `requires` of a suite file for batch.",
 )
 @click.option("--decisions", is_flag=True, help="Print the decisions of a planned run instead.")
 @click.option(
@@ -61,16 +61,20 @@ _OF_MESSAGES = frozenset({"mapping", "on_time_jump", "max_lateness", "max_gap"})
     metavar="[NAME]",
     is_flag=False,
     flag_value="",
-    help="Print the recorded specification as it was written instead; NAME chooses a file or a spec.",
+    help="Print the text of the recorded specification instead; NAME chooses a file or a spec.",
 )
 @click.option("--layout", is_flag=True, help="Print the layout to import in a viewer instead.")
-@click.option("--panels", is_flag=True, help="With --layout: the one for viewers that have the extension.")
+@click.option(
+    "--panels",
+    is_flag=True,
+    help="With --layout: a layout with the panels of the extension, for viewers that have it (see --panel).",
+)
 @click.option(
     "--panel",
     is_flag=True,
     help="Write the extension for viewers instead; it is the same for every log, so give no LOG.",
 )
-@output_option("File to write instead of standard output; with --panel, of spatial-replay.foxe.")
+@output_option("File to write instead of standard output; with --panel, instead of spatial-replay.foxe.")
 @reading_options
 def info(
     log: LogFile | None,

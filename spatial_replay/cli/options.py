@@ -77,7 +77,8 @@ def serving_options(port: int, only_with: str = "") -> Callable[[_Command], _Com
             default="127.0.0.1",
             show_default=True,
             help=help_of(
-                "Address to listen on; one open to other machines needs the token in the printed address."
+                "Address to listen on. If other machines can reach it, viewers need the token in the"
+                " printed address."
             ),
         ),
         click.option(
@@ -168,7 +169,7 @@ durability_option = click.option(
     type=click.Choice(["process", "disk"]),
     default="process",
     show_default=True,
-    help="process: written chunks survive a crash of this process; disk: also one of the machine (fsync).",
+    help="process: written chunks survive a crash of this process; disk: also one of the computer (fsync).",
 )
 
 
@@ -206,7 +207,7 @@ def keep_option(text: str, default: str = "all") -> Callable[[_Command], _Comman
         "keep",
         metavar="all|mapped|PATTERN",
         multiple=True,
-        help=f"{text}: all, those of mapped topics, or of topics such as '/camera/*'; repeat for several."
+        help=f"{text}: all, mapped (of mapped topics), or of topics such as '/camera/*'; repeat for several."
         f"  [default: {default}]",
     )
 
@@ -216,7 +217,8 @@ semantics_option = click.option(
     type=click.Choice(["ltlf", "paper"]),
     default="ltlf",
     show_default=True,
-    help="ltlf: robustness over finite traces; paper: exactly Def. 16 of SpaTiaL's paper.",
+    help="What formulas mean. ltlf: robustness on a log that ends; paper: exactly Def. 16 of SpaTiaL's"
+    " paper.",
 )
 
 
@@ -339,13 +341,14 @@ _READING = (
     click.option(
         "--max-lateness",
         metavar="T|all",
-        help="External logs: how late messages may come, such as 2s; with 'all' the whole log is sorted."
+        help="External logs: by how much messages may be out of order, such as 2s. 'all' sorts the whole log."
         "  [default: 1s]",
     ),
     click.option(
         "--max-gap",
         metavar="T",
-        help="In pauses longer than T, everything is unknown; in those of one topic, its objects only.",
+        help="If samples pause for longer than T, everything is unknown there. If one topic pauses for"
+        " longer than T, only its objects are unknown.",
     ),
     click.option(
         "--read",
@@ -425,7 +428,7 @@ _CONDITIONS = (
         metavar="N",
         type=click.IntRange(min=1),
         default=1,
-        help="Use every Nth sample of the log; F[0, 10] and other bounds in samples count only these.",
+        help="Use every Nth sample of the log; bounds in samples, such as F[0, 10], count only these.",
     ),
     choices_option,
     constants_option,

@@ -102,7 +102,7 @@ def duration_ns(context: click.Context, parameter: click.Parameter, text: str | 
     "--rate",
     metavar="HZ",
     type=float,
-    help="Time a video's frames at this rate, instead of by its own stamps.",
+    help="Frame rate that gives a video's frames their times, instead of its own stamps.",
 )
 @click.option(
     "--for", "length_ns", metavar="T", callback=duration_ns, help="Duration of a recording from a camera."
@@ -128,8 +128,8 @@ def video(
 
     Reads a video file, a topic of a log with images or AprilTag detections, or a camera of this machine.
     Objects carry AprilTags; the tags file says which. Every footprint comes with its uncertainty, so that
-    a verdict near a threshold is unknown rather than guessed. Several videos or topics are cameras that
-    see the same scene: frames of equal time make one sample. Needs the extra `vision`.
+    a verdict near a threshold is unknown rather than guessed. Several videos or topics count as
+    several cameras of the same scene: frames of equal time make one sample. Needs the extra `vision`.
 
     Exits with 0 if all specifications are satisfied, 1 if any is violated, 4 if none is violated and any is
     unknown. It exits with 3 if the video is damaged; the recording up to there is complete.

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 @evaluation_options
 @log_output_option("Annotated log to write (MCAP).", required=False)
 @click.option("--layer", is_flag=True, help="Write the derived messages only, without the log's own.")
-@keep_option("With -o: messages of the log to copy", "all; none of a ROS 2 bag")
+@keep_option("Messages of the log to copy with -o", "all; none of a ROS 2 bag")
 @click.option(
     "--arrow",
     metavar="RESULT",
@@ -46,12 +46,16 @@ if TYPE_CHECKING:
     help="With -o: the violated result that the scene's arrow points at.  [default: the first violated one]",
 )
 @click.option("--json", "json_file", metavar="FILE|-", help="Results to write, as one JSON object.")
-@click.option("--series", is_flag=True, help="With --json: add the numbers of every node at every sample.")
+@click.option(
+    "--series",
+    is_flag=True,
+    help="With --json: add value, now, lower and upper of every node of the formula at every sample.",
+)
 @click.option(
     "--to-end",
     "signal",
     is_flag=True,
-    help="With --json: as --series, plus each node's robustness from each sample to the end.",
+    help="With --json: as --series, plus, for each node and sample, the robustness from there to the end.",
 )
 @click.option(
     "--window",
@@ -80,7 +84,7 @@ def replay(
 ) -> int:
     """Evaluate specifications over a recorded log.
 
-    A time T is 12.5s or 1500ms after the first sample, 5250000000ns on the log's clock, or
+    Write a time T as 12.5s or 1500ms after the first sample, 5250000000ns on the log's clock, or
     2026-01-31T12:00:00Z.
 
     Exits with 0 if all results are satisfied, 1 if any is violated, 4 if none is violated and any is unknown.

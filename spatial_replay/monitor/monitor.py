@@ -106,7 +106,7 @@ class Update:
         numbers: for each result spec (N, 4), as in `SpecUpdate`.
         monitored: what they are numbers of.
         settled: what `violations` are found from.
-        satisfied: the specs that are satisfied whatever comes; why is found when asked for (`reason`).
+        satisfied: the specs that are permanently satisfied; why is found when asked for (`reason`).
         remarks: a warning for each object and signal of the specification that is missing for too long.
     """
 

@@ -378,7 +378,7 @@ def _flip(
                 return f"No number that can stand in it makes that {opposite}."
             case "unknown":
                 return f"No number in it makes that {opposite}: samples that are unknown decide, too."
-        return f"No number of this atom alone makes it {opposite}: other atoms decide it, too."
+        return f"No number in `{deciding.text}` alone makes it {opposite}: other atoms decide it, too."
     would = f"It would be {threshold.verdict}"
     if is_open:
         would = f"So far it would {'fail' if witness.verdict is Verdict.SATISFIED else 'hold'}"

@@ -72,7 +72,7 @@ class InstanceStream:
     Attributes:
         semantics: which of them evaluates it.
         first_satisfied_ns: the first sample with a value of at least 0 at the root, or None.
-        settled_ns: (N, 2): when each node's satisfaction and its violation became certain, whatever comes;
+        settled_ns: (N, 2): when each node's satisfaction and its violation became certain;
             `NEVER` where only the end of the log decides, and under the paper's semantics.
         robustness: (N,): each node's value on the samples so far.
     """

@@ -44,7 +44,7 @@ _AT_ONCE = 64
 
 @dataclass(frozen=True, eq=False)
 class Violation:
-    """A part of a specification that is violated whatever comes. `str()` is a sentence on it.
+    """A part of a specification that is permanently violated. `str()` is a sentence on it.
 
     Attributes:
         spec: the innermost named spec that it belongs to.
@@ -144,7 +144,7 @@ class Settled:
     """A verdict that a monitor has seen, with the samples to find its atom in.
 
     Attributes:
-        verdict: satisfied or violated, whatever comes.
+        verdict: permanently satisfied or violated.
         number: the end of the interval that settles it: the lower one of what is satisfied.
         samples: the newest; from `start` on they count, and they are all of them if `is_whole`.
     """

@@ -521,7 +521,7 @@ class VerdictChange(NamedTuple):
     Attributes:
         time_ns: of the sample that confirms it.
         spec: its name.
-        state: "satisfied" and "violated" whatever comes; "holds" and "pending" so far.
+        state: "satisfied" and "violated" permanently; "holds" and "pending" so far.
         sentence: what changed and why.
         is_first: whether nothing was known before.
     """
@@ -569,5 +569,5 @@ class VerdictChanges:
         if period.code == VIOLATED:
             own = {node for node in spec.names if node is not None} | {name}
             reasons = [str(each) for each in update.violations if each.spec in own]
-            sentence = f"{title} is violated, whatever comes: {'; '.join(reasons)}." if reasons else sentence
+            sentence = f"{title} is permanently violated: {'; '.join(reasons)}." if reasons else sentence
         return VerdictChange(update.time_ns, name, _WORDS[period.code], sentence, is_first)

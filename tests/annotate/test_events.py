@@ -112,14 +112,14 @@ def test_a_verdict_is_reported_at_once(tmp_path):
     assert event.start_time == event.end_time
     assert facts(event)["verdict"] == "violated"
     assert (line.level, line.line) == (Log.ERROR, 2)
-    assert line.message.startswith("`kept` is violated, whatever comes: `battery >= 0` fails by 1.")
+    assert line.message.startswith("`kept` is permanently violated: `battery >= 0` fails by 1.")
 
 
 def test_a_verdict_of_the_first_sample_has_nothing_before(tmp_path):
     [(number, event, line)] = events_of(tmp_path, "spec kept = G battery >= 0", -1.0, 1.0)
     assert number == 0
     assert not any(key.endswith("_before") for key in facts(event))
-    assert line.message == "`kept` is violated, whatever comes: `battery >= 0` fails by 1."
+    assert line.message == "`kept` is permanently violated: `battery >= 0` fails by 1."
 
 
 def test_how_it_begins_is_no_change(tmp_path):
@@ -143,7 +143,7 @@ def test_what_decided_may_lie_before_the_sample_that_settles_a_verdict(tmp_path)
         "1100000000",
     )
     assert line.message.startswith(
-        "`soon` is violated, whatever comes: `battery >= 5` failed by 1 (0.200 s earlier)."
+        "`soon` is permanently violated: `battery >= 5` failed by 1 (0.200 s earlier)."
     )
 
 
@@ -177,7 +177,7 @@ def test_a_template_says_for_whom(tmp_path):
     found = written(tmp_path, "spec near(x) = G x closeto[2] a", samples, each={"x": "all"})
     [(_, event, line)] = [each for each in found if END not in each[2].message]
     assert facts(event)["object"] == "b"
-    assert line.message.startswith("`near` for b is violated, whatever comes: `b closeto[2] a` fails by 1.")
+    assert line.message.startswith("`near` for b is permanently violated: `b closeto[2] a` fails by 1.")
 
 
 def test_negated_and_implied_atoms_are_witnesses_in_their_own_sign(tmp_path):
@@ -324,9 +324,7 @@ def test_an_event_names_the_requirement_that_its_spec_stands_for(tmp_path):
     [(_, event, line)] = events_of(tmp_path, text, 2.0, -1.0)
     assert facts(event)["requirement"] == "REQ-7"
     assert facts(event)["title"] == "the battery never runs empty"
-    assert line.message.startswith(
-        "`kept` (REQ-7: the battery never runs empty) is violated, whatever comes: "
-    )
+    assert line.message.startswith("`kept` (REQ-7: the battery never runs empty) is permanently violated: ")
 
 
 def test_a_part_that_decided_nothing_is_a_warning_at_the_end(tmp_path):
@@ -370,7 +368,7 @@ def test_a_result_that_becomes_unknown_is_an_event(tmp_path):
     said = [each[2].message for each in events_of(tmp_path, "spec full = F battery >= 3", *values)]
     assert said == [
         "`full` is unknown: `battery >= 3` is unknown. Before, it was pending for 0.200 s.",
-        "`full` is satisfied, whatever comes: `battery >= 3` just holds. Before, it was unknown for 0.400 s.",
+        "`full` is permanently satisfied: `battery >= 3` just holds. Before, it was unknown for 0.400 s.",
     ]
 
 
@@ -385,7 +383,7 @@ def test_an_uncertain_atom_has_one_number_everywhere(tmp_path):
     samples = [sr.Sample(index * STEP_NS, objects) for index, objects in enumerate(discs)]
     number = "fails by 0.5, at least 0.25 with what is uncertain"
     [(_, _, line)] = written(tmp_path, "spec far = G a dist b >= 2", samples)[:1]
-    assert line.message.startswith(f"`far` is violated, whatever comes: `a dist b >= 2` {number}.")
+    assert line.message.startswith(f"`far` is permanently violated: `a dist b >= 2` {number}.")
     [result] = sr.evaluate(
         sr.parse_specification("spec far = G a dist b >= 2"), sr.Trace.from_samples(samples)
     )

@@ -101,7 +101,7 @@ def test_every_message_says_how_all_results_stand_and_the_last_what_the_log_come
     assert [message.worst for message in found] == ["met", "met", "apart", "apart", "apart"]
     states = [message.results[1].automaton for message in found]
     assert states[1].endswith("satisfied if nothing more came")
-    assert states[2].endswith("violated, whatever comes")
+    assert states[2].endswith("permanently violated")
     assert found[0].results[0].automaton.endswith("still to come: a closeto[1] b")
 
 
@@ -115,10 +115,10 @@ def test_a_set_of_states_is_described_by_all_that_it_may_be(tmp_path: Path) -> N
     assert away[0].startswith("one of the states 0, 1: either ")
     assert set(away[0].partition("either ")[2].split("; or ")) == {
         "satisfied if nothing more came",
-        "violated, whatever comes",
+        "permanently violated",
     }
     assert set(met[0].partition("either ")[2].split("; or ")) == {
-        "satisfied, whatever comes",
+        "permanently satisfied",
         "not satisfied yet",
     }
 

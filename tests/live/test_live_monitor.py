@@ -255,7 +255,7 @@ def test_the_program_ends_at_the_violation_and_says_why(
     assert "`clear` holds so far" in shown
     assert "vase" in shown.partition("violated")[2] and "too close to vase" in shown
     assert "clear  violated" in shown and "seen   satisfied" in shown
-    assert "`seen` is satisfied, whatever comes: `robot dist vase <= 9` holds by 8.2 at 0.000 s." in shown
+    assert "`seen` is permanently satisfied: `robot dist vase <= 9` holds by 8.2 at 0.000 s." in shown
 
 
 def test_what_a_silent_topic_reported_is_unknown(tmp_path: Path) -> None:

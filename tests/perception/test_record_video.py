@@ -48,7 +48,7 @@ def test_verdicts_are_printed_as_they_change(folder: Path, capsys: pytest.Captur
     recorded(folder, "table.mp4")
     first, second, wrote, fit, end = capsys.readouterr().out.splitlines()
     assert "0.000 s  holds      `apart` holds so far" in first
-    assert "violated   `apart` is violated, whatever comes: red is" in second
+    assert "violated   `apart` is permanently violated: red is" in second
     assert wrote.endswith("12 samples over 0.440 s")
     assert fit.startswith("reference tags fit within 0.0")
     assert end.startswith("  apart  violated   robustness -0.02")

@@ -409,7 +409,7 @@ class WindowedPart(PartRows):
         is_until = (formula.operator != "G") == positive
         code, weak = codes.UNTIL if is_until else codes.RELEASE, int(not is_until)
         # in an until, say, positions outside the window are -inf, and so is the operand that has to hold so
-        # far where the window ends: whatever comes later is out of reach
+        # far where the window ends: later samples are out of reach
         self._has_window_signals, sign = True, -1 if is_until else 1
         outside = [self._elapsed(unit, low, -sign)] if low > 0 else []
         outside += [self._elapsed(unit, high + 1, sign)] if high < LAST else []

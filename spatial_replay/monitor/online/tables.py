@@ -139,7 +139,7 @@ def run_table(
     if position == 0:
         _start(rows, first, end, corners, memory, channel, table, work, values)
     elif memory[channel, table] == memory[channel, table + corners - 1]:
-        # it says the same whatever comes
+        # it no longer changes
         for k in range(count):
             work[says, k] = work[says + 1, k] = work[says + 2, k] = memory[channel, table]
         return int(says)

@@ -128,7 +128,7 @@ def find_witness(
         leaves: (C, A, T), the instance's leaves in them.
         times_ns: (T,), T at least 1.
         node: its id.
-        goes_on: whether samples may follow these, which settle the node's verdict whatever comes.
+        goes_on: whether samples may follow these, whatever they are, the node's verdict is settled.
         whole: leaves and times of the whole log, if the number that flips the verdict is sought over it.
         flips: whether that number is sought at all.
     """

@@ -23,7 +23,7 @@ function makeScene(clock, name = "scene") {
     hasMaps ? layerBox("map", "map", layers, redraw) : null)),
   key([{ground: "positive", words: scene.entities.some((each) => each.shades)
     ? "its requirements in the chosen result hold now" : "its requirements hold now"},
-    {ground: "negative", words: "one is violated, whatever comes"},
+    {ground: "negative", words: "one is permanently violated"},
     {ground: "neutral", words: "no requirement, still to come, or unknown"}]));
   let before = null;
   const show = () => {
