@@ -26,7 +26,7 @@ class Cause:
         text: its canonical text.
         verdict: violated, or unknown.
         robustness: of the conjunct on the whole log; NaN if not determined.
-        settled_ns: when its violation became certain, whatever came after; None if only the end of the log
+        settled_ns: when its violation became certain; None if only the end of the log
             decided.
         witness: the atom that decides it: at `settled_ns`, on the samples up to there, or else on the
             whole log. None if the leaves were not stored, and under the paper's semantics.

@@ -221,12 +221,12 @@ class SpecResult(Displayed):
 
     @property
     def satisfied_at_ns(self) -> int | None:
-        """When it became certain that it is satisfied, whatever came after; None if only the end decided."""
+        """When it became certain that it is satisfied; None if only the end decided."""
         return self.certain_ns() if self.verdict is Verdict.SATISFIED else None
 
     @property
     def violated_at_ns(self) -> int | None:
-        """When it became certain that it is violated, whatever came after; None if only the end decided."""
+        """When it became certain that it is violated; None if only the end decided."""
         return self.certain_ns() if self.verdict is Verdict.VIOLATED else None
 
     def certain_ns(self, node: int = 0) -> int | None:

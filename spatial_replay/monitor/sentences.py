@@ -198,7 +198,7 @@ def _robustness(lower: float, upper: float, unit: str) -> str:
 
 
 def _settled(title: str, verdict: Verdict, since: Instant) -> Sentence:
-    return Sentence(f"{title} is {verdict} since ", since, ", whatever came after.")
+    return Sentence(f"{title} is permanently {verdict} from ", since, " on.")
 
 
 def reason_sentence(witness: Witness, *, first_ns: int) -> Sentence:

@@ -166,7 +166,7 @@ def test_named_parts_that_later_samples_can_change_are_reported_too(tmp_path):
     )
     names = [(line.name, line.message) for *_, line in events_of(tmp_path, text, 0.5, 2.0, 2.0, 2.0, 2.0)]
     assert [name for name, _ in names] == ["filled", "both"]
-    assert names[0][1].startswith("`filled` in `both` is satisfied")
+    assert names[0][1].startswith("`filled` in `both` is permanently satisfied")
 
 
 def test_a_template_says_for_whom(tmp_path):

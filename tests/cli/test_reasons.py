@@ -82,7 +82,7 @@ def test_the_requirements_of_a_result_its_parts_and_causes_are_in_every_output(
     assert "safe [REQ-3: keeps its distance]: " in capsys.readouterr().out
     run(["explain", str(LOG), "--spec", "mission.spatial"])
     said = capsys.readouterr().out
-    assert "`safe` (REQ-3: keeps its distance) is violated since 5.533 s" in said
+    assert "`safe` (REQ-3: keeps its distance) is permanently violated from 5.533 s" in said
 
 
 def test_on_a_terminal_a_violation_leads_to_explain(
@@ -176,7 +176,7 @@ def test_explain_lists_every_failing_spec_the_settled_one_first(
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "REQ-7: done and safe"
     assert lines[1].startswith("`mission` is violated: robustness -0.1449, certain since 5.533 s")
-    assert lines[2] == "`safe` is violated since 5.533 s, whatever came after."
+    assert lines[2] == "`safe` is permanently violated from 5.533 s on."
     assert any(line.startswith("`goal` is violated, for the log has ended: ") for line in lines[3:])
 
 
@@ -189,7 +189,7 @@ def test_explain_names_the_part_with_the_least_robustness(
     assert run(["explain", str(LOG), "--spec", "stopped.spatial"]) == 1
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].endswith("(the least robustness is that of `goal`).")
-    assert lines[1].startswith("`safe` is violated since ")
+    assert lines[1].startswith("`safe` is permanently violated from ")
 
 
 def test_a_named_part_is_explained_by_what_settled_it(

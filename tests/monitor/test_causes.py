@@ -110,12 +110,12 @@ def test_explanations_name_every_cause_and_what_would_have_prevented_it() -> Non
     assert evaluated().explain().splitlines() == [
         "`task` is violated: robustness -7.76, certain since 3.000 s (the least robustness is that of "
         "`deliver`).",
-        "`safe` is violated since 3.000 s, whatever came after.",
+        "`safe` is permanently violated from 3.000 s on.",
         "What decides is `red dist vase >= 0.1`, which fails by 0.34 at 4.000 s (its least within `safe`): "
         "red and vase overlap by 0.24.",
         "It was violated first at 3.000 s, by 0.03.",
         "It would be satisfied with -0.2401 or less instead of 0.1 in `red dist vase >= 0.1`.",
-        "`charged` is violated since 4.000 s, whatever came after.",
+        "`charged` is permanently violated from 4.000 s on.",
         "What decides is `battery >= 0.2`, which fails by 0.06 at 4.000 s (within `charged`): "
         "battery is 0.14.",
         "It would be satisfied with 0.14 or less instead of 0.2 in `battery >= 0.2`.",

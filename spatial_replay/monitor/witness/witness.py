@@ -64,7 +64,7 @@ class Witness:
         obstacle: why there is none, if there is an atom.
         open_end: for a settled verdict whose interval has an open end, the atom that leaves it open, and the
             time of its sample.
-        settled_ns: the time of the sample that made the verdict certain, whatever came after; interval and
+        settled_ns: the time of the sample that made the verdict certain; interval and
             threshold are then those of that moment. None if it is about the whole log.
         missed: the outermost implication on the path that failed, or None.
         gaps: of an unknown atom, when what it is about is missing.
@@ -128,7 +128,7 @@ def find_witness(
         leaves: (C, A, T), the instance's leaves in them.
         times_ns: (T,), T at least 1.
         node: its id.
-        goes_on: whether samples may follow these, whatever they are, the node's verdict is settled.
+        goes_on: whether samples may follow these; the verdict then holds for any of them.
         whole: leaves and times of the whole log, if the number that flips the verdict is sought over it.
         flips: whether that number is sought at all.
     """
