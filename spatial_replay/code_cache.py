@@ -119,7 +119,7 @@ def _digest_of(path: Path) -> bytes:
 def _cache_parents() -> Iterator[Path]:
     for name in ("SPATIAL_REPLAY_CACHE", "NUMBA_CACHE_DIR"):
         if value := os.environ.get(name):
-            yield Path(value)
+            yield Path(value).absolute()
     yield _PACKAGE / "__pycache__"
     if Path(value := os.environ.get("XDG_CACHE_HOME", "")).is_absolute():
         yield Path(value) / "spatial-replay"

@@ -370,8 +370,8 @@ def _version_at(address: str) -> str:
 def _version_of(file: RemoteFile) -> tuple[int, str]:
     """Return the size of a remote file, and its strong tag or, without one, the digest of its bytes."""
     version = file.current_version()
-    if version.tag is not None and version.tag.startswith('"'):
-        return version.size, version.tag
+    if version.is_exact:
+        return version.size, str(version.tag)
     digest = hashlib.sha256()
     for piece in file.iter_whole():
         digest.update(piece)

@@ -290,6 +290,11 @@ class FileVersion:
     tag: str | None
     has_ranges: bool = True
 
+    @property
+    def is_exact(self) -> bool:
+        """Whether an equal version has equal bytes: a date or a weak tag does not promise that."""
+        return self.tag is not None and self.tag.startswith('"')
+
 
 class RemoteFile(PathLike[str]):
     """A file at an address. Holds its version and, up to 256 MiB, what was read of it lately.
@@ -457,7 +462,7 @@ class RemoteFile(PathLike[str]):
         """Read a range of the version that is known."""
         known = self._version
         # a weak tag never fits; then the answer's own tag is compared
-        strong = {"if_match": known.tag} if known and known.tag and known.tag.startswith('"') else {}
+        strong = {"if_match": known.tag} if known and known.is_exact else {}
         version, _, data = self._part({"range": wanted, **strong})
         if version != known or len(data) != wanted[1] - wanted[0]:
             raise self._changed()
@@ -639,8 +644,7 @@ def _copied(files: Sequence[RemoteFile], shown: str, reason: str, below: str = "
     parent = user_cache_folder("downloads")
     known = [f"{os.fspath(file)}\n{file.version.tag}\n{file.version.size}" for file in files]
     folder = parent / hashlib.sha256("\n".join(known).encode()).hexdigest()[:32]
-    # what has no tag may have changed
-    if all(version.tag is not None for version in versions) and all(
+    if all(version.is_exact for version in versions) and all(
         _has(folder / below / _name(file), file.version.size) for file in files
     ):
         with suppress(OSError):
@@ -716,7 +720,7 @@ def user_cache_folder(name: str) -> Path:
         RuntimeError: the user has no home folder.
     """
     if chosen := os.environ.get("SPATIAL_REPLAY_CACHE"):
-        return Path(chosen) / name
+        return Path(chosen).absolute() / name
     # the XDG specification has a relative path ignored
     parent = Path(os.environ.get("XDG_CACHE_HOME", ""))
     return (parent if parent.is_absolute() else Path.home() / ".cache") / "spatial-replay" / name

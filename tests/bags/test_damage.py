@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import pytest
 
@@ -204,6 +204,20 @@ def test_a_decompression_bomb_is_refused(tmp_path: Path) -> None:
     messages, reported = read(bag)
     assert not messages
     assert "claims to hold" in reported[0]
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_a_message_that_decompresses_to_a_thousand_times_its_size_is_refused_alone(
+    tmp_path: Path, storage: Literal["mcap", "sqlite3"]
+) -> None:
+    sent = [
+        Sent("/a", TEXT, START_NS + number, text(" " * size)) for number, size in enumerate((9, 2**27, 9))
+    ]
+    bag = write_ros2(tmp_path / "bag", sent, storage=storage, compression="message")
+    assert sum(each.stat().st_size for each in bag.iterdir()) < 2**16
+    messages, reported = read(bag)
+    assert [each.log_time_ns - START_NS for each in messages] == [0, 2]
+    assert "a message claims to hold" in reported[0]
 
 
 @pytest.mark.parametrize("junk", [b"", b"\x00" * 5_000, b"\xff" * 5_000, bytes(range(256)) * 20])

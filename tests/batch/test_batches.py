@@ -823,6 +823,26 @@ def test_logs_at_addresses_are_evaluated_once_for_each_version(fleet: Path) -> N
     assert "there is no such file" in done.out
 
 
+def test_another_log_of_equal_size_and_date_at_an_address_is_evaluated_again(
+    fleet: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("obstore")
+    from logs.web_server import serving
+
+    monkeypatch.setenv("SPATIAL_REPLAY_CACHE", str(fleet / "cache"))
+    near, far = (write_log(Path(f"{distance}.jsonl"), distance).read_bytes() for distance in (0.25, 0.75))
+    assert len(near) == len(far)
+    with serving({"run.jsonl": far}) as server:
+        server.dated = "Sat, 01 Jan 2000 00:00:00 GMT"
+        asked = ("batch", server.url("run.jsonl"), "--spec", "gate.spatial", "--jobs", "1")
+        assert command(*asked).code == 0
+        assert "1 known" in command(*asked).out
+        server.files["run.jsonl"] = near
+        done = command(*asked)
+        assert (done.code, "2 results: 1 satisfied, 1 violated" in done.out) == (1, True), done
+        assert command("replay", server.url("run.jsonl"), "--spec", "gate.spatial").code == 1
+
+
 def test_every_key_of_suites_is_documented_and_the_published_schema_is_that_of_the_package() -> None:
     root = Path(__file__).parents[2]
     schema = json.loads((root / "schemas/suite.schema.json").read_text())

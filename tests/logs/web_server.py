@@ -18,6 +18,7 @@ class WebServer:
         asked: for each answered request, the bytes from the first up to, not including, the second.
         fault: called for each request with its number; an answer such as 503, "cut" for half of the content,
             or None for what was asked.
+        dated: a date that all files have in place of tags.
     """
 
     files: dict[str, bytes]
@@ -25,9 +26,15 @@ class WebServer:
     asked: list[tuple[int, int]] = field(default_factory=list)
     fault: Callable[[int], int | str | None] = lambda number: None
     requests: int = 0
+    dated: str = ""
 
     def url(self, name: str) -> str:
         return f"{self.address}/logs/{name}"
+
+    def version(self, content: bytes) -> dict[str, str]:
+        """The head of an answer that tells versions of a file apart."""
+        tag = f'"{hashlib.sha256(content).hexdigest()[:16]}"'
+        return {"Last-Modified": self.dated} if self.dated else {"ETag": tag}
 
     @property
     def sent(self) -> int:
@@ -51,20 +58,19 @@ def serving(files: dict[str, bytes]) -> Iterator[WebServer]:
             if content is None or isinstance(fault, int):
                 self._answer(404 if content is None else fault, b"", {})
                 return
-            tag = f'"{hashlib.sha256(content).hexdigest()[:16]}"'
-            if self.headers.get("If-Match", tag) != tag:
+            version = server.version(content)
+            if self.headers.get("If-Match", version.get("ETag")) != version.get("ETag"):
                 self._answer(412, b"", {})
                 return
             begin, end = self._range(len(content))
             with lock:
                 server.asked.append((begin, end))
-            ranged = {"Content-Range": f"bytes {begin}-{end - 1}/{len(content)}", "ETag": tag}
+            ranged = {"Content-Range": f"bytes {begin}-{end - 1}/{len(content)}"} | version
             self._answer(206, content[begin:end], ranged, cut=fault == "cut")
 
         def do_HEAD(self) -> None:
             content = server.files.get(self.path.removeprefix("/logs/"))
-            tag = f'"{hashlib.sha256(content or b"").hexdigest()[:16]}"'
-            length = {"Content-Length": str(len(content or b"")), "ETag": tag}
+            length = {"Content-Length": str(len(content or b""))} | server.version(content or b"")
             self._answer(404 if content is None else 200, b"", length)
 
         def _range(self, size: int) -> tuple[int, int]:

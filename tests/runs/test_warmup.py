@@ -51,11 +51,27 @@ def test_an_unknown_form_of_kernels_is_refused_with_those_that_are_known():
     assert "SPATIAL_REPLAY_KERNELS is 'fast'; give 'compiled' or 'interpreted'" in done.stderr
 
 
-def test_a_relative_cache_folder_is_ignored(monkeypatch, tmp_path):
-    monkeypatch.setenv("XDG_CACHE_HOME", "here")
-    monkeypatch.setenv("HOME", str(tmp_path))
-    monkeypatch.delenv("SPATIAL_REPLAY_CACHE", raising=False)
-    assert user_cache_folder("downloads") == tmp_path / ".cache/spatial-replay/downloads"
+def test_a_relative_cache_folder_of_all_programs_is_ignored_and_an_own_one_stays_where_it_was_named(
+    monkeypatch,
+):
+    # where every user may look
+    with TemporaryDirectory(dir="/tmp") as name, monkeypatch.context() as patched:
+        home = Path(name)
+        home.chmod(0o777)
+        patched.chdir(home)
+        patched.setenv("XDG_CACHE_HOME", "here")
+        patched.setenv("HOME", name)
+        patched.delenv("NUMBA_CACHE_DIR", raising=False)
+        patched.delenv("SPATIAL_REPLAY_CACHE", raising=False)
+        own = home / ".cache/spatial-replay"
+        assert user_cache_folder("downloads") == own / "downloads"
+        # who cannot write beside the sources
+        with plain_user():
+            assert cache_folder().parent == own
+        patched.setenv("SPATIAL_REPLAY_CACHE", "own")
+        assert cache_folder().parent == home / "own"
+        assert user_cache_folder("downloads") == home / "own/downloads"
+        assert {each.name for each in home.iterdir()} == {".cache", "own"}
 
 
 def test_machine_code_is_kept_on_no_disk_that_is_full(monkeypatch, tmp_path):
