@@ -20,7 +20,7 @@ from spatial_replay.bags.ros1 import record_table
 from spatial_replay.cli.terminal import progress, show
 from spatial_replay.code_cache import cache_folder
 from spatial_replay.compare.runs import diff_sources
-from spatial_replay.compiled import compile_ahead
+from spatial_replay.compiled import compilations, compile_ahead
 from spatial_replay.errors import OutputError
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
 from spatial_replay.logs.source import MemorySource
@@ -62,7 +62,8 @@ def warm_up_kernels(workers: int, advance: Callable[[int], None] = lambda steps:
 
 
 def _run(name: str) -> None:
-    TASKS[name]()
+    with compilations(lambda: None):
+        TASKS[name]()
 
 
 def _samples() -> list[Sample]:

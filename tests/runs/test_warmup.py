@@ -37,7 +37,7 @@ def test_a_warm_up_compiles_every_kernel_and_says_where_the_code_is():
     # into the folder that the other tests use, where the code may be already
     command = [sys.executable, "-m", "spatial_replay", "warmup", "--jobs", "2"]
     said = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (said.returncode, said.stdout) == (0, f"compiled into {cache_folder()}\n"), said.stderr
+    assert (said.returncode, said.stdout, said.stderr) == (0, f"compiled into {cache_folder()}\n", "")
     done = subprocess.run([sys.executable, "-c", _EVERY_KERNEL], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout.strip()) == (0, ""), done.stderr
 
