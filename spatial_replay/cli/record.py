@@ -96,7 +96,7 @@ def duration_ns(context: click.Context, parameter: click.Parameter, text: str | 
     metavar="T",
     callback=duration_ns,
     help="Keep a hidden object at its last place for this long, such as 200ms, with growing uncertainty."
-    "  [default: hold of the tags file, or 0s]",
+    "  [default: 'hold' in the tags file, else 0s]",
 )
 @click.option(
     "--rate",

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 @click.option(
     "--series",
     is_flag=True,
-    help="With --json: add value, now, lower and upper of every node of the formula at every sample.",
+    help="With --json: add the fields value, now, lower and upper of every node at every sample.",
 )
 @click.option(
     "--to-end",
