@@ -38,8 +38,8 @@ if TYPE_CHECKING:
     default="time",
     show_default=True,
     help="How to align two logs. time: by time since the first sample. progress:NAME: by states of the"
-    " automaton of NAME. progress: by those of the spec with most states in common. NAME: by the moment when"
-    " that spec's robustness first changes its sign.",
+    " automaton of NAME. progress: the same, with the spec that has most states in common. NAME: by the"
+    " moment when that spec's robustness first changes its sign.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print JSON instead of text.")
 @output_option("HTML page to write: both sides under one time cursor.")

@@ -217,7 +217,7 @@ semantics_option = click.option(
     type=click.Choice(["ltlf", "paper"]),
     default="ltlf",
     show_default=True,
-    help="Meaning of formulas. ltlf: robustness on a log that ends; paper: exactly Def. 16 of SpaTiaL's"
+    help="Meaning of formulas. ltlf: robustness over finite traces; paper: exactly Def. 16 of SpaTiaL's"
     " paper.",
 )
 
