@@ -273,7 +273,7 @@ def message_from_error(error: BaseException) -> str:
         case click.UsageError(ctx=click.Context() as context):
             path, what = context.command_path, error.format_message()
             if "unexpected extra" in what and any("--spec" in each.opts for each in context.command.params):
-                what += f"; specifications come after --spec: {path} LOG --spec FILE"
+                what += f"; specifications come after --spec: {path} LOG --spec FILE; batch takes many logs"
             if "'--spec'" in what and any(each.name == "specification" for each in context.command.params):
                 what += f" {path} FILE takes the specification without it."
             return f"{what}\n  see '{path} --help'"

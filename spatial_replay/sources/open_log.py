@@ -143,9 +143,10 @@ def readable_file(path: str | PathLike[str]) -> LogFile:
             # the bag, by one of its files
             return file.absolute().parent
         if file.is_dir() and not is_bag_folder(file):
-            first = min((each.name for each in file.iterdir()), default=None)
-            what = "no file of a ROS 2 bag (.db3, .mcap)" if first else "nothing"
-            such = f", such as {printable(str(file / first))}" if first else ""
+            names = sorted(each.name for each in file.iterdir())
+            logs = [name for name in names if name.endswith((".mcap", ".bag", ".jsonl", ".jsonl.gz", ".csv"))]
+            what = "no file of a ROS 2 bag (.db3, .mcap)" if names else "nothing"
+            such = f", such as {printable(str(file / logs[0]))}; batch takes a folder" if logs else ""
             raise MissingFileError(f"{path}: there is {what} in this folder; give the path of a log{such}")
         return file
     if not file.version.has_ranges:

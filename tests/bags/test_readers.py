@@ -353,7 +353,10 @@ def test_folders_and_files_that_are_no_logs_say_what_to_give(tmp_path: Path) -> 
         read_trace(tmp_path / "empty")
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "notes.txt").write_text("words")
-    with pytest.raises(MissingFileError, match="no file of a ROS 2 bag"):
+    with pytest.raises(MissingFileError, match=r"no file of a ROS 2 bag .* give the path of a log$"):
+        read_trace(tmp_path / "other")
+    (tmp_path / "other" / "run.jsonl").write_text("")
+    with pytest.raises(MissingFileError, match=r"such as .*run\.jsonl; batch takes a folder$"):
         read_trace(tmp_path / "other")
     several = tmp_path / "several"
     several.mkdir()

@@ -189,7 +189,7 @@ TEN_FAULTS = "\n".join(
         (("replay", "run.jsonl", "--spec", "none.spatial"), "none.spatial: no such file; check the path"),
         (
             ("replay", "run.jsonl", "blocks.spatial"),
-            "specifications come after --spec: spatial-replay replay",
+            "specifications come after --spec: spatial-replay replay LOG --spec FILE; batch takes many logs",
         ),
         (("replay", "run.jsonl"), "run.jsonl holds no specification of its own; give one with --spec"),
         ((*REPLAY, "-o", "run.jsonl"), "run.jsonl: what is written is a log (MCAP); name it run.mcap"),
