@@ -32,7 +32,7 @@ class WebServer:
         return f"{self.address}/logs/{name}"
 
     def version(self, content: bytes) -> dict[str, str]:
-        """The head of an answer that tells versions of a file apart."""
+        """The header that distinguishes versions of a file."""
         tag = f'"{hashlib.sha256(content).hexdigest()[:16]}"'
         return {"Last-Modified": self.dated} if self.dated else {"ETag": tag}
 
