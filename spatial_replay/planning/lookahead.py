@@ -641,6 +641,8 @@ class Lookahead:
         path: tuple[Transition, ...],
         movables: Movables,
         pruned: Collection[Edge],
+        *,
+        together: bool = False,
     ) -> Consideration:
         """Return an edge with the candidate with which acceptance can be reached, or pruned.
 
@@ -649,6 +651,7 @@ class Lookahead:
             path: that begins with the edge.
             movables: of the newest sample.
             pruned: the edges given up so far.
+            together: whether several motions may take the edge, or move an object twice.
         """
         self._first = scene = self._expected.begin(movables)
         self._pruned = set(pruned)
@@ -664,11 +667,11 @@ class Lookahead:
             if len(set(names)) == len(names):
                 return found
             second_best = second_best or found
-        for motions, after in islice(self._joint(scene, path, consideration), 4):
+        for motions, after in islice(self._joint(scene, path, consideration), 4) if together else ():
             rest = self._ahead(*after)
             if rest is not None:
                 return self._begun(consideration, motions, rest, movables)
-        if second_best is not None:
+        if second_best is not None and together:
             return second_best
         if not by_cost(consideration.candidates, self._settings):
             return consideration

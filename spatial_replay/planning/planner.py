@@ -119,6 +119,8 @@ class Planner:
         self._stop_reason = ""
         self._lost: Loss | None = None
         self._pruned: dict[Edge, Reason] = {}
+        # those of them that several motions may take
+        self._passed: set[Edge] = set()
         self._attempts = Attempts()
         self._running: Step | None = None
         self._waiting: Step | None = None
@@ -295,24 +297,44 @@ class Planner:
         movables = self._movables(self._attempts)
         foresight = self._foresight(self._attempts, budget)
         considered: list[Consideration] = []
+        undecided: dict[int, tuple[Consideration, tuple[Transition, ...], frozenset[Edge]]] = {}
         # time takes idle transitions without any object being moved, so they stay possible
-        pruned = set(self._pruned) - idle.edges
-        while (path := next(self.automaton.paths(state, pruned), None)) is not None:
-            consideration = consideration_of(self.automaton, path, pruned, self._symbol)
-            if ahead := idle.along(path):
-                return self._waiting_step([*considered, consideration], ahead)
-            considered.append(self._considered(consideration, path, movables, foresight))
-            if considered[-1].pruned and self._may_repeat(consideration.edge):
-                # a motion may fail by chance: without any other, one that failed is made again
-                forgiven = self._attempts.forgiven()
-                again = self._movables(forgiven), self._foresight(forgiven, budget)
-                repeated = self._considered(consideration, path, *again)
-                considered[-1] = considered[-1] if repeated.pruned else repeated
+        given_up = frozenset(self._pruned) - self._passed
+        pruned = given_up - idle.edges
+        while (path := next(self.automaton.paths(state, pruned), None)) and not idle.along(path):
+            aim = consideration_of(self.automaton, path, pruned, self._symbol)
+            exhausted = self._attempts.why_exhausted(aim.edge, self.settings.attempts)
+            if exhausted is not None:
+                considered.append(replace(aim, pruned=exhausted))
+                self._passed.discard(aim.edge)
+            else:
+                aim = self._considered(aim, path, movables)
+                before = pruned | given_up
+                undecided[len(considered)] = aim, path, before
+                considered.append(foresight.decide(aim, path, movables, before) if foresight else aim)
+                self._passed.add(aim.edge)
             if (reason := considered[-1].pruned) is None:
                 return self._running_step(considered)
-            edge = consideration.edge
-            self._pruned[edge] = reason
-            pruned |= {edge, *equivalent_edges(self.automaton, consideration, idle, pruned, self._symbol)}
+            self._pruned[aim.edge] = reason
+            pruned |= {aim.edge, *equivalent_edges(self.automaton, aim, idle, pruned, self._symbol)}
+        # what takes several motions, or one that failed before, comes after all that one motion takes
+        for number, (alone, way, before) in undecided.items():
+            found = foresight.decide(alone, way, movables, before, together=True) if foresight else alone
+            if found.pruned and self._attempts.motions > 0:
+                # a motion may fail by chance: without any other, one that failed is made again
+                forgiven = self._attempts.forgiven()
+                again, ahead = self._movables(forgiven), self._foresight(forgiven, budget)
+                repeated = self._considered(alone, way, again)
+                repeated = ahead.decide(repeated, way, again, before, together=True) if ahead else repeated
+                found = found if repeated.pruned else repeated
+            considered[number] = found
+            if found.pruned is None:
+                return self._running_step(considered[: number + 1])
+            self._pruned[found.edge] = found.pruned
+            self._passed.discard(found.edge)
+        if path is not None:
+            considered.append(consideration_of(self.automaton, path, pruned, self._symbol))
+            return self._waiting_step(considered, idle.along(path))
         why = ""
         if foresight is not None and not self._attempts.are_any:
             first = considered[0].pruned if considered else None
@@ -328,28 +350,16 @@ class Planner:
         about = self.automaton, self._formulas, self._regions, self.settings
         return Lookahead(*about, attempts, budget) if self.settings.motions > 1 else None
 
-    def _may_repeat(self, edge: Edge) -> bool:
-        exhausted = self._attempts.why_exhausted(edge, self.settings.attempts)
-        return self._attempts.motions > 0 and exhausted is None
-
     def _considered(
-        self,
-        consideration: Consideration,
-        path: tuple[Transition, ...],
-        movables: Movables,
-        foresight: Lookahead | None,
+        self, consideration: Consideration, path: tuple[Transition, ...], movables: Movables
     ) -> Consideration:
-        """Return an edge with its candidates, or pruned."""
-        exhausted = self._attempts.why_exhausted(consideration.edge, self.settings.attempts)
-        if exhausted is not None:
-            return replace(consideration, pruned=exhausted)
+        """Return an edge with its candidates, the best one chosen; pruned if one motion does not take it."""
         later = moved_later(path, self._symbol, self._formulas, movables.names)
         candidates = [
             movables.candidate(name, consideration, movables.failed_places(name), later, refine=True)
             for name in movables.names_for(consideration.progress)
         ]
-        alone = with_choice(consideration, candidates, self.settings)
-        return alone if foresight is None else foresight.decide(alone, path, movables, self._pruned)
+        return with_choice(replace(consideration, pruned=None), candidates, self.settings)
 
     def _waiting_step(self, considered: list[Consideration], ahead: tuple[int, ...]) -> Step:
         reason = f"wait for {counted(len(ahead), 'sample')}: time alone leads on, to state {ahead[-1]}"
@@ -361,6 +371,7 @@ class Planner:
         if target is None:
             raise UsageError("the chosen object has no target")
         self._attempts.begin(aim.edge, self._newest(), self.settings)
+        self._pruned.pop(aim.edge, None)
         verb = "push" if self.settings.skill == "push" else "place"
         edge = f"{aim.edge[0]} -> {aim.edge[1]}"
         which = f", the first of {len(aim.motions)} motions," if aim.is_joint and len(aim.motions) > 1 else ""
