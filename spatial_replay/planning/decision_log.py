@@ -555,7 +555,7 @@ def decision_lines(decision: PlanDecision) -> Iterator[str]:
     yield f"step {decision.number} at {time_text(decision.time_ns)}, state {states}"
     yield f"  {decision.reason}"
     if decision.HasField("target"):
-        yield f"  {_target_text(decision.target)}{_once_all_are_done(decision.considered[-1])}"
+        yield f"  {_target_text(decision.target)}{once_all_are_done(decision.considered[-1])}"
     said: dict[tuple[str, ...], str] = {}
     for place, edge in enumerate(decision.considered, 1):
         yield from _edge_lines(edge, said, is_aim=place == len(decision.considered) and not edge.pruned)
@@ -569,7 +569,7 @@ def decision_lines(decision: PlanDecision) -> Iterator[str]:
         yield f"  {how} at {time_text(outcome.end_ns)}: {outcome.reason}; state {after}"
 
 
-def _once_all_are_done(edge: PlanEdge) -> str:
+def once_all_are_done(edge: PlanEdge) -> str:
     """Return when a target has its robustness, of several motions for one edge."""
     return f" once all {len(edge.motions)} motions are done" if edge.joint and len(edge.motions) > 1 else ""
 

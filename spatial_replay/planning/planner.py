@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import Final
@@ -44,7 +45,8 @@ from spatial_replay.planning.lookahead import MOST_MAPS, Lookahead
 from spatial_replay.planning.maps import concerns, refuse_delays, refuse_unknown
 from spatial_replay.planning.motions import Movables, with_choice
 from spatial_replay.planning.settings import Settings, Workspace, kind_faults, refuse_faults
-from spatial_replay.spec.formula import Specification
+from spatial_replay.spec.formula import Specification, Temporal
+from spatial_replay.spec.walks import iter_formulas
 from spatial_replay.text import counted, named_arguments, times_apart
 from spatial_replay.trace.sample import Sample, require_sample
 
@@ -112,6 +114,20 @@ class Planner:
         self._formulas = [each.formula for each in self.automaton.propositions]
         refuse_delays(self._formulas)
         self._specs = specs_of(formula, self._formulas)
+        # in words, a long proposition goes by the spec that it alone is part of, unless that always holds
+        always = [
+            each.name
+            for each in iter_formulas(formula)
+            if isinstance(each, Temporal) and each.operator == "G"
+        ]
+        uses = Counter([*always, *(name for names in self._specs for name in names)])
+        owns = (next((each for each in names if uses[each] == 1), None) for names in self._specs)
+        self._words = self.automaton.renamed(
+            [
+                replace(each, name=own) if own and len(each.literal(True)) > _LONGEST_WANTED else each
+                for each, own in zip(self.automaton.propositions, owns, strict=True)
+            ]
+        )
         self._states: frozenset[int] = frozenset({self.automaton.initial})
         self._sample: Sample | None = None
         self._observer = Observer(self._formulas, specification.regions)
@@ -200,7 +216,7 @@ class Planner:
         self._symbol = self._observer.symbol(sample)
         self._states = self.automaton.step_set(states, self._symbol)
         if self._lost is None and self._states.isdisjoint(self.automaton.can_accept):
-            text = loss_text(self.automaton, states, symbol, self._symbol)
+            text = loss_text(self._words, states, symbol, self._symbol)
             self._lost = Loss(sample.time_ns, text)
         self._stop_reason = self._why_stop(before, sample)
         # a wait ends early if the automaton is not where time alone should have taken it
@@ -225,7 +241,7 @@ class Planner:
         symbol = self._observer.symbol(Sample(sample.time_ns, objects, sample.signals, sample.unknown))
         if not self.automaton.step_set(self._states, symbol).isdisjoint(self.automaton.can_accept):
             return ""
-        labels = zip(self.automaton.propositions, self._symbol, symbol, strict=True)
+        labels = zip(self._words.propositions, self._symbol, symbol, strict=True)
         changed = [each.literal(bool(after)) for each, value, after in labels if after is not value]
         return (
             f"stopped: with the next sample, {' and '.join(changed) or 'the specification would be violated'}"
@@ -302,7 +318,7 @@ class Planner:
         given_up = frozenset(self._pruned) - self._passed
         pruned = given_up - idle.edges
         while (path := next(self.automaton.paths(state, pruned), None)) and not idle.along(path):
-            aim = consideration_of(self.automaton, path, pruned, self._symbol)
+            aim = consideration_of(self._words, path, pruned, self._symbol)
             exhausted = self._attempts.why_exhausted(aim.edge, self.settings.attempts)
             if exhausted is not None:
                 considered.append(replace(aim, pruned=exhausted))
@@ -333,7 +349,7 @@ class Planner:
             self._pruned[found.edge] = found.pruned
             self._passed.discard(found.edge)
         if path is not None:
-            considered.append(consideration_of(self.automaton, path, pruned, self._symbol))
+            considered.append(consideration_of(self._words, path, pruned, self._symbol))
             return self._waiting_step(considered, idle.along(path))
         why = ""
         if foresight is not None and not self._attempts.are_any:
@@ -406,8 +422,8 @@ class Planner:
 
     def _wanted(self, number: int, value: bool) -> str:
         """Return a proposition that has to hold or not, with the specs that it is of; a long one by these."""
-        text, specs = self.automaton.propositions[number].literal(value), " and ".join(self._specs[number])
-        if not specs:
+        text, specs = self._words.propositions[number].literal(value), " and ".join(self._specs[number])
+        if not specs or self._words.propositions[number].name:
             return text
         return specs if len(text) > _LONGEST_WANTED else f"{text} ({specs})"
 
@@ -425,7 +441,7 @@ class Planner:
 
     def _unknown(self) -> str:
         """Return the labels of the propositions that the newest sample leaves unknown."""
-        propositions = self.automaton.propositions
+        propositions = self._words.propositions
         labels = zip(propositions, self._symbol, strict=True)
         return ", ".join(each.label for each, value in labels if value is None)
 

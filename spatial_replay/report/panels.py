@@ -53,6 +53,7 @@ from spatial_replay.planning.decision_log import (
     decision_from_payload,
     latest_decisions,
     map_fields,
+    once_all_are_done,
 )
 from spatial_replay.planning.decisions import Reason
 from spatial_replay.report.compact import Packing, sentence_parts, singles
@@ -870,6 +871,8 @@ def _edge_value(edge: PlanEdge, is_aim: bool) -> Mapping[str, Any]:
         "progress": _guard_texts(edge.progress),
         "constraints": _guard_texts(edge.constraints),
         "candidates": [_candidate_value(candidate) for candidate in edge.candidates],
+        "later": [f"{each.object} to {_target_value(each)['words']}" for each in edge.motions[1:]],
+        "once": once_all_are_done(edge),
         "pruned": Reason.from_text(edge.pruned).kind,
     }
 

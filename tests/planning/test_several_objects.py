@@ -122,6 +122,7 @@ def test_the_reason_names_the_specs_that_a_relation_is_of():
     """
     _, _, steps, _ = planned(text)
     first, second = (step.reason for step in steps if step.target)
+    assert str(steps[0].considered[0].progress) in ("close and d leftof a", "d leftof a and close")
     assert re.search("^[bc] moves: close is wanted[;.] ", first)
     assert re.search(r"^[ad] moves: d leftof a \(tidy\) is wanted[;.] ", second)
 

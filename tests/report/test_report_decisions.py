@@ -60,6 +60,15 @@ def test_failed_attempts_are_listed() -> None:
     assert [(each["title"], each["edge"], each["candidate"]) for each in reported["maps"]] == [("cup", 0, 0)]
 
 
+def test_later_motions_are_listed() -> None:
+    planned = decision(0)
+    planned.considered[0].motions.extend(PlanTarget(object=name, x=0.5) for name in ("cup", "jug", "cup"))
+    planned.considered[0].joint = True
+    ((edge,),) = (each["edges"] for each in value_of(planned)["decisions"])
+    assert edge["later"] == ["jug to (0.5, 0)", "cup to (0.5, 0)"]
+    assert edge["once"] == " once all 3 motions are done"
+
+
 def test_maps_of_several_orientations_say_which() -> None:
     maps = [PlanMap(number=0, turn=0.0), PlanMap(number=1, turn=math.pi / 2)]
     (reported,) = value_of(decision(0, *maps), grid(), grid())["decisions"]

@@ -8,6 +8,8 @@ function makeDecisions(clock) {
   if (hasMaps) {
     place.append(mapKey());
   }
+  place.append(element("p", {class: "quiet"},
+    "Edges are tried in the order of their paths' lengths, those that one motion takes first."));
   place.append(element("ol", {class: "cards"}, ...cards));
   let here = null;
   clock.on("time", () => {
@@ -37,7 +39,9 @@ function makeDecision(clock, decision) {
   const tried = decision.edges.map((edge, number) => makeEdge(clock, decision, edge, number));
   const unnamed = decision.maps.filter((map) => map.edge === null);
   const meant = chosenMap(decision);
+  const later = decision.edges.flatMap((edge) => (edge.aim ? edge.later : []));
   const heading = element("div", {}, title, element("p", {}, sentence(decision.reason)),
+    later.length ? element("p", {}, `Planned next: ${later.join(", then ")}.`) : null,
     decision.outcome ? element("p", {}, outcomeWords(decision.outcome)) : null);
   return element("li", {class: "card"},
     heading, meant ? makeMap(clock, meant, false) : null, makeRedone(clock, decision.redone),
@@ -90,14 +94,14 @@ function makeEdge(clock, decision, edge, number) {
     edge.constraints.length ? element("p", {class: "quiet"}, "Never on the way") : null,
     edge.constraints.length ? guards(edge.constraints) : null,
     element("div", {class: "candidates"},
-      ...edge.candidates.map((candidate, place) => makeCandidate(clock, candidate, mapsOf(place)))),
+      ...edge.candidates.map((candidate, place) => makeCandidate(clock, candidate, mapsOf(place), edge.once))),
     edge.pruned ? element("p", {class: "pruned"}, `Given up: ${sentence(edge.pruned)}`) : null);
 }
 
-function makeCandidate(clock, candidate, own) {
+function makeCandidate(clock, candidate, own, once) {
   const {object, target, rejected, best} = candidate;
   const status = {chosen: "satisfied", possible: "holding", rejected: "violated"}[candidate.status];
-  const why = rejected || `to ${target.words}, robustness ${target.robustness}; at best ${best}`;
+  const why = rejected || `to ${target.words}, robustness ${target.robustness}${candidate.status === "chosen" ? once : ""}; at best ${best}`;
   return element("div", {class: "candidate"}, ...own.map((map) => makeMap(clock, map, own.length > 1)),
     element("p", {}, mark(status), element("b", {}, object), ` ${candidate.status}: ${sentence(why)}`),
     candidate.why?.length ? element("ul", {class: "quiet"}, ...candidate.why.map((line) => element("li", {}, line))) : null);
