@@ -6,17 +6,21 @@ import asyncio
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable
-from contextlib import aclosing
+from contextlib import aclosing, suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from websockets.asyncio.server import ServerConnection, serve
+from websockets.exceptions import ConnectionClosed
+from websockets.typing import Subprotocol
 
 import spatial_replay as sr
 from cli.program import PROGRAM, environment
@@ -42,7 +46,7 @@ from spatial_replay import LogError, Sample, Trace, Trigger, UsageError
 from spatial_replay.bags import open_messages
 from spatial_replay.cli import run
 from spatial_replay.live import LiveSession, LiveUpdate, monitor
-from spatial_replay.live.client import LARGEST_FRAME, Inbox, Received
+from spatial_replay.live.client import LARGEST_FRAME, Client, Inbox, Received
 from spatial_replay.logs.messages import Channel
 from spatial_replay.logs.topics import OBJECTS, ROBUSTNESS, SCENE
 
@@ -347,6 +351,39 @@ def test_large_messages_that_wait_are_bounded_by_their_bytes() -> None:
     waiting = [item.time_ns for item in inbox.take() if isinstance(item, Received)]
     assert waiting == list(range(36, 100))
     assert inbox.dropped == 36
+
+
+def test_frames_of_a_server_that_reads_no_answer_wait_there() -> None:
+    channels = [{"id": number, "topic": "/more", "encoding": "json"} for number in range(20_000)]
+    advertised = json.dumps({"op": "advertise", "channels": channels, "more": "x" * 2**22})
+    sent = 0
+
+    async def offer(connection: ServerConnection) -> None:
+        nonlocal sent
+        with suppress(ConnectionClosed):
+            while True:
+                await connection.send(advertised)
+                sent += 1
+
+    async def sent_at_most() -> int:
+        listening = socket.create_server(("127.0.0.1", 0))
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2**16)
+        protocols = [Subprotocol("foxglove.sdk.v1")]
+        async with serve(offer, sock=listening, subprotocols=protocols, max_size=None, max_queue=1) as server:
+            address = f"ws://127.0.0.1:{listening.getsockname()[1]}"
+            client = asyncio.create_task(Client(address, lambda topic: True, Inbox()).run())
+            last, turns = 0, 0
+            # both are in this thread: nothing moves any more once many turns changed nothing
+            while turns < 1_000 and sent < 50:
+                await asyncio.sleep(0)
+                last, turns = sent, (turns + 1 if last == sent > 0 else 0)
+            client.cancel()
+            for connection in server.connections:
+                connection.transport.abort()
+        return last
+
+    # also those in buffers of the system
+    assert asyncio.run(sent_at_most()) < 20
 
 
 def test_definitions_without_end_end_the_connection(tmp_path: Path) -> None:
