@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
 import pytest
+from mcap.writer import Writer
 
 from spatial_replay import UsageError, read_trace
 from spatial_replay.bags import Topic
@@ -436,3 +438,44 @@ def test_detections_in_images_are_turned_over() -> None:
     ground = Topic("/robot", "geometry_msgs/msg/PoseStamped", "cdr")
     assert "axes: {y: down}\n" in suggest_mapping("a.bag", [image], {})
     assert "axes:" not in suggest_mapping("a.bag", [image, ground], {})
+
+
+def test_a_robot_and_markers_in_two_frames_get_their_true_distance_or_a_refusal(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # odometry begins 2 m from the origin of the map, and the marker is 1.5 m from that
+    pose = {"position": {"x": 0, "y": 0, "z": 0}, "orientation": TURN}
+    marker = {"ns": "a", "id": 1, "type": 1, "action": 0, "lifetime": {"sec": 0, "nanosec": 0}}
+    marker |= {
+        "header": {"frame_id": "map", "stamp": STAMP},
+        "pose": {**pose, "position": {"x": 1.5, "y": 0, "z": 0}},
+    }
+    shift = {"translation": {"x": 2, "y": 0, "z": 0}, "rotation": TURN}
+    placed = {"header": {"frame_id": "map", "stamp": STAMP}, "child_frame_id": "odom", "transform": shift}
+    mapping = str(tmp_path / "m.yaml")
+    for transforms, code in (([placed], 1), ([], 2)):
+        messages = {
+            ("/tf", "tf2_msgs/msg/TFMessage"): {"transforms": transforms},
+            ("/odom", "nav_msgs/msg/Odometry"): {
+                "header": {"frame_id": "odom", "stamp": STAMP},
+                "pose": {"pose": pose},
+            },
+            ("/m", "visualization_msgs/msg/MarkerArray"): {
+                "markers": [{**marker, "scale": {"x": 1, "y": 1, "z": 1}}]
+            },
+        }
+        log = tmp_path / f"{code}.mcap"
+        with log.open("wb") as stream:
+            writer = Writer(stream)
+            writer.start("", "test")
+            for (topic, kind), message in messages.items():
+                schema = writer.register_schema(kind, "jsonschema", b"{}")
+                channel = writer.register_channel(topic, "json", schema)
+                writer.add_message(channel, 10**9, json.dumps(message).encode(), 10**9)
+            writer.finish()
+        Path(mapping).unlink(missing_ok=True)
+        assert run(["info", str(log), "--suggest-mapping", "-o", mapping]) == 0
+        capsys.readouterr()
+        assert run(["replay", str(log), "--mapping", mapping, "--spec", "G (odom dist a_1 >= 0)"]) == code
+        said = capsys.readouterr()
+        assert ("violated   robustness -0.5" if transforms else "no frame was chosen") in said.out + said.err
