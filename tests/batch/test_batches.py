@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import re
 import shutil
 from contextlib import suppress
 from importlib.resources import files
@@ -271,6 +272,20 @@ def test_a_batch_names_the_logs_that_are_damaged_and_those_that_lack_a_name(flee
     done = batch("logs", "--spec", "gate.spatial")
     assert (done.code, "damaged, or not to be read: logs/run-1.jsonl" in done.err) == (3, True)
     assert "(in logs/run-2.jsonl)" in done.err
+
+
+def test_a_folder_has_logs_of_every_ending_that_the_page_names(fleet: Path) -> None:
+    Path("empty").mkdir()
+    page = (Path(__file__).parents[2] / "docs/ci.md").read_text()
+    (named,) = re.findall(r"files that end in (.*?) are logs", page.replace("\n", " "))
+    endings = re.findall(r"`(.*?)`", named)
+    refused = batch("empty", "--spec", "gate.spatial")
+    assert (refused.code, f"logs end in {', '.join(endings)}" in refused.err) == (2, True)
+    for ending in endings:
+        Path(f"empty/log{ending}").write_text("{")
+    Path("empty/notes.txt").write_text("words")
+    done = batch("empty", "--spec", "gate.spatial")
+    assert (done.code, done.out.startswith(f"{len(endings)} logs, ")) == (3, True)
 
 
 def test_annotations_are_of_different_kinds_before_they_repeat_one(
