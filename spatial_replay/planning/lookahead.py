@@ -657,22 +657,17 @@ class Lookahead:
         self._pruned = set(pruned)
         self._why.clear()
         state = path[0].source
-        second_best: Consideration | None = None
-        for number in by_cost(consideration.candidates, self._settings):
-            target = consideration.candidates[number].target
-            if target is None or (rest := self._after(scene, state, (target,), path[0].target)) is None:
-                continue
-            found = _chosen(consideration, number, (target, *rest))
-            names = [each.name for each in found.motions]
-            if len(set(names)) == len(names):
-                return found
-            second_best = second_best or found
         for motions, after in islice(self._joint(scene, path, consideration), 4) if together else ():
             rest = self._ahead(*after)
             if rest is not None:
                 return self._begun(consideration, motions, rest, movables)
-        if second_best is not None and together:
-            return second_best
+        for number in by_cost(consideration.candidates, self._settings):
+            target = consideration.candidates[number].target
+            if target is None or (rest := self._after(scene, state, (target,), path[0].target)) is None:
+                continue
+            names = [target.name, *(each.name for each in rest)]
+            if together or len(set(names)) == len(names):
+                return _chosen(consideration, number, (target, *rest))
         if not by_cost(consideration.candidates, self._settings):
             return consideration
         why = "; ".join(islice(self._why, 3)) or "no sequence of motions was found"
@@ -728,7 +723,7 @@ class Lookahead:
         for name in movables.names_for(consideration.progress):
             if not self._expected.budget.spend():
                 return
-            candidates.append(movables.candidate(name, consideration, self._attempts.places_of(name), later))
+            candidates.append(movables.candidate(name, consideration, later))
         for number in by_cost(candidates, self._settings):
             target = candidates[number].target
             if target is not None:

@@ -111,7 +111,6 @@ class Movables:
         self,
         name: str,
         consideration: Consideration,
-        failed: Collection[tuple[float, float]] = (),
         later: Collection[str] = (),
         *,
         refine: bool = False,
@@ -119,7 +118,6 @@ class Movables:
         """Return an object with its map for an edge, and its target or why it has none.
 
         Args:
-            failed: places (x, y) where earlier attempts failed.
             later: objects that may still have to be moved after this motion.
             refine: refine the target, if the settings want that.
 
@@ -132,15 +130,13 @@ class Movables:
         gradient = gradient_map(maps, *cubes, settings.workspace, settings.constraint_margin)
         keeps_all = settings.room_from == "all" or name in later or self._attempts.needs_room(name)
         room_from = None if keeps_all else later
-        if self._attempts.failed_pick(name, self._sample, settings):
-            # no other target helps
-            rejected = "it could not be picked up where it lies"
-            return Candidate(
-                name, gradient, None, rejected, failed=tuple(failed), room_from=_tuple(room_from)
+        failed = self._attempts.places_of(name)
+        # if it cannot be picked up, no other target helps
+        target: Target | str = "it could not be picked up where it lies"
+        if not self._attempts.failed_pick(name, self._sample, settings):
+            target = find_target(
+                gradient, tracked, settings, maps.room(room_from), failed, self.failed_here(name)
             )
-        target = find_target(
-            gradient, tracked, settings, maps.room(room_from), failed, self.failed_here(name)
-        )
         if isinstance(target, Target) and refine:
             target = self.refined(target, consideration, room_from)
         if isinstance(target, Target):
@@ -148,11 +144,7 @@ class Movables:
         if isinstance(target, Target) and self.is_repeated(target):
             target = "it was tried wherever it would hold, and nothing has changed since"
         found, why = (None, target) if isinstance(target, str) else (target, "")
-        return Candidate(name, gradient, found, why, failed=tuple(failed), room_from=_tuple(room_from))
-
-    def failed_places(self, name: str) -> tuple[tuple[float, float], ...]:
-        """Return the places (x, y) where moving an object failed, whatever it was for."""
-        return self._attempts.places_of(name)
+        return Candidate(name, gradient, found, why, failed=failed, room_from=_tuple(room_from))
 
     def failed_here(self, name: str) -> tuple[Target, ...]:
         """Return the targets for which motions of an object failed while everything stood as it does."""

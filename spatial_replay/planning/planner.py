@@ -115,19 +115,15 @@ class Planner:
         refuse_delays(self._formulas)
         self._specs = specs_of(formula, self._formulas)
         # in words, a long proposition goes by the spec that it alone is part of, unless that always holds
-        always = [
-            each.name
-            for each in iter_formulas(formula)
-            if isinstance(each, Temporal) and each.operator == "G"
-        ]
-        uses = Counter([*always, *(name for names in self._specs for name in names)])
+        uses = Counter(name for names in self._specs for name in names)
+        temporal = (each for each in iter_formulas(formula) if isinstance(each, Temporal))
+        uses += Counter(each.name for each in temporal if each.name and each.operator == "G")
         owns = (next((each for each in names if uses[each] == 1), None) for names in self._specs)
-        self._words = self.automaton.renamed(
-            [
-                replace(each, name=own) if own and len(each.literal(True)) > _LONGEST_WANTED else each
-                for each, own in zip(self.automaton.propositions, owns, strict=True)
-            ]
-        )
+        named = [
+            replace(each, name=own) if own and len(each.literal(True)) > _LONGEST_WANTED else each
+            for each, own in zip(self.automaton.propositions, owns, strict=True)
+        ]
+        self._words = self.automaton.renamed(named)
         self._states: frozenset[int] = frozenset({self.automaton.initial})
         self._sample: Sample | None = None
         self._observer = Observer(self._formulas, specification.regions)
@@ -372,7 +368,7 @@ class Planner:
         """Return an edge with its candidates, the best one chosen; pruned if one motion does not take it."""
         later = moved_later(path, self._symbol, self._formulas, movables.names)
         candidates = [
-            movables.candidate(name, consideration, movables.failed_places(name), later, refine=True)
+            movables.candidate(name, consideration, later, refine=True)
             for name in movables.names_for(consideration.progress)
         ]
         return with_choice(replace(consideration, pruned=None), candidates, self.settings)
