@@ -296,6 +296,11 @@ def batch(
         write_junit(outputs.junit, result.table, suite.name, attached, inputs=inputs)
     if outputs.json_file is not None:
         write_json_lines(result.table, outputs.json_file, inputs)
+    if outputs.update_baseline and outputs.baseline is not None:
+        from spatial_replay.batch.store import ResultsFolder
+
+        ResultsFolder.create(outputs.baseline).write_run(found.table)
+        show(f"wrote {outputs.baseline}", err=outputs.json_file == "-")
     if outputs.json_file != "-":
         _print(result, found, folder)
     warn(*found.remarks)
@@ -310,11 +315,6 @@ def batch(
         warn(f"edited since the baseline, which may be why results differ: {_listed(edited)}")
     if differences is not None and _print_differences(differences, outputs.json_file == "-"):
         code = most_severe([code, ExitCode.VIOLATED])
-    if outputs.update_baseline and outputs.baseline is not None:
-        from spatial_replay.batch.store import ResultsFolder
-
-        ResultsFolder.create(outputs.baseline).write_run(found.table)
-        show(f"wrote {outputs.baseline}", err=outputs.json_file == "-")
     return code
 
 

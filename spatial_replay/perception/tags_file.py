@@ -349,8 +349,8 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
             continue
         place: Place = ("objects", name)
         shapes = [key for key in ("box", "disc", "polygon") if key in entry]
-        lengths = [key for key in (*shapes, "height") if key in entry]
-        faults += [((*place, key), large) for key in lengths if (large := _beyond(entry[key], reach))]
+        keys = (*shapes, "height")
+        faults += [((*place, key), large) for key in keys if (large := _beyond(entry.get(key), reach))]
         if len(shapes) != 1:
             faults.append(
                 (place, "give one of box, disc and polygon, the footprint around the object's centre")
