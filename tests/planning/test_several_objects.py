@@ -127,6 +127,15 @@ def test_the_reason_names_the_specs_that_a_relation_is_of():
     assert re.search(r"^[ad] moves: d leftof a \(tidy\) is wanted[;.] ", second)
 
 
+def test_an_edge_that_no_single_motion_takes_is_not_given_up_for_good():
+    regions = "region p = box(4, 6, 7, 9)\nregion q = box(0, 3, 2, 5)\n"
+    text = f"{regions}spec s = (F a enclosedin p) and (F d enclosedin q)"
+    _, end, steps, _ = planned(text, slips=1)
+    edges = [[each.edge for each in step.considered] for step in steps[:2]]
+    assert (end, len(edges[0])) == ("hold", 2)
+    assert edges[0] == edges[1]
+
+
 def test_what_is_in_the_way_is_moved_first():
     moved, end, _, _ = planned("region spot = box(7.2, 0.2, 8.8, 1.8)\nspec s = F (a enclosedin spot)")
     assert moved == ["c", "a"]
