@@ -31,7 +31,7 @@ from spatial_replay.annotate.violations import EvaluatedResult, ShadeTracker, vi
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.messages import Channel, Messages, messages_of
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
-from spatial_replay.logs.schemas.Robustness_pb2 import Robustness, StandingUpdate
+from spatial_replay.logs.schemas.Robustness_pb2 import RecentEvent, RecentEvents, Robustness, StandingUpdate
 from spatial_replay.logs.schemas.Specification_pb2 import Specification as SpecificationMessage
 from spatial_replay.logs.topics import (
     AUTOMATON,
@@ -51,7 +51,6 @@ from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.spec.formula import Outline, Specification, iter_nodes
-from spatial_replay.text import time_text
 from spatial_replay.trace.sample import LATEST_NS
 from spatial_replay.trace.trace import Trace
 
@@ -138,7 +137,7 @@ class Annotator:
         self._show = show
         self._written = dict.fromkeys(DERIVED, 0)
         self._first_ns = self._scene.first_ns
-        self._lines = deque[str](maxlen=_MOST_RECENT)
+        self._newest = deque[RecentEvent](maxlen=_MOST_RECENT)
 
     @property
     def scene(self) -> SceneState:
@@ -303,9 +302,9 @@ class Annotator:
     def _recent(self, event: EncodedEvent) -> bytes:
         """Return the newest events as one message: after a seek, viewers get no more of a topic of a file."""
         first_ns = event.time_ns if self._first_ns is None else self._first_ns
-        self._lines.appendleft(f"{time_text(event.time_ns, first_ns)}  {event.log.message}")
-        recent = Log(timestamp=event.log.timestamp, level=event.log.level, message="\n".join(self._lines))
-        return recent.SerializeToString(deterministic=True)
+        seconds = round((event.time_ns - first_ns) / 1e9, 3)
+        self._newest.appendleft(RecentEvent(at=seconds, event=event.log.message))
+        return RecentEvents(events=self._newest).SerializeToString(deterministic=True)
 
     def _automaton_states(self, blocks: Sequence[SeriesBlock]) -> Messages:
         """Return one message per sample and result that has an automaton."""
@@ -394,7 +393,7 @@ _AUTOMATON = protobuf_channel(AUTOMATON, AutomatonState)
 _SCENE = protobuf_channel(SCENE, SceneUpdate)
 _EVENTS = protobuf_channel(EVENTS, Event)
 _EVENT_LOG = protobuf_channel(EVENT_LOG, Log)
-_RECENT_EVENTS = protobuf_channel(RECENT_EVENTS, Log)
+_RECENT_EVENTS = protobuf_channel(RECENT_EVENTS, RecentEvents)
 
 
 def channels_of_results(trees: Sequence[ReportedTree]) -> tuple[Channel, ...]:

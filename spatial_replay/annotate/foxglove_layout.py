@@ -208,8 +208,8 @@ def violation_table() -> Panel:
 
 
 def event_list() -> Panel:
-    """Return the list of recent events, which stays complete after a seek."""
-    return _titled("RawMessages!events", "Events", {"topicPath": f"{RECENT_EVENTS}.message"})
+    """Return the table of recent events, which is complete after a seek, too."""
+    return _titled("Table!events", "Events", {"topicPath": f"{RECENT_EVENTS}.events"})
 
 
 def specification_text() -> Panel:

@@ -14,6 +14,7 @@ from mcap.records import Message
 
 import spatial_replay as sr
 from spatial_replay.logs import MemorySource
+from spatial_replay.logs.schemas.Robustness_pb2 import RecentEvents
 from spatial_replay.replay import ReplayOptions, Window, run_replay
 
 STEP_NS = 10**8
@@ -61,10 +62,10 @@ def test_a_viewer_that_seeks_gets_the_newest_events_in_one_message(tmp_path):
     found = written(tmp_path, "spec last = F G battery >= 0", batteries(*charges))
     recent = _messages(tmp_path / "annotated.mcap", "/spatial/recent_events")
     assert [each.log_time for each in recent] == [line.timestamp.ToNanoseconds() for *_, line in found]
-    listed = Log.FromString(recent[30].data).message.split("\n")
+    listed = [(each.at, each.event) for each in RecentEvents.FromString(recent[30].data).events]
     newest = [line for *_, line in found[30:10:-1]]
     seconds = [(line.timestamp.ToNanoseconds() - 10**9) / 1e9 for line in newest]
-    assert listed == [f"{s:.3f} s  {line.message}" for s, line in zip(seconds, newest, strict=True)]
+    assert listed == [(s, line.message) for s, line in zip(seconds, newest, strict=True)]
 
 
 def _messages(log: Path, topic: str) -> list[Message]:

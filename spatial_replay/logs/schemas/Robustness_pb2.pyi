@@ -239,6 +239,48 @@ class Violation(google.protobuf.message.Message):
 global___Violation = Violation
 
 @typing.final
+class RecentEvents(google.protobuf.message.Message):
+    """The newest events, so that a viewer that seeks in a file can list them."""
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    EVENTS_FIELD_NUMBER: builtins.int
+    @property
+    def events(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___RecentEvent]:
+        """The newest first."""
+
+    def __init__(
+        self,
+        *,
+        events: collections.abc.Iterable[global___RecentEvent] | None = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["events", b"events"]) -> None: ...
+
+global___RecentEvents = RecentEvents
+
+@typing.final
+class RecentEvent(google.protobuf.message.Message):
+    """One of them, for tables."""
+
+    DESCRIPTOR: google.protobuf.descriptor.Descriptor
+
+    AT_FIELD_NUMBER: builtins.int
+    EVENT_FIELD_NUMBER: builtins.int
+    at: builtins.float
+    """When it was confirmed: seconds after the first sample."""
+    event: builtins.str
+    """The sentence of /spatial/log."""
+    def __init__(
+        self,
+        *,
+        at: builtins.float = ...,
+        event: builtins.str = ...,
+    ) -> None: ...
+    def ClearField(self, field_name: typing.Literal["at", b"at", "event", b"event"]) -> None: ...
+
+global___RecentEvent = RecentEvent
+
+@typing.final
 class ResultStanding(google.protobuf.message.Message):
     """How one result stands."""
 
