@@ -196,6 +196,9 @@ def test_the_jobs_of_both_services_run_the_gate(gate: list[Block]) -> None:
         assert install.startswith("pip install './spatial-replay[parquet]'")
         ended = shell(" && ".join(rest))
         assert ended.returncode == 0, ended.stderr
+    # results of a gate that failed are kept, too
+    saved = next(each for each in github["jobs"]["gate"]["steps"] if "cache/save" in each.get("uses", ""))
+    assert (saved["if"], gitlab["gate"]["cache"]["when"]) == ("always()", "always")
     assert Path(gitlab["gate"]["artifacts"]["reports"]["junit"]).exists()
     assert Path(gitlab["gate"]["artifacts"]["paths"][0], "index.html").exists()
     assert Path(gitlab["gate"]["cache"]["paths"][0], "last_run.parquet").exists()
