@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import random
 from pathlib import Path
 from typing import Any
 
@@ -111,6 +112,22 @@ def test_every_message_attachment_and_metadata_record_of_a_whole_log_is_copied(
     assert metadata_of(tmp_path / "saved.mcap") == metadata_of(recorded)
     assert content_of(tmp_path / "saved.mcap").attachments == content_of(recorded).attachments
     assert call("verify", tmp_path / "saved.mcap")[0] == 0
+
+
+def test_what_is_recovered_of_any_damage_is_of_the_undamaged_log_and_the_rest_is_counted(
+    recorded: Path, tmp_path: Path
+) -> None:
+    chance, whole = random.Random(7), messages_of(recorded)
+    data = recorded.read_bytes()
+    for _ in range(25):
+        damaged = bytearray(data[: chance.choice([len(data), chance.randrange(20_000, len(data))])])
+        damaged[chance.randrange(8, len(damaged))] ^= 1 << chance.randrange(8)
+        (tmp_path / "broken.mcap").write_bytes(damaged)
+        code, said = call("recover", tmp_path / "broken.mcap", "-o", tmp_path / "saved.mcap")
+        saved = messages_of(tmp_path / "saved.mcap")
+        there = iter(whole)
+        assert all(each in there for each in saved), "a message that was not there, or in another order"
+        assert code == 3 or saved == whole, said
 
 
 def test_what_reads_a_recovered_log_warns_of_what_is_missing(recorded: Path, tmp_path: Path) -> None:
