@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from base64 import b64encode
 from importlib import import_module
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from mcap.writer import Writer
 
 import spatial_replay as sr
 from cli.program import run_program
+from report.report_pages import page_of
 from spatial_replay.logs.topics import RECORDED_PREFIX
 
 TEXT = (Path(__file__).parents[1] / "SECURITY.md").read_text()
@@ -89,6 +91,10 @@ def test_names_in_a_log_become_neither_paths_nor_parts_of_a_page(tmp_path: Path)
         for topic in topics.values():
             channel = writer.register_channel(topic, "json", 0)
             writer.add_message(channel, 1, b'{"x": 1, "y": 2}', 1)
+        image = writer.register_schema("foxglove.CompressedImage", "jsonschema", b"{}")
+        camera = writer.register_channel(f"/camera{script}", "json", image)
+        picture = {"format": f"jpeg{script}", "data": b64encode(script.encode()).decode()}
+        writer.add_message(camera, 1, json.dumps(picture).encode(), 1)
         for number, name in enumerate(["../../out", f"{tmp_path}/out", "../out", f"../{script}"]):
             text = f"spec s{number} = G (a dist b >= 1)"
             for prefix in ("", RECORDED_PREFIX):
@@ -112,3 +118,4 @@ def test_names_in_a_log_become_neither_paths_nor_parts_of_a_page(tmp_path: Path)
     pages = [folder / "run.html", *(folder / "pages").rglob("*.html")]
     assert len(pages) == 3
     assert not [page for page in pages if script in page.read_text()]
+    assert f"/camera{script}" in page_of(folder / "run.html").facts["camera"]["reason"]

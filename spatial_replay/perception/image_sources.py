@@ -82,13 +82,15 @@ class ImageTopic:
         Raises:
             MissingFileError: there is no such file.
             LogError: it is not a log of messages.
-            UsageError: no such topic, or none or several to choose from.
+            UsageError: no such topic, one of JSON, or none or several to choose from.
         """
         self._reader = open_messages(path)
         self.name = self._reader.name
         chosen = _chosen(self.name, self._reader.topics(), topic)
         self.topic, self._type = chosen.name, short_type(chosen.type)
         self.channel = next(iter(self._reader.channels({self.topic}).values()), None)
+        if self.channel is not None and self.channel.encoding == "json":
+            raise UsageError(f"{self.topic} has JSON messages; record it as protobuf or as ROS messages")
         self._decode = self._reader.decoder(self.topic)
         self._is_video = "CompressedVideo" in self._type
         self.faults: list[str] = []
