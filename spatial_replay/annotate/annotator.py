@@ -149,10 +149,6 @@ class Annotator:
         """Deciding atoms of the results that are decided so far."""
         return [each.over for each in self._reporters]
 
-    def redraw(self) -> None:
-        """Draw the whole scene with the next sample, for a viewer that shows nothing yet."""
-        self._scene = SceneState(first_ns=self._scene.first_ns, last=self._scene.last)
-
     def messages(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> list[Messages]:
         """Return what to write beside the next samples.
 

@@ -105,10 +105,6 @@ class AnnotatedEvaluation:
         """Return the event of what happens to a run beside its samples."""
         return merge(self._annotator.occurrence(time_ns, what, sentence))
 
-    def redraw(self) -> None:
-        """Draw the whole scene with the next sample, for a viewer that shows nothing yet."""
-        self._annotator.redraw()
-
     @property
     def finals(self) -> list[Floats]:
         """For each of `trees` (N, 2), lower and upper end of each node's value if the log ends here."""

@@ -25,7 +25,7 @@ from spatial_replay.logs.messages import Channel, MemorySink, Messages
 from spatial_replay.logs.objects import decode_objects
 from spatial_replay.logs.read_options import FaultKinds
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
-from spatial_replay.logs.topics import OBJECTS, SPECIFICATION, is_kept, protobuf_channel
+from spatial_replay.logs.topics import OBJECTS, is_kept, protobuf_channel
 from spatial_replay.mapping import LiveAssembler, LogMapping, ReadingPlan, load_mapping
 from spatial_replay.mapping.assemble import rehearse
 from spatial_replay.mapping.message_types import TRANSFORM_TYPES, short_type
@@ -744,24 +744,13 @@ class _ViewerLog:
         self._sink = MemorySink()
         self._recording = Recording(self._sink, files, about)
         warm_up(files, self._recording.automata)
-        self._specification: Messages | None = None
-        self.is_asked = False
-        """Whether a viewer has subscribed since the last sample, and shows nothing yet."""
 
     def add(self, samples: Sequence[Sample], trace: Trace, messages: Messages) -> None:
         """Send the next samples and messages, and what follows from them."""
-        is_asked = self.is_asked and len(trace) > 0
-        if is_asked:
-            self.is_asked = False
-            self._recording.redraw()
         self._recording.add(trace, messages)
-        self._remember_specification()
         self._publish()
         if len(trace):
-            newest_ns = int(trace.times_ns[-1])
-            self._server.send_time(newest_ns)
-            if self._specification is not None and is_asked:
-                self._server.publish(_at(self._specification, newest_ns))
+            self._server.send_time(int(trace.times_ns[-1]))
 
     def miss(self, time_ns: int, kind: Missed) -> None:
         """Viewers miss it unseen."""
@@ -790,28 +779,6 @@ class _ViewerLog:
             self._server.publish(made)
         self._sink.messages.clear()
 
-    def _remember_specification(self) -> None:
-        for made in self._sink.messages if self._specification is None else ():
-            for number, channel in made.channels.items():
-                if channel.topic == SPECIFICATION:
-                    place = np.flatnonzero(made.channel == number)[:1]
-                    if len(place):
-                        self._specification = Messages(
-                            {0: channel},
-                            np.zeros(1, np.int64),
-                            np.zeros(1, np.int64),
-                            made.log_time_ns[place],
-                            made.publish_time_ns[place],
-                            [made.payloads[int(place[0])]],
-                        )
-
-
-def _at(messages: Messages, time_ns: int) -> Messages:
-    times_ns = np.array([time_ns], np.int64)
-    return Messages(
-        messages.channels, messages.channel, messages.sequence, times_ns, times_ns, messages.payloads
-    )
-
 
 class Viewing(SampleWriter):
     """Shows a run to viewers: a writer that a session is given beside recorders."""
@@ -820,12 +787,7 @@ class Viewing(SampleWriter):
         """Compile everything."""
         refuse_templates(files)
         self.address = server.address
-        self._view = _ViewerLog(files, about, server)
-        super().__init__(self._view, "the view", _MOST_WAITING, block=False)
-
-    def ask(self) -> None:
-        """Send everything that is shown with the next sample."""
-        self._view.is_asked = True
+        super().__init__(_ViewerLog(files, about, server), "the view", _MOST_WAITING, block=False)
 
 
 @contextmanager
@@ -852,13 +814,7 @@ def open_viewing(
     with importing("serving takes foxglove-sdk", extra="live"):
         from spatial_replay.serve.server import RunServer
     channels = [*Recording(MemorySink(), files).channels, protobuf_channel(OBJECTS, ObjectStates)]
-    viewing: Viewing | None = None
-
-    def ask() -> None:
-        if viewing is not None:
-            viewing.ask()
-
-    server = RunServer(channels, host, port, ask, fire, origins)
+    server = RunServer(channels, host, port, fire, origins)
     try:
         viewing = Viewing(files, _axes(mapping), server)
         try:

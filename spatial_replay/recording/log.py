@@ -156,10 +156,6 @@ class Recording:
 
         return layout_attachment(self._evaluation.contents(None, (), self._axes))
 
-    def redraw(self) -> None:
-        """Draw the whole scene with the next sample, for a viewer that shows nothing yet."""
-        self._evaluation.redraw()
-
     def add(self, trace: Trace, beside: Messages | None = None) -> None:
         """Write the next samples, with the messages of their evaluation.
 

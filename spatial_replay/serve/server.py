@@ -481,24 +481,24 @@ class LiveServer(PublishingServer):
 
 
 class RunServer(PublishingServer):
-    """A server of a run that goes on, which reports new subscriptions, and offers a service that fires."""
+    """A server of a run that goes on: late viewers get the last message of a topic, and a service fires."""
 
     def __init__(
         self,
         channels: Sequence[Channel],
         host: str,
         port: int,
-        subscribed: Callable[[], None],
         fire: Callable[[str], None] | None,
         origins: Sequence[str] = (),
     ) -> None:
         """Listen; see `PublishingServer`.
 
         Args:
-            subscribed: called, on a thread of the library, when a viewer has subscribed to a topic.
             fire: what the service `trigger` calls with a reason; None for no service.
         """
-        self._subscribed, self._fire = subscribed, fire
+        self._fire = fire
+        self._latest: dict[str, tuple[Channel, bytes]] = {}
+        self._time_ns = 0
         super().__init__("spatial-replay: live", channels, host, port, origins)
 
     def publish(self, messages: Messages) -> None:
@@ -506,7 +506,18 @@ class RunServer(PublishingServer):
         for channel in messages.channels.values():
             if channel not in self._channels:
                 self._advertise(channel)
+        for number, payload in zip(messages.channel.tolist(), messages.payloads, strict=True):
+            channel = messages.channels[number]
+            self._latest[channel.topic] = channel, payload
+        self._time_ns = max([self._time_ns, *messages.log_time_ns.tolist()])
         super().publish(messages)
+
+    def resend(self, topic: str) -> None:
+        """Send the last message of a topic again, at the present time of the run."""
+        if topic in self._latest:
+            channel, payload = self._latest[topic]
+            self._channels[channel].log(payload, log_time=self._time_ns)
+            self.send_time(self._time_ns)
 
     def _start(self) -> protocol.WebSocketServer:
         services = [] if self._fire is None else [_trigger_service(self._fire)]
@@ -518,19 +529,19 @@ class RunServer(PublishingServer):
             supported_encodings=["json"],
             capabilities=capabilities,
             services=services,
-            server_listener=_Subscriptions(self._subscribed),
+            server_listener=_Subscriptions(self),
             context=self._context,
         )
 
 
 class _Subscriptions(protocol.ServerListener):
-    """Reports subscriptions; called on threads of the SDK."""
+    """Passes on subscriptions; called on threads of the SDK."""
 
-    def __init__(self, subscribed: Callable[[], None]) -> None:
-        self._subscribed = subscribed
+    def __init__(self, server: RunServer) -> None:
+        self._server = server
 
     def on_subscribe(self, client: protocol.Client, channel: protocol.ChannelView) -> None:
-        self._subscribed()
+        self._server.resend(channel.topic)
 
 
 def _trigger_service(fire: Callable[[str], None]) -> Service:

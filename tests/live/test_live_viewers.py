@@ -21,7 +21,17 @@ from live.robots import MAPPING, SPEC, Robot, files, messages_of, occurrence, ro
 from serve.viewer import PROTOCOL, viewer
 from spatial_replay.cli import run
 from spatial_replay.live.session import open_viewing
-from spatial_replay.logs.topics import AUTOMATON, EVENTS, OBJECTS, ROBUSTNESS, SCENE, STANDING
+from spatial_replay.logs.schemas.Robustness_pb2 import RecentEvents
+from spatial_replay.logs.topics import (
+    AUTOMATON,
+    EVENTS,
+    OBJECTS,
+    RECENT_EVENTS,
+    ROBUSTNESS,
+    SCENE,
+    SPECIFICATION,
+    STANDING,
+)
 
 SHOWN = (OBJECTS, ROBUSTNESS, STANDING, AUTOMATON, SCENE)
 
@@ -54,7 +64,7 @@ def test_a_viewer_sees_the_run_and_a_service_fires_the_trigger(
             offered.update(own.channels)
             assert await own.call("trigger", {"reason": "looked odd"}) == {"fired": True}
             moving.set()
-            await own.message(EVENTS, lambda each: b"`clear` is violated" in each.data)
+            await own.message(EVENTS, lambda each: b"`clear` is permanently violated" in each.data)
 
     with robot() as own:
 
@@ -130,6 +140,26 @@ def test_a_viewer_hears_that_the_robot_falls_silent(tmp_path: Path) -> None:
         for thread in threads:
             thread.join()
     assert "silence on /" in heard[0] and "what it reports is unknown" in heard[0]
+
+
+def test_a_viewer_that_joins_while_nothing_comes_sees_the_last_state() -> None:
+    shown = [STANDING, SCENE, ROBUSTNESS, RECENT_EVENTS, SPECIFICATION]
+
+    async def look(address: str) -> None:
+        async with viewer(address) as first, viewer(address) as own:
+            await first.subscribe([SCENE])
+            await first.message(SCENE, lambda each: each.time_ns == 3 * 10**9)
+            await own.subscribe(shown)
+            found = [await own.message(topic) for topic in shown]
+        assert {each.time_ns for each in found} == {3 * 10**9}
+        [event] = RecentEvents.FromString(found[3].data).events
+        assert event.event.startswith("`kept` is permanently violated: `battery >= 1` fails by 1.")
+
+    file = sr.parse_specification("spec kept = G battery >= 1")
+    with open_viewing([file], None, host="127.0.0.1", port=0, fire=str) as own:
+        for t in range(1, 4):
+            own.write(sr.Sample(t * 10**9, {}, {"battery": 2.0 - t}))
+        asyncio.run(look(own.address))
 
 
 def test_only_who_has_the_token_and_comes_from_an_allowed_page_sees_a_robot_from_elsewhere() -> None:
