@@ -533,37 +533,49 @@ _FEWEST: Final = 10
 _RARE: Final = 20
 """Where more than one in so many intervals is long, nothing comes regularly."""
 _MOST_LISTED: Final = 3
+_MOST_HELD: Final = 65_536
+"""After so many intervals, only the long ones are held."""
 
 
 class Pauses:
-    """The intervals between times, added in order."""
+    """The intervals between times, added in order. Of a long log, few are held."""
 
     def __init__(self) -> None:
-        self._times = np.empty(0, np.int64)
-        self._starts: list[Integers] = []
-        self._intervals: list[Integers] = []
+        self._last = np.empty(0, np.int64)
+        self._long = np.empty((2, 0), np.int64)
+        self._added: list[Integers] = []
+        self._first_usual_ns = 0
+        self._count = 0
 
     def add(self, times_ns: Integers) -> None:
         """Add times, which follow those before."""
-        times = np.concatenate([self._times, times_ns])
-        self._starts.append(times[:-1])
-        self._intervals.append(np.diff(times))
-        self._times = times[-1:]
+        times = np.concatenate([self._last, times_ns])
+        self._last = times[-1:].copy()
+        self._added.append(np.array([times[:-1], np.diff(times)]))
+        self._count += max(0, len(times) - 1)
+        if self._count // _MOST_HELD > (self._count - len(times_ns)) // _MOST_HELD:
+            self._first_usual_ns = self.usual_ns
+            held = self._held
+            self._long, self._added = held[:, held[1] > LONG_PAUSE * self._first_usual_ns], []
+
+    @property
+    def _held(self) -> Integers:
+        """(2, N): starts and lengths."""
+        return np.concatenate([self._long, *self._added], axis=1)
 
     def found(self) -> list[tuple[int, int]]:
         """Return the start and the length of each pause, the longest first."""
-        intervals = np.concatenate([np.empty(0, np.int64), *self._intervals])
-        is_long = intervals > LONG_PAUSE * self.usual_ns
-        if len(intervals) < _FEWEST or np.count_nonzero(is_long) > max(1, len(intervals) // _RARE):
+        held = self._held
+        starts, lengths = held[:, held[1] > LONG_PAUSE * self.usual_ns].tolist()
+        if self._count < _FEWEST or len(starts) > max(1, self._count // _RARE):
             return []
-        starts = np.concatenate(self._starts)[is_long].tolist()
-        return sorted(zip(starts, intervals[is_long].tolist(), strict=True), key=lambda each: -each[1])
+        return sorted(zip(starts, lengths, strict=True), key=lambda each: -each[1])
 
     @property
     def usual_ns(self) -> int:
-        """The median of the intervals; 0 without any."""
-        intervals = [each for each in self._intervals if len(each)]
-        return int(np.median(np.concatenate(intervals))) if intervals else 0
+        """The median of the intervals, in a long log of the first ones; 0 without any."""
+        lengths = self._held[1]
+        return self._first_usual_ns or (int(np.median(lengths)) if len(lengths) else 0)
 
     def remark(self, what: str, max_gap_ns: int | None) -> Sentence | None:
         """Return a sentence about the pauses of `what`; None without any."""

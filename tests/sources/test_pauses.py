@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from spatial_replay import UsageError, read_trace, replay_log
 from spatial_replay.cli import run
+from spatial_replay.trace.trace import Pauses
 
 
 @pytest.fixture
@@ -106,3 +109,21 @@ def test_a_window_that_may_miss_what_fills_a_pause_is_refused(log: Path, tmp_pat
 def test_a_limit_has_a_unit(log: Path) -> None:
     with pytest.raises(UsageError, match=r"max_gap is '2'; give a duration above 0, such as 2s or 500ms"):
         read_trace(log, max_gap="2")
+
+
+def test_pauses_of_a_long_log_are_found_and_take_no_memory() -> None:
+    intervals = np.full(1_000_000, 33_000_000)
+    intervals[[900, 500_000, 999_000]] = 10**9, 2 * 10**9, 3 * 10**9
+    times_ns = np.cumsum(intervals)
+    pauses = Pauses()
+    tracemalloc.start()
+    try:
+        for first in range(0, len(times_ns), 4_096):
+            pauses.add(times_ns[first : first + 4_096])
+        held_bytes, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert held_bytes < 2_000_000
+    assert pauses.usual_ns == 33_000_000
+    assert [length for _, length in pauses.found()] == [3 * 10**9, 2 * 10**9, 10**9]
+    assert pauses.found()[1][0] == times_ns[499_999]
