@@ -538,7 +538,7 @@ _MOST_HELD: Final = 65_536
 
 
 class Pauses:
-    """The intervals between times, added in order. Of a long log, few are held."""
+    """The intervals between times, added in order; few of them are held in a long log."""
 
     def __init__(self) -> None:
         self._last = np.empty(0, np.int64)
