@@ -157,7 +157,7 @@ class Annotator:
         """
         if not len(trace):
             return []
-        self._begin(trace)
+        first_ns = self._begin(trace)
         messages = []
         if not self._written[FRAME]:
             messages.append(
@@ -170,7 +170,7 @@ class Annotator:
                 self._units,
                 [() if run is None else run.propositions for run in self._runs],
                 self._automata,
-                self._first_ns,
+                first_ns,
             )
             messages.append(self._messages(_SPECIFICATION, trace.times_ns[:1], [specification]))
         messages.append(self._robustness(blocks))
@@ -248,9 +248,11 @@ class Annotator:
         times_ns = np.full(len(scene), time_ns)
         return [numbers, standing, replace(scene, log_time_ns=times_ns, publish_time_ns=times_ns)]
 
-    def _begin(self, trace: Trace) -> None:
+    def _begin(self, trace: Trace) -> int:
+        """Return the time of the first sample."""
         if self._first_ns is None:
             self._first_ns = int(trace.times_ns[0])
+        return self._first_ns
 
     def _remember(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> None:
         """Keep the last sample, and the last one of each result, for the end."""

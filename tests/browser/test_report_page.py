@@ -259,7 +259,7 @@ def test_choosing_an_event_goes_there(open_page: Open) -> None:
     expect(readout(page)).to_have_text("4.667 s / 9.967 s")
     expect(event).to_have_attribute("aria-current", "true")
     expect(page.locator("#tree .which")).to_contain_text("parallel at 4.667 s")
-    page.locator(".event", has_text="is violated").first.focus()
+    page.locator(".event", has_text="is permanently violated").first.focus()
     page.keyboard.press("Enter")
     expect(readout(page)).to_have_text("4.000 s / 9.967 s")
 
@@ -702,7 +702,7 @@ def test_of_events_at_once_the_one_of_the_chosen_result_is_marked(open_page: Ope
     page = open_page("violated")
     marked = page.locator("#events [aria-current] .sentence")
     # one of its named parts is violated at the same time
-    expect(marked).to_have_text(re.compile("^table_set is violated"))
+    expect(marked).to_have_text(re.compile("^table_set is permanently violated"))
 
 
 def test_a_damaged_log_is_announced(open_page: Open) -> None:

@@ -185,7 +185,9 @@ def test_a_file_without_a_sample_is_an_error(tmp_path, jsonl):
     empty.touch()
     with pytest.raises(LogError, match="empty"):
         open_source(empty)
-    with pytest.raises(MissingFileError, match=r"give the path of a log, such as .*empty\.jsonl$"):
+    with pytest.raises(
+        MissingFileError, match=r"give the path of a log, such as .*empty\.jsonl; batch takes a folder$"
+    ):
         open_source(tmp_path)
     other = tmp_path / "picture.png"
     other.write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(100))

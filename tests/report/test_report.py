@@ -202,7 +202,9 @@ def test_events_are_those_of_an_annotated_log(violated: Page) -> None:
     events = violated.facts["events"]
     assert [event["time"] for event in events] == sorted(event["time"] for event in events)
     found = next(
-        event for event in events if event["parts"][1] == "table_set" and "is violated" in event["parts"][2]
+        event
+        for event in events
+        if event["parts"][1] == "table_set" and "is permanently violated" in event["parts"][2]
     )
     assert (found["time"], found["status"], found["specification"]) == (4.0, "violated", "table_set")
 
