@@ -189,7 +189,7 @@ def bench_foreign_window(measure: Any) -> None:
 
 _PEAK = """
 import resource, sys
-from spatial_replay.logs.source import open_source
+from spatial_replay.sources import open_source
 for block in open_source(sys.argv[1], mapping=sys.argv[2]).iter_blocks():
     pass
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
