@@ -19,8 +19,8 @@ from spatial_replay.monitor.online.step import OnlineRun
 MILLION = 1_000_000
 WIDTHS = (10, 1000, 100_000)
 WIDER_LIMIT = 1.2
-LIMITS_S = {"F": 20e-3, "G": 20e-3, "U": 60e-3}
 """How much longer any width of a window may take than the quickest."""
+LIMITS_S = {"F": 20e-3, "G": 20e-3, "U": 60e-3}
 
 
 def _formula(operator: str, bound: str) -> Any:
