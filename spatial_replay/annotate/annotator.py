@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from itertools import groupby
+from operator import attrgetter
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
@@ -157,7 +159,6 @@ class Annotator:
         """
         if not len(trace):
             return []
-        first_ns = self._begin(trace)
         messages = []
         if not self._written[FRAME]:
             messages.append(
@@ -170,7 +171,7 @@ class Annotator:
                 self._units,
                 [() if run is None else run.propositions for run in self._runs],
                 self._automata,
-                first_ns,
+                int(trace.times_ns[0]) if self._scene.first_ns is None else self._scene.first_ns,
             )
             messages.append(self._messages(_SPECIFICATION, trace.times_ns[:1], [specification]))
         messages.append(self._robustness(blocks))
@@ -192,7 +193,6 @@ class Annotator:
         """Take in the next samples and return only their events."""
         if not len(trace):
             return []
-        self._begin(trace)
         for run, block in zip(self._runs, blocks, strict=True):
             if run is not None:
                 run.pass_over(block)
@@ -248,12 +248,6 @@ class Annotator:
         times_ns = np.full(len(scene), time_ns)
         return [numbers, standing, replace(scene, log_time_ns=times_ns, publish_time_ns=times_ns)]
 
-    def _begin(self, trace: Trace) -> int:
-        """Return the time of the first sample."""
-        if self._first_ns is None:
-            self._first_ns = int(trace.times_ns[0])
-        return self._first_ns
-
     def _remember(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> None:
         """Keep the last sample, and the last one of each result, for the end."""
         before = [None] * len(blocks) if self._latest is None else self._latest[1]
@@ -274,6 +268,8 @@ class Annotator:
     def _changes(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> list[EncodedEvent]:
         """Return the events, by time, then in the order of results and of their nodes."""
         self._samples.extend(trace)
+        if self._first_ns is None:
+            self._first_ns = int(trace.times_ns[0])
         for shades, block in zip(self._shades, blocks, strict=True):
             shades.extend(trace, block)
         self._since_ns = [
@@ -290,18 +286,23 @@ class Annotator:
     def _events(self, events: Sequence[EncodedEvent]) -> list[Messages]:
         times_ns = np.array([each.time_ns for each in events], np.int64)
         logs = [each.log.SerializeToString(deterministic=True) for each in events]
-        recent = [self._recent(each) for each in events]
+        by_time = groupby(events, attrgetter("time_ns"))
+        recent = {time_ns: self._recent(list(own)) for time_ns, own in by_time}
         return [
             self._messages(_EVENTS, times_ns, [each.event for each in events]),
             self._messages(_EVENT_LOG, times_ns, logs),
-            self._messages(_RECENT_EVENTS, times_ns, recent),
+            self._messages(_RECENT_EVENTS, np.array([*recent], np.int64), [*recent.values()]),
         ]
 
-    def _recent(self, event: EncodedEvent) -> bytes:
-        """Return the newest events as one message: after a seek, viewers get no more of a topic of a file."""
-        first_ns = event.time_ns if self._first_ns is None else self._first_ns
-        seconds = round((event.time_ns - first_ns) / 1e9, 3)
-        self._newest.appendleft(RecentEvent(at=seconds, event=event.log.message))
+    def _recent(self, events: Sequence[EncodedEvent]) -> bytes:
+        """Add events of one time to the newest ones, and return these as one message.
+
+        After a seek, viewers get no more of a topic of a file.
+        """
+        first_ns = events[0].time_ns if self._first_ns is None else self._first_ns
+        for event in events:
+            seconds = round((event.time_ns - first_ns) / 1e9, 3)
+            self._newest.appendleft(RecentEvent(at=seconds, event=event.log.message))
         return RecentEvents(events=self._newest).SerializeToString(deterministic=True)
 
     def _automaton_states(self, blocks: Sequence[SeriesBlock]) -> Messages:

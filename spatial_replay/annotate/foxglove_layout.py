@@ -208,7 +208,7 @@ def violation_table() -> Panel:
 
 
 def event_list() -> Panel:
-    """Return the table of recent events, which is complete after a seek, too."""
+    """Return the table of the newest events, also right after a seek."""
     return _titled("Table!events", "Events", {"topicPath": f"{RECENT_EVENTS}.events"})
 
 

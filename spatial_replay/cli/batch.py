@@ -294,13 +294,13 @@ def batch(
     if outputs.junit is not None:
         attached = {key: path.as_posix() for key, path in pages.items()}
         write_junit(outputs.junit, result.table, suite.name, attached, inputs=inputs)
-    if outputs.json_file is not None:
-        write_json_lines(result.table, outputs.json_file, inputs)
     if outputs.update_baseline and outputs.baseline is not None:
         from spatial_replay.batch.store import ResultsFolder
 
         ResultsFolder.create(outputs.baseline).write_run(found.table)
         show(f"wrote {outputs.baseline}", err=outputs.json_file == "-")
+    if outputs.json_file is not None:
+        write_json_lines(result.table, outputs.json_file, inputs)
     if outputs.json_file != "-":
         _print(result, found, folder)
     warn(*found.remarks)

@@ -64,11 +64,7 @@ _OF_MESSAGES = frozenset({"mapping", "on_time_jump", "max_lateness", "max_gap"})
     help="Print the text of the recorded specification instead; NAME chooses a file or a spec.",
 )
 @click.option("--layout", is_flag=True, help="Print the layout to import in a viewer instead.")
-@click.option(
-    "--panels",
-    is_flag=True,
-    help="With --layout: a layout with the panels of the extension, for viewers that have it (see --panel).",
-)
+@click.option("--panels", is_flag=True, help="With --layout: one with the panels of the extension.")
 @click.option(
     "--panel",
     is_flag=True,

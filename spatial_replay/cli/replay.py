@@ -46,11 +46,7 @@ if TYPE_CHECKING:
     help="With -o: the violated result that the scene's arrow points at.  [default: the first violated one]",
 )
 @click.option("--json", "json_file", metavar="FILE|-", help="Results to write, as one JSON object.")
-@click.option(
-    "--series",
-    is_flag=True,
-    help="With --json: add the fields value, now, lower and upper of every node at every sample.",
-)
+@click.option("--series", is_flag=True, help="With --json: add four numbers of every node at every sample.")
 @click.option(
     "--to-end",
     "signal",

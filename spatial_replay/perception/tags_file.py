@@ -398,8 +398,8 @@ def _reach(known: Any) -> float:
     """Return the diagonal of the box around reference tags, or a camera and the point that it looks at, in
     metres; inf where it is not known."""
     try:
-        entries = [each["at"] if isinstance(each, dict) else each for each in known.values()]
-        places = np.array([[_length(number) for number in entry] for entry in entries])
+        entries = [each for key, each in known.items() if key != "up"]
+        places = [[*map(_length, each["at"] if isinstance(each, dict) else each)] for each in entries]
         return float(np.linalg.norm(np.ptp(places, axis=0))) or math.inf
     except (AttributeError, KeyError, TypeError, ValueError, UsageError):
         return math.inf

@@ -672,7 +672,7 @@ class Lookahead:
             return consideration
         why = "; ".join(islice(self._why, 3)) or "no sequence of motions was found"
         unmarked = tuple(replace(each, is_chosen=False) for each in consideration.candidates)
-        reason = Reason(LATER, why)
+        reason = Reason(LATER, why if together else f"not by one motion: {why}")
         return replace(consideration, candidates=unmarked, pruned=reason)
 
     # ------------------------------------------------------------------------------------ one at a time

@@ -29,6 +29,7 @@ from spatial_replay.errors import SpecificationError, UsageError
 from spatial_replay.geometry.arrays import Integers, select
 from spatial_replay.logs.messages import Attachment, Block, Channel, Messages, join, merge
 from spatial_replay.logs.source import MemorySource, Source, axes_of, read_blocks
+from spatial_replay.logs.topics import RECENT_EVENTS
 from spatial_replay.monitor.result import SpecResult, worst_first
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.monitor.verdict import Verdict, worst_verdict
@@ -657,4 +658,8 @@ class Playback:
 
 
 def _last(events: Messages) -> Messages:
-    return select(events, np.arange(max(0, len(events) - _MOST_EVENTS), len(events)))
+    places = [
+        np.flatnonzero(events.channel == number)[-1 if channel.topic == RECENT_EVENTS else -_MOST_EVENTS :]
+        for number, channel in events.channels.items()
+    ]
+    return select(events, np.sort(np.concatenate([np.empty(0, np.int64), *places])))

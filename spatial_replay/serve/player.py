@@ -28,6 +28,7 @@ from spatial_replay.logs.topics import (
     GRADIENT_MAP,
     PLAN_DECISION,
     PLAN_PATH,
+    RECENT_EVENTS,
     REDONE_MAP,
     REDONE_PATH,
     SCENE,
@@ -566,6 +567,7 @@ _NEVER_THINNED: Final = (EVENTS, EVENT_LOG)
 _DRAWN: Final = (
     SCENE,
     STANDING,
+    RECENT_EVENTS,
     PLAN_DECISION,
     GRADIENT_MAP,
     PLAN_PATH,

@@ -16,6 +16,7 @@ from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 import foxglove
+import numpy as np
 from foxglove import Parameter, Service, ServiceRequest
 from foxglove import websocket as protocol
 from jsonschema import Draft202012Validator
@@ -23,7 +24,7 @@ from jsonschema.exceptions import best_match
 
 from spatial_replay.errors import SpatialReplayError, UsageError, system_reason
 from spatial_replay.logs.messages import Channel, Messages, Schema
-from spatial_replay.logs.topics import LAYOUT
+from spatial_replay.logs.topics import EVENT_LOG, EVENTS, LAYOUT
 from spatial_replay.replay.document import document_from_replay, explain_results
 from spatial_replay.replay.loaded_log import Evaluated
 from spatial_replay.serve.player import (
@@ -480,7 +481,7 @@ class LiveServer(PublishingServer):
         return _json_service(name, STEERING[name].request, PLAYBACK_STATE, handle)
 
 
-class RunServer(PublishingServer):
+class RunServer(PublishingServer, protocol.ServerListener):
     """A server of a run that goes on: late viewers get the last message of a topic, and a service fires."""
 
     def __init__(
@@ -497,7 +498,7 @@ class RunServer(PublishingServer):
             fire: what the service `trigger` calls with a reason; None for no service.
         """
         self._fire = fire
-        self._latest: dict[str, tuple[Channel, bytes]] = {}
+        self._latest: dict[int, tuple[foxglove.Channel, list[bytes]]] = {}
         self._time_ns = 0
         super().__init__("spatial-replay: live", channels, host, port, origins)
 
@@ -506,18 +507,28 @@ class RunServer(PublishingServer):
         for channel in messages.channels.values():
             if channel not in self._channels:
                 self._advertise(channel)
-        for number, payload in zip(messages.channel.tolist(), messages.payloads, strict=True):
-            channel = messages.channels[number]
-            self._latest[channel.topic] = channel, payload
-        self._time_ns = max([self._time_ns, *messages.log_time_ns.tolist()])
         super().publish(messages)
+        for number, channel in messages.channels.items():
+            own = np.flatnonzero(messages.channel == number)
+            if len(own) and channel in self._channels and _is_state(channel):
+                newest = own[messages.log_time_ns[own] == messages.log_time_ns[own[-1]]].tolist()
+                sent = self._channels[channel]
+                self._latest[sent.id()] = sent, [messages.payloads[place] for place in newest]
 
-    def resend(self, topic: str) -> None:
-        """Send the last message of a topic again, at the present time of the run."""
-        if topic in self._latest:
-            channel, payload = self._latest[topic]
-            self._channels[channel].log(payload, log_time=self._time_ns)
-            self.send_time(self._time_ns)
+    def send_time(self, time_ns: int) -> None:
+        """See `Viewers.send_time`."""
+        self._time_ns = time_ns
+        super().send_time(time_ns)
+
+    def on_subscribe(self, client: protocol.Client, channel: protocol.ChannelView) -> None:
+        """Send the last messages of a channel again, at the present time of the run."""
+        latest = None
+        # others may have come while these are sent
+        while latest is not (latest := self._latest.get(channel.id)) and latest is not None:
+            sent, payloads = latest
+            for payload in payloads:
+                sent.log(payload, log_time=self._time_ns)
+            super().send_time(self._time_ns)
 
     def _start(self) -> protocol.WebSocketServer:
         services = [] if self._fire is None else [_trigger_service(self._fire)]
@@ -529,19 +540,15 @@ class RunServer(PublishingServer):
             supported_encodings=["json"],
             capabilities=capabilities,
             services=services,
-            server_listener=_Subscriptions(self),
+            server_listener=self,
             context=self._context,
         )
 
 
-class _Subscriptions(protocol.ServerListener):
-    """Passes on subscriptions; called on threads of the SDK."""
-
-    def __init__(self, server: RunServer) -> None:
-        self._server = server
-
-    def on_subscribe(self, client: protocol.Client, channel: protocol.ChannelView) -> None:
-        self._server.resend(channel.topic)
+def _is_state(channel: Channel) -> bool:
+    """Return whether the last message of a channel says all; no event and no frame of a video does."""
+    schema = "" if channel.schema is None else channel.schema.name
+    return channel.topic not in (EVENTS, EVENT_LOG) and not schema.endswith("Video")
 
 
 def _trigger_service(fire: Callable[[str], None]) -> Service:

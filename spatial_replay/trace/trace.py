@@ -542,26 +542,32 @@ class Pauses:
 
     def __init__(self) -> None:
         self._last = np.empty(0, np.int64)
-        self._long = np.empty((2, 0), np.int64)
-        self._added: list[Integers] = []
-        self._first_usual_ns = 0
+        self._pieces: list[Integers] = []
+        self._first_usual_ns: int | None = None
         self._count = 0
 
     def add(self, times_ns: Integers) -> None:
         """Add times, which follow those before."""
         times = np.concatenate([self._last, times_ns])
         self._last = times[-1:].copy()
-        self._added.append(np.array([times[:-1], np.diff(times)]))
         self._count += max(0, len(times) - 1)
-        if self._count // _MOST_HELD > (self._count - len(times_ns)) // _MOST_HELD:
-            self._first_usual_ns = self.usual_ns
+        self._hold(np.array([times[:-1], np.diff(times)]))
+        if self._first_usual_ns is None and self._count >= _MOST_HELD:
             held = self._held
-            self._long, self._added = held[:, held[1] > LONG_PAUSE * self._first_usual_ns], []
+            self._first_usual_ns = int(np.median(held[1, :_MOST_HELD]))
+            self._pieces = []
+            self._hold(held)
+
+    def _hold(self, found: Integers) -> None:
+        if self._first_usual_ns is not None:
+            found = found[:, found[1] > LONG_PAUSE * self._first_usual_ns]
+        if found.size:
+            self._pieces.append(found)
 
     @property
     def _held(self) -> Integers:
         """(2, N): starts and lengths."""
-        return np.concatenate([self._long, *self._added], axis=1)
+        return np.concatenate([np.empty((2, 0), np.int64), *self._pieces], axis=1)
 
     def found(self) -> list[tuple[int, int]]:
         """Return the start and the length of each pause, the longest first."""
@@ -574,8 +580,9 @@ class Pauses:
     @property
     def usual_ns(self) -> int:
         """The median of the intervals, in a long log of the first ones; 0 without any."""
-        lengths = self._held[1]
-        return self._first_usual_ns or (int(np.median(lengths)) if len(lengths) else 0)
+        if self._first_usual_ns is not None:
+            return self._first_usual_ns
+        return int(np.median(self._held[1])) if self._pieces else 0
 
     def remark(self, what: str, max_gap_ns: int | None) -> Sentence | None:
         """Return a sentence about the pauses of `what`; None without any."""

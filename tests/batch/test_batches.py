@@ -276,12 +276,13 @@ def test_a_batch_names_the_logs_that_are_damaged_and_those_that_lack_a_name(flee
     assert "(in logs/run-2.jsonl)" in done.err
 
 
-def test_a_reader_that_closes_the_output_costs_no_baseline(fleet: Path) -> None:
-    line = f"{sys.executable} -m spatial_replay batch logs --spec gate.spatial --baseline main"
+@pytest.mark.parametrize("output", ["", "--json -"])
+def test_a_reader_that_closes_the_output_costs_no_baseline(fleet: Path, output: str) -> None:
+    line = f"{sys.executable} -m spatial_replay batch logs --spec gate.spatial --baseline main {output}"
     ended = subprocess.run(
         ["sh", "-c", f"{line} --update-baseline | true"], capture_output=True, text=True, check=False
     )
-    assert ended.stderr == "" and Path("main/last_run.parquet").exists()
+    assert ended.stderr in ("", "wrote main\n") and Path("main/last_run.parquet").exists()
 
 
 def test_a_folder_has_logs_of_every_ending_that_the_page_names(fleet: Path) -> None:

@@ -21,7 +21,7 @@ from live.robots import MAPPING, SPEC, Robot, files, messages_of, occurrence, ro
 from serve.viewer import PROTOCOL, viewer
 from spatial_replay.cli import run
 from spatial_replay.live.session import open_viewing
-from spatial_replay.logs.schemas.Robustness_pb2 import RecentEvents
+from spatial_replay.logs.schemas.Robustness_pb2 import RecentEvents, Robustness
 from spatial_replay.logs.topics import (
     AUTOMATON,
     EVENTS,
@@ -147,19 +147,28 @@ def test_a_viewer_that_joins_while_nothing_comes_sees_the_last_state() -> None:
 
     async def look(address: str) -> None:
         async with viewer(address) as first, viewer(address) as own:
-            await first.subscribe([SCENE])
+            await first.subscribe([SCENE, EVENTS])
             await first.message(SCENE, lambda each: each.time_ns == 3 * 10**9)
-            await own.subscribe(shown)
-            found = [await own.message(topic) for topic in shown]
-        assert {each.time_ns for each in found} == {3 * 10**9}
-        [event] = RecentEvents.FromString(found[3].data).events
-        assert event.event.startswith("`kept` is permanently violated: `battery >= 1` fails by 1.")
+            await own.subscribe([*shown, EVENTS])
+            found = {topic: await own.message(topic) for topic in shown}
+            assert {each.time_ns for each in found.values()} == {3 * 10**9}
+            other = await own.message(ROBUSTNESS)
+            names = {Robustness.FromString(each.data).specification for each in (found[ROBUSTNESS], other)}
+            assert names == {"kept", "full"}
+            [event] = RecentEvents.FromString(found[RECENT_EVENTS].data).events
+            assert event.event.startswith("`kept` is permanently violated: `battery >= 1` fails by 1.")
+            # nothing that has happened is sent as if it happened again
+            viewing.write(sr.Sample(4 * 10**9, {}, {"battery": -10.0}))
+            for each in (first, own):
+                assert (
+                    await each.message(EVENTS, lambda each: each.time_ns > 2 * 10**9)
+                ).time_ns == 4 * 10**9
 
-    file = sr.parse_specification("spec kept = G battery >= 1")
-    with open_viewing([file], None, host="127.0.0.1", port=0, fire=str) as own:
+    file = sr.parse_specification("spec kept = G battery >= 1\nspec full = G battery >= -5")
+    with open_viewing([file], None, host="127.0.0.1", port=0, fire=str) as viewing:
         for t in range(1, 4):
-            own.write(sr.Sample(t * 10**9, {}, {"battery": 2.0 - t}))
-        asyncio.run(look(own.address))
+            viewing.write(sr.Sample(t * 10**9, {}, {"battery": 2.0 - t}))
+        asyncio.run(look(viewing.address))
 
 
 def test_only_who_has_the_token_and_comes_from_an_allowed_page_sees_a_robot_from_elsewhere() -> None:

@@ -127,3 +127,15 @@ def test_pauses_of_a_long_log_are_found_and_take_no_memory() -> None:
     assert pauses.usual_ns == 33_000_000
     assert [length for _, length in pauses.found()] == [3 * 10**9, 2 * 10**9, 10**9]
     assert pauses.found()[1][0] == times_ns[499_999]
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 50, 403])
+def test_pauses_do_not_depend_on_blocks(size: int) -> None:
+    intervals = np.full(402, 33_000_000)
+    intervals[[0, 200]] = 10**9, 5 * 10**9
+    times_ns = np.append(0, np.cumsum(intervals))
+    pauses = Pauses()
+    for first in range(0, len(times_ns), size):
+        pauses.add(times_ns[first : first + size])
+    assert pauses.usual_ns == 33_000_000
+    assert [length for _, length in pauses.found()] == [5 * 10**9, 10**9]

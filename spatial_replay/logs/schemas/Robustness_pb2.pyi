@@ -174,8 +174,8 @@ class StandingUpdate(google.protobuf.message.Message):
 
     @property
     def violated(self) -> google.protobuf.internal.containers.RepeatedCompositeFieldContainer[global___Violation]:
-        """The results that are violated, whatever comes, the one that was so first before the others. While there is
-        none, one entry without numbers says so: viewers draw no table without rows.
+        """The permanently violated results, the first one first. While there is none, one entry without numbers says
+        so: viewers draw no table without rows.
         """
 
     def __init__(
