@@ -511,24 +511,22 @@ class RunServer(PublishingServer, protocol.ServerListener):
         for number, channel in messages.channels.items():
             own = np.flatnonzero(messages.channel == number)
             if len(own) and channel in self._channels and _is_state(channel):
-                newest = own[messages.log_time_ns[own] == messages.log_time_ns[own[-1]]].tolist()
+                time_ns = int(messages.log_time_ns[own[-1]])
+                self._time_ns = max(self._time_ns, time_ns)
+                newest = own[messages.log_time_ns[own] == time_ns].tolist()
                 sent = self._channels[channel]
                 self._latest[sent.id()] = sent, [messages.payloads[place] for place in newest]
 
-    def send_time(self, time_ns: int) -> None:
-        """See `Viewers.send_time`."""
-        self._time_ns = time_ns
-        super().send_time(time_ns)
-
     def on_subscribe(self, client: protocol.Client, channel: protocol.ChannelView) -> None:
-        """Send the last messages of a channel again, at the present time of the run."""
+        """Send the last messages of a channel again, at the time of the newest message of the run."""
         latest = None
-        # others may have come while these are sent
-        while latest is not (latest := self._latest.get(channel.id)) and latest is not None:
+        # newer ones may come while these are sent
+        while latest is not self._latest.get(channel.id):
+            latest = self._latest[channel.id]
             sent, payloads = latest
             for payload in payloads:
                 sent.log(payload, log_time=self._time_ns)
-            super().send_time(self._time_ns)
+            self.send_time(self._time_ns)
 
     def _start(self) -> protocol.WebSocketServer:
         services = [] if self._fire is None else [_trigger_service(self._fire)]

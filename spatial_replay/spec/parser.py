@@ -553,7 +553,7 @@ def _parse_group(group: TokenGroup, relations: Collection[str], faults: Faults) 
         for first, sign, word in zip(tokens, tokens[1:], tokens[2:], strict=False):
             if (first.type, sign.type) == ("NAME", "MINUS") and word.type in STATEMENT_TYPES:
                 hint = f'a name with - is written in quotes: "{first.value}-{word.value}"'
-        hint = hint or "a line that goes on ends in an operator"
+        hint = hint or "a formula is named by spec NAME = ...; a line that goes on ends in an operator"
         faults.add(span_of(tokens[0]), f"expected a statement ({words}), found {tokens[0].value!r}", hint)
         return _broken(tokens)
     parsing: Any = grammar().parse_interactive(start="formula" if group.is_bare_formula else "statement")

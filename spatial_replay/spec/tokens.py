@@ -45,6 +45,7 @@ _MEANT: Mapping[str, str] = MappingProxyType(
         **dict.fromkeys(("g", "globally", "alw"), "G"),
         **dict.fromkeys(("f", "finally", "ev", "sometime", "sometimes"), "F"),
         **{"x": "X", "wx": "WX", "h": "H", "o": "O", "y": "Y", "never": "G not", "if": "->"},
+        **{"previously": "Y", "yesterday": "Y", "p": "O", "n": "X", "gf": "G F", "fg": "F G"},
         **{"[]": "G", "<>": "F"},
     }
 )
@@ -169,7 +170,8 @@ def read_spellings(tokens: list[Token], faults: Faults) -> list[Token]:
             result.append(_as(token, "COMMA", ","))
         elif token.type == "NAME" and following and not _is_quoted(token):
             written = _word(token, result, following, macros)
-            if written.type == "ERROR" and not _holds_formula(tokens[index + 1 :]):
+            holds_formula = following[0].value in macros or _holds_formula(tokens[index + 1 :])
+            if written.type == "ERROR" and not holds_formula:
                 written = token
             if written.type == "ERROR":
                 _report(token, faults)
@@ -187,7 +189,7 @@ def _word(token: Token, before: Sequence[Token], after: Sequence[Token], macros:
         return _as(token, *infix)
     if (prefix is None and _plain(token) not in _MEANT) or not _is_in_front(before, after):
         return token
-    if token.value in macros and after[0].type == "LPAR":
+    if token.value in macros and (prefix is None or after[0].type == "LPAR"):
         return token
     return _as(token, "ERROR", token.value) if prefix is None else _as(token, *prefix)
 
@@ -336,6 +338,8 @@ def meant(tokens: Sequence[Token], position: int, accepted: Collection[str]) -> 
     if last.type in _STATEMENTS and token.type != "NAME" and token.value.isidentifier():
         kind = "a relation" if "RELATION" not in accepted and token.type in _RELATIONS else "a reserved word"
         return f"{token.value!r} is {kind}, so no name for a {last.value}", "give it another name"
+    if tokens[0].type == "DEF" and position == 2 and token.type in ("EQUAL", "COLON"):
+        return f"{last.value!r} has no parameters", f"such a formula is named by spec {last.value} = ..."
     if "EQUAL" in accepted and tokens[0].type in _STATEMENTS:
         return _meant_definition(tokens, position)
     if last.type == "NUMBER" and token.type == "NAME":
@@ -496,8 +500,9 @@ def meant_statement(tokens: Sequence[Token]) -> str:
         return f"words of the language have their own case: write {word}"
     if len(line) < 3 or line[1].type not in ("EQUAL", "COLON") or line[2].type == "COMPARE":
         return ""
-    is_number = all(each.type in ("NUMBER", "NAME", *_OPPOSITE) for each in line[2:])
-    definition = f"{line[0].value} = {_as_written(line[2:])}"
+    value = line[3:] if line[2].type == "EQUAL" else line[2:]
+    is_number = all(each.type in ("NUMBER", "NAME", *_OPPOSITE) for each in value)
+    definition = f"{line[0].value} = {_as_written(value)}"
     if is_number:
         return f"a number is defined by const {definition}; equality is written =="
     return f"a formula is named by spec {definition}"
