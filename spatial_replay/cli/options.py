@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import partial, wraps
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
+_Option = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +52,7 @@ class ServingArguments:
             warn(f"who has this address, with its token, can {what}")
 
 
-def serving_options(port: int, only_with: str = "") -> Callable[[_Command], _Command]:
+def serving_options(port: int, only_with: str = "") -> _Option:
     """Add the options of a server of viewers; the command takes them as `serving`.
 
     Args:
@@ -92,20 +93,7 @@ def serving_options(port: int, only_with: str = "") -> Callable[[_Command], _Com
         ),
     ]
 
-    def add(command: _Command) -> _Command:
-        @wraps(command)
-        def run(*arguments: Any, host: str, port: int, origins: tuple[str, ...], **named: Any) -> Any:
-            return command(*arguments, serving=ServingArguments(host, port, origins), **named)
-
-        decorated: Callable[..., Any] = run
-        for option in reversed(options):
-            decorated = option(decorated)
-        return cast(_Command, decorated)
-
-    return add
-
-
-_Option = Callable[[Callable[..., Any]], Callable[..., Any]]
+    return lambda command: add_options(options, gather("serving", ServingArguments, command))
 
 
 class JsonCommand(click.Command):

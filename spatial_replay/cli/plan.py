@@ -25,8 +25,6 @@ from spatial_replay.cli.options import (
 from spatial_replay.cli.record import (
     SCENARIOS,
     SimulationArguments,
-    parse_injections,
-    parse_starts,
     show_film,
     simulation_options,
 )
@@ -247,18 +245,13 @@ def planning_command(scenario: str) -> click.Command:
                 output,
                 file,
                 name=of,
-                seed=simulation["seed"],
-                noise_m=simulation["noise"],
-                injections=parse_injections(simulation["inject"]),
-                starts=parse_starts(simulation["start"]),
-                gui=simulation["gui"],
-                cameras=simulation["cameras"],
                 inputs=local_files(named),
                 advance=advance,
                 durability=durability,
                 changes=changes,
                 timings=timings,
                 also=files,
+                **simulation,
             )
         show(
             f"wrote {output}: {counted(planned.samples, 'sample')} over {planned.seconds:.3f} s; "
@@ -266,7 +259,7 @@ def planning_command(scenario: str) -> click.Command:
         )
         for note in filter(None, (planned.bounds, planned.yaws)):
             show(note)
-        show_film(simulation)
+        show_film(simulation["cameras"])
         show(f"planning took {planned.planning_s:.2f} s", err=True)
         show(f"the planner: {planned.reason}")
         if planned.ended == "no path":

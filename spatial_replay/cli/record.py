@@ -252,12 +252,34 @@ SCENARIOS: Mapping[str, str] = MappingProxyType(
 )
 """The simulated worlds, with a description of each."""
 
+
+def _injections(
+    context: click.Context, parameter: click.Parameter, texts: tuple[str, ...]
+) -> list[Injection]:
+    # imported here so that --help stays fast
+    from spatial_replay.simulation.world import Injection
+
+    return [Injection.parse(text) for text in texts]
+
+
+def _starts(context: click.Context, parameter: click.Parameter, texts: tuple[str, ...]) -> list[Start]:
+    from spatial_replay.simulation.world import Start
+
+    starts = [Start.parse(text) for text in texts]
+    names = [start.name for start in starts]
+    for name in names:
+        if names.count(name) > 1:
+            raise UsageError(f"--start: {name!r} is given twice; give one place")
+    return starts
+
+
 _SIMULATION = (
     click.option(
         "--seed", type=click.IntRange(0), default=0, help="Seed of initial poses and noise.  [default: 0]"
     ),
     click.option(
         "--noise",
+        "noise_m",
         metavar="METRES",
         type=click.FloatRange(0),
         default=0.0,
@@ -265,14 +287,18 @@ _SIMULATION = (
     ),
     click.option(
         "--inject",
+        "injections",
         metavar="MISHAP",
         multiple=True,
+        callback=_injections,
         help="Mishap to inject: drop@7s, slip@7s, or slip for the whole run; repeat for several.",
     ),
     click.option(
         "--start",
+        "starts",
         metavar="NAME=X,Y[,TURN]",
         multiple=True,
+        callback=_starts,
         help="Where an object is at the beginning, in metres and radians; repeat for several."
         "  [default: as the seed has it]",
     ),
@@ -295,9 +321,9 @@ class SimulationArguments(TypedDict):
     """How to simulate a world, as given on the command line."""
 
     seed: int
-    noise: float
-    inject: tuple[str, ...]
-    start: tuple[str, ...]
+    noise_m: float
+    injections: list[Injection]
+    starts: list[Start]
     gui: bool
     cameras: tuple[Path, ...]
 
@@ -307,42 +333,14 @@ def simulation_options(command: Callable[..., Any]) -> Callable[..., Any]:
     return add_options(_SIMULATION, gather("simulation", SimulationArguments, command))
 
 
-def show_film(simulation: SimulationArguments) -> None:
-    """Print how to read the video of a run, if there is one."""
-    videos = simulation["cameras"]
+def show_film(videos: Sequence[Path]) -> None:
+    """Print how to read the videos of a run, if there are any."""
     if videos:
         from spatial_replay.runs.virtual_camera import tags_of_film
 
         listed = " ".join(str(video) for video in videos)
         tags = tags_of_film(videos)
         show(f"filmed {listed}: spatial-replay record video {listed} --tags {tags} -o seen.mcap")
-
-
-def parse_injections(texts: Sequence[str]) -> list[Injection]:
-    """Return the mishaps given on the command line.
-
-    Raises:
-        UsageError: an unknown one.
-    """
-    from spatial_replay.simulation.world import Injection
-
-    return [Injection.parse(text) for text in texts]
-
-
-def parse_starts(texts: Sequence[str]) -> list[Start]:
-    """Return the starts of objects given on the command line.
-
-    Raises:
-        UsageError: one that is none, or two of one object.
-    """
-    from spatial_replay.simulation.world import Start
-
-    starts = [Start.parse(text) for text in texts]
-    names = [start.name for start in starts]
-    for name in names:
-        if names.count(name) > 1:
-            raise UsageError(f"--start: {name!r} is given twice; give one place")
-    return starts
 
 
 def recording_command(scenario: str) -> click.Command:
@@ -367,7 +365,11 @@ def recording_command(scenario: str) -> click.Command:
     @constants_option
     @profile_option
     @click.option(
-        "--duration", metavar="T", help="Simulated time, such as 10s.  [default: to the end of the script]"
+        "--duration",
+        "length_ns",
+        metavar="T",
+        callback=duration_ns,
+        help="Simulated time, such as 10s.  [default: to the end of the script]",
     )
     @simulation_options
     def command(
@@ -376,7 +378,7 @@ def recording_command(scenario: str) -> click.Command:
         specs: tuple[LogFile, ...],
         constants: Mapping[str, float | str],
         profile: str | None,
-        duration: str | None,
+        length_ns: int | None,
         simulation: SimulationArguments,
     ) -> int:
         # imported here so that --help stays fast
@@ -389,23 +391,18 @@ def recording_command(scenario: str) -> click.Command:
                 scenario,
                 output,
                 files or None,
-                seed=simulation["seed"],
-                duration_ns=None if duration is None else duration_ns_from_text(duration),
-                noise_m=simulation["noise"],
-                injections=parse_injections(simulation["inject"]),
-                starts=parse_starts(simulation["start"]),
-                gui=simulation["gui"],
-                cameras=simulation["cameras"],
+                duration_ns=length_ns,
                 inputs=local_files(specs),
                 advance=advance,
                 durability=durability,
+                **simulation,
             )
         show(
             f"wrote {output}: {counted(recorded.samples, 'sample')} over {recorded.seconds:.3f} s of "
             f"{counted(len(recorded.objects), 'object')}: {', '.join(recorded.objects)}"
         )
         show(f"the robot: {recorded.outcome}")
-        show_film(simulation)
+        show_film(simulation["cameras"])
         return ExitCode.SATISFIED
 
     return command
