@@ -12,6 +12,7 @@ import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from graphlib import CycleError, TopologicalSorter
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
@@ -670,24 +671,11 @@ def _in_order(described: FileDescriptorSet) -> list[FileDescriptorProto]:
     if len(described.file) > _MOST_FILES:
         raise ValueError(f"it has {len(described.file)} files; at most {_MOST_FILES} are read")
     files = {file.name: file for file in described.file}
-    missing: dict[str, int] = {}
-    importers: dict[str, list[str]] = {name: [] for name in files}
-    for name, file in files.items():
-        imports = {each for each in file.dependency if each in files}
-        missing[name] = len(imports)
-        for each in imports:
-            importers[each].append(name)
-    ready = [name for name, count in missing.items() if not count]
-    # the list grows during the loop: a file is ready when the last of its imports is
-    for name in ready:
-        for importer in importers[name]:
-            missing[importer] -= 1
-            if not missing[importer]:
-                ready.append(importer)
-    if len(ready) < len(files):
-        first = next(name for name, count in missing.items() if count)
-        raise ValueError(f"{first!r:.100} imports itself")
-    return [files[name] for name in ready]
+    imports = {name: [each for each in file.dependency if each in files] for name, file in files.items()}
+    try:
+        return [files[name] for name in TopologicalSorter(imports).static_order()]
+    except CycleError as error:
+        raise ValueError(f"{error.args[1][0]!r:.100} imports itself") from None
 
 
 def _decode_json(payload: bytes) -> object:

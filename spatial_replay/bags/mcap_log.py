@@ -14,7 +14,6 @@ import numpy as np
 
 from spatial_replay.bags.decoders import Topic, topic_of, topics_by_name
 from spatial_replay.bags.reader import Columns, MessageColumns, MessageReader, in_order, places_in
-from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.mcap.index import (
     ChunkPlace,
     DamageError,
@@ -81,10 +80,17 @@ class McapLog(MessageReader):
         is_first, self._is_remarked = not self._is_remarked, True
         return directory_remarks(self.name, self._contents[0], self.metadata()) if is_first else ()
 
+    @cached_property
+    def _topic_of(self) -> Mapping[int, str]:
+        return {number: channel.topic for number, channel in self._contents[1].items()}
+
+    def _channel(self, number: int) -> Channel:
+        return self._contents[1][number]
+
     @property
     def channel_topics(self) -> frozenset[str]:
         """The topics of its channels, without a look at their definitions."""
-        return frozenset(channel.topic for channel in self._contents[1].values())
+        return frozenset(self._topic_of.values())
 
     @property
     def start_ns(self) -> int | None:
@@ -92,8 +98,7 @@ class McapLog(MessageReader):
         return min((place.start_ns for place in self._contents[0].chunks), default=None)
 
     def _read(self, topics: Collection[str], first: int, last: int, *, as_recorded: bool) -> Columns:
-        directory, channels = self._contents
-        wanted = {number: channel.topic for number, channel in channels.items() if channel.topic in topics}
+        directory, wanted = self._contents[0], self._wanted(topics)
         places = [
             (rank, place)
             for rank, place in enumerate(directory.chunks)
@@ -127,14 +132,6 @@ class McapLog(MessageReader):
                     f"{self.name}: it declares {total} messages in all; {self._walked} could be read"
                 )
 
-    def channels(self, topics: Collection[str]) -> Mapping[int, Channel]:
-        declared = self._contents[1]
-        return {
-            rank: declared[number]
-            for rank, number in enumerate(self._numbers.tolist())
-            if declared[number].topic in topics
-        }
-
     def attachments(self) -> tuple[Attachment, ...]:
         with open_file(self._file) as stream:
             return tuple(iter_attachments(stream, self._contents[0], FaultList(), self.name))
@@ -142,16 +139,6 @@ class McapLog(MessageReader):
     def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
         with open_file(self._file) as stream:
             return tuple(iter_metadata(stream, self._contents[0], FaultList(), self.name))
-
-    @property
-    def channel_count(self) -> int:
-        """The number of channels, of whatever topics."""
-        return len(self._numbers)
-
-    @cached_property
-    def _numbers(self) -> Integers:
-        """The numbers of the channels, in order."""
-        return np.array(sorted(self._contents[1]), np.int64)
 
     def _messages(
         self,

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable, Mapping
+from bisect import bisect_right
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from functools import cached_property, partial
 from itertools import accumulate
@@ -14,7 +15,7 @@ import numpy as np
 
 from spatial_replay.bags.decoders import Topic, full_type_name, topics_by_name
 from spatial_replay.bags.mcap_log import McapLog
-from spatial_replay.bags.reader import Columns, MessageColumns, MessageReader, TimedColumns, merged
+from spatial_replay.bags.reader import Columns, MessageColumns, MessageReader, merged
 from spatial_replay.bags.ros1 import BAG_MAGIC, Ros1Bag
 from spatial_replay.bags.sqlite import (
     LARGEST_METADATA,
@@ -99,6 +100,7 @@ class BagFolder(MessageReader):
         if not files:
             reason = next(iter(self._faults.take()), "it has no .db3 and no .mcap file")
             raise LogError(f"{self.name} is not a ROS 2 bag that can be read: {reason}")
+        self._parts = files
         return files
 
     @cached_property
@@ -139,23 +141,6 @@ class BagFolder(MessageReader):
     def topics(self) -> tuple[Topic, ...]:
         return self._topics
 
-    def take_faults(self) -> tuple[str, ...]:
-        return (
-            tuple(fault for each in self._opened_files() for fault in each.take_faults())
-            + self._faults.take()
-        )
-
-    def move_faults(self, other: FaultList) -> None:
-        for each in self._opened_files():
-            each.move_faults(other)
-        self._faults.move_to(other)
-
-    def take_remarks(self) -> tuple[str, ...]:
-        return (
-            tuple(remark for each in self._opened_files() for remark in each.take_remarks())
-            + self._remarks.take()
-        )
-
     def _read(self, topics: Collection[str], first: int, last: int, *, as_recorded: bool) -> Columns:
         def read(number: int, file: _File) -> Columns:
             for each in file.iter_columns(topics, first, last, as_recorded=as_recorded):
@@ -167,7 +152,7 @@ class BagFolder(MessageReader):
             columns: Columns = (each for open_file in reads for each in open_file())
         else:
             pairs = zip(self._files, reads, strict=True)
-            columns = merged(TimedColumns(file.start_ns or 0, open_file) for file, open_file in pairs)
+            columns = merged((file.start_ns or 0, open_file) for file, open_file in pairs)
         if self._metadata and self._metadata.compression == "message":
             return self._all_unpacked(columns)
         return columns
@@ -184,12 +169,15 @@ class BagFolder(MessageReader):
                     yield self._unpacked(select(packed, slice(begin, number)), plain)
                     begin, size = number, 0
 
-    def channels(self, topics: Collection[str]) -> Mapping[int, Channel]:
-        return {
-            first + number: channel
-            for first, file in zip(self._first_channels, self._files, strict=True)
-            for number, channel in file.channels(topics).items()
-        }
+    @cached_property
+    def _topic_of(self) -> Mapping[int, str]:
+        topics = (file._topic_of[number] for file in self._files for number in file._numbers.tolist())
+        return dict(enumerate(topics))
+
+    def _channel(self, number: int) -> Channel:
+        at = bisect_right(self._first_channels, number) - 1
+        file = self._files[at]
+        return file._channel(int(file._numbers[number - self._first_channels[at]]))
 
     def attachments(self) -> tuple[Attachment, ...]:
         return tuple(each for file in self._files for each in file.attachments())
@@ -216,10 +204,6 @@ class BagFolder(MessageReader):
                     f" {topic.type!r}"
                 )
         return super()._counted(columns, topics, name)
-
-    def _opened_files(self) -> Iterable[_File]:
-        """Return the files that were opened so far."""
-        return self._files if "_files" in self.__dict__ else ()
 
     def _opened(self, path: Path) -> _File | None:
         """Open a file by its content; None, and a fault, where nothing in it can be read."""

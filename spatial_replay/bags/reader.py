@@ -11,10 +11,11 @@ from __future__ import annotations
 
 import heapq
 from abc import ABC, abstractmethod
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property
+from operator import itemgetter
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
@@ -24,7 +25,7 @@ from spatial_replay.bags.decoders import Decoder, Topic, decoder_of
 from spatial_replay.errors import LogError
 from spatial_replay.geometry.arrays import Integers, concatenated, select
 from spatial_replay.logs.mcap.read import too_many_waiting
-from spatial_replay.logs.messages import Attachment, Channel
+from spatial_replay.logs.messages import Attachment, Channel, Messages
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.logs.remote import LogFile
 from spatial_replay.text import Instant, encodable
@@ -50,9 +51,6 @@ class Message(NamedTuple):
     publish_time_ns: int
     sequence: int
     payload: bytes
-
-
-_NEW_MESSAGE = partial(tuple.__new__, Message)
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +95,11 @@ class MessageColumns:
         """Count the messages, which are in order, before a time."""
         return int(np.searchsorted(self.log_time_ns, time_ns, side="left"))
 
+    def raw(self, channels: Mapping[int, Channel]) -> Messages:
+        """Return the messages as a copy of the log has them, on these channels."""
+        columns = self.channel, self.sequence, self.log_time_ns, self.publish_time_ns, self.payloads
+        return Messages(channels, *columns)
+
     def messages(self) -> list[Message]:
         """Return the messages one by one."""
         columns = zip(
@@ -107,7 +110,7 @@ class MessageColumns:
             self.payloads,
             strict=True,
         )
-        return list(map(_NEW_MESSAGE, columns))
+        return list(map(Message._make, columns))
 
 
 Columns: TypeAlias = Iterator[MessageColumns]
@@ -118,12 +121,6 @@ def in_pieces(columns: Columns, size: int = _TOGETHER) -> Columns:
     for each in columns:
         for begin in range(0, len(each), size):
             yield select(each, slice(begin, begin + size))
-
-
-def one_by_one(columns: Columns) -> Iterator[Message]:
-    """Yield the messages one by one."""
-    for piece in in_pieces(columns):
-        yield from piece.messages()
 
 
 def places_in(part: int, within: Integers) -> Integers:
@@ -164,31 +161,27 @@ def in_order(
         yield waiting
 
 
-@dataclass(frozen=True)
-class TimedColumns:
-    """Messages in order, with the time from which they may be opened."""
-
-    start_ns: int
-    read: Callable[[], Columns]
-
-
 _Active = list[tuple[int, int, MessageColumns, Columns]]
 """A heap: time of the first message, number of the file, messages, and those that follow them."""
 
 
-def merged(files: Iterable[TimedColumns]) -> Columns:
-    """Merge the messages of several files by log time; a file is opened when its time has come."""
-    waiting = sorted(files, key=lambda file: file.start_ns, reverse=True)
+def merged(files: Iterable[tuple[int, Callable[[], Columns]]]) -> Columns:
+    """Merge the messages of several files by log time; a file is opened when its time has come.
+
+    Args:
+        files: of each, the time of its first message, and what opens it.
+    """
+    waiting = sorted(files, key=itemgetter(0), reverse=True)
     active: _Active = []
     opened = 0
     while waiting or active:
-        while waiting and (not active or waiting[-1].start_ns <= active[0][0]):
-            _push_next(active, opened, waiting.pop().read())
+        while waiting and (not active or waiting[-1][0] <= active[0][0]):
+            _push_next(active, opened, waiting.pop()[1]())
             opened += 1
         if not active:
             continue
         _, number, columns, following = heapq.heappop(active)
-        limits = [file.start_ns for file in waiting[-1:]] + [each[0] for each in active[:1]]
+        limits = [start_ns for start_ns, _ in waiting[-1:]] + [each[0] for each in active[:1]]
         # equal times come in the order of the files
         ready = columns.count_before(min(limits) + 1) if limits else len(columns)
         yield select(columns, slice(ready))
@@ -204,19 +197,6 @@ def _push_next(active: _Active, number: int, following: Columns) -> None:
         if len(columns):
             heapq.heappush(active, (int(columns.log_time_ns[0]), number, columns, following))
             return
-
-
-def iter_counted(
-    columns: Columns, declared: Mapping[str, int | None], name: str, faults: FaultList
-) -> Columns:
-    """Yield the messages as they are; topics with more or fewer messages than declared go to `faults`."""
-    read = Counter[str]()
-    for each in columns:
-        read.update(each.topics)
-        yield each
-    for topic, count in declared.items():
-        if count is not None and count != read[topic]:
-            faults.add(f"{name}: it declares {count} messages on {topic!r}; {read[topic]} could be read")
 
 
 DISORDER_NS = 10**9
@@ -275,32 +255,23 @@ class _Recorded:
 
     def __init__(self, disorder_ns: int) -> None:
         self._disorder_ns = disorder_ns
-        self._latest: deque[tuple[Integers, Integers]] = deque()
-        self._before = -1
-        self._furthest = -1
+        self._times_ns = np.zeros(0, np.int64)
+        # one longer: how far it had come before each
+        self._furthest = np.array([-1], np.int64)
 
     def first_jump(self, times_ns: Integers, places: Integers) -> int | None:
-        """Return the first message recorded before one that is more than a second earlier, or None.
+        """Return the first message recorded before one that is earlier by more than the disorder, or None.
 
         Args:
-            times_ns, places: (M,) of messages in the order of time, after those of the call before.
+            times_ns, places: (M,) of messages in the order of time, at least one, after those of the call
+                before.
         """
-        if not len(times_ns):
-            return None
-        is_ordered = places[0] >= self._furthest and (places[1:] >= places[:-1]).all()
-        furthest = places if is_ordered else np.maximum(np.maximum.accumulate(places), self._furthest)
-        self._latest.append((times_ns, furthest))
-        self._furthest = int(furthest[-1])
-        jump = None if is_ordered else self._search(times_ns, places)
-        while self._latest[0][0][-1] < times_ns[-1] - self._disorder_ns:
-            self._before = int(self._latest.popleft()[1][-1])
-        return jump
-
-    def _search(self, times_ns: Integers, places: Integers) -> int | None:
-        times = np.concatenate([times for times, _ in self._latest])
-        furthest = np.concatenate([[self._before], *(furthest for _, furthest in self._latest)])
-        earlier = np.searchsorted(times, times_ns - self._disorder_ns)
-        jumps = np.flatnonzero(places < furthest[earlier])
+        furthest = np.maximum.accumulate(np.append(self._furthest[-1], places))[1:]
+        self._times_ns = np.concatenate([self._times_ns, times_ns])
+        self._furthest = np.concatenate([self._furthest, furthest])
+        earlier = np.searchsorted(self._times_ns, times_ns - self._disorder_ns)
+        jumps = np.flatnonzero(places < self._furthest[earlier])
+        self._times_ns, self._furthest = self._times_ns[earlier[-1] :], self._furthest[earlier[-1] :]
         return int(jumps[0]) if len(jumps) else None
 
 
@@ -317,6 +288,7 @@ class MessageReader(ABC):
         # readers that open paths get none of a remote file
         self._path = path if isinstance(path, Path) else Path(path.name)
         self._faults, self._remarks = FaultList(), FaultList()
+        self._parts: Sequence[MessageReader] = ()
 
     @property
     @abstractmethod
@@ -342,13 +314,36 @@ class MessageReader(ABC):
     def _read(self, topics: Collection[str], first: int, last: int, *, as_recorded: bool) -> Columns:
         """Yield the messages of some topics logged from `first` up to, not including, `last`."""
 
+    @property
     @abstractmethod
+    def _topic_of(self) -> Mapping[int, str]:
+        """The topics of channels, by the numbers that the log gives them."""
+
+    @abstractmethod
+    def _channel(self, number: int) -> Channel:
+        """Return the channel to which the log gives a number."""
+
+    @cached_property
+    def _numbers(self) -> Integers:
+        """The numbers that the log gives channels, in order."""
+        return np.array(sorted(self._topic_of), np.int64)
+
+    def _wanted(self, topics: Collection[str]) -> dict[int, str]:
+        return {number: topic for number, topic in self._topic_of.items() if topic in topics}
+
+    @property
+    def channel_count(self) -> int:
+        """The number of channels, of whatever topics."""
+        return len(self._numbers)
+
     def channels(self, topics: Collection[str]) -> Mapping[int, Channel]:
         """Return the channels of some topics by the numbers of `MessageColumns.channel`, which are dense.
 
         A copy of a log declares them: their schema, encoding and metadata are those of the log. ROS types
         without a definition in the log get that of the standard type, if there is one.
         """
+        numbered = enumerate(self._numbers.tolist())
+        return {rank: self._channel(number) for rank, number in numbered if self._topic_of[number] in topics}
 
     def attachments(self) -> tuple[Attachment, ...]:
         """Return the files in the log; those that are damaged are left out."""
@@ -397,7 +392,8 @@ class MessageReader(ABC):
         Raises:
             LogError: nothing can be read.
         """
-        return one_by_one(self.iter_columns(topics, start_ns, end_ns))
+        for piece in in_pieces(self.iter_columns(topics, start_ns, end_ns)):
+            yield from piece.messages()
 
     def iter_columns(
         self,
@@ -418,17 +414,33 @@ class MessageReader(ABC):
 
     def take_faults(self) -> tuple[str, ...]:
         """Return what was lost since the last call, each with its place, on the topics that were read."""
+        self._gather_parts()
         return self._faults.take()
 
     def move_faults(self, other: FaultList) -> None:
         """Move what `take_faults` would return to another list, with the count of faults beyond its limit."""
+        self._gather_parts()
         self._faults.move_to(other)
 
     def take_remarks(self) -> tuple[str, ...]:
         """Return what is wrong since the last call without a loss on the topics that were read."""
+        self._gather_parts()
         return self._remarks.take()
+
+    def _gather_parts(self) -> None:
+        """Take the faults and remarks of the files of the log that were opened."""
+        for part in self._parts:
+            part.move_faults(self._faults)
+            for remark in part.take_remarks():
+                self._remarks.add(remark)
 
     def _counted(self, columns: Columns, topics: Collection[str], name: str | None = None) -> Columns:
         """Yield all messages of some topics, then compare their number with what the log declares."""
-        declared = {each.name: each.count for each in self._topics if each.name in topics}
-        return iter_counted(columns, declared, name or self.name, self._faults)
+        read = Counter[str]()
+        for each in columns:
+            read.update(each.topics)
+            yield each
+        for topic in self._topics:
+            if topic.name in topics and topic.count not in (None, found := read[topic.name]):
+                declared = f"it declares {topic.count} messages on {topic.name!r}"
+                self._faults.add(f"{name or self.name}: {declared}; {found} could be read")

@@ -64,22 +64,17 @@ def fields_of(head: bytes) -> dict[str, bytes]:
         DamageError: they do not fill it exactly.
     """
     fields: dict[str, bytes] = {}
-    for entry in _iter_fields(head):
-        name, separator, value = entry.partition(b"=")
+    position = 0
+    while position < len(head):
+        begin = position + 4
+        position = begin + int.from_bytes(head[position:begin], "little")
+        if position > len(head):
+            raise DamageError("a record's head breaks off")
+        name, separator, value = head[begin:position].partition(b"=")
         if not separator:
             raise DamageError("a field of a record's head has no name")
         fields[name.decode("latin-1")] = value
     return fields
-
-
-def _iter_fields(head: bytes) -> Iterator[bytes]:
-    position = 0
-    while position < len(head):
-        length = int.from_bytes(head[position : position + 4], "little")
-        position += 4 + length
-        if position > len(head):
-            raise DamageError("a record's head breaks off")
-        yield head[position - length : position]
 
 
 def number(fields: dict[str, bytes], name: str, size: int = 4) -> int:
@@ -483,7 +478,7 @@ class Ros1Bag(MessageReader):
         return min((chunk.start_ns for chunk in self._directory.chunks), default=None)
 
     def _read(self, topics: Collection[str], first: int, last: int, *, as_recorded: bool) -> Columns:
-        wanted = {c.number: c for c in self._directory.connections.values() if c.topic in topics}
+        wanted = {number: self._directory.connections[number] for number in self._wanted(topics)}
         chunks = [
             (rank, chunk)
             for rank, chunk in enumerate(self._directory.chunks)
@@ -512,17 +507,12 @@ class Ros1Bag(MessageReader):
         ordered = sorted(self._directory.chunks, key=lambda chunk: (chunk.start_ns, chunk.end_ns))
         return all(one.end_ns <= other.start_ns for one, other in pairwise(ordered))
 
-    def channels(self, topics: Collection[str]) -> Mapping[int, Channel]:
-        return {
-            rank: channel_of(self._topic(self._directory.connections[number], 0))
-            for rank, number in enumerate(self._numbers.tolist())
-            if self._directory.connections[number].topic in topics
-        }
-
     @cached_property
-    def _numbers(self) -> Integers:
-        """The numbers of the connections, in order."""
-        return np.array(sorted(self._directory.connections), np.int64)
+    def _topic_of(self) -> Mapping[int, str]:
+        return {number: each.topic for number, each in self._directory.connections.items()}
+
+    def _channel(self, number: int) -> Channel:
+        return channel_of(self._topic(self._directory.connections[number], 0))
 
     def _messages(
         self,

@@ -14,7 +14,7 @@ from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import count
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -35,7 +35,6 @@ from spatial_replay.bags.decoders import (
 )
 from spatial_replay.bags.reader import Columns, MessageColumns, MessageReader
 from spatial_replay.errors import LogError, OutputError
-from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.mcap.index import LARGEST_CHUNK
 from spatial_replay.logs.mcap.read import ALWAYS_ALLOWED, MOST_TIMES_LARGER
 from spatial_replay.logs.messages import Channel, Schema
@@ -324,7 +323,8 @@ class SqliteBag(MessageReader):
         return copy
 
     @cached_property
-    def _tables(self) -> BagTables:
+    def _tables(self) -> tuple[dict[int, Topic], str | None]:
+        """The topics by their numbers, and the ROS release that wrote the file."""
         journal = self._path.with_name(f"{self.name}-journal")
         if journal.is_file() and journal.stat().st_size:
             self._faults.add(
@@ -332,19 +332,23 @@ class SqliteBag(MessageReader):
                 " both with sqlite3 to bring them together"
             )
         with _opened(self._whole) as database:
-            tables = _read_tables(database, self.name)
+            described, distribution = _read_tables(database, self.name)
         if self._with_log != self._path:
             # the counts are those of a file that was closed before
-            tables = replace(tables, topics={n: replace(t, count=None) for n, t in tables.topics.items()})
-        return tables
+            described = {number: replace(topic, count=None) for number, topic in described.items()}
+        return described, distribution
+
+    @property
+    def _described(self) -> dict[int, Topic]:
+        return self._tables[0]
 
     @cached_property
     def _topics(self) -> tuple[Topic, ...]:
-        return topics_by_name(self._tables.topics.values(), self._tables.distribution)
+        return topics_by_name(self._described.values(), self._distribution)
 
     @property
     def _distribution(self) -> str | None:
-        return self._tables.distribution
+        return self._tables[1]
 
     @cached_property
     def start_ns(self) -> int | None:
@@ -357,26 +361,15 @@ class SqliteBag(MessageReader):
             return 0
         return start_ns if isinstance(start_ns, int) else None
 
-    def channels(self, topics: Collection[str]) -> Mapping[int, Channel]:
-        described = self._tables.topics
-        return {
-            rank: channel_of(described[number], self._distribution)
-            for rank, number in enumerate(self._numbers.tolist())
-            if described[number].name in topics
-        }
-
-    @property
-    def channel_count(self) -> int:
-        """The number of channels, of whatever topics."""
-        return len(self._numbers)
-
     @cached_property
-    def _numbers(self) -> Integers:
-        """The numbers of the topics, in order."""
-        return np.array(sorted(self._tables.topics), np.int64)
+    def _topic_of(self) -> Mapping[int, str]:
+        return {number: topic.name for number, topic in self._described.items()}
+
+    def _channel(self, number: int) -> Channel:
+        return channel_of(self._described[number], self._distribution)
 
     def _read(self, topics: Collection[str], first: int, last: int, *, as_recorded: bool) -> Columns:
-        wanted = {number: topic.name for number, topic in self._tables.topics.items() if topic.name in topics}
+        wanted = self._wanted(topics)
         query = (
             "SELECT rowid, topic_id, timestamp, data FROM messages"
             f" WHERE topic_id IN ({', '.join('?' * len(wanted))}) AND timestamp BETWEEN ? AND ?"
@@ -440,21 +433,6 @@ class SqliteBag(MessageReader):
         return MessageColumns(topics, times_ns, times_ns, np.zeros_like(place), payloads, place, channel)
 
 
-@dataclass(frozen=True, slots=True)
-class BagTables:
-    """Version and metadata of a file.
-
-    Attributes:
-        topics: by number.
-        metadata: what the recorder wrote when it closed the file; None without it.
-        distribution: the ROS release that wrote it.
-    """
-
-    topics: dict[int, Topic] = field(hash=False)
-    metadata: BagMetadata | None
-    distribution: str | None
-
-
 @contextmanager
 def _opened(path: Path) -> Iterator[sqlite3.Connection]:
     """Open the database in a file, read only: no file beside it is read, no function in it is trusted.
@@ -500,8 +478,8 @@ def _bytes_missing(path: Path) -> tuple[int, int]:
     return max(0, pages * page - size), size - size % page
 
 
-def _read_tables(database: sqlite3.Connection, name: str) -> BagTables:
-    """Read what a file says about itself.
+def _read_tables(database: sqlite3.Connection, name: str) -> tuple[dict[int, Topic], str | None]:
+    """Read what a file says about itself: its topics by number, and the ROS release that wrote it.
 
     Raises:
         LogError: it is not a bag.
@@ -527,7 +505,7 @@ def _read_tables(database: sqlite3.Connection, name: str) -> BagTables:
         if not (isinstance(number, int) and isinstance(topic, str) and isinstance(type_name, str)):
             raise LogError(f"{name} is damaged: its table 'topics' has a row without an id, a name or a type")
         topics[number] = _topic(row, schemas.get(type_name), counts.get(topic))
-    return BagTables(topics, metadata, distribution)
+    return topics, distribution
 
 
 def _batches(cursor: Iterable[Row]) -> Iterator[list[Row]]:

@@ -13,14 +13,13 @@ import numpy as np
 
 from spatial_replay.bags.mcap_log import McapLog
 from spatial_replay.bags.open import open_messages
-from spatial_replay.bags.reader import MessageColumns, MessageReader
+from spatial_replay.bags.reader import MessageReader
 from spatial_replay.bags.ros1 import Ros1Bag
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Integers, select
-from spatial_replay.logs.mcap.read import is_samples
+from spatial_replay.logs.mcap.read import decode_samples, is_samples, without
 from spatial_replay.logs.mcap.write import WHOLE_CHUNK_NS, LogWriter
 from spatial_replay.logs.messages import Channel, Messages
-from spatial_replay.logs.objects import decode_objects
 from spatial_replay.logs.output_file import refuse_inputs, replacing
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.logs.remote import LogFile, local_files
@@ -165,16 +164,11 @@ def _write(
         for name, data in metadata:
             if name != RECOVERY:
                 writer.add_metadata(name, data)
-        for attachment in reader.attachments():
-            writer.add_attachment(
-                attachment.name,
-                attachment.media_type,
-                attachment.data,
-                log_time_ns=attachment.log_time_ns,
-                create_time_ns=attachment.create_time_ns,
-            )
+        for each in reader.attachments():
+            at = {"log_time_ns": each.log_time_ns, "create_time_ns": each.create_time_ns}
+            writer.add_attachment(each.name, each.media_type, each.data, **at)
         for columns in reader.iter_columns(names):
-            messages = samples.usable(_messages(columns, channels))
+            messages = samples.usable(columns.raw(channels))
             writer.write_messages(messages)
             for number, count in zip(*np.unique(messages.channel, return_counts=True), strict=True):
                 saved[channels[int(number)].topic] += int(count)
@@ -228,17 +222,6 @@ def _opened(file: LogFile) -> tuple[MessageReader, FaultList]:
     return open_messages(file), faults
 
 
-def _messages(columns: MessageColumns, channels: Mapping[int, Channel]) -> Messages:
-    return Messages(
-        channels,
-        columns.channel,
-        columns.sequence,
-        columns.log_time_ns,
-        columns.publish_time_ns,
-        columns.payloads,
-    )
-
-
 def _missing(count: int, noun: str) -> str:
     return f"{counted(count, noun)} {'is' if count == 1 else 'are'} missing"
 
@@ -275,23 +258,12 @@ class _Samples:
 
     def usable(self, messages: Messages) -> Messages:
         """Return messages without samples that cannot be decoded, or repeat a time."""
-        is_own = np.isin(messages.channel, self._own)
-        own = np.flatnonzero(is_own)
+        own = np.flatnonzero(np.isin(messages.channel, self._own))
         if not len(own):
             return messages
-        times = messages.log_time_ns[own]
-        before = np.maximum.accumulate(np.concatenate([[self._last_ns], times]))[:-1]
-        for time_ns in times[times <= before].tolist():
-            self._fault(Sentence("sample at ", Instant(time_ns, 0), ": there is one at this time already"))
-        own = own[times > before]
-        times = messages.log_time_ns[own]
-        trace, faults = decode_objects([messages.payloads[row] for row in own.tolist()], times)
-        for fault in faults:
-            self._fault(fault)
-        own = own[np.isin(times, trace.times_ns)]
-        self._find_gaps(messages.sequence[own], messages.log_time_ns[own])
-        is_own[own] = False
-        return select(messages, np.flatnonzero(~is_own)) if is_own.any() else messages
+        _, sound = decode_samples(messages, own, self._last_ns, self._fault)
+        self._find_gaps(messages.sequence[sound], messages.log_time_ns[sound])
+        return select(messages, without(messages, own, sound)) if len(sound) < len(own) else messages
 
     def gaps(self) -> tuple[SampleGap, ...]:
         """Return the gaps, with the one between the last sample and as many as the recording declares."""

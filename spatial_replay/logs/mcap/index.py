@@ -158,9 +158,7 @@ def read_directory(stream: BinaryIO, faults: FaultList, name: str) -> Directory:
         if len(faults) == known:
             faults.add(f"{name}: {damage}; the log was read without its index")
     if _is_own(directory.header):
-        directory.chunks = [
-            place if place.has_checksum else place._replace(has_checksum=True) for place in directory.chunks
-        ]
+        directory.chunks = [place._replace(has_checksum=True) for place in directory.chunks]
     return directory
 
 
@@ -254,9 +252,9 @@ def _take_in(directory: Directory, opcode: int, body: bytes) -> None:
             raise DamageError("the index breaks off")
         start_ns, end_ns, offset, length, indexed = _CHUNK_INDEX.unpack_from(body)
         channels = _indexed_channels(body, indexed)
-        is_own = _is_own(directory.header)
         size = int.from_bytes(body[-_SIZE_BYTES:], "little")
-        directory.chunks.append(ChunkPlace(offset, length, start_ns, end_ns, True, channels, is_own, size))
+        place = ChunkPlace(offset, length, start_ns, end_ns, channels=channels, size=size)
+        directory.chunks.append(place)
     elif opcode == Opcode.ATTACHMENT_INDEX:
         attachment = decoded(records.AttachmentIndex.read, body)
         directory.attachments.append((attachment.offset, attachment.length))

@@ -30,7 +30,7 @@ from mcap.opcode import Opcode
 
 from spatial_replay.cores import cores
 from spatial_replay.errors import LogError, UsageError
-from spatial_replay.geometry.arrays import concatenated, select
+from spatial_replay.geometry.arrays import Integers, concatenated, select
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.mcap.index import (
     CHUNK_HEAD,
@@ -248,11 +248,6 @@ class ChunkWalk:
         if directory.statistics is None:
             self._find_channels()
 
-    @property
-    def sees_objects(self) -> bool:
-        """Whether a channel with samples has been declared."""
-        return any(channel.topic == OBJECTS for channel in self.channels.values())
-
     def iter_messages(
         self, places: Sequence[ChunkPlace], is_wanted: Callable[[str], bool] = lambda topic: True
     ) -> Iterator[tuple[ChunkPlace, Messages]]:
@@ -371,7 +366,7 @@ class McapSource:
                 check_attachments(walk.stream, walk.directory, walk.faults, self.name)
             rest = walk.faults.take(last=True)
             fault = decoder.first_fault or next(iter(rest), None)
-            if not decoder.any_sample and not walk.sees_objects:
+            if not decoder.any_sample and all(each.topic != OBJECTS for each in walk.channels.values()):
                 raise self._without_objects(walk, fault)
             if not decoder.any_sample and window == (0, AFTER_ALL_NS) and fault is not None:
                 raise LogError(f"{self.name} holds no sample: {fault}")
@@ -410,10 +405,7 @@ class McapSource:
     def has_samples(self) -> bool:
         """Whether the log has the topic of our samples."""
         with self.open_walk() as walk:
-            return any(
-                channel.topic == OBJECTS and channel.schema is not None and channel.schema.name == _SAMPLES
-                for channel in walk.channels.values()
-            )
+            return any(map(is_samples, walk.channels.values()))
 
     def is_wanted(self, topic: str) -> bool:
         """Return whether the blocks hold messages of a topic."""
@@ -526,6 +518,36 @@ def _in_order(several: Sequence[Messages]) -> Messages:
     return select(joined, np.lexsort((joined.sequence, joined.channel, times)))
 
 
+def decode_samples(
+    messages: Messages,
+    own: Integers,
+    latest_ns: int,
+    report: Callable[[Sentence], None],
+    concave: Concave = "decompose",
+) -> tuple[Trace, Integers]:
+    """Decode samples of ours; return them, and the places of those that can be used.
+
+    Args:
+        own: the places of the samples among the messages.
+        latest_ns: the time after which they have to come.
+        report: takes what is wrong with the others.
+    """
+    times = messages.log_time_ns[own]
+    before = np.maximum.accumulate(np.append(latest_ns, times))[:-1]
+    for time_ns in times[times <= before].tolist():
+        report(Sentence("sample at ", Instant(time_ns, 0), ": there is one at this time already"))
+    own, times = own[times > before], times[times > before]
+    trace, faults = decode_objects([messages.payloads[at] for at in own.tolist()], times, concave=concave)
+    for fault in faults:
+        report(fault)
+    return trace, own[np.isin(times, trace.times_ns)]
+
+
+def without(messages: Messages, own: Integers, sound: Integers) -> Integers:
+    """Return the places of messages but those in `own`, except those in `sound`."""
+    return np.setdiff1d(np.arange(len(messages)), np.setdiff1d(own, sound))
+
+
 class _BlockDecoder:
     """Decodes messages to blocks; remembers the latest sample, after which the next one has to come."""
 
@@ -541,21 +563,12 @@ class _BlockDecoder:
         wanted = {n: each for n, each in messages.channels.items() if self._source.is_wanted(each.topic)}
         columns = replace(messages, channels=MappingProxyType(wanted))
         samples = [number for number, channel in wanted.items() if self._is_objects(channel)]
-        is_own = np.isin(columns.channel, samples)
-        own = np.flatnonzero(is_own)
-        times = columns.log_time_ns[own]
-        before = np.maximum.accumulate(np.concatenate([[self._latest_ns], times]))
-        for time_ns in times[times <= before[:-1]].tolist():
-            self._fault(Sentence("sample at ", Instant(time_ns, 0), ": there is one at this time already"))
-        own, self._latest_ns = own[times > before[:-1]], int(before[-1])
-        payloads = [messages.payloads[index] for index in own.tolist()]
-        trace, faults = decode_objects(payloads, columns.log_time_ns[own], concave=self._source.concave)
-        for fault in faults:
-            self._fault(fault)
-        if len(trace) < int(is_own.sum()):
+        own = np.flatnonzero(np.isin(columns.channel, samples))
+        trace, sound = decode_samples(columns, own, self._latest_ns, self._fault, self._source.concave)
+        self._latest_ns = int(columns.log_time_ns[own].max(initial=self._latest_ns))
+        if len(sound) < len(own):
             # a copy holds the samples that were read, and is sound
-            read = own[np.isin(columns.log_time_ns[own], trace.times_ns)]
-            columns = select(columns, np.union1d(np.flatnonzero(~is_own), read))
+            columns = select(columns, without(columns, own, sound))
         self.any_sample = self.any_sample or len(trace) > 0
         lost = self._walk.faults.take()
         self.first_fault = self.first_fault or next(iter(lost), None)
