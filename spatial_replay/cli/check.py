@@ -244,7 +244,7 @@ def _compare_with_log(
     # only needed with --log: log readers load the numerical libraries
     from spatial_replay.logs.source import axes_of, reading_only
     from spatial_replay.monitor.plausibility import LogNumbers, plausibility_warnings, window_lines
-    from spatial_replay.replay import LogNames
+    from spatial_replay.replay.selection import LogNames
     from spatial_replay.sources.open_log import open_source
 
     source = open_source(log, **reading)

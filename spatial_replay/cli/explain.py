@@ -34,7 +34,7 @@ from spatial_replay.trace.trace import time_point_from_text
 
 if TYPE_CHECKING:
     from spatial_replay.monitor.result import SpecResult
-    from spatial_replay.replay import Explanation
+    from spatial_replay.replay.document import Explanation
 
 
 @click.command(cls=JsonCommand)
@@ -64,7 +64,9 @@ def explain(request: EvaluationArguments, result: str, at: str | None, as_json: 
     """
     # imported here so that --help stays fast
     from spatial_replay.logs.topics import MAPPED
-    from spatial_replay.replay import explain_results, has_samples_from, idle_document, run_replay, verdict_of
+    from spatial_replay.replay.document import explain_results, idle_document, verdict_of
+    from spatial_replay.replay.engine import run_replay
+    from spatial_replay.replay.selection import has_samples_from
 
     name, _, object_of = result.partition("@")
     node, object_name = name or None, object_of or None
@@ -137,7 +139,7 @@ def _texts(explanations: Sequence[Explanation]) -> Iterator[list[str]]:
 
 def _until(inputs: EvaluationInputs, at: str | None) -> EvaluationInputs:
     """Return the same inputs with a window that ends with the samples at a time."""
-    from spatial_replay.replay import first_sample_ns
+    from spatial_replay.replay.selection import first_sample_ns
 
     if at is None:
         return inputs

@@ -75,7 +75,7 @@ def _is_evaluated(request: EvaluationArguments) -> bool:
 
 def _evaluate(request: EvaluationArguments, output: Path) -> tuple[str, ...]:
     """Evaluate specifications over a log, write what comes out, and return what was lost."""
-    from spatial_replay.replay import run_replay
+    from spatial_replay.replay.engine import run_replay
 
     inputs = open_inputs(request)
     with progress("samples") as advance:

@@ -179,7 +179,7 @@ def _print_overview(log: LogFile, as_json: bool, reading: Reading) -> int:
 def _print_decisions(log: LogFile, as_json: bool) -> int:
     """Print the decisions of a planned run."""
     from spatial_replay.planning.read import read_decisions
-    from spatial_replay.replay import known_start_ns
+    from spatial_replay.replay.selection import known_start_ns
     from spatial_replay.sources.open_log import open_source
 
     recorded = read_decisions(log)
@@ -232,7 +232,7 @@ def _print_layout(log: LogFile, *, panels: bool) -> int:
 
 def _print_specification(log: LogFile, name: str) -> int:
     """Print the texts of the specifications that a log was written with, or the one of a name."""
-    from spatial_replay.replay import recorded_texts
+    from spatial_replay.replay.engine import recorded_texts
     from spatial_replay.sources.open_log import open_source
 
     source = open_source(log)
@@ -262,7 +262,7 @@ def _names_of(text: SpecificationText) -> list[str]:
 
 def _requirements(source: Source) -> dict[str, NamedSpec]:
     """Return the specs of requirements that a log was written with, by the names of their results."""
-    from spatial_replay.replay import recorded_texts
+    from spatial_replay.replay.engine import recorded_texts
 
     files = [(Path(text.filename).stem, _specs_of(text)) for text in recorded_texts(source)]
     names = [spec.name for _, specs in files for spec in specs]

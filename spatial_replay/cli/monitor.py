@@ -35,9 +35,8 @@ if TYPE_CHECKING:
     from spatial_replay.live import LiveSession, LiveUpdate
     from spatial_replay.live.session import Viewing
     from spatial_replay.mapping import LogMapping
-    from spatial_replay.recording import Recorder
     from spatial_replay.recording.clips import Trigger
-    from spatial_replay.recording.recorder import SampleWriter
+    from spatial_replay.recording.recorder import Recorder, SampleWriter
     from spatial_replay.spec.formula import Specification
 
 _STATUS_S: Final = 0.5

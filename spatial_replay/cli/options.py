@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from spatial_replay.logs.source import Source
     from spatial_replay.monitor.semantics import Semantics
     from spatial_replay.recording.recorder import Recorded
-    from spatial_replay.replay import Replayed, ReplayOptions, Window
+    from spatial_replay.replay.engine import Replayed
+    from spatial_replay.replay.selection import ReplayOptions, Window
     from spatial_replay.spec.formula import Specification
 
 
@@ -452,7 +453,7 @@ class EvaluationInputs:
 
     def options(self, semantics: Semantics = "ltlf", keep: tuple[str, ...] = ()) -> ReplayOptions:
         """Return how the specifications are evaluated over the log, and what a copy of it keeps."""
-        from spatial_replay.replay import ReplayOptions
+        from spatial_replay.replay.selection import ReplayOptions
 
         return ReplayOptions(self.window, self.each, semantics, self.strict_names, keep or None)
 
@@ -471,8 +472,7 @@ def open_inputs(
         LogError, SpecificationError: an input cannot be read.
     """
     # imported here so that --help stays fast
-    from spatial_replay.replay import load_files
-    from spatial_replay.replay.engine import recorded_texts
+    from spatial_replay.replay.engine import load_files, recorded_texts
     from spatial_replay.sources.open_log import open_source
 
     source = open_source(request.log, **request.reading)
@@ -504,7 +504,7 @@ def objects_by_parameter(choices: tuple[str, ...]) -> dict[str, str]:
 
 
 def _window(source: Source, request: EvaluationArguments) -> Window:
-    from spatial_replay.replay import Window, first_sample_ns
+    from spatial_replay.replay.selection import Window, first_sample_ns
 
     if request.start is None and request.end is None:
         return Window(every=request.every)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from spatial_replay.monitor.monitor import Ending
     from spatial_replay.monitor.result import SpecResult
     from spatial_replay.recording.log import VerdictChange
-    from spatial_replay.replay import Replayed
+    from spatial_replay.replay.engine import Replayed
 
 WORST_FIRST: Final = ("violated", "unknown", "satisfied")
 MANY: Final = 6
@@ -94,7 +94,7 @@ def write_document(
 ) -> None:
     """Write all results as one JSON object to a file, or to standard output for "-"."""
     from spatial_replay.logs.output_file import replacing
-    from spatial_replay.replay import document_from_replay
+    from spatial_replay.replay.document import document_from_replay
 
     document = document_from_replay(replayed, signal=signal, window_ns=window_ns)
     if file == "-":

@@ -97,7 +97,8 @@ def _redo(
     """Decide again on the samples of a log, and show the first decision that differs."""
     # imported here so that --help stays fast
     from spatial_replay.planning.read import ReplannedSource, planner_of, redo_decisions
-    from spatial_replay.replay import ReplayOptions, known_start_ns, load_files, run_replay
+    from spatial_replay.replay.engine import load_files, run_replay
+    from spatial_replay.replay.selection import ReplayOptions, known_start_ns
     from spatial_replay.sources.open_log import open_source
 
     source = open_source(log)

@@ -31,7 +31,7 @@ from spatial_replay.trace.trace import duration_ns_from_text
 
 if TYPE_CHECKING:
     from spatial_replay.monitor.semantics import Semantics
-    from spatial_replay.replay import Replayed
+    from spatial_replay.replay.engine import Replayed
 
 
 @click.command()
@@ -106,7 +106,8 @@ def replay(
     """
     # imported here so that --help stays fast
     from spatial_replay.logs.topics import MAPPED
-    from spatial_replay.replay import default_keep, run_replay
+    from spatial_replay.replay.engine import run_replay
+    from spatial_replay.replay.selection import default_keep
 
     if (series or signal) and json_file is None:
         option = "--series" if series else "--to-end"

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from spatial_replay.monitor.semantics import Semantics
-    from spatial_replay.replay import SpecificationFiles
     from spatial_replay.replay.loaded_log import Evaluated
+    from spatial_replay.replay.specification_files import SpecificationFiles
 
 
 @click.command()
@@ -81,7 +81,7 @@ def _serve(
     evaluated: Evaluated, files: SpecificationFiles | None, serving: ServingArguments, play: bool
 ) -> ExitCode | None:
     # imported here so that --help stays fast
-    from spatial_replay.serve import open_server
+    from spatial_replay.serve.serving import open_server
 
     host, port, origins = serving.host, serving.port, serving.origins
     with open_server(evaluated, host=host, port=port, play=play, origins=origins) as server:

@@ -77,7 +77,7 @@ def verify(
     from spatial_replay.logs.output_file import replacing
     from spatial_replay.logs.read_options import ReadOptions
     from spatial_replay.planning.read import recompute_decisions
-    from spatial_replay.replay import known_start_ns
+    from spatial_replay.replay.selection import known_start_ns
     from spatial_replay.replay.verification import (
         recorded_reading,
         sign_certificate,

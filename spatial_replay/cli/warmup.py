@@ -27,7 +27,7 @@ from spatial_replay.logs.source import MemorySource
 from spatial_replay.monitor.evaluate import evaluate
 from spatial_replay.monitor.monitor import Monitor
 from spatial_replay.recording.recorder import Recorder
-from spatial_replay.replay import run_replay
+from spatial_replay.replay.engine import run_replay
 from spatial_replay.runs.planned import warm_up_planner
 from spatial_replay.sources.open_log import open_source
 from spatial_replay.spec import parse_specification

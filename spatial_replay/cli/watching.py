@@ -23,7 +23,9 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from spatial_replay.monitor.semantics import Semantics
-    from spatial_replay.replay import Evaluated, LoadedLog, ReplayOptions, SpecificationFiles
+    from spatial_replay.replay.loaded_log import Evaluated, LoadedLog
+    from spatial_replay.replay.selection import ReplayOptions
+    from spatial_replay.replay.specification_files import SpecificationFiles
     from spatial_replay.spec.formula import Specification
 
 _MOST_KEYS: Final = 64
@@ -41,7 +43,7 @@ def files_to_watch(request: EvaluationArguments) -> SpecificationFiles:
         LogError: the log cannot be read.
     """
     # imported here so that --help stays fast
-    from spatial_replay.replay import SpecificationFiles
+    from spatial_replay.replay.specification_files import SpecificationFiles
 
     specs = [local_copy(each) for each in request.specs]
     files = SpecificationFiles(specs, profile=request.profile, constants=request.constants)
@@ -79,7 +81,7 @@ def load_log(
     Args:
         files: what is watched, or None.
     """
-    from spatial_replay.replay import LoadedLog
+    from spatial_replay.replay.loaded_log import LoadedLog
 
     with progress("samples") as advance:
         return LoadedLog(inputs.source, inputs.files, options, saved=files, advance=advance)

@@ -14,8 +14,7 @@ from spatial_replay.logs.mcap.write import LogWriter
 from spatial_replay.logs.messages import Messages, merge
 from spatial_replay.logs.output_file import Durability, open_output, refuse_inputs
 from spatial_replay.monitor.verdict import Verdict
-from spatial_replay.recording import Recording
-from spatial_replay.recording.log import refuse_templates
+from spatial_replay.recording.log import Recording, refuse_templates
 from spatial_replay.recording.recorder import leaving, terminable, uninterrupted
 from spatial_replay.runs.virtual_camera import Film, open_film
 from spatial_replay.simulation.tabletop import Tabletop, default_specification, make_world

@@ -18,8 +18,9 @@ from spatial_replay.logs import Attachment, MemorySink
 from spatial_replay.logs.schemas import AutomatonState_pb2
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.schemas.Specification_pb2 import Specification as SpecificationMessage
-from spatial_replay.recording import Recording
-from spatial_replay.replay import ReplayOptions, run_replay
+from spatial_replay.recording.log import Recording
+from spatial_replay.replay.engine import run_replay
+from spatial_replay.replay.selection import ReplayOptions
 from spatial_replay.sources import open_source
 
 FALSE, TRUE, UNKNOWN = (

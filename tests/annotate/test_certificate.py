@@ -9,7 +9,7 @@ import pytest
 
 from replay.runs import SPECIFICATION, PiecewiseSource, run, sample
 from spatial_replay import Footprint, Sample, Trace, TrackedObject, parse_specification
-from spatial_replay.replay import run_replay
+from spatial_replay.replay.engine import run_replay
 
 
 def _certificate(trace: Trace, text: str = SPECIFICATION) -> Mapping[str, str]:

@@ -15,7 +15,8 @@ from mcap.records import Message
 import spatial_replay as sr
 from spatial_replay.logs import MemorySource
 from spatial_replay.logs.schemas.Robustness_pb2 import RecentEvents
-from spatial_replay.replay import ReplayOptions, Window, run_replay
+from spatial_replay.replay.engine import run_replay
+from spatial_replay.replay.selection import ReplayOptions, Window
 
 STEP_NS = 10**8
 

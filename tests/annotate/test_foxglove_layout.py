@@ -17,7 +17,8 @@ from spatial_replay.annotate.foxglove_layout import LayoutContents, layout_for_l
 from spatial_replay.cli import run as run_command
 from spatial_replay.logs import MemorySource
 from spatial_replay.logs.schemas.Robustness_pb2 import Standing
-from spatial_replay.replay import ReplayOptions, run_replay
+from spatial_replay.replay.engine import run_replay
+from spatial_replay.replay.selection import ReplayOptions
 from spatial_replay.sources import open_source
 
 TEXT = "spec near = F a closeto[2] b\nspec apart = G a farfrom[0] b"

@@ -22,7 +22,7 @@ from spatial_replay.annotate.violations import EvaluatedResult
 from spatial_replay.logs import MemorySource
 from spatial_replay.monitor.instances import find_instances
 from spatial_replay.monitor.stream import EvaluationStream, SeriesBlock
-from spatial_replay.replay import run_replay
+from spatial_replay.replay.engine import run_replay
 from spatial_replay.spec.formula import Atom, Outline, RegionName, SignedDistance, TrackedName, iter_nodes
 
 FRAME_NS = 1_000_000_000 // 30

@@ -27,7 +27,7 @@ from spatial_replay.logs.schemas.Robustness_pb2 import (
     StandingUpdate,
 )
 from spatial_replay.logs.wire import rounded
-from spatial_replay.replay import run_replay
+from spatial_replay.replay.engine import run_replay
 
 STEP_NS = 10**8
 

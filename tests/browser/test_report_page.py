@@ -23,7 +23,7 @@ from report.report_pages import (
     two_discs,
 )
 from spatial_replay.perception import load_tags, open_frames
-from spatial_replay.replay import load_files
+from spatial_replay.replay.engine import load_files
 from spatial_replay.report.write import write_report
 from spatial_replay.runs.record_video import record_seen
 from spatial_replay.sources import open_source

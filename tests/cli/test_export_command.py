@@ -13,7 +13,8 @@ from cli.program import run_program
 from replay.runs import SPECIFICATION, PiecewiseSource, record, run
 from spatial_replay import parse_specification
 from spatial_replay.cli import run as run_in_process
-from spatial_replay.replay import export_table, run_replay
+from spatial_replay.replay.engine import run_replay
+from spatial_replay.replay.table import export_table
 from spatial_replay.sources import open_source
 
 

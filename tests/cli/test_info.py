@@ -15,7 +15,7 @@ from replay.runs import run as recorded_run
 from spatial_replay import parse_specification
 from spatial_replay.cli import run
 from spatial_replay.mapping import parse_mapping
-from spatial_replay.replay import run_replay
+from spatial_replay.replay.engine import run_replay
 
 CUBE = '{"name": "cube", "class": "block", "polygon": [[0, 0], [1, 0], [1, 1]]}'
 LOST_CUBE = '{"name": "cube", "class": "block", "polygon": [[NaN, 0], [1, 0], [1, 1]]}'

@@ -16,7 +16,8 @@ from spatial_replay.annotate.scene.scene_frames import DrawnViolation, SceneFram
 from spatial_replay.logs import MemorySource, Messages
 from spatial_replay.logs.topics import EVENT_LOG, EVENTS
 from spatial_replay.monitor.result import SpecResult
-from spatial_replay.replay import Replay, Replayed, document_from_replay
+from spatial_replay.replay.document import document_from_replay
+from spatial_replay.replay.engine import Replay, Replayed
 from spatial_replay.spec import format_formula
 from spatial_replay.spec.formula import Atom, Formula, Quantified, iter_nodes
 from spatial_replay.text import time_text

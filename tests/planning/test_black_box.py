@@ -29,7 +29,9 @@ from spatial_replay.planning import (
     settings_from_text,
     text_from_settings,
 )
-from spatial_replay.replay import ReplayOptions, Window, load_files, run_replay, verify_certificate
+from spatial_replay.replay.engine import load_files, run_replay
+from spatial_replay.replay.selection import ReplayOptions, Window
+from spatial_replay.replay.verification import verify_certificate
 from spatial_replay.sources import open_source
 
 RECORDED = Path(__file__).resolve().parents[2] / "recordings" / "push.mcap"

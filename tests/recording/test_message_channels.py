@@ -24,7 +24,8 @@ import spatial_replay as sr
 from examples import examples
 from replay.runs import SPECIFICATION, content_of, sample
 from spatial_replay.cli import run
-from spatial_replay.replay import run_replay, verify_certificate
+from spatial_replay.replay.engine import run_replay
+from spatial_replay.replay.verification import verify_certificate
 from spatial_replay.sources import open_source
 
 SPEC = sr.parse_specification(SPECIFICATION, filename="blocks.spatial")

@@ -9,7 +9,8 @@ import pytest
 
 from replay.runs import SPECIFICATION, PiecewiseSource, run
 from spatial_replay import parse_specification
-from spatial_replay.replay import document_from_replay, run_replay
+from spatial_replay.replay.document import document_from_replay
+from spatial_replay.replay.engine import run_replay
 
 
 @pytest.fixture

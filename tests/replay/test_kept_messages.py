@@ -22,7 +22,10 @@ from replay.runs import content_of, sample
 from spatial_replay import UsageError
 from spatial_replay.cli import run
 from spatial_replay.logs import MemorySource
-from spatial_replay.replay import LoadedLog, Playback, ReplayOptions, Window, run_replay, verify_certificate
+from spatial_replay.replay.engine import run_replay
+from spatial_replay.replay.loaded_log import LoadedLog, Playback
+from spatial_replay.replay.selection import ReplayOptions, Window
+from spatial_replay.replay.verification import verify_certificate
 from spatial_replay.sources import open_source
 
 TURTLES = """\

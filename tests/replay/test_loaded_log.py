@@ -11,15 +11,9 @@ import spatial_replay as sr
 from examples import examples
 from replay.runs import PAST, STEP_NS, PiecewiseSource, run
 from spatial_replay import LogError, SpecificationError, UsageError
-from spatial_replay.replay import (
-    Evaluated,
-    LoadedLog,
-    ReplayOptions,
-    Window,
-    constant_text,
-    constant_values,
-    run_replay,
-)
+from spatial_replay.replay.engine import run_replay
+from spatial_replay.replay.loaded_log import Evaluated, LoadedLog, constant_text, constant_values
+from spatial_replay.replay.selection import ReplayOptions, Window
 
 TEXT = """\
 const far = {far}

@@ -38,7 +38,9 @@ from spatial_replay.logs.topics import (
     STANDING,
     protobuf_channel,
 )
-from spatial_replay.replay import LoadedLog, Playback, ReplayOptions, Window, run_replay
+from spatial_replay.replay.engine import run_replay
+from spatial_replay.replay.loaded_log import LoadedLog, Playback
+from spatial_replay.replay.selection import ReplayOptions, Window
 from spatial_replay.sources import open_source
 
 ROOT = Path(__file__).parents[2]

@@ -25,16 +25,10 @@ from spatial_replay import (
     parse_specification,
 )
 from spatial_replay.logs import Block
-from spatial_replay.recording import record_source
-from spatial_replay.replay import (
-    Replayed,
-    ReplayOptions,
-    Window,
-    document_from_replay,
-    explain_results,
-    load_files,
-    run_replay,
-)
+from spatial_replay.recording.recorder import record_source
+from spatial_replay.replay.document import document_from_replay, explain_results
+from spatial_replay.replay.engine import Replayed, load_files, run_replay
+from spatial_replay.replay.selection import ReplayOptions, Window
 from spatial_replay.sources import open_source
 
 SPEC = parse_specification(SPECIFICATION, filename="blocks.spatial")

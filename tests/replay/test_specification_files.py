@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 import spatial_replay as sr
 from examples import examples
 from spatial_replay import MissingFileError, SpatialReplayError, SpecificationError, UsageError
-from spatial_replay.replay import SpecificationFiles, write_constants
+from spatial_replay.replay.specification_files import SpecificationFiles, write_constants
 
 TEXT = "const near = 70 in [40, 100]  # pixels\nspec s = F cube dist cup <= near\n"
 PATIENCE_S = 60.0

@@ -11,7 +11,9 @@ import pytest
 
 from replay.runs import SPECIFICATION, PiecewiseSource, record, run
 from spatial_replay import UsageError, parse_specification
-from spatial_replay.replay import QUANTITIES, Replayed, ReplayOptions, Window, export_table, run_replay
+from spatial_replay.replay.engine import Replayed, run_replay
+from spatial_replay.replay.selection import ReplayOptions, Window
+from spatial_replay.replay.table import QUANTITIES, export_table
 from spatial_replay.sources import open_source
 
 

@@ -27,7 +27,8 @@ from report.report_pages import (
     two_discs,
 )
 from spatial_replay import UsageError
-from spatial_replay.replay import Window, load_files, run_replay
+from spatial_replay.replay.engine import load_files, run_replay
+from spatial_replay.replay.selection import Window
 from spatial_replay.report.write import write_report
 from spatial_replay.sources import open_source
 

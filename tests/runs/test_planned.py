@@ -12,7 +12,8 @@ import pytest
 import spatial_replay as sr
 from spatial_replay.logs.schemas.BehaviourTree_pb2 import BehaviourTree
 from spatial_replay.planning import centre_of, read_decisions, recompute_decisions
-from spatial_replay.replay import load_files, run_replay, verify_certificate
+from spatial_replay.replay.engine import load_files, run_replay
+from spatial_replay.replay.verification import verify_certificate
 from spatial_replay.runs.planned import PlannedRun, record_plan, settings_for
 from spatial_replay.simulation.tabletop import make_world
 from spatial_replay.sources import open_source

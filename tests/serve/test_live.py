@@ -50,8 +50,9 @@ from spatial_replay.logs.topics import (
     STANDING,
     protobuf_channel,
 )
-from spatial_replay.replay import LoadedLog, run_replay
-from spatial_replay.serve import Serving, open_server
+from spatial_replay.replay.engine import run_replay
+from spatial_replay.replay.loaded_log import LoadedLog
+from spatial_replay.serve.serving import Serving, open_server
 from spatial_replay.sources import open_source
 
 TEXT = """\

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 import spatial_replay as sr
 from spatial_replay.logs import MemorySource
-from spatial_replay.replay import LoadedLog, SpecificationFiles
+from spatial_replay.replay.loaded_log import LoadedLog
+from spatial_replay.replay.specification_files import SpecificationFiles
 from spatial_replay.serve.player import FASTEST, SLOWEST, Session, Status, Transport
 
 START_NS, END_NS = 5_000_000_000, 65_000_000_000
