@@ -12,7 +12,6 @@ from typing import Final, Literal, NamedTuple, cast
 from spatial_replay.compiled import compile_ahead
 from spatial_replay.errors import SpecificationError, TraceError, UsageError
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.geometry.footprint import TrackedObject
 from spatial_replay.monitor.result import no_such_node
 from spatial_replay.monitor.semantics import checked_semantics
 from spatial_replay.monitor.stream import LiveStream
@@ -312,8 +311,9 @@ class _AwaitedNames:
             self._first_ns = sample.time_ns
         missing = len(self._objects) + len(self._signals)
         objects, signals = {*sample.objects, *sample.unknown}, sample.signals.keys()
-        tracked = (each for each in sample.objects.values() if isinstance(each, TrackedObject))
-        self._learn(objects, signals, {each.class_name for each in tracked if each.class_name})
+        self._learn(
+            objects, signals, {each.class_name for each in sample.objects.values() if each.class_name}
+        )
         self._objects -= objects
         self._signals -= signals
         self.is_open = bool(self._objects or self._signals)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from spatial_replay.annotate.scene.scene_template import outlines_of
-from spatial_replay.geometry.footprint import Footprint, TrackedObject, moved_object
+from spatial_replay.geometry.footprint import Footprint, moved_object
 from spatial_replay.lazy import page_of
 from spatial_replay.notebook import html, plot
 from spatial_replay.notebook.figures import (
@@ -138,13 +138,12 @@ def _draw_cells(gradient: GradientMap, ax: Axes, turn: int, reach: float) -> Axe
 def _draw_objects(ax: Axes, sample: Sample | None, name: str) -> None:
     """Draw the objects of a sample, the one to be moved with bolder lines."""
     for each, tracked in (sample.objects if sample is not None else {}).items():
-        if isinstance(tracked, TrackedObject):
-            _draw_footprint(ax, tracked.footprint, 2.0 if each == name else 1.0)
-            x, y = np.concatenate(outlines_of(tracked.footprint)).max(axis=0).tolist()
-            ax.annotate(
-                plain(each, 24), (x, y), (2, 2), textcoords="offset points", fontsize=8.5, color=INK,
-                annotation_clip=True,
-            )  # fmt: skip
+        _draw_footprint(ax, tracked.footprint, 2.0 if each == name else 1.0)
+        x, y = np.concatenate(outlines_of(tracked.footprint)).max(axis=0).tolist()
+        ax.annotate(
+            plain(each, 24), (x, y), (2, 2), textcoords="offset points", fontsize=8.5, color=INK,
+            annotation_clip=True,
+        )  # fmt: skip
 
 
 def _draw_target(ax: Axes, target: Target, sample: Sample | None) -> None:
@@ -153,7 +152,7 @@ def _draw_target(ax: Axes, target: Target, sample: Sample | None) -> None:
     ax.plot(*zip(*target.waypoints, strict=True), color=INK, linewidth=1.5, solid_capstyle="round")
     ax.plot(target.x, target.y, "o", color="white", markeredgecolor=INK, markersize=6)
     tracked = None if sample is None else sample.objects.get(target.name)
-    if isinstance(tracked, TrackedObject):
+    if tracked is not None:
         there = moved_object(tracked, target.x, target.y, target.turn)
         _draw_footprint(ax, there.footprint, 1.5, "--")
 

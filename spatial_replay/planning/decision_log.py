@@ -336,8 +336,7 @@ class BlackBox:
         """Return the object that the last step moves, from the newest sample."""
         if self._step is None or self._step.target is None or self._sample is None:
             return None
-        tracked = self._sample.objects.get(self._step.target.name)
-        return tracked if isinstance(tracked, TrackedObject) else None
+        return self._sample.objects.get(self._step.target.name)
 
     def _messages(self, time_ns: int, *of_channels: Sequence[Message]) -> Messages:
         """Return messages of each channel, numbered on from those before."""

@@ -105,9 +105,7 @@ class Budget:
 
 def with_moved(sample: Sample, poses: Mapping[str, Pose], later_ns: int = 0) -> Sample:
     """Return a sample with objects moved to poses (x, y, turn)."""
-    tracked = {name: sample.objects[name] for name in poses}
-    moved = {name: each for name, each in tracked.items() if isinstance(each, TrackedObject)}
-    placed = {name: moved_object(each, *poses[name]) for name, each in moved.items()}
+    placed = {name: moved_object(sample.objects[name], *pose) for name, pose in poses.items()}
     return with_objects(sample, placed, later_ns)
 
 
@@ -481,7 +479,7 @@ def _is_same_scene(motion: FailedMotion, sample: Sample, settings: Settings) -> 
     if settings.skill == "push":
         if not motion.stayed:
             return False
-        near = BESIDE * radius_of(tracked) if isinstance(tracked, TrackedObject) else math.inf
+        near = BESIDE * radius_of(tracked)
         names = [
             each
             for each in names
@@ -490,9 +488,9 @@ def _is_same_scene(motion: FailedMotion, sample: Sample, settings: Settings) -> 
     return all(_stands(each, before, sample, settings) for each in names)
 
 
-def _away(tracked: object, other: object) -> float:
-    """Return about how far two objects are from each other; infinite if one of them is not seen."""
-    if not (isinstance(tracked, TrackedObject) and isinstance(other, TrackedObject)):
+def _away(tracked: TrackedObject, other: TrackedObject | None) -> float:
+    """Return about how far an object is from another one; infinite if that is not seen."""
+    if other is None:
         return math.inf
     centres = math.dist(centre_of(tracked.footprint), centre_of(other.footprint))
     return centres - radius_of(tracked) - radius_of(other)
@@ -501,8 +499,8 @@ def _away(tracked: object, other: object) -> float:
 def _stands(name: str, before: Sample, sample: Sample, settings: Settings) -> bool:
     """Return whether an object is where it was in an earlier sample, or is in neither."""
     was, now = before.objects.get(name), sample.objects.get(name)
-    if not (isinstance(was, TrackedObject) and isinstance(now, TrackedObject)):
-        return was == now
+    if was is None or now is None:
+        return was is now
     moved = math.dist(centre_of(was.footprint), centre_of(now.footprint))
     turned = math.remainder((now.yaw or 0.0) - (was.yaw or 0.0), math.tau)
     allowed = settings.workspace.grid.cell_size + was.uncertainty + now.uncertainty

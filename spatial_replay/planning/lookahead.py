@@ -121,9 +121,8 @@ class Arranger:
         self._sample, self._regions, self._settings, self._budget = sample, regions, settings, budget
         self._demands = tuple(dict.fromkeys(demands))
         self._grid = settings.workspace.grid
-        present = {name: each for name, each in sample.objects.items() if isinstance(each, TrackedObject)}
-        order = sorted(present) if settings.movable is None else settings.movable
-        self._movable = {name: present[name] for name in order if name in present}
+        order = sorted(sample.objects) if settings.movable is None else settings.movable
+        self._movable = {name: sample.objects[name] for name in order if name in sample.objects}
         self._about = {each: self._names(each) for each in self._demands}
         self._fields: dict[str, _Field] = {}
         self._stencils: dict[tuple[object, ...], Floats] = {}
@@ -825,13 +824,11 @@ class Lookahead:
     ) -> Mapping[str, Pose]:
         """Return an arrangement without the objects that may as well stay where they are."""
         for name in list(poses):
-            tracked, (x, y, turn) = scene.sample.objects[name], poses[name]
+            x, y, turn = poses[name]
             others = {other: pose for other, pose in poses.items() if other != name}
-            if not isinstance(tracked, TrackedObject) or abs(turn) > _STILL_TURN:
-                continue
-            away = math.dist((x, y), centre_of(tracked.footprint))
-            is_near = away <= self._settings.workspace.grid.cell_size
-            if is_near and about.meets(with_moved(scene.sample, others)):
+            away = math.dist((x, y), centre_of(scene.sample.objects[name].footprint))
+            is_still = away <= self._settings.workspace.grid.cell_size and abs(turn) <= _STILL_TURN
+            if is_still and about.meets(with_moved(scene.sample, others)):
                 poses = others
         return poses
 

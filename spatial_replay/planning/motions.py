@@ -15,7 +15,6 @@ import numpy as np
 
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.guards import Transition
-from spatial_replay.errors import TraceError
 from spatial_replay.geometry.arrays import Booleans, Floats
 from spatial_replay.geometry.footprint import Footprint, TrackedObject, centre_of, moved_object, radius_of
 from spatial_replay.planning.decisions import Candidate, Consideration, Guards, Reason, Target
@@ -121,10 +120,8 @@ class Movables:
             later: objects that may still have to be moved after this motion.
             refine: refine the target, if the settings want that.
 
-        Raises:
-            TraceError: the sample has no footprint for the object.
         """
-        tracked = self._tracked(name)
+        tracked = self._sample.objects[name]
         settings, maps = self._settings, self.maps_of(name)
         cubes = consideration.progress.cubes, consideration.constraints.cubes
         gradient = gradient_map(maps, *cubes, settings.workspace, settings.constraint_margin)
@@ -157,7 +154,7 @@ class Movables:
             if self._attempts.failed_pick(target.name, self._sample, self._settings):
                 return True
             return is_repeated(target, failures, self._settings)
-        return begins_as(target, failures, self._tracked(target.name))
+        return begins_as(target, failures, self._sample.objects[target.name])
 
     def refined(
         self,
@@ -177,7 +174,7 @@ class Movables:
             return target
         failures = () if settings.skill == "push" else self.failed_here(name)
         measured = self._measures(name, consideration, room_from, then)
-        found = refined(target, self._tracked(name), settings, measured, failures)
+        found = refined(target, self._sample.objects[name], settings, measured, failures)
         is_kept = settings.skill == "place" or self._is_pushed_to(found, consideration.constraints.cubes)
         return found if is_kept else target
 
@@ -219,12 +216,6 @@ class Movables:
         size = gradient.grid.cell_size
         spot = Grid(target.x - size / 2, target.y - size / 2, size, 1, 1)
         return bool(can_turn_in(spot, gradient, target.turn, settings).all())
-
-    def _tracked(self, name: str) -> TrackedObject:
-        tracked = self._sample.objects[name]
-        if not isinstance(tracked, TrackedObject):
-            raise TraceError(f"object {name!r} is {tracked!r}; give a TrackedObject")
-        return tracked
 
     def with_way(self, target: Target, constraints: Cubes) -> Target | str:
         """Return the target of a carried object with a way that keeps the constraints, or why there is none.
@@ -269,7 +260,7 @@ class Movables:
 
         Also return the grid, and the maps that this was computed from, with the object turned last.
         """
-        settings, tracked = self._settings, self._tracked(target.name)
+        settings, tracked = self._settings, self._sample.objects[target.name]
         if tracked.height is not None and settings.lift:
             low, high = tracked.height
             tracked = replace(tracked, height=(low + settings.lift, high + settings.lift))
@@ -287,17 +278,13 @@ class Movables:
         return danger, grid, MapParts(maps[-1], maps[-1], (), cubes)
 
     def maps_of(self, name: str) -> PropositionMaps:
-        """Return the maps of all propositions over the cells of an object.
-
-        Raises:
-            TraceError: the sample has no footprint for the object.
-        """
-        tracked = self._tracked(name)
+        """Return the maps of all propositions over the cells of an object."""
         if name not in self._maps:
             workspace = self._settings.workspace
             pushes = self._settings.skill == "push"
             # a pushed object crosses all cells from where it lies, which may be outside the workspace
-            grid = workspace.grid.reaching(*centre_of(tracked.footprint)) if pushes else workspace.grid
+            here = centre_of(self._sample.objects[name].footprint)
+            grid = workspace.grid.reaching(*here) if pushes else workspace.grid
             about = self._propositions, self._regions, self._sample, name
             self._maps[name] = proposition_maps(*about, workspace, grid)
         return self._maps[name]
@@ -625,8 +612,6 @@ class MotionOrder:
         """Return the motion of an object to its place; None if it is not possible now."""
         settings, constraints = self._expected.settings, self._constraints_at(state, is_first)
         tracked = scene.sample.objects[name]
-        if not isinstance(tracked, TrackedObject):
-            return None
         if settings.skill == "place":
             return self._placed(scene, name, tracked, constraints)
         if not self._spend(1):
@@ -689,7 +674,6 @@ class MotionOrder:
         if way is None:
             return
         bound = self._bound_by(scene, {name: way}, constraints)
-        names = [each for each in names if isinstance(scene.sample.objects[each], TrackedObject)]
         beside = self._beside(scene, name, names)
         clearances = self._expected.clearances(with_objects(scene.sample, {name: way}), name, names)
         for other, clearance in zip(names, clearances, strict=True):
@@ -712,8 +696,6 @@ class MotionOrder:
         """Return all that an object covers on its way as if none of some others was in it."""
         settings, tracked = self._expected.settings, scene.sample.objects[name]
         place = self._place_of(scene, name)
-        if not isinstance(tracked, TrackedObject):
-            return None
         if settings.skill == "place":
             return moved_object(tracked, *place)
         workspace = settings.workspace
@@ -757,10 +739,9 @@ class MotionOrder:
 
     def _beside(self, scene: PredictedState, name: str, others: Sequence[str]) -> set[str]:
         """Return the objects so near to one that could not be moved that they may be why."""
-        tracked = scene.sample.objects[name]
-        if not (isinstance(tracked, TrackedObject) and self._expected.movables(scene).failed_here(name)):
+        if not self._expected.movables(scene).failed_here(name):
             return set()
-        near = BESIDE * radius_of(tracked)
+        near = BESIDE * radius_of(scene.sample.objects[name])
         clearances = zip(others, self._expected.clearances(scene.sample, name, others), strict=True)
         return {each for each, clearance in clearances if clearance <= near}
 
@@ -790,8 +771,6 @@ class MotionOrder:
         """
         settings, constraints = self._expected.settings, self._constraints_at(state, is_first)
         tracked = scene.sample.objects[name]
-        if not isinstance(tracked, TrackedObject):
-            return
         movables = self._expected.movables(scene)
         now, workspace = movables.maps_of(name), settings.workspace
         gradient = gradient_map(now, self._aims[0].guard, constraints, workspace, settings.constraint_margin)
@@ -818,10 +797,9 @@ class MotionOrder:
             far = roomy & (danger_of(maps, later[1]) < -spare)
             roomy = far if far.any() else roomy
         (blocked,) = covered
-        beside = scene.sample.objects[blocked]
-        if is_beside and isinstance(beside, TrackedObject):
+        if is_beside:
             good &= distance_to([centre_of(tracked.footprint)], now.grid) > 2.0 * now.grid.cell_size
-            far = good & (now.room([blocked]) > BESIDE * radius_of(beside))
+            far = good & (now.room([blocked]) > BESIDE * radius_of(scene.sample.objects[blocked]))
             roomy = roomy & far if (roomy & far).any() else far
         free = np.ones_like(good)
         for is_at_edge in (False, True) if settings.skill == "push" else (False,):

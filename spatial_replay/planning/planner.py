@@ -14,7 +14,7 @@ from spatial_replay.automata.compile import chosen_spec
 from spatial_replay.automata.guards import Transition
 from spatial_replay.automata.ltlf import bounds_in_samples, counts_seconds
 from spatial_replay.errors import TraceError, UsageError
-from spatial_replay.geometry.footprint import TrackedObject, centre_of, moved_object
+from spatial_replay.geometry.footprint import centre_of, moved_object
 from spatial_replay.planning.decisions import (
     Consideration,
     Edge,
@@ -224,7 +224,7 @@ class Planner:
         if before is None or target is None or self._states.isdisjoint(self.automaton.can_accept):
             return ""
         was, now = before.objects.get(target.name), sample.objects.get(target.name)
-        if not (isinstance(was, TrackedObject) and isinstance(now, TrackedObject)):
+        if was is None or now is None:
             return ""
         (u, v), (x, y) = centre_of(was.footprint), centre_of(now.footprint)
         turned = math.remainder((now.yaw or 0.0) - (was.yaw or 0.0), math.tau) if target.turn else 0.0

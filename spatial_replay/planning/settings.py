@@ -18,7 +18,7 @@ import numpy as np
 
 from spatial_replay.errors import GeometryError, LogError, UsageError
 from spatial_replay.geometry.arrays import Booleans, Floats
-from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
+from spatial_replay.geometry.footprint import ConvexPart, Footprint
 from spatial_replay.logs.remote import log_file
 from spatial_replay.mapping.yaml_document import checked_document, read_yaml_text, schema_of
 from spatial_replay.text import named_arguments
@@ -195,8 +195,7 @@ class Workspace:
         Raises:
             UsageError: the sample has no object.
         """
-        tracked = [each for each in sample.objects.values() if isinstance(each, TrackedObject)]
-        parts = [part for each in tracked for part in each.footprint.parts]
+        parts = [part for each in sample.objects.values() for part in each.footprint.parts]
         if not parts:
             raise UsageError("there is nothing in the sample to lay a grid around; give a workspace")
         low = np.min([part.vertices.min(axis=0) - part.radius for part in parts], axis=0)

@@ -191,8 +191,7 @@ def can_turn_in(grid: Grid, gradient: GradientMap, turn: float, settings: Settin
     """
     count = math.ceil(abs(turn) / _SWEPT)
     about = gradient.made_of.now.about
-    tracked = about.sample.objects[gradient.name]
-    here = (tracked.yaw or 0.0) if isinstance(tracked, TrackedObject) else 0.0
+    here = about.sample.objects[gradient.name].yaw or 0.0
     yaws = tuple(here + turn * number / count for number in range(1, count))
     if not yaws:
         return np.ones(grid.shape, np.bool_)

@@ -17,7 +17,6 @@ from typing import Final, NamedTuple, TypeAlias
 import numpy as np
 
 from spatial_replay.errors import OutputError, UsageError, system_reason
-from spatial_replay.geometry.footprint import Footprint
 from spatial_replay.logs.mcap.write import LogWriter
 from spatial_replay.logs.messages import Channel, Messages
 from spatial_replay.logs.output_file import open_output
@@ -582,8 +581,7 @@ class ClipLog:
 def _sample_bytes(sample: Sample) -> int:
     size = _SAMPLE_BYTES
     for tracked in sample.objects.values():
-        footprint = tracked if isinstance(tracked, Footprint) else tracked.footprint
-        size += _OBJECT_BYTES + sum(len(part.packed) for part in footprint.parts)
+        size += _OBJECT_BYTES + sum(len(part.packed) for part in tracked.footprint.parts)
     return size
 
 

@@ -129,7 +129,7 @@ def yaws_for(formula: Formula, sample: Sample) -> tuple[float, ...]:
         term for part in parts if isinstance(part, Misalignment) for term in (part.first, part.second)
     ]
     tracked = [sample.objects.get(getattr(base_of(term), "name", "")) for term in compared]
-    known = [each.yaw for each in tracked if isinstance(each, TrackedObject) and each.yaw is not None]
+    known = [each.yaw for each in tracked if each is not None and each.yaw is not None]
     yaws: list[float] = []
     for yaw in (*known, *(turn * math.pi / 2 + yaw for yaw in known[:1] for turn in (1, 2, 3))):
         if all(abs(math.remainder(yaw - each, math.tau)) > _SAME_YAW for each in yaws):

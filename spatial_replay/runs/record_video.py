@@ -22,7 +22,6 @@ from spatial_replay.annotate.requirements import Requirement, Standing, requirem
 from spatial_replay.annotate.scene.scene_template import FRAME
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.geometry.footprint import TrackedObject
 from spatial_replay.logs.messages import Channel, Messages, messages_of
 from spatial_replay.logs.output_file import Durability
 from spatial_replay.logs.topics import (
@@ -112,8 +111,7 @@ def _members(requirement: Requirement, sample: Sample) -> set[str]:
     names = set(requirement.objects)
     for group in requirement.groups:
         for name, each in sample.objects.items():
-            kind = each.class_name if isinstance(each, TrackedObject) else None
-            if group.class_name == ANY_CLASS or (kind or "").casefold() == group.class_name:
+            if group.class_name in (ANY_CLASS, (each.class_name or "").casefold()):
                 names |= {name} - group.excluded
     return names
 
@@ -135,8 +133,6 @@ def encode_annotations(seen: View, sample: Sample, colours: Mapping[str, Colour]
     if seen.plane is None:
         return message.SerializeToString(deterministic=True)
     for name, each in sample.objects.items():
-        if not isinstance(each, TrackedObject):
-            continue
         colour = colours.get(name, NEUTRAL)
         # as high as its upper face, where its tags are
         z = 0.0 if each.height is None else each.height[1]

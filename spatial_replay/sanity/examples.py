@@ -663,7 +663,6 @@ def _turned(atoms: Iterable[Atom]) -> list[str]:
 def _row(sample: Sample) -> dict[str, Any]:
     objects = []
     for name, tracked in sample.objects.items():
-        assert isinstance(tracked, TrackedObject)
         (part,) = tracked.footprint.parts
         row: dict[str, Any] = {"name": name, "polygon": part.vertices.tolist()}
         if tracked.yaw is not None:

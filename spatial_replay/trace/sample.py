@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from reprlib import repr as shortened
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -84,9 +84,19 @@ class Sample:
     """
 
     time_ns: int
-    objects: Mapping[str, TrackedObject | Footprint] = field(default_factory=dict)
+    objects: Mapping[str, TrackedObject] = field(default_factory=dict)
     signals: Mapping[str, float] = field(default_factory=dict)
     unknown: Mapping[str, str | None] = field(default_factory=dict)
+
+    if TYPE_CHECKING:
+        # what is given may be less than what is there then
+        def __init__(
+            self,
+            time_ns: int,
+            objects: Mapping[str, TrackedObject | Footprint] = ...,
+            signals: Mapping[str, float | str] = ...,
+            unknown: Mapping[str, str | None] = ...,
+        ) -> None: ...
 
     def __post_init__(self) -> None:
         if isinstance(self.time_ns, bool) or not isinstance(self.time_ns, (int, np.integer)):
@@ -98,8 +108,9 @@ class Sample:
                 )
         if not 0 <= self.time_ns <= LATEST_NS:
             raise TraceError(f"time_ns is {self.time_ns}; give a time from 0 to 2**63 - 1 ns")
-        objects: dict[str, TrackedObject | Footprint] = {}
-        for name, tracked in self.objects.items():
+        objects: dict[str, TrackedObject] = {}
+        given: Mapping[str, object] = self.objects
+        for name, tracked in given.items():
             _require_name(name, "an object")
             if isinstance(tracked, Footprint):
                 tracked = TrackedObject(tracked)
@@ -109,9 +120,8 @@ class Sample:
                     f" and texts are signals: Sample(time_ns, objects, {{{name!r}: ...}})"
                 )
             objects[name] = tracked
-        given: Mapping[str, object] = self.signals
         signals: dict[str, float] = {}
-        for name, value in given.items():
+        for name, value in self.signals.items():
             _require_name(name, "a signal")
             signals[name] = _signal_value(name, value)
         for name, class_name in self.unknown.items():

@@ -288,9 +288,8 @@ class Trace(Displayed):
         observed: list[TrackedObject] = []
         for index, sample in enumerate(listed):
             for name in sorted(sample.objects):
-                tracked = sample.objects[name]
                 rows[index, number[name]] = len(observed)
-                observed.append(TrackedObject(tracked) if isinstance(tracked, Footprint) else tracked)
+                observed.append(sample.objects[name])
         # what is known of an object that is not known where: its class, in a row after the others
         blank: list[str | None] = []
         for index, sample in enumerate(listed):
