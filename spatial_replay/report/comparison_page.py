@@ -69,7 +69,7 @@ def comparison_page(diff: SpecificationDiff | LogDiff, a: RunReport, b: RunRepor
         element("header", title, about, **{"class": "top"}),
         element(
             "main",
-            panel("verdicts", "What differs", *_changes(diff, (a.first_ns, b.first_ns))),
+            panel("verdicts", "What differs", *_changes(diff, (a.replayed.first_ns, b.replayed.first_ns))),
             panel("scene-a", labels[0]),
             panel("scene-b", labels[1]),
             *_decision_panels(diff, labels),
@@ -182,7 +182,7 @@ def _pairs(
     nodes: list[dict[str, Any]] = []
     places = [_places(report) for report in (a, b)]
     if isinstance(diff, SpecificationDiff):
-        knots = [[0.0, (a.first_ns - b.first_ns) / 1e9]]
+        knots = [[0.0, (a.replayed.first_ns - b.replayed.first_ns) / 1e9]]
         for spec in diff.specs:
             if first_ns is None and spec.first is not None:
                 first_ns = spec.first.time_ns
@@ -195,7 +195,7 @@ def _pairs(
     else:
         if diff.alignment is not None:
             knots = [
-                [(knot.a_ns - a.first_ns) / 1e9, (knot.b_ns - b.first_ns) / 1e9]
+                [(knot.a_ns - a.replayed.first_ns) / 1e9, (knot.b_ns - b.replayed.first_ns) / 1e9]
                 for knot in diff.alignment.knots
             ]
         found = (
@@ -214,7 +214,7 @@ def _pairs(
         "knots": knots,
         "nodes": nodes,
         "decision": _decision_number(diff),
-        "first": None if first_ns is None else (first_ns - a.first_ns) / 1e9,
+        "first": None if first_ns is None else (first_ns - a.replayed.first_ns) / 1e9,
     }
 
 

@@ -3,28 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from foxglove_schemas_protobuf.Event_pb2 import Event
 from numpy.typing import NDArray
 
+from spatial_replay.annotate.automaton_state import SpecAutomaton
 from spatial_replay.annotate.specification import ReportedTree
-from spatial_replay.automata.automaton import Automaton
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.result import NodeResult, SpecResult, worst_first
-from spatial_replay.monitor.semantics import Semantics
-from spatial_replay.monitor.vacuity import UntestedPart
-from spatial_replay.monitor.verdict import Verdict, worst_verdict
+from spatial_replay.monitor.sentences import divisor_of, open_text
+from spatial_replay.monitor.verdict import Verdict
+from spatial_replay.monitor.witness.atom import DecidingAtom
+from spatial_replay.monitor.witness.witness import Witness, WitnessStep
 from spatial_replay.palette import CURVES, NEGATIVE, NEUTRAL, POSITIVE, hexadecimal
+from spatial_replay.replay.engine import Replayed
 from spatial_replay.report.compact import Packing, sentence_parts, singles
 from spatial_replay.report.panels import (
     MOST_EVENTS,
     MOST_NODES,
     NO_PICTURES,
     ReportedDecisions,
-    ReportedEvent,
-    ReportedPictures,
     ReportedScene,
     StatePath,
     automaton_value,
@@ -32,15 +34,15 @@ from spatial_replay.report.panels import (
     event_values,
     final_text,
     named_nodes,
-    picture_values,
     requirement_values,
     scene_value,
     series_of,
     shown_nodes,
+    start_of,
     tree_value,
 )
-from spatial_replay.spec.formula import Formula, NamedSpec, Specification
-from spatial_replay.spec.walks import Unit
+from spatial_replay.spec.formula import Quantified, Specification, iter_nodes
+from spatial_replay.spec.relations import RELATION_NAMES
 from spatial_replay.text import Sentence, json_number
 from spatial_replay.trace.units import Axes
 
@@ -50,63 +52,27 @@ MOST_DRAWN: Final = 24
 """Results with an explanation, a tree and curves, at most: the worst. All have their verdicts."""
 
 
-class Pointer(NamedTuple):
-    """The atom that decided a verdict, as an arrow in the scene.
-
-    Attributes:
-        ends: (2, 2), from where to where it points.
-        text: the atom's.
-        number: its robustness, in the unit of the log where `scale` divides it.
-        is_condition: whether it is in the condition of an implication, whose response is what was missed.
-        is_response: whether it is what came nearest to such a response.
-        objects: what it is about.
-    """
-
-    ends: Floats
-    text: str
-    number: float
-    is_condition: bool = False
-    is_response: bool = False
-    objects: tuple[str, ...] = ()
-
-
 @dataclass(frozen=True, eq=False)
 class ReportedResult:
     """One result of a run, with its explanation and its path through its automaton.
 
     Attributes:
         tree: under which it is reported.
-        source: the text of its file.
-        relations: the names of relations that its file may use.
+        file: that it comes from.
         sentences: the explanation of its verdict; none if the page does not explain it.
-        decided_ns: the sample that decided it; None without an explanation.
-        decided_node: the id of the node that decided it; None without an explanation.
-        decided_text: the atom of the objects that decided it, where that node is a quantifier, or "".
-        left_open: between which numbers that atom lies, if its uncertainty leaves the verdict open, or "".
-        pointer: the two points between which the atom that decided it stands; None if it has none.
-        named: the specs of its file, by name.
-        units: those of the numbers that its robustness is the least of.
+        witness: what decided it; None without an explanation.
         unit: that of its robustness, if it is declared, or "".
-        automaton: None if it has none.
-        no_automaton: why not.
+        compiled: its automaton, or why it has none.
         path: the states of the run.
     """
 
     result: SpecResult
     tree: ReportedTree
-    source: str
-    relations: frozenset[str]
+    file: Specification
     sentences: tuple[Sentence, ...]
-    decided_ns: int | None
-    decided_node: int | None
-    decided_text: str
-    left_open: str
-    pointer: Pointer | None
-    named: Mapping[str, NamedSpec]
-    units: tuple[Unit, ...]
+    witness: Witness | None
     unit: str
-    automaton: Automaton | None
-    no_automaton: str
+    compiled: SpecAutomaton
     path: StatePath
 
     @property
@@ -119,19 +85,33 @@ class ReportedResult:
                 yield node
 
     @property
+    def decided(self) -> WitnessStep | None:
+        """The step to look at: the one that decided or, of a missed response, came nearest.
+
+        Where an operator took its number from the past, that is the operator: it failed then, and not before.
+        """
+        if self.witness is None:
+            return None
+        path = self.witness.closest_path or self.witness.path
+        return next((step for step, below in pairwise(path) if below.time_ns < step.time_ns), path[-1])
+
+    @property
+    def deciding(self) -> DecidingAtom | None:
+        """The atom that decided it or, of a response that was missed, came nearest."""
+        if self.witness is None:
+            return None
+        return self.witness.deciding if self.witness.closest is None else self.witness.closest[0]
+
+    @property
     def fault_ns(self) -> int | None:
         """The sample that made it violated or unknown."""
-        return None if self.result.verdict is Verdict.SATISFIED else self.decided_ns
+        decided = self.decided
+        return None if decided is None or self.result.verdict is Verdict.SATISFIED else decided.time_ns
 
     @property
     def robustness_text(self) -> str:
         """The root's robustness with its unit, or between which numbers it lies."""
         return final_text(self.result.robustness, self.result.lower, self.result.upper, self.unit)
-
-    @property
-    def formula(self) -> Formula:
-        """Its formula, with the object that it is about in place of a template's parameter."""
-        return self.result.evidence.bound(self.result.formula)
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,40 +119,25 @@ class RunReport:
     """A run with its results.
 
     Attributes:
-        log: base name of the log.
-        first_ns, start_ns, end_ns: times of the log's first sample, and of the first and last evaluated.
         axes: those of the source, as opposed to those of the samples.
-        faults, remarks: what was lost while reading, and other notes of the reader.
-        vacuous: templates that no object fits.
+        results: those of `replayed`.
         gaps: sentences on what unknown results lack before or after a time.
-        unreadable: how many observations have no finite numbers.
+        redone: what would have been decided otherwise, if the log has that.
+        pictures: see `pictures_of`.
         planned_for: the file that decisions were made for, if another one is evaluated; else "".
     """
 
-    log: str
-    samples: int
-    first_ns: int
-    start_ns: int
-    end_ns: int
+    replayed: Replayed
     axes: Axes
-    faults: tuple[str, ...]
-    remarks: tuple[str, ...]
-    unreadable: int
-    semantics: Semantics
-    certificate: Mapping[str, str]
     files: tuple[Specification, ...]
     results: tuple[ReportedResult, ...]
-    vacuous: tuple[UntestedPart, ...]
     gaps: tuple[str, ...]
     scene: ReportedScene
-    events: tuple[ReportedEvent, ...]
+    events: tuple[Event, ...]
     decisions: ReportedDecisions
-    pictures: ReportedPictures = NO_PICTURES
-    planned_for: str = ""
-
-    @property
-    def verdict(self) -> Verdict:
-        return worst_verdict(each.result.verdict for each in self.results)
+    redone: ReportedDecisions
+    planned_for: str
+    pictures: Mapping[str, Any] = field(default_factory=lambda: NO_PICTURES)
 
     @property
     def drawn(self) -> tuple[ReportedResult, ...]:
@@ -182,7 +147,12 @@ class RunReport:
     @property
     def drawn_numbers(self) -> list[int]:
         """The places of those results."""
-        return worst_results([each.result for each in self.results])
+        return worst_results(self.replayed.results)
+
+    @property
+    def decided_ns(self) -> list[int]:
+        """The samples that decided the drawn results."""
+        return [each.decided.time_ns for each in self.drawn if each.decided is not None]
 
 
 def worst_results(results: Sequence[SpecResult]) -> list[int]:
@@ -285,7 +255,7 @@ class PageData:
 def page_data(report: RunReport) -> PageData:
     """Return everything that the page draws; equal reports give equal data."""
     packing = Packing()
-    drawn = report.drawn
+    drawn, first_ns = report.drawn, report.replayed.first_ns
     times_ns = np.unique(
         np.concatenate([report.scene.times_ns, *(each.result.times_ns for each in drawn)]).astype(np.int64)
     )
@@ -293,13 +263,12 @@ def page_data(report: RunReport) -> PageData:
     room = _room(drawn, len(times_ns))
     shown_ns = _shown_times(report, times_ns, room // 2)
     kept = np.union1d(times_ns[choose_samples(times_ns, curves, room - len(shown_ns))], shown_ns)
-    scene = report.scene.at(kept)
-    decisions = decisions_value(report.decisions, report.first_ns, packing)
+    decisions = decisions_value(report.decisions, report.redone, first_ns, packing)
     facts = {
-        "settles": report.semantics == "ltlf",
+        "settles": report.replayed.semantics == "ltlf",
         "lengths": report.axes.unit,
         "is_thinned": len(kept) < len(times_ns),
-        "times": packing.add((kept - report.first_ns) / 1e9, "f8"),
+        "times": packing.add((kept - first_ns) / 1e9, "f8"),
         "palette": {
             "positive": hexadecimal(POSITIVE),
             "negative": hexadecimal(NEGATIVE),
@@ -308,10 +277,10 @@ def page_data(report: RunReport) -> PageData:
             "curves": CURVES[2:],
         },
         "results": [_result_value(each, kept, report, packing) for each in drawn],
-        "scene": scene_value(scene, report.first_ns, _places(report), packing),
-        "events": event_values(report.events, report.first_ns),
+        "scene": scene_value(report.scene, kept, first_ns, _places(report), packing),
+        "events": event_values(report.events, first_ns),
         "decisions": decisions["decisions"],
-        "camera": picture_values(report.pictures, report.first_ns),
+        "camera": dict(report.pictures),
     }
     omissions = tuple(_omissions(report, len(times_ns), len(kept), decisions["maps_left_out"]))
     return PageData(facts, packing.text(), omissions)
@@ -342,9 +311,8 @@ def _shown_times(report: RunReport, times_ns: Integers, most: int) -> Integers:
     They are the samples that decided a verdict, the samples of events and, if there is room, samples of the
     scene at equal distances. At one cursor, the page shows one sample.
     """
-    decided_ns = [each.decided_ns for each in report.drawn if each.decided_ns is not None]
-    events_ns = sorted({each.start_ns for each in report.events[:MOST_EVENTS]})[: most // 2]
-    shown_ns = np.array([*decided_ns, *events_ns], np.int64)
+    events_ns = sorted(set(map(start_of, report.events[:MOST_EVENTS])))[: most // 2]
+    shown_ns = np.array([*report.decided_ns, *events_ns], np.int64)
     room = max(most - len(shown_ns), 2)
     scene_ns = report.scene.times_ns[:: max(1, -(-len(report.scene.times_ns) // room))]
     return np.intersect1d(np.concatenate([shown_ns, scene_ns]), times_ns)
@@ -353,7 +321,8 @@ def _shown_times(report: RunReport, times_ns: Integers, most: int) -> Integers:
 def _result_value(
     each: ReportedResult, kept: Integers, report: RunReport, packing: Packing
 ) -> Mapping[str, Any]:
-    first_ns = report.first_ns
+    first_ns = report.replayed.first_ns
+    relations = RELATION_NAMES | each.file.relations
     samples = np.flatnonzero(np.isin(each.result.times_ns, kept))
     here = each.result.times_ns[samples]
     series = series_of(each.result.series, each.result.formula, samples)
@@ -367,27 +336,20 @@ def _result_value(
         "first": int(np.searchsorted(kept, here[0])) if len(here) else 0,
         "samples": len(here),
         "decided": _place_of(each),
-        "decided_text": each.decided_text,
-        "left_open": each.left_open,
-        "nodes": tree_value(
-            each.formula,
-            each.result.values,
-            each.result.final,
-            each.relations,
-            report.axes.units,
-            each.tree.calls(each.source),
-        ),
+        "decided_text": _decided_text(each),
+        "left_open": "" if each.witness is None else open_text(each.witness),
+        "nodes": tree_value(each.result, relations, report.axes.units, each.tree.calls(each.file.source)),
         "requirements": requirement_values(each.result, samples, packing),
         "series": packing.add(singles(series), "f4"),
         "automaton": None,
-        "no_automaton": sentence_parts(each.no_automaton),
+        "no_automaton": sentence_parts(each.compiled.reason),
     }
-    if each.automaton is not None:
+    if each.compiled.automaton is not None:
         inside = np.searchsorted(each.path.times_ns, here)
         value["automaton"] = {
-            **automaton_value(each.automaton, each.path, each.tree.named),
-            "sets": each.path.sets,
-            "path": packing.add(each.path.codes[inside], "i4"),
+            **automaton_value(each.compiled.automaton, each.path, each.tree.named),
+            "sets": list(each.path.sets),
+            "path": packing.add(np.array(each.path.codes)[inside], "i4"),
         }
     return value
 
@@ -395,24 +357,40 @@ def _result_value(
 def _place_of(each: ReportedResult) -> int | None:
     """Return the place on the page of the node that decided a result."""
     shown = shown_nodes(each.result.formula)
-    return shown.index(each.decided_node) if each.decided_node in shown else None
+    return shown.index(each.decided.node) if each.decided and each.decided.node in shown else None
+
+
+def _decided_text(each: ReportedResult) -> str:
+    """Return the atom of the objects that decided a quantifier, or "" if what decided is none."""
+    if each.decided is None or each.deciding is None:
+        return ""
+    nodes = {identifier: node for identifier, _, node in iter_nodes(each.result.formula)}
+    return each.deciding.text if isinstance(nodes[each.decided.node], Quantified) else ""
 
 
 def _pointer_value(each: ReportedResult, first_ns: int, lengths: str) -> Mapping[str, Any] | None:
     """Return the arrow at what decided a result that is not satisfied, and when it is shown."""
-    if each.pointer is None or each.fault_ns is None:
+    witness, deciding = each.witness, each.deciding
+    if each.fault_ns is None or witness is None or deciding is None or deciding.unknown:
         return None
+    if each.decided != (witness.closest_path or witness.path)[-1]:
+        return None  # things stood elsewhere when the atom had its number
+    contact = next((each.contact for each in deciding.measured if each.contact is not None), None)
+    if contact is None:
+        return None
+    number = deciding.value * divisor_of(deciding.atom)
+    is_response = witness.closest is not None
     # as the arrow of the log's scene says it
-    holds = "must not hold, holds by " if each.pointer.number >= 0 else ""
+    holds = "must not hold, holds by " if number >= 0 else ""
     return {
         "time": (each.fault_ns - first_ns) / 1e9,
-        "ends": each.pointer.ends.reshape(-1).tolist(),
-        "text": each.pointer.text,
-        "label": each.left_open or f"{holds}{each.pointer.number:.3g} {lengths}".rstrip(),
-        "number": json_number(each.pointer.number),
-        "is_condition": each.pointer.is_condition,
-        "is_response": each.pointer.is_response,
-        "objects": list(each.pointer.objects),
+        "ends": [*map(float, (*contact.first, *contact.second))],
+        "text": deciding.text,
+        "label": open_text(witness) or f"{holds}{number:.3g} {lengths}".rstrip(),
+        "number": json_number(number),
+        "is_condition": not is_response and witness.missed is not None and witness.missed.is_condition,
+        "is_response": is_response,
+        "objects": list(deciding.objects),
     }
 
 
@@ -424,7 +402,7 @@ def _omissions(report: RunReport, samples: int, kept: int, maps: int) -> Iterato
         )
     if report.scene.stride > 1:
         yield f"The scene has one of {report.scene.stride} messages of /spatial/scene."
-    drawn = [each for frame in report.scene.frames[:1] for each in frame.entities.values()]
+    drawn = [each for _, frame in report.scene.frames[:1] for each in frame.entities.values()]
     if len(report.results) > 1 and not all(each.shades for each in drawn):
         yield "The scene has the colours of all results together: there are too many for colours of each."
     if len(report.results) > MOST_DRAWN:

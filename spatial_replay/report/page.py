@@ -25,8 +25,8 @@ from spatial_replay.report.compact import json_text, sentence_parts
 from spatial_replay.report.data import MANY, ReportedResult, RunReport, page_data
 from spatial_replay.report.panels import final_text
 from spatial_replay.spec.formula import iter_nodes
-from spatial_replay.spec.walks import declared_unit, units_text
-from spatial_replay.text import Instant, Sentence, counted, printable
+from spatial_replay.spec.walks import declared_unit, units_of, units_text
+from spatial_replay.text import Instant, Sentence, counted, printable, time_text
 
 _CALENDAR_NS: Final = 500_000_000 * 10**9
 """Times from here on count from 1970; smaller ones are of clocks that start at power-on."""
@@ -40,7 +40,9 @@ def header(report: RunReport, omissions: Sequence[str]) -> Html:
         omissions: what the page leaves out to limit its size.
     """
     counts = element("span", _counts(report), **{"class": "quiet"}) if len(report.results) > 1 else Html("")
-    title = element("div", element("h1", text(report.log)), _chip_of(report), counts, **{"class": "title"})
+    title = element(
+        "div", element("h1", text(report.replayed.log)), _chip_of(report), counts, **{"class": "title"}
+    )
     return element(
         "header",
         element("a", "Skip to the run", **{"class": "skip", "href": "#main"}),
@@ -53,16 +55,17 @@ def header(report: RunReport, omissions: Sequence[str]) -> Html:
 
 
 def _chip_of(report: RunReport) -> Html:
-    deciding = [each.result for each in report.results if each.result.verdict is report.verdict]
-    return chip(report.verdict, is_tested=all(each.tested != "nothing" for each in deciding))
+    verdict = report.replayed.verdict
+    deciding = [each.result for each in report.results if each.result.verdict is verdict]
+    return chip(verdict, is_tested=all(each.tested != "nothing" for each in deciding))
 
 
 def panels(report: RunReport) -> Html:
     """Return the verdicts, and a place for each panel that is drawn."""
-    has_automaton = any(result.automaton is not None for result in report.drawn)
+    has_automaton = any(each.compiled.automaton is not None for each in report.drawn)
     sections = [
         panel("verdicts", "Verdicts", *_verdicts(report)),
-        *([panel("camera", "Camera", kind="panel wide")] if report.pictures.topic else []),
+        *([panel("camera", "Camera", kind="panel wide")] if report.pictures["topic"] else []),
         panel("scene", "Scene", element("p", f"Seen from above, {report.axes}.", **{"class": "axes"})),
         panel("tree", "Specification"),
         panel("timeline", "Over time"),
@@ -84,7 +87,7 @@ def footer(report: RunReport) -> Html:
     ]
     hashes = [
         element("div", element("dt", text(key)), element("dd", text(value)))
-        for key, value in report.certificate.items()
+        for key, value in report.replayed.certificate.items()
     ]
     certificate = element("details", element("summary", "Certificate"), element("dl", *hashes))
     return element("footer", *texts, certificate, **{"class": "foot"})
@@ -96,29 +99,31 @@ def text(words: str) -> Html:
 
 
 def _about(report: RunReport) -> Iterator[str]:
+    replayed = report.replayed
     yield ", ".join(file.filename for file in report.files)
-    if report.first_ns >= _CALENDAR_NS:
-        yield f"{datetime.fromtimestamp(report.first_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC"
-    start, end = (str(Instant(time_ns, report.first_ns)) for time_ns in (report.start_ns, report.end_ns))
-    yield f"{start} to {end}" if report.start_ns != report.first_ns else end
-    yield counted(report.samples, "sample")
-    yield f"semantics {report.semantics}"
+    if replayed.first_ns >= _CALENDAR_NS:
+        yield f"{datetime.fromtimestamp(replayed.first_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC"
+    start, end = (time_text(time_ns, replayed.first_ns) for time_ns in (replayed.start_ns, replayed.end_ns))
+    yield f"{start} to {end}" if replayed.start_ns != replayed.first_ns else end
+    yield counted(replayed.samples, "sample")
+    yield f"semantics {replayed.semantics}"
     yield f"spatial-replay {__version__}"
 
 
 def _notices(report: RunReport, omissions: Sequence[str]) -> Iterator[Html]:
-    if report.faults:
+    replayed = report.replayed
+    if replayed.faults:
         what = "The log is damaged: verdicts are over what could be read."
-        yield _notice("alert", what, report.faults)
-    if report.unreadable:
-        verb = "holds" if report.unreadable == 1 else "hold"
-        what = f"{counted(report.unreadable, 'observation')} {verb} no finite number: unknown there."
-        yield _notice("note", what, report.remarks)
-    elif report.remarks:
-        yield _notice("note", "The log says of its samples:", report.remarks)
+        yield _notice("alert", what, replayed.faults)
+    if replayed.unreadable:
+        verb = "holds" if replayed.unreadable == 1 else "hold"
+        what = f"{counted(replayed.unreadable, 'observation')} {verb} no finite number: unknown there."
+        yield _notice("note", what, replayed.remarks)
+    elif replayed.remarks:
+        yield _notice("note", "The log says of its samples:", replayed.remarks)
     if report.gaps:
         yield _notice("note", "Samples lack what unknown results are about:", report.gaps)
-    if report.semantics != "ltlf" and report.results:
+    if replayed.semantics != "ltlf" and report.results:
         yield _notice("note", "Explanations are given under the semantics ltlf alone.", ())
     if omissions:
         yield _notice("note", "The run is large, and the page leaves something out:", omissions)
@@ -138,25 +143,24 @@ def panel(name: str, title: str, *content: Html, kind: str = "panel") -> Html:
 def _verdicts(report: RunReport) -> Iterator[Html]:
     if not report.results:
         yield element("p", "The templates matched no objects.")
-    for part in report.vacuous:
-        yield element("p", *sentence_html(part.message, report.first_ns))
+    first_ns = report.replayed.first_ns
+    for part in report.replayed.vacuous:
+        yield element("p", *sentence_html(part.message, first_ns))
     places = {id(result): place for place, result in enumerate(report.drawn)}
     are_many = len(report.results) > MANY
     if are_many:
         yield element("p", text(_counts(report)), id="counts", **{"class": "counts"})
-    worst = worst_first([each.result for each in report.results])
+    worst = worst_first(report.replayed.results)
     for number, each in enumerate(report.results[place] for place in worst):
         # which result the page shows when something in the verdict is chosen
         drawn = {"data-result": str(places[id(each)])} if id(each) in places else {}
-        is_reported = each.result.verdict == report.verdict or bool(each.result.remarks)
+        is_reported = each.result.verdict == report.replayed.verdict or bool(each.result.remarks)
         is_unfolded = is_reported and not (are_many and number)
         unfolded = {"open": ""} if each.sentences and is_unfolded else {}
         attributes = {"class": "verdict", "data-verdict": str(each.result.verdict), **drawn, **unfolded}
-        content = [element("p", *sentence_html(sentence, report.first_ns)) for sentence in each.sentences]
-        content += [_specs(each, report.first_ns)] if each.sentences else []
-        yield element(
-            "details" if content else "div", _summary(each, report.first_ns), *content, **attributes
-        )
+        content = [element("p", *sentence_html(sentence, first_ns)) for sentence in each.sentences]
+        content += [_specs(each, first_ns)] if each.sentences else []
+        yield element("details" if content else "div", _summary(each, first_ns), *content, **attributes)
 
 
 def _counts(report: RunReport) -> str:
@@ -211,10 +215,11 @@ def _requirement(identifier: str | None, name: str, title: str | None) -> Iterat
 
 def _specs(each: ReportedResult, first_ns: int) -> Html:
     """Return one row for each named spec within a result, and the units that its number is the least of."""
+    named = {spec.name: spec for spec in each.file.specs}
     rows, formulas = [], {identifier: node for identifier, _, node in iter_nodes(each.result.formula)}
     for node in each.specs:
         settled_ns = settled_time(each.result.settled_ns, node.id)
-        spec = each.named.get(node.name or "")
+        spec = named.get(node.name or "")
         about = (None, None) if spec is None else (spec.id, spec.title)
         unit = declared_unit(formulas[node.id], each.result.evidence.units)
         numbers = f"robustness {final_text(node.robustness, node.final_lower, node.final_upper, unit)}"
@@ -225,7 +230,7 @@ def _specs(each: ReportedResult, first_ns: int) -> Html:
             element("li", chip(node.verdict), *_requirement(about[0], node.name or "", about[1]), line)
         )
     parts = [element("ul", *rows, **{"class": "specs"})] if rows else []
-    if words := units_text(each.units):
+    if words := units_text(units_of(each.result.formula)):
         parts.append(element("p", text(words), **{"class": "units"}))
     return element("div", *parts)
 
@@ -319,12 +324,12 @@ def page(report: RunReport) -> bytes:
     """Return the page, in UTF-8; equal reports give equal bytes."""
     data = page_data(report)
     return document(
-        f"{report.log}: {report.verdict}",
+        f"{report.replayed.log}: {report.replayed.verdict}",
         [header(report, data.omissions), panels(report), footer(report)],
         {"facts": json_text(data.facts)},
         {"numbers": data.numbers},
         "page",
-        has_pictures=bool(report.pictures.pictures),
+        has_pictures=bool(report.pictures.get("pictures")),
     )
 
 

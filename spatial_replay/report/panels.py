@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import base64
 import math
+from array import array
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
+from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -92,22 +94,17 @@ def initial_nodes(formula: Formula) -> frozenset[int]:
 
 
 def tree_value(
-    formula: Formula,
-    robustness: Floats,
-    final: Floats,
-    relations: frozenset[str],
-    units: Mapping[str, str],
-    calls: Mapping[int, str],
+    result: SpecResult, relations: frozenset[str], units: Mapping[str, str], calls: Mapping[int, str]
 ) -> list[Mapping[str, Any]]:
     """Return the shown nodes, each with its text and its final verdict.
 
     Args:
-        formula: with the object that it is about in place of a template's parameter.
-        robustness: (N,), each node's value on the whole log.
-        final: (N, 2), lower and upper end of each node for the finished log.
+        relations: the names of those that its file may use.
         units: those that are declared.
         calls: of nodes that are a `def` with its arguments, as the file writes them.
     """
+    # with the object that it is about in place of a template's parameter
+    formula = result.evidence.bound(result.formula)
     shown, initial = shown_nodes(formula), initial_nodes(formula)
     place = {identifier: index for index, identifier in enumerate(shown)}
     return [
@@ -120,8 +117,8 @@ def tree_value(
             "unit": unit_of(node, units),
             "divisor": divisor_of(node),
             "initial": identifier in initial,
-            "verdict": str(final_verdict(*final[identifier].tolist())),
-            "value": final_text(float(robustness[identifier]), *final[identifier].tolist()),
+            "verdict": str(final_verdict(*result.final[identifier].tolist())),
+            "value": final_text(float(result.values[identifier]), *result.final[identifier].tolist()),
         }
         for identifier, parent, node in iter_nodes(formula)
         if identifier in place
@@ -196,45 +193,23 @@ def _cut(text: str) -> str:
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1].rstrip()}…"
 
 
-@dataclass(frozen=True, eq=False)
 class StatePath:
-    """The states of a run after each of some samples.
+    """The states of a run, collected from its messages as they come.
 
     Attributes:
-        times_ns: (T,) int64.
-        codes: (T,) int64, index into `sets`.
-        sets: states that the run may be in.
+        times_ns: of each message.
+        codes: of each message, the number of its states in `sets`.
+        sets: states that the run may be in, with their numbers.
     """
 
-    times_ns: Integers
-    codes: Integers
-    sets: tuple[tuple[int, ...], ...]
-
-
-class StatePathCollector:
-    """Collects the states of one result from its messages as they come."""
-
     def __init__(self) -> None:
-        self._times_ns: list[Integers] = []
-        self._codes: list[Integers] = []
-        self._sets: dict[tuple[int, ...], int] = {}
+        self.times_ns, self.codes = array("q"), array("q")
+        self.sets: dict[tuple[int, ...], int] = {}
 
-    def extend(self, times_ns: Integers, groups: Sequence[tuple[Integers, tuple[int, ...]]]) -> None:
-        """Take in the states after the next samples: places of samples, each time with their states."""
-        codes = [
-            np.full(len(places), self._sets.setdefault(states, len(self._sets))) for places, states in groups
-        ]
-        places = np.concatenate([places for places, _ in groups])
-        order = np.argsort(places)
-        self._times_ns.append(times_ns[places[order]])
-        self._codes.append(np.concatenate(codes)[order])
-
-    @property
-    def path(self) -> StatePath:
-        """The path so far."""
-        none = [np.empty(0, np.int64)]
-        times_ns, codes = (np.concatenate(none + each) for each in (self._times_ns, self._codes))
-        return StatePath(times_ns, codes, tuple(self._sets))
+    def add(self, time_ns: int, states: tuple[int, ...]) -> None:
+        """Add the states after a sample."""
+        self.times_ns.append(time_ns)
+        self.codes.append(self.sets.setdefault(states, len(self.sets)))
 
 
 def automaton_value(automaton: Automaton, path: StatePath, named: Callable[[str], str]) -> Mapping[str, Any]:
@@ -272,38 +247,27 @@ MOST_EVENTS: Final = 2_000
 """Events of a page, at most: the first ones."""
 
 
-class ReportedEvent(NamedTuple):
-    """One change.
-
-    Attributes:
-        start_ns: the first sample of what began.
-        facts: the metadata of the event, by key.
-    """
-
-    start_ns: int
-    facts: Mapping[str, str]
-
-
-def event_of(payload: bytes) -> ReportedEvent:
-    """Decode a message of /spatial/events."""
-    event = Event.FromString(payload)
-    facts = {each.key: each.value for each in event.metadata}
-    return ReportedEvent(event.start_time.ToNanoseconds(), facts)
-
-
-def event_values(events: Sequence[ReportedEvent], first_ns: int) -> list[Mapping[str, Any]]:
+def event_values(events: Sequence[Event], first_ns: int) -> list[Mapping[str, Any]]:
     """Return the list as the page reads it, by start time."""
-    ordered = sorted(events, key=lambda each: each.start_ns)
-    return [
-        {
-            "time": (each.start_ns - first_ns) / 1e9,
-            "status": _status(each.facts),
-            "specification": each.facts.get("specification", ""),
-            "object": each.facts.get("object"),
-            "parts": sentence_parts(each.facts.get("message", "")),
-        }
-        for each in ordered[:MOST_EVENTS]
-    ]
+    ordered = sorted(events, key=start_of)
+    return [_event_value(each, first_ns) for each in ordered[:MOST_EVENTS]]
+
+
+def start_of(event: Event) -> int:
+    """Return the first sample of what began."""
+    time_ns: int = event.start_time.ToNanoseconds()
+    return time_ns
+
+
+def _event_value(event: Event, first_ns: int) -> Mapping[str, Any]:
+    facts = {each.key: each.value for each in event.metadata}
+    return {
+        "time": (start_of(event) - first_ns) / 1e9,
+        "status": _status(facts),
+        "specification": facts.get("specification", ""),
+        "object": facts.get("object"),
+        "parts": sentence_parts(facts.get("message", "")),
+    }
 
 
 def _status(facts: Mapping[str, str]) -> str:
@@ -323,57 +287,37 @@ _FORMS: Final = ((320, 70), (320, 45), (200, 45), (120, 40), (60, 30))
 """Widths in pixels and qualities of JPEG, of which the first is taken that is small enough."""
 
 
-class ReportedPictures(NamedTuple):
-    """Pictures of a run's camera.
-
-    Attributes:
-        topic: with the images; "" without any.
-        times_ns: of the pictures, increasing.
-        pictures: each as JPEG.
-        reason: why there is none though the log has images; "" otherwise.
-    """
-
-    topic: str = ""
-    times_ns: tuple[int, ...] = ()
-    pictures: tuple[bytes, ...] = ()
-    reason: str = ""
+NO_PICTURES: Final[Mapping[str, Any]] = MappingProxyType(
+    {"topic": "", "reason": "", "times": (), "pictures": ()}
+)
+"""For a log without images."""
 
 
-NO_PICTURES: Final = ReportedPictures()
-"""Note for a log without images."""
-
-
-def pictures_of(source: Source, start_ns: int, end_ns: int, decided_ns: Collection[int]) -> ReportedPictures:
-    """Return small pictures of what a log's camera saw from `start_ns` to `end_ns`.
+def pictures_of(
+    source: Source, first_ns: int, span_ns: tuple[int, int], decided_ns: Collection[int]
+) -> Mapping[str, Any]:
+    """Return small pictures of what a log's camera saw, as the page reads them; why there are none, if so.
 
     Args:
+        span_ns: from when to when.
         decided_ns: samples whose pictures are among them, as far as there is room.
     """
     path = getattr(source, "path", None)
-    if not isinstance(path, LogFile) or (topic := _image_topic(path)) is None:
+    topic = _image_topic(path) if isinstance(path, LogFile) else None
+    if topic is None or not isinstance(path, LogFile):
         return NO_PICTURES
     decided = sorted(decided_ns)[: MOST_PICTURES // 2]
-    others = np.linspace(start_ns, end_ns, MOST_PICTURES - len(decided)).astype(np.int64).tolist()
+    others = np.linspace(*span_ns, MOST_PICTURES - len(decided)).astype(np.int64).tolist()
     try:
         frames = ImageTopic(path, topic).frames_at(sorted({*decided, *others}))
         made = [(frame.time_ns, _small(frame.image)) for frame in frames]
     except (LogError, UsageError) as error:
-        return ReportedPictures(topic, reason=f"The pictures of {topic} are not shown: {error}.")
-    if not made:
-        return ReportedPictures(topic, reason=f"No picture of {topic} can be decoded.")
-    times_ns, pictures = zip(*made, strict=True)
-    return ReportedPictures(topic, times_ns, pictures)
-
-
-def picture_values(seen: ReportedPictures, first_ns: int) -> Mapping[str, Any]:
-    """Return the pictures as the page reads them."""
+        return {**NO_PICTURES, "topic": topic, "reason": f"The pictures of {topic} are not shown: {error}."}
     return {
-        "topic": seen.topic,
-        "reason": seen.reason,
-        "times": [(time_ns - first_ns) / 1e9 for time_ns in seen.times_ns],
-        "pictures": [
-            f"data:image/jpeg;base64,{base64.b64encode(each).decode('ascii')}" for each in seen.pictures
-        ],
+        "topic": topic,
+        "reason": "" if made else f"No picture of {topic} can be decoded.",
+        "times": [(time_ns - first_ns) / 1e9 for time_ns, _ in made],
+        "pictures": [f"data:image/jpeg;base64,{base64.b64encode(data).decode('ascii')}" for _, data in made],
     }
 
 
@@ -410,69 +354,54 @@ _STEPS: Final = 65_535
 """Steps of a coordinate along each side of the scene: 16 bits, finer than any screen."""
 
 
-@dataclass(frozen=True, eq=False)
 class ReportedScene:
-    """Frames of a scene.
+    """Frames of a scene, collected as they come; if there are too many, every other one is dropped.
 
     Attributes:
-        times_ns: (F,) int64.
+        frames: with their times.
         stride: every how many messages there is a frame.
     """
 
-    times_ns: Integers
-    frames: tuple[SceneFrame, ...]
-    stride: int
-
-    def at(self, times_ns: Integers) -> ReportedScene:
-        """Return the scene with its frames at some times only."""
-        is_kept = np.isin(self.times_ns, times_ns).tolist()
-        frames = tuple(frame for frame, kept in zip(self.frames, is_kept, strict=True) if kept)
-        return replace(self, times_ns=self.times_ns[is_kept], frames=frames)
-
-
-class SceneCollector:
-    """Collects frames as they come; if there are too many, it drops every other one."""
-
     def __init__(self) -> None:
-        self._frames: list[tuple[int, SceneFrame]] = []
-        self._count, self._stride, self._corners = 0, 1, 0
+        self.frames: list[tuple[int, SceneFrame]] = []
+        self.stride = 1
+        self._count = self._corners = 0
         self._last_ns: int | None = None
 
     def add(self, frames: SceneFrames) -> None:
-        """Take in what the next messages show."""
+        """Add what the next messages show."""
         # no others have a place
-        chosen = np.arange(-self._count % self._stride, len(frames.times_ns), self._stride)
+        chosen = np.arange(-self._count % self.stride, len(frames.times_ns), self.stride)
         is_again = len(frames.times_ns) > 0 and int(frames.times_ns[0]) == self._last_ns
         frames = replace(frames, chosen=np.union1d(chosen, [0]) if is_again else chosen)
         for index, time_ns in enumerate(frames.times_ns.tolist()):
             self.add_frame(time_ns, partial(frames.frame, index))
 
     def add_frame(self, time_ns: int, frame_of: Callable[[], SceneFrame]) -> None:
-        """Take in the next frame, which is made only if it has a place.
+        """Add the next frame, which is made only if it has a place.
 
         One of the same time as the frame before, that of the finished log, is the last and replaces it.
         """
         if time_ns == self._last_ns:
-            while self._frames and self._frames[-1][0] == time_ns:
-                self._frames.pop()
-            self._frames.append((time_ns, frame_of()))
+            while self.frames and self.frames[-1][0] == time_ns:
+                self.frames.pop()
+            self.frames.append((time_ns, frame_of()))
             return
         self._last_ns = time_ns
-        if self._count % self._stride == 0:
+        if self._count % self.stride == 0:
             frame = frame_of()
-            self._frames.append((time_ns, frame))
+            self.frames.append((time_ns, frame))
             self._corners += frame.corners
         self._count += 1
-        while len(self._frames) > MOST_FRAMES or (self._corners > MOST_CORNERS and len(self._frames) > 2):
-            self._frames = self._frames[::2]
-            self._stride *= 2
-            self._corners = sum(frame.corners for _, frame in self._frames)
+        while len(self.frames) > MOST_FRAMES or (self._corners > MOST_CORNERS and len(self.frames) > 2):
+            self.frames = self.frames[::2]
+            self.stride *= 2
+            self._corners = sum(frame.corners for _, frame in self.frames)
 
     @property
-    def scene(self) -> ReportedScene:
-        """The frames so far."""
-        times_ns = np.array([time_ns for time_ns, _ in self._frames], np.int64)
-        return ReportedScene(times_ns, tuple(frame for _, frame in self._frames), self._stride)
+    def times_ns(self) -> Integers:
+        """(F,) int64, of the frames."""
+        return np.array([time_ns for time_ns, _ in self.frames], np.int64)
 
 
 class _Box(NamedTuple):
@@ -487,21 +416,29 @@ class _Box(NamedTuple):
 
 
 def scene_value(
-    scene: ReportedScene, first_ns: int, places: Mapping[tuple[int, int], tuple[int, int]], packing: Packing
+    scene: ReportedScene,
+    kept_ns: Integers,
+    first_ns: int,
+    places: Mapping[tuple[int, int], tuple[int, int]],
+    packing: Packing,
 ) -> Mapping[str, Any]:
     """Return the scene as the page reads it; coordinates are in steps of the box that everything lies in.
 
     Args:
+        kept_ns: times of the samples that the page has.
         places: of results and their nodes, where the page has them.
     """
-    entities = _entities(scene.frames)
+    times_ns = scene.times_ns
+    is_kept = np.isin(times_ns, kept_ns)
+    frames = [frame for (_, frame), kept in zip(scene.frames, is_kept.tolist(), strict=True) if kept]
+    entities = _entities(frames)
     # of one result there is one arrow in a frame
     results = dict(sorted((result, place) for (result, _), (place, _) in places.items()))
     listed = sorted(results, key=results.__getitem__)
-    most = max(1, MOST_ARROWS // max(len(scene.frames), 1))
+    most = max(1, MOST_ARROWS // max(len(frames), 1))
     shown = [
         (number, arrow)
-        for number, frame in enumerate(scene.frames)
+        for number, frame in enumerate(frames)
         for result, place in results.items()
         if place < most and (arrow := frame.violation(result)) is not None
     ]
@@ -509,13 +446,13 @@ def scene_value(
     outlines = list(dict.fromkeys(each.dashes for each in arrows))
     box = _box(entities, arrows)
     return {
-        "times": packing.add((scene.times_ns - first_ns) / 1e9, "f8"),
+        "times": packing.add((times_ns[is_kept] - first_ns) / 1e9, "f8"),
         "stride": scene.stride,
         "shades": packing.add(SHADES, "u1"),
         "low": box.low.tolist(),
         "high": (box.low + box.size).tolist(),
         "entities": [
-            _entity_value(identifier, shown, len(scene.frames), listed, box, packing)
+            _entity_value(identifier, shown, len(frames), listed, box, packing)
             for identifier, shown in sorted(entities.items(), key=_drawing_order)
         ],
         "violations": {
@@ -612,52 +549,31 @@ _MOST_LAYERED: Final = 50_000
 """Cells of a map of which a page says what limits and blocks them."""
 
 
-@dataclass(frozen=True, eq=False)
 class ReportedDecisions:
-    """The decisions in a log, with the gradient maps.
+    """The decisions in a log, with the gradient maps, collected from messages as they come.
 
     Attributes:
-        decisions: in order, each with its outcome if it has one.
         maps: by the number by which decisions name them, in the order of the log.
-        redone: what would have been decided otherwise, if the log has that.
     """
 
-    decisions: tuple[PlanDecision, ...]
-    maps: Mapping[int, Grid]
-    redone: ReportedDecisions | None = None
-
-
-class DecisionCollector:
-    """Collects decisions and maps from messages as they come."""
-
     def __init__(self) -> None:
+        self.maps: dict[int, Grid] = {}
         self._decisions: list[PlanDecision] = []
-        self._maps: dict[int, Grid] = {}
-        self._redone: DecisionCollector | None = None
-
-    @property
-    def redone(self) -> DecisionCollector:
-        """Collector of the decisions that would have been different."""
-        self._redone = self._redone or DecisionCollector()
-        return self._redone
 
     def add_decision(self, payload: bytes) -> None:
-        """Take in a decision; one that cannot be decoded is skipped."""
+        """Add a decision; one that cannot be decoded is skipped."""
         with suppress(LogError):
             self._decisions.append(decision_from_payload(payload))
 
     def add_map(self, number: int, payload: bytes) -> None:
-        """Take in a gradient map; one that cannot be decoded is skipped."""
-        try:
-            self._maps[number] = Grid.FromString(payload)
-        except DecodeError:
-            return
+        """Add a gradient map; one that cannot be decoded is skipped."""
+        with suppress(DecodeError):
+            self.maps[number] = Grid.FromString(payload)
 
     @property
-    def decisions(self) -> ReportedDecisions:
-        """The decisions and maps so far."""
-        redone = None if self._redone is None else self._redone.decisions
-        return ReportedDecisions(latest_decisions(self._decisions), dict(self._maps), redone)
+    def decisions(self) -> tuple[PlanDecision, ...]:
+        """In order, each with its outcome if it has one."""
+        return latest_decisions(self._decisions)
 
 
 class _Owner(NamedTuple):
@@ -705,32 +621,34 @@ class _Drawn(NamedTuple):
 
 
 def decisions_value(
-    plan: ReportedDecisions, first_ns: int, packing: Packing, most_cells: int = MOST_CELLS
+    plan: ReportedDecisions,
+    redone: ReportedDecisions,
+    first_ns: int,
+    packing: Packing,
+    most_cells: int = MOST_CELLS,
 ) -> Mapping[str, Any]:
-    """Return the decisions as the page reads them, and how many maps did not fit."""
+    """Return the decisions as the page reads them, and how many maps did not fit.
+
+    Args:
+        redone: what would have been decided otherwise, if the log has that.
+    """
     drawn = [list(_maps_of(plan, decision)) for decision in plan.decisions]
     kept = _kept([each for maps in drawn for each in maps], most_cells)
-    redone = {} if plan.redone is None else _redone_by_number(plan, plan.redone)
+    others = {each.number: each for each in redone.decisions}
     decisions = []
     for decision, maps in zip(plan.decisions, drawn, strict=True):
         values = [_map_value(each, packing) for each in maps if id(each) in kept]
-        value = dict(_decision_value(decision, values, first_ns, packing))
-        if plan.redone is not None and (other := redone.get(decision.number)) is not None:
-            chosen = [each for each in _maps_of(plan.redone, other) if each.is_chosen]
-            own = [_map_value(each, packing) for each in chosen]
+        value = _decision_value(decision, values, first_ns, packing)
+        other = others.get(decision.number)
+        if other is not None and _done(other) != _done(decision):
+            own = [_map_value(each, packing) for each in _maps_of(redone, other) if each.is_chosen]
             value["redone"] = _decision_value(other, own, first_ns, packing)
         decisions.append(value)
     return {"decisions": decisions, "maps_left_out": sum(map(len, drawn)) - len(kept)}
 
 
-def _redone_by_number(plan: ReportedDecisions, redone: ReportedDecisions) -> dict[int, PlanDecision]:
-    """Return the decisions that do something else than those of the log, by number."""
-    done = {each.number: (each.kind, each.reason, each.time_ns) for each in plan.decisions}
-    return {
-        each.number: each
-        for each in redone.decisions
-        if (each.kind, each.reason, each.time_ns) != done.get(each.number)
-    }
+def _done(decision: PlanDecision) -> tuple[object, ...]:
+    return decision.kind, decision.reason, decision.time_ns
 
 
 def _kept(maps: Sequence[_Drawn], most_cells: int) -> set[int]:
@@ -836,7 +754,7 @@ def _layer_values(drawn: _Drawn, candidate: PlanCandidate, packing: Packing) -> 
 
 def _decision_value(
     decision: PlanDecision, maps: Sequence[Mapping[str, Any]], first_ns: int, packing: Packing
-) -> Mapping[str, Any]:
+) -> dict[str, Any]:
     value: dict[str, Any] = {
         "number": decision.number,
         "time": (decision.time_ns - first_ns) / 1e9,

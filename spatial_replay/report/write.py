@@ -9,42 +9,31 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
 import numpy as np
+from foxglove_schemas_protobuf.Event_pb2 import Event
 
 from spatial_replay.annotate.specification import unit_of
 from spatial_replay.errors import UsageError
-from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs import topics as log_topics
 from spatial_replay.logs.messages import Messages
 from spatial_replay.logs.output_file import refuse_inputs, replacing
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.source import Source, axes_of
-from spatial_replay.monitor.sentences import divisor_of, gap_sentence, open_text
+from spatial_replay.monitor.sentences import gap_sentence
 from spatial_replay.monitor.verdict import Verdict
-from spatial_replay.monitor.witness.witness import Witness, WitnessStep
 from spatial_replay.replay.engine import Replay, Replayed, planned_for
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions
-from spatial_replay.report.data import Pointer, ReportedResult, RunReport, worst_results
+from spatial_replay.report.data import ReportedResult, RunReport, worst_results
 from spatial_replay.report.page import page
-from spatial_replay.report.panels import (
-    DecisionCollector,
-    ReportedEvent,
-    SceneCollector,
-    StatePath,
-    StatePathCollector,
-    event_of,
-    pictures_of,
-)
-from spatial_replay.spec.formula import Formula, Quantified, Specification, iter_nodes
-from spatial_replay.spec.relations import RELATION_NAMES
-from spatial_replay.spec.walks import units_of
+from spatial_replay.report.panels import ReportedDecisions, ReportedScene, StatePath, pictures_of
+from spatial_replay.spec.formula import Specification
 
 _COLLECTED: Final = frozenset(
     (
+        log_topics.AUTOMATON,
         log_topics.EVENTS,
         log_topics.PLAN_DECISION,
         log_topics.GRADIENT_MAP,
@@ -58,49 +47,34 @@ class Collector:
     """Collects what a page shows from a run, as its messages come."""
 
     def __init__(self) -> None:
-        self.scene = SceneCollector()
-        self.decisions = DecisionCollector()
-        self.events: list[ReportedEvent] = []
-        self._paths: defaultdict[tuple[str, str], StatePathCollector] = defaultdict(StatePathCollector)
+        self.scene = ReportedScene()
+        self.decisions, self.redone = ReportedDecisions(), ReportedDecisions()
+        self.events: list[Event] = []
+        self.paths: defaultdict[tuple[str, str | None], StatePath] = defaultdict(StatePath)
 
     def add(self, messages: Messages) -> None:
         """Take in the next messages."""
         topics = {number: channel.topic for number, channel in messages.channels.items()}
         collected = [number for number, topic in topics.items() if topic in _COLLECTED]
         chosen = np.flatnonzero(np.isin(messages.channel, collected))
-        columns = (messages.channel, messages.sequence)
+        columns = (messages.channel, messages.sequence, messages.log_time_ns)
         numbers = zip(*(column[chosen].tolist() for column in columns), strict=True)
-        for place, (channel, sequence) in zip(chosen.tolist(), numbers, strict=True):
+        for place, (channel, sequence, time_ns) in zip(chosen.tolist(), numbers, strict=True):
             payload = messages.payloads[place]
             match topics[channel]:
+                case log_topics.AUTOMATON:
+                    state = AutomatonState.FromString(payload)
+                    self.paths[state.specification, state.object or None].add(time_ns, tuple(state.states))
                 case log_topics.EVENTS:
-                    self.events.append(event_of(payload))
+                    self.events.append(Event.FromString(payload))
                 case log_topics.PLAN_DECISION:
                     self.decisions.add_decision(payload)
                 case log_topics.GRADIENT_MAP:
                     self.decisions.add_map(sequence, payload)
                 case log_topics.REDONE_DECISION:
-                    self.decisions.redone.add_decision(payload)
+                    self.redone.add_decision(payload)
                 case log_topics.REDONE_MAP:
-                    self.decisions.redone.add_map(sequence, payload)
-        of_states = [number for number, topic in topics.items() if topic == log_topics.AUTOMATON]
-        chosen = np.flatnonzero(np.isin(messages.channel, of_states))
-        states = [messages.payloads[place] for place in chosen.tolist()]
-        self._add_states(messages.log_time_ns[chosen], states)
-
-    def _add_states(self, times_ns: Integers, payloads: Sequence[bytes]) -> None:
-        places: defaultdict[tuple[str, str], defaultdict[tuple[int, ...], list[int]]] = defaultdict(
-            lambda: defaultdict(list)
-        )
-        for place, message in enumerate(map(AutomatonState.FromString, payloads)):
-            places[message.specification, message.object][tuple(message.states)].append(place)
-        for result, of_states in places.items():
-            own = [(np.array(each), states) for states, each in of_states.items()]
-            self._paths[result].extend(times_ns, own)
-
-    def path(self, name: str, object: str | None) -> StatePath:
-        """Return where the automaton of a result was; an empty path if it has none."""
-        return self._paths[name, object or ""].path
+                    self.redone.add_map(sequence, payload)
 
 
 def refuse_output(output: Path, inputs: Sequence[Path] = ()) -> None:
@@ -140,8 +114,8 @@ def write_report(
     refuse_output(output, inputs)
     with replacing(output, inputs) as stream:
         replayed, report = report_of(source, files, options, advance)
-        decided_ns = [each.decided_ns for each in report.drawn if each.decided_ns is not None]
-        pictures = pictures_of(source, report.start_ns, report.end_ns, decided_ns)
+        span_ns = replayed.start_ns, replayed.end_ns
+        pictures = pictures_of(source, replayed.first_ns, span_ns, report.decided_ns)
         stream.write(page(replace(report, pictures=pictures)))
     return replayed
 
@@ -156,100 +130,40 @@ def report_of(
     collector = Collector()
     replay = Replay(source, files, options, keep_series=True, keep_leaves=True, show=collector.scene.add)
     replayed = replay.run(collector.add, advance=advance)
-    return replayed, _report(source, replay, replayed, collector)
-
-
-def _report(source: Source, replay: Replay, replayed: Replayed, collector: Collector) -> RunReport:
-    return RunReport(
-        log=replayed.log,
-        samples=replayed.samples,
-        first_ns=replayed.first_ns,
-        start_ns=replayed.start_ns,
-        end_ns=replayed.end_ns,
-        axes=axes_of(source),
-        faults=replayed.faults,
-        remarks=replayed.remarks,
-        unreadable=replayed.unreadable,
-        semantics=replayed.semantics,
-        certificate=replayed.certificate,
-        files=tuple(replay.files),
-        results=tuple(_results(replay, replayed, collector, axes_of(source).units)),
-        vacuous=replayed.vacuous,
-        gaps=_gaps(replayed),
-        scene=collector.scene.scene,
-        events=tuple(collector.events),
-        decisions=collector.decisions.decisions,
-        planned_for=planned_for(source, replay.files),
+    report = RunReport(
+        replayed,
+        axes_of(source),
+        tuple(replay.files),
+        tuple(_results(replay, replayed, collector, axes_of(source).units)),
+        _gaps(replayed),
+        collector.scene,
+        tuple(collector.events),
+        collector.decisions,
+        collector.redone,
+        planned_for(source, replay.files),
     )
+    return replayed, report
 
 
 def _results(
     replay: Replay, replayed: Replayed, collector: Collector, declared: Mapping[str, str]
 ) -> Iterator[ReportedResult]:
-    explained = _explained(replayed)
+    # under the paper's semantics, none can be explained
+    explained = frozenset(worst_results(replayed.results) if replayed.semantics == "ltlf" else ())
     for index, result in enumerate(replayed.results):
-        tree, compiled = replay.trees[index], replay.automata[index]
-        file, unit = replay.files[tree.file], unit_of(result.formula, declared)
+        tree, unit = replay.trees[index], unit_of(result.formula, declared)
         is_explained = index in explained
         witness = (result.causes[0].shown if result.causes else result.worst) if is_explained else None
         yield ReportedResult(
-            result=result,
-            tree=tree,
-            source=file.source,
-            relations=RELATION_NAMES | file.relations,
-            sentences=result.sentences(replayed.first_ns) if is_explained else (),
-            decided_ns=None if witness is None else _decided(witness).time_ns,
-            decided_node=None if witness is None else _decided(witness).node,
-            decided_text="" if witness is None else _decided_text(witness, result.formula),
-            left_open="" if witness is None else open_text(witness),
-            pointer=None if witness is None else _pointer(witness),
-            named={spec.name: spec for spec in file.specs},
-            units=units_of(result.formula),
-            unit=unit if unit in declared.values() else "",
-            automaton=compiled.automaton,
-            no_automaton=compiled.reason,
-            path=collector.path(tree.name, tree.object),
+            result,
+            tree,
+            replay.files[tree.file],
+            result.sentences(replayed.first_ns) if is_explained else (),
+            witness,
+            unit if unit in declared.values() else "",
+            replay.automata[index],
+            collector.paths[tree.name, tree.object],
         )
-
-
-def _decided(witness: Witness) -> WitnessStep:
-    """Return what to look at, and when: what decided or, of a response that was missed, came nearest.
-
-    Where an operator took its number from the past, that is the operator: it failed then, and not before.
-    """
-    path = witness.closest_path or witness.path
-    return next((step for step, below in pairwise(path) if below.time_ns < step.time_ns), path[-1])
-
-
-def _decided_text(witness: Witness, formula: Formula) -> str:
-    """Return the atom of the objects that decided a quantifier, or "" if what decided is none."""
-    deciding = witness.deciding if witness.closest is None else witness.closest[0]
-    decided = _decided(witness).node
-    node = next(node for identifier, _, node in iter_nodes(formula) if identifier == decided)
-    return deciding.text if deciding is not None and isinstance(node, Quantified) else ""
-
-
-def _pointer(witness: Witness) -> Pointer | None:
-    deciding = witness.deciding if witness.closest is None else witness.closest[0]
-    if deciding is None or deciding.unknown:
-        return None
-    if _decided(witness) != (witness.closest_path or witness.path)[-1]:
-        return None  # things stood elsewhere when the atom had its number
-    for measured in deciding.measured:
-        if measured.contact is not None:
-            ends = np.array([measured.contact.first, measured.contact.second])
-            number = deciding.value * divisor_of(deciding.atom)
-            is_response = witness.closest is not None
-            is_condition = not is_response and witness.missed is not None and witness.missed.is_condition
-            return Pointer(ends, deciding.text, number, is_condition, is_response, deciding.objects)
-    return None
-
-
-def _explained(replayed: Replayed) -> frozenset[int]:
-    """Return which results are explained: under the paper's semantics, none can be."""
-    if replayed.semantics != "ltlf":
-        return frozenset()
-    return frozenset(worst_results(replayed.results))
 
 
 def _gaps(replayed: Replayed) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from hypothesis.extra import numpy as arrays
 from spatial_replay.annotate.scene.scene_frames import DrawnEntity, SceneFrame
 from spatial_replay.report.compact import json_text, sentence_parts, singles
 from spatial_replay.report.data import NodeSeries, choose_samples
-from spatial_replay.report.panels import MOST_CORNERS, MOST_FRAMES, SceneCollector
+from spatial_replay.report.panels import MOST_CORNERS, MOST_FRAMES, ReportedScene
 
 NUMBERS = st.one_of(
     st.floats(-10, 10), st.sampled_from([np.nan, np.inf, -np.inf, 0.0, -0.0, 1e-300, -1e-300])
@@ -82,23 +82,21 @@ def test_of_few_changes_of_sign_both_sides_are_kept(changes: np.ndarray) -> None
 
 @given(st.integers(1, 10_000), st.sampled_from([0, 7]))
 def test_frames_are_taken_at_equal_distances(count: int, corners: int) -> None:
-    collector = SceneCollector()
+    scene = ReportedScene()
     frame = frame_with(corners)
     for time_ns in range(count):
-        collector.add_frame(time_ns, lambda: frame)
-    scene = collector.scene
+        scene.add_frame(time_ns, lambda: frame)
     assert scene.times_ns.tolist() == list(range(0, count, scene.stride))
     assert len(scene.frames) == len(scene.times_ns) <= MOST_FRAMES
     assert scene.stride == 1 or len(scene.frames) >= MOST_FRAMES // 2
 
 
 def test_of_frames_with_many_corners_fewer_are_taken() -> None:
-    collector = SceneCollector()
+    scene = ReportedScene()
     frame = frame_with(MOST_CORNERS // 10)
     for time_ns in range(25):
-        collector.add_frame(time_ns, lambda: frame)
-    scene = collector.scene
-    assert sum(frame.corners for frame in scene.frames) <= MOST_CORNERS
+        scene.add_frame(time_ns, lambda: frame)
+    assert sum(frame.corners for _, frame in scene.frames) <= MOST_CORNERS
     assert scene.times_ns.tolist() == list(range(0, 25, scene.stride))
     assert scene.stride == 4
 

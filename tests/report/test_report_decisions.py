@@ -16,7 +16,7 @@ from spatial_replay.logs.schemas.PlanDecision_pb2 import (
     PlanTarget,
 )
 from spatial_replay.report.compact import Packing, json_text
-from spatial_replay.report.panels import MOST_CELLS, DecisionCollector, decisions_value
+from spatial_replay.report.panels import MOST_CELLS, ReportedDecisions, decisions_value
 
 
 def grid(time_ns: int = 0, *, rows: int = 2, columns: int = 3, value: float = 1.0) -> Grid:
@@ -42,11 +42,11 @@ def decision(time_ns: int, *maps: PlanMap, target: PlanTarget | None = None) -> 
 
 
 def value_of(reported: PlanDecision, *grids: Grid) -> dict:
-    maker = DecisionCollector()
+    maker = ReportedDecisions()
     maker.add_decision(reported.SerializeToString())
     for number, each in enumerate(grids):
         maker.add_map(number, each.SerializeToString())
-    value = decisions_value(maker.decisions, 0, Packing())
+    value = decisions_value(maker, ReportedDecisions(), 0, Packing())
     assert json_text(value)
     return dict(value)
 
@@ -81,10 +81,10 @@ def test_maps_without_a_decision_belong_to_the_one_of_their_time() -> None:
 
 
 def test_an_unreadable_decision_is_left_out() -> None:
-    maker = DecisionCollector()
+    maker = ReportedDecisions()
     maker.add_decision(b"\xff\xff")
     maker.add_map(0, b"\xff\xff")
-    assert decisions_value(maker.decisions, 0, Packing()) == {"decisions": [], "maps_left_out": 0}
+    assert decisions_value(maker, ReportedDecisions(), 0, Packing()) == {"decisions": [], "maps_left_out": 0}
 
 
 def test_a_map_whose_sizes_do_not_fit_is_not_drawn() -> None:
@@ -135,12 +135,12 @@ def several(time_ns: int, first: int, chosen: int) -> PlanDecision:
 
 @pytest.mark.parametrize(("most_cells", "shown"), [(36, 6), (24, 4), (18, 3), (12, 2), (11, 1), (5, 0)])
 def test_where_room_is_short_the_maps_of_what_was_chosen_stay(most_cells: int, shown: int) -> None:
-    maker = DecisionCollector()
+    maker = ReportedDecisions()
     for reported in (several(0, 0, 1), several(10**9, 3, 2)):
         maker.add_decision(reported.SerializeToString())
     for number in range(6):
         maker.add_map(number, grid().SerializeToString())
-    value = decisions_value(maker.decisions, 0, Packing(), most_cells)
+    value = decisions_value(maker, ReportedDecisions(), 0, Packing(), most_cells)
     kept = [[(each["title"], each["chosen"]) for each in reported["maps"]] for reported in value["decisions"]]
     chosen = [[title for title, is_chosen in maps if is_chosen] for maps in kept]
     assert chosen == [["cup1"] if shown else [], ["cup2"] if shown > 1 else []]
