@@ -94,7 +94,11 @@ class Evaluation(Displayed):
         if len(fitting) == 1:
             return fitting[0]
         known = ", ".join(r.name if r.object is None else f"{r.name} for {r.object}" for r in self.results)
-        raise UsageError(f"{len(fitting)} results fit name={name!r}, object={object!r}; there are {known}")
+        is_part = any(node.name == name for result in self.results for node in result.nodes if node.name)
+        hint = f"; {name!r} is part of a result: node({name!r})" if is_part and not fitting else ""
+        raise UsageError(
+            f"{len(fitting)} results fit name={name!r}, object={object!r}; there are {known}{hint}"
+        )
 
     def to_pandas(self) -> Any:
         """Return the results as a pandas DataFrame: a row for each, with its verdict, numbers and times.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, Final
 
@@ -70,10 +70,10 @@ class NodeResult:
     text: str
     requirement: str | None
     title: str | None
-    value: Floats
-    now: Floats
-    lower: Floats
-    upper: Floats
+    value: Floats = field(repr=False)
+    now: Floats = field(repr=False)
+    lower: Floats = field(repr=False)
+    upper: Floats = field(repr=False)
     robustness: float
     final_lower: float
     final_upper: float

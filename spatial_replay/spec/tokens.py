@@ -501,6 +501,8 @@ def meant_statement(tokens: Sequence[Token]) -> str:
     if len(line) < 3 or line[1].type not in ("EQUAL", "COLON") or line[2].type == "COMPARE":
         return ""
     value = line[3:] if line[2].type == "EQUAL" else line[2:]
+    if not value:
+        return ""
     is_number = all(each.type in ("NUMBER", "NAME", *_OPPOSITE) for each in value)
     definition = f"{line[0].value} = {_as_written(value)}"
     if is_number:

@@ -108,7 +108,7 @@ def test_a_result_is_selected_by_name(trace):
     assert evaluation.result("high").robustness == -6
     with pytest.raises(UsageError, match=r"2 results fit name=None, object=None; there are both, high"):
         evaluation.result()
-    with pytest.raises(UsageError, match=r"0 results fit name='near'"):
+    with pytest.raises(UsageError, match=r"0 results fit name='near'.*: node\('near'\)"):
         evaluation.result("near")
 
 

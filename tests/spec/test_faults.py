@@ -56,6 +56,7 @@ spec template(ego) = ego ovlp goal
         ("spec s = GF earlier", "GF", "'GF' is not an operator", "is written G F"),
         ("spec s = P (a ovlp b)", "P", "'P' is not an operator", "is written O"),
         ("def s := a ovlp b", ":", "'s' has no parameters", "named by spec s = ..."),
+        ("s = =", "s", "expected a statement", "named by spec NAME = ..."),
         ("s := a ovlp b", "s", "expected a statement", "named by spec s = a ovlp b"),
         ("a ovlp b", "a", "expected a statement", "named by spec NAME = ..."),
         ("spec s = a ovlp b iff c ovlp d", "iff", "'iff' is not an operator", "is written <->"),
