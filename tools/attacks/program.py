@@ -20,7 +20,9 @@ CODES = (0, 1, 2, 3, 4)
 PATIENCE_S = 120.0
 """How long a command on a terminal may take."""
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-_OURS = re.compile(r"\x1b\[(?:[0-3]|3[0-7]|38;5;\d+|22|0;\d\d)?m|\r\x1b\[2K|\x1b\[(?:1A|2K|\?25[lh])|\r\n")
+_OURS = re.compile(
+    r"\x1b\[(?:[0-3]|[39][0-7]|38;5;\d+|22|0;\d\d)?m|\r(?:\x1b\[1A)?\x1b\[2K|\x1b\[(?:1A|2K|\?25[lh])|\r\n"
+)
 """Colours, line ends of a terminal, and the moves of the progress bar."""
 
 
