@@ -8,7 +8,7 @@ from dataclasses import replace
 from itertools import groupby
 from operator import attrgetter
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from foxglove_schemas_protobuf.Event_pb2 import Event
@@ -16,10 +16,7 @@ from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
-from spatial_replay.annotate.automaton_state import (
-    AutomatonRun,
-    SpecAutomaton,
-)
+from spatial_replay.annotate.automaton_state import AutomatonRun, SpecAutomaton
 from spatial_replay.annotate.deciding_leaf import NewestSamples, leaf_pairs
 from spatial_replay.annotate.events import EncodedEvent, EventReporter, encoded_occurrence
 from spatial_replay.annotate.requirements import requirements_of
@@ -56,14 +53,60 @@ from spatial_replay.spec.formula import Outline, Specification, iter_nodes
 from spatial_replay.trace.sample import LATEST_NS
 from spatial_replay.trace.trace import Trace
 
-if TYPE_CHECKING:
-    from spatial_replay.annotate.automaton_state import SpecAutomaton
-    from spatial_replay.annotate.scene.scene_frames import SceneFrames
-    from spatial_replay.annotate.scene.scene_update import SceneState
-
-
 _MOST_RECENT: Final = 20
 """The most events in a message on recent ones."""
+
+
+class _Result:
+    """One result, with what its messages are made from; it follows the samples."""
+
+    def __init__(
+        self,
+        tree: ReportedTree,
+        instance: Instance,
+        kept: SpecAutomaton,
+        file: Specification,
+        reporter: EventReporter,
+        *,
+        settles: bool,
+        has_arrow: bool,
+    ) -> None:
+        self.tree, self.reporter = tree, reporter
+        self.requirements = requirements_of(tree.formula, tree.object, settles=settles)
+        parts = requirements_of(tree.formula, tree.object, settles=settles, splits=True)
+        self._shades = ShadeTracker(instance, parts, file.regions)
+        self._since_ns = np.full(len(self.requirements), LATEST_NS)
+        self._names = [node.name for _, _, node in iter_nodes(tree.formula)]
+        self._pairs = (
+            leaf_pairs(instance, self.requirements, file.regions, file.relations) if has_arrow else None
+        )
+        self.run: AutomatonRun | None = None
+        if kept.automaton is not None:
+            leaves = instance.program.leaves
+            self.run = AutomatonRun(tree.name, tree.object, kept.automaton, tree.formula, leaves, tree.named)
+
+    def extend(self, trace: Trace, block: SeriesBlock) -> list[EncodedEvent]:
+        """Take in the next samples and their evaluation; return the events."""
+        self._shades.extend(trace, block)
+        self.violate(block)
+        return self.reporter.extend(block)
+
+    def violate(self, block: SeriesBlock) -> None:
+        """Follow which requirements are violated for certain."""
+        self._since_ns = violated_since(self.requirements, block, self._since_ns)
+
+    def robustness(self, block: SeriesBlock, *, final: bool = False) -> list[bytes]:
+        """Return one message per sample."""
+        tree = self.tree
+        return encode_robustness(
+            tree.name, tree.object, self._names, block.times_ns, block.series, final=final
+        )
+
+    def evaluated(self, block: SeriesBlock, *, is_final: bool) -> EvaluatedResult:
+        """Return the result as the scene shows it."""
+        settled, violated_ns = self.reporter.settled, self.reporter.violated_ns
+        of = self._since_ns, settled, violated_ns, self.tree.title, is_final, self._shades.shades
+        return EvaluatedResult(self.requirements, block, self._pairs, *of)
 
 
 class Annotator:
@@ -97,42 +140,25 @@ class Annotator:
         self._units = units
         self._files = files
         self._trees = trees
-        self._requirements = [
-            requirements_of(tree.formula, tree.object, settles=semantics == "ltlf") for tree in trees
-        ]
-        self._shades = [
-            ShadeTracker(
-                instance,
-                requirements_of(tree.formula, tree.object, settles=semantics == "ltlf", splits=True),
-                files[tree.file].regions,
-            )
-            for tree, instance in zip(trees, instances, strict=True)
-        ]
-        self._since_ns = [np.full(len(own), LATEST_NS) for own in self._requirements]
         self._automata = [each.automaton for each in automata]
-        self._names = [[node.name for _, _, node in iter_nodes(tree.formula)] for tree in trees]
         chosen = [tree for tree in trees if tree.is_called(arrow)] or trees
-        self._leaf_pairs = [
-            leaf_pairs(instance, requirements, files[tree.file].regions, files[tree.file].relations)
-            if tree in chosen
-            else None
-            for tree, instance, requirements in zip(trees, instances, self._requirements, strict=True)
-        ]
         self._samples = NewestSamples()
-        self._reporters = [
-            EventReporter(tree, instance, files[tree.file], semantics, units, self._samples)
-            for tree, instance in zip(trees, instances, strict=True)
-        ]
-        self._runs = [
-            None
-            if kept.automaton is None
-            else AutomatonRun(
-                tree.name, tree.object, kept.automaton, tree.formula, instance.program.leaves, tree.named
+        self._results = [
+            _Result(
+                tree,
+                instance,
+                kept,
+                files[tree.file],
+                EventReporter(tree, instance, files[tree.file], semantics, units, self._samples),
+                settles=semantics == "ltlf",
+                has_arrow=tree in chosen,
             )
             for tree, instance, kept in zip(trees, instances, automata, strict=True)
         ]
+        self._runs = [each.run for each in self._results]
         self.standing = StandingEncoder(trees, self._runs, units)
-        named = frozenset(name for own in self._requirements for each in own for name in each.objects)
+        requirements = [each for result in self._results for each in result.requirements]
+        named = frozenset(name for each in requirements for name in each.objects)
         self._encoder = SceneEncoder(shown_regions(files), units.get("", ""), named)
         self._latest: tuple[Trace, list[SeriesBlock]] | None = None
         self._scene = scene or SceneState()
@@ -149,7 +175,7 @@ class Annotator:
     @property
     def _over(self) -> list[str]:
         """Deciding atoms of the results that are decided so far."""
-        return [each.over for each in self._reporters]
+        return [each.reporter.over for each in self._results]
 
     def messages(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> list[Messages]:
         """Return what to write beside the next samples.
@@ -212,13 +238,11 @@ class Annotator:
             finals: for each tree, (N, 2), lower and upper end of each node's value over the finished log.
             results: for each tree its result, if there is one: they know what they were tested by.
         """
-        events = [
-            each
-            for reporter, final in zip(self._reporters, finals, strict=True)
-            for each in reporter.end(time_ns, final)
-        ]
-        for reporter, result in zip(self._reporters, results, strict=False):
-            events += reporter.untested(time_ns, result)
+        events = list[EncodedEvent]()
+        for each, final in zip(self._results, finals, strict=True):
+            events += each.reporter.end(time_ns, final)
+        for each, result in zip(self._results, results, strict=False):
+            events += each.reporter.untested(time_ns, result)
         return [*self._events(events), *self._finals(time_ns, finals)]
 
     def _finals(self, time_ns: int, finals: Sequence[Floats]) -> list[Messages]:
@@ -229,19 +253,15 @@ class Annotator:
         ended = [_ended(block, final) for block, final in zip(blocks, finals, strict=True)]
         robustness = [
             payload
-            for tree, names, block in zip(self._trees, self._names, ended, strict=True)
-            for payload in encode_robustness(
-                tree.name, tree.object, names, block.times_ns, block.series, final=True
-            )
+            for result, block in zip(self._results, ended, strict=True)
+            for payload in result.robustness(block, final=True)
         ]
         last_ns = int(trace.times_ns[-1])
         numbers = self._messages(_ROBUSTNESS, np.full(len(robustness), time_ns), robustness)
         ending = self.standing.end(last_ns, finals, self._over)
         standing = self._messages(_STANDING, np.array([time_ns]), [ending])
-        self._since_ns = [
-            violated_since(own, block, since_ns)
-            for own, block, since_ns in zip(self._requirements, ended, self._since_ns, strict=True)
-        ]
+        for result, block in zip(self._results, ended, strict=True):
+            result.violate(block)
         # drawn again at once, now in the colours of the finished log
         self._scene = replace(self._scene, written_ns=None)
         scene = self._scene_messages(trace, ended, is_final=True)
@@ -259,10 +279,7 @@ class Annotator:
 
     def _robustness(self, blocks: Sequence[SeriesBlock]) -> Messages:
         """Return one message per sample and result."""
-        encoded = [
-            encode_robustness(tree.name, tree.object, names, block.times_ns, block.series)
-            for tree, names, block in zip(self._trees, self._names, blocks, strict=True)
-        ]
+        encoded = [each.robustness(block) for each, block in zip(self._results, blocks, strict=True)]
         return self._in_order(_ROBUSTNESS, blocks, encoded)
 
     def _changes(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> list[EncodedEvent]:
@@ -270,17 +287,8 @@ class Annotator:
         self._samples.extend(trace)
         if self._first_ns is None:
             self._first_ns = int(trace.times_ns[0])
-        for shades, block in zip(self._shades, blocks, strict=True):
-            shades.extend(trace, block)
-        self._since_ns = [
-            violated_since(own, block, since_ns)
-            for own, block, since_ns in zip(self._requirements, blocks, self._since_ns, strict=True)
-        ]
-        events = [
-            each
-            for reporter, block in zip(self._reporters, blocks, strict=True)
-            for each in reporter.extend(block)
-        ]
+        pairs = zip(self._results, blocks, strict=True)
+        events = [event for result, block in pairs for event in result.extend(trace, block)]
         return sorted(events, key=lambda each: each.time_ns)
 
     def _events(self, events: Sequence[EncodedEvent]) -> list[Messages]:
@@ -314,29 +322,8 @@ class Annotator:
     def _scene_messages(
         self, trace: Trace, blocks: Sequence[SeriesBlock], *, is_final: bool = False
     ) -> Messages:
-        results = [
-            EvaluatedResult(
-                requirements,
-                block,
-                pairs,
-                since_ns,
-                reporter.settled,
-                reporter.violated_ns,
-                tree.title,
-                is_final,
-                shades.shades,
-            )
-            for requirements, block, pairs, since_ns, reporter, tree, shades in zip(
-                self._requirements,
-                blocks,
-                self._leaf_pairs,
-                self._since_ns,
-                self._reporters,
-                self._trees,
-                self._shades,
-                strict=True,
-            )
-        ]
+        pairs = zip(self._results, blocks, strict=True)
+        results = [each.evaluated(block, is_final=is_final) for each, block in pairs]
         drawn = self._encoder.encode(trace, results, self._scene)
         if drawn.frames is not None:
             self._show(drawn.frames)
@@ -397,7 +384,7 @@ _RECENT_EVENTS = protobuf_channel(RECENT_EVENTS, RecentEvents)
 
 def channels_of_results(trees: Sequence[ReportedTree]) -> tuple[Channel, ...]:
     """Return the channels of the messages that annotate a sample with results."""
-    specification = [_SPECIFICATION] if trees else []
-    standing = [_STANDING] if trees else []
+    if not trees:
+        return (_FRAME, _ROBUSTNESS, _AUTOMATON, _EVENTS, _EVENT_LOG, _RECENT_EVENTS, _SCENE)
     events = (_EVENTS, _EVENT_LOG, _RECENT_EVENTS)
-    return (_FRAME, *specification, _ROBUSTNESS, _AUTOMATON, *standing, *events, _SCENE)
+    return (_FRAME, _SPECIFICATION, _ROBUSTNESS, _AUTOMATON, _STANDING, *events, _SCENE)

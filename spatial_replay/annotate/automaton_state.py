@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,11 +73,11 @@ class AutomatonRun:
         self.propositions = tuple(numbers[id(each.formula)] for each in automaton.propositions)
         self._possible = np.zeros(len(automaton.states), np.bool_)
         self._possible[automaton.initial] = True
-        self._templates: dict[bytes, WireTemplate] = {}
+        self._template = lru_cache(_MOST_TEMPLATES)(self._made_template)
         about = (automaton.accepting, automaton.can_accept, automaton.can_reject)
         self._about = np.array([[state in each for each in about] for state in automaton.states], np.bool_)
         self._after: NDArray[np.bool_] | Integers = np.empty(0, np.int64)
-        self._texts: dict[bytes, str] = {}
+        self._text = lru_cache(_MOST_TEMPLATES)(self._described)
 
     def encode(self, block: SeriesBlock) -> Sequence[bytes]:
         """Take in the next samples; return one message for each."""
@@ -86,9 +87,11 @@ class AutomatonRun:
         before, after = self._steps(values)
         keys, groups = _distinct(before, after)
         encoded = []
-        for number, key in enumerate(keys):
+        for number in range(len(keys)):
             members = np.flatnonzero(groups == number)
-            template = self._template(key, before[members[0]], after[members[0]])
+            template = self._template(
+                *(tuple(_members(each[members[0]]).tolist()) for each in (before, after))
+            )
             marks = np.empty((len(members), len(self.propositions) + 3), np.uint8)
             marks[:, :-3] = _TRUTHS[values[:, members]].T
             marks[:, -3:] = self._summary(after[members[0]])
@@ -109,26 +112,21 @@ class AutomatonRun:
         """Return states in words, and which of them is after each of the samples last taken in."""
         kinds, groups = _distinct(self._after, self._after)
         firsts = [int(np.argmax(groups == number)) for number in range(len(kinds))]
-        return [self._text(kind, first) for kind, first in zip(kinds, firsts, strict=True)], groups
+        return [self._text(self._after_states(first)) for first in firsts], groups
 
     @property
     def latest_words(self) -> str:
         """The states after the last sample, in words."""
-        [kind], _ = _distinct(self._after[-1:], self._after[-1:])
-        return self._text(kind, -1)
+        return self._text(self._after_states(-1))
 
-    def _text(self, kind: bytes, sample: int) -> str:
-        if kind not in self._texts:
-            if len(self._texts) >= _MOST_TEMPLATES:
-                self._texts.clear()
-            self._texts[kind] = self._described(_members(self._after[sample]).tolist())
-        return self._texts[kind]
+    def _after_states(self, sample: int) -> tuple[int, ...]:
+        return tuple(_members(self._after[sample]).tolist())
 
-    def _described(self, states: list[int]) -> str:
+    def _described(self, states: tuple[int, ...]) -> str:
         """Return some states in words: what they decide, or what is still to be done."""
         numbers = ", ".join(map(str, states[:_MOST_NAMED])) + (", …" if len(states) > _MOST_NAMED else "")
         title = f"state {numbers}" if len(states) == 1 else f"one of the states {numbers}"
-        accepting, can_accept, can_reject = self._about[states].T
+        accepting, can_accept, can_reject = self._about[list(states)].T
         possible = {
             "permanently satisfied": ~can_reject,
             "satisfied if nothing more came": accepting & can_reject,
@@ -164,18 +162,14 @@ class AutomatonRun:
 
     def _steps(self, values: Flags) -> tuple[NDArray[np.bool_] | Integers, NDArray[np.bool_] | Integers]:
         """Return the states before and after each sample: (T,), or as sets of states (T, S)."""
-        before, self._after = self._moved(values)
-        return before, self._after
-
-    def _moved(self, values: Flags) -> tuple[NDArray[np.bool_] | Integers, NDArray[np.bool_] | Integers]:
         states = np.flatnonzero(self._possible)
         if len(states) == 1 and not (values == UNKNOWN).any():
             first = int(states[0])
-            after = self._table.states(first, values)
+            self._after = after = self._table.states(first, values)
             self._possible = np.zeros_like(self._possible)
             self._possible[after[-1]] = True
             return np.concatenate([[first], after[:-1]]), after
-        sets = self._table.state_sets(self._possible, values)
+        self._after = sets = self._table.state_sets(self._possible, values)
         before = np.concatenate([self._possible[None], sets[:-1]])
         self._possible = sets[-1].copy()
         return before, sets
@@ -186,18 +180,8 @@ class AutomatonRun:
         values = np.where(about.all(axis=0), TRUE, np.where(about.any(axis=0), UNKNOWN, FALSE))
         return _TRUTHS[values]
 
-    def _template(
-        self, key: bytes, before: NDArray[np.bool_] | Integers, after: NDArray[np.bool_] | Integers
-    ) -> WireTemplate:
-        if key not in self._templates:
-            if len(self._templates) >= _MOST_TEMPLATES:
-                self._templates.clear()
-            message = self._message(_members(before).tolist(), _members(after).tolist())
-            self._templates[key] = WireTemplate.of(message)
-        return self._templates[key]
-
-    def _message(self, sources: list[int], targets: list[int]) -> AutomatonState:
-        """Return the message of one step, with a value in every field that differs between samples."""
+    def _made_template(self, sources: tuple[int, ...], targets: tuple[int, ...]) -> WireTemplate:
+        """Return the template of one step, with a value in every field that differs between samples."""
         message = AutomatonState(
             time_ns=1, specification=self._name, object=self._object or "", states=targets
         )
@@ -208,7 +192,7 @@ class AutomatonRun:
             taken = self._automaton.transition(sources[0], targets[0])
             message.guard = "" if taken is None else _shortened(self._guard(taken))
         message.accepting = message.can_accept = message.can_reject = AutomatonState_pb2.TRUTH_TRUE
-        return message
+        return WireTemplate.of(message)
 
 
 _LONGEST_GUARD = 500
@@ -294,11 +278,6 @@ def automata_of(
             spec = next(each for each in file.results if each.formula is tree.formula)
             found[id(tree.formula)] = _spec_automaton(tree.name, file, spec, semantics, stored)
     return [found[id(tree.formula)] for tree in trees]
-
-
-def automata_metadata(automata: Sequence[SpecAutomaton]) -> Mapping[str, str]:
-    """Return the size of each spec's automaton, or the reason why it has none."""
-    return {each.name: each.summary for each in automata}
 
 
 def automata_attachments(automata: Sequence[SpecAutomaton], prefix: str) -> list[Attachment]:

@@ -192,18 +192,6 @@ class AnnotatedEvaluation:
             return layout_attachment(contents._replace(has_states=[False] * len(self.trees), topics=topics))
         return layout_attachment(contents._replace(outcomes=self._annotator.standing.outcomes))
 
-    def automata_metadata(self) -> Mapping[str, str]:
-        """Return the size of each spec's automaton, or the reason why it has none."""
-        from spatial_replay.annotate.automaton_state import automata_metadata
-
-        return automata_metadata(self.automata)
-
-    def automata_attachments(self, prefix: str) -> list[Attachment]:
-        """Return the automata as attachments, beside those of `specification_attachments`."""
-        from spatial_replay.annotate.automaton_state import automata_attachments
-
-        return automata_attachments(self.automata, prefix)
-
     @cached_property
     def automata(self) -> Sequence[SpecAutomaton]:
         """Automata of the trees; compiled on first use, since not every evaluation is written to a log."""

@@ -165,7 +165,7 @@ def whole_curves(trees: Sequence[ReportedTree], units: Mapping[str, str]) -> lis
     curves += [
         _Curve(
             part_title(node.name, tree),
-            f"{_curves_path(tree, identifier)}.{_shown_number(node)}[:]",
+            f"{_curves_path(tree, identifier)}.{'value' if looks_ahead(node) else 'now'}[:]",
             unit_of(node, units),
         )
         for tree in trees
@@ -202,36 +202,6 @@ def state_strips(trees: Sequence[ReportedTree]) -> Panel:
     return _titled("StateTransitions!verdicts", "How results stand", {"isSynced": True, "paths": paths})
 
 
-def violation_table() -> Panel:
-    """Return the table of violated results: since when, by how much and over what."""
-    return _titled("Table!violated", "Violated results", {"topicPath": f"{STANDING}.violated"})
-
-
-def event_list() -> Panel:
-    """Return the table of the newest events, also right after a seek."""
-    return _titled("Table!events", "Events", {"topicPath": f"{RECENT_EVENTS}.events"})
-
-
-def specification_text() -> Panel:
-    """Return the text of the specification as it is written."""
-    return _titled(
-        "RawMessages!specification", "Specification", {"topicPath": f"{SPECIFICATION}.files[:].source"}
-    )
-
-
-def automaton_text(tree: ReportedTree) -> Panel:
-    """Return the state of a result's automaton in words."""
-    config = {"topicPath": _standing_path(tree.title, "automaton")}
-    return _titled("RawMessages!automaton", f"Automaton of {tree.title}", config)
-
-
-def decision_reason(planned_for: str) -> Panel:
-    """Return the reason of the planner's decision."""
-    config = {"topicPath": f"{PLAN_DECISION}.reason"}
-    of = f", for {planned_for} as recorded" if planned_for else ""
-    return _titled("RawMessages!decision", f"Why the planner decided so{of}", config)
-
-
 def image_panels(images: Sequence[str], topics: Collection[str]) -> list[Panel]:
     """Return the picture of each camera that objects were found by, with the outlines that we draw on it.
 
@@ -258,17 +228,6 @@ def image_panels(images: Sequence[str], topics: Collection[str]) -> list[Panel]:
         title = "Camera" if number == 1 else f"Camera {number}"
         panels.append(_titled(f"Image!{name}", title, {"imageMode": mode, "synchronize": False}))
     return panels
-
-
-def constants() -> Panel:
-    """Return the playback and the constants, which a live server lets a viewer edit."""
-    title = "Playback and constants of the specification"
-    return _titled("Parameters!constants", title, {"title": title})
-
-
-def summary() -> Panel:
-    """Return what the whole log comes to, with the constants as they are set."""
-    return _titled("RawMessages!summary", "The whole log", {"topicPath": f"{CURVES_TOPIC}.summary"})
 
 
 def _light_title(tree: ReportedTree, outcome: FinalStanding | None) -> str:
@@ -343,10 +302,6 @@ def _curves_path(tree: ReportedTree, identifier: int) -> str:
     return f"{CURVES_TOPIC}.specifications[:]{which}.nodes[:]{{id=={identifier}}}"
 
 
-def _shown_number(node: Formula) -> str:
-    return "value" if looks_ahead(node) else "now"
-
-
 def _quoted(text: str) -> str:
     return json.dumps(text, ensure_ascii=False)
 
@@ -416,8 +371,11 @@ def layout_for_live(contents: LayoutContents) -> dict[str, Any]:
     contents = contents.worst_first()
     details = _details(contents)
     if contents.trees:
-        details.insert(0, ("whole log", summary()))
-    return _layout(contents, whole_curves(contents.trees, contents.units), details, below=constants())
+        summary = {"topicPath": f"{CURVES_TOPIC}.summary"}
+        details.insert(0, ("whole log", _titled("RawMessages!summary", "The whole log", summary)))
+    title = "Playback and constants of the specification"
+    constants = _titled("Parameters!constants", title, {"title": title})
+    return _layout(contents, whole_curves(contents.trees, contents.units), details, below=constants)
 
 
 _PANELS: Final = "spatial-replay.spatial-replay {}!{}"
@@ -449,16 +407,24 @@ _Details = list[tuple[str, Panel]]
 
 def _details(contents: LayoutContents) -> _Details:
     """Return the panels that are in tabs, those of violations first."""
-    trees = contents.trees
-    details = [("violated", violation_table())] if trees else []
-    if trees and RECENT_EVENTS in contents.topics:
-        details.append(("events", event_list()))
+    trees, planned_for = contents.trees, contents.planned_for
+    shown = list[tuple[str, str, str, str]]()
     if trees:
-        details.append(("specification", specification_text()))
+        shown.append(("violated", "Table!violated", "Violated results", f"{STANDING}.violated"))
+    if trees and RECENT_EVENTS in contents.topics:
+        shown.append(("events", "Table!events", "Events", f"{RECENT_EVENTS}.events"))
+    if trees:
+        sources = f"{SPECIFICATION}.files[:].source"
+        shown.append(("specification", "RawMessages!specification", "Specification", sources))
     if any(contents.has_states):
-        details.append(("automaton", automaton_text(trees[contents.has_states.index(True)])))
+        title = trees[contents.has_states.index(True)].title
+        path = _standing_path(title, "automaton")
+        shown.append(("automaton", "RawMessages!automaton", f"Automaton of {title}", path))
     if PLAN_DECISION in contents.topics:
-        details.append(("decision", decision_reason(contents.planned_for)))
+        of = f", for {planned_for} as recorded" if planned_for else ""
+        why = f"Why the planner decided so{of}"
+        shown.append(("decision", "RawMessages!decision", why, f"{PLAN_DECISION}.reason"))
+    details = [(tab, _titled(panel, title, {"topicPath": path})) for tab, panel, title, path in shown]
     cameras = image_panels(contents.images, contents.topics)
     return details + [(each.config["foxglovePanelTitle"].lower(), each) for each in cameras]
 

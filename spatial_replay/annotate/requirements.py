@@ -84,37 +84,6 @@ class Standing(IntEnum):
     UNKNOWN = 4
 
 
-def standing_of(
-    series: Floats, at: Integers, own: Obligation, obligation: Obligation | None, conjunct: Obligation | None
-) -> tuple[NDArray[np.uint8], Floats]:
-    """Return how a requirement stands in some samples (S,), and its robustness where that counts.
-
-    Args:
-        series: (N, 4, T): value, now, lower, upper of each node.
-        at: (S,) indices of samples.
-        own: the requirement itself.
-        obligation: the temporal subformula that needs it; None if there is none.
-        conjunct: the one of the formula that it is in; None if its failing now violates nothing.
-
-    Returns:
-        (S,) numbers of `Standing`, and (S,) its robustness, in the sign that counts, where it holds or is
-        violated; else NaN.
-    """
-    now = own.sign * series[own.node, 1, at]
-    standing = np.full(now.shape, Standing.UNKNOWN, np.uint8)
-    standing[now >= 0.0] = Standing.HOLDING
-    is_pending = np.full(now.shape, conjunct is None)
-    for each in (conjunct, obligation):
-        if each is not None:
-            is_pending |= each.is_open(series, at)
-    fails = now < 0.0
-    standing[fails] = np.where(is_pending[fails], Standing.PENDING, Standing.VIOLATED)
-    if obligation is not None:
-        standing[obligation.is_fulfilled(series, at)] = Standing.FULFILLED
-    counts = (standing == Standing.HOLDING) | (standing == Standing.VIOLATED)
-    return standing, np.where(counts, now, np.nan)
-
-
 class ClassMembers(NamedTuple):
     """An open group: all objects of a class in a sample, with exceptions.
 
@@ -172,8 +141,19 @@ class Requirement(NamedTuple):
         return self._numbers(series, at)[1]
 
     def _numbers(self, series: Floats, at: Integers) -> tuple[NDArray[np.uint8], Floats]:
-        own = Obligation(self.node, self.sign)
-        return standing_of(series, at, own, self.obligation, self.conjunct if self.can_violate else None)
+        now = self.sign * series[self.node, 1, at]
+        standing = np.full(now.shape, Standing.UNKNOWN, np.uint8)
+        standing[now >= 0.0] = Standing.HOLDING
+        is_pending = np.full(now.shape, not self.can_violate)
+        for each in (self.conjunct if self.can_violate else None, self.obligation):
+            if each is not None:
+                is_pending |= each.is_open(series, at)
+        fails = now < 0.0
+        standing[fails] = np.where(is_pending[fails], Standing.PENDING, Standing.VIOLATED)
+        if self.obligation is not None:
+            standing[self.obligation.is_fulfilled(series, at)] = Standing.FULFILLED
+        counts = (standing == Standing.HOLDING) | (standing == Standing.VIOLATED)
+        return standing, np.where(counts, now, np.nan)
 
     def outcome(self, series: Floats, at: Integers) -> Floats:
         """Return (S,) the robustness of its obligation over the finished log, in the sign that counts.

@@ -22,7 +22,6 @@ from spatial_replay.logs.schemas.Robustness_pb2 import (
     UNKNOWN,
     VIOLATED,
     Robustness,
-    Standing,
 )
 from spatial_replay.logs.topics import CURVES_TOPIC, protobuf_channel
 from spatial_replay.logs.wire import WireTemplate, words_of
@@ -42,20 +41,16 @@ class RobustnessSeries:
         object: the object that a template's parameter stands for, or None.
         ids: (N,) int64, the nodes' numbers.
         names: N names; None for a node without one.
-        messages: (T,) int64, which of the messages decoded these samples are.
         times_ns: (T,) int64.
         series: (N, 4, T): value, now, lower, upper.
-        codes: (N, T) uint8, numbers of `Standing`.
     """
 
     specification: str
     object: str | None
     ids: Integers
     names: tuple[str | None, ...]
-    messages: Integers
     times_ns: Integers
     series: Floats
-    codes: Codes
 
 
 def encode_robustness(
@@ -124,57 +119,39 @@ def decode_robustness(payloads: Sequence[bytes]) -> list[RobustnessSeries]:
     messages, about the finished log, are left out.
 
     Raises:
-        LogError: a message of another type, or with a standing of a later version.
+        LogError: a message of another type.
     """
-    rows: dict[_Heading, list[_Row]] = {}
+    rows: dict[tuple[str, str | None, tuple[int, ...], tuple[str | None, ...]], list[Robustness]] = {}
     for index, payload in enumerate(payloads):
-        message = _parse(payload, index)
+        try:
+            message = Robustness.FromString(payload)
+        except DecodeError as error:
+            raise LogError(
+                f"message {index} of {len(payload)} bytes is not a spatial_replay.Robustness; "
+                "write the annotated log again from its source"
+            ) from error
         if not message.final:
-            rows.setdefault(_heading(message), []).append((index, message))
-    return [_joined(heading, own) for heading, own in rows.items()]
-
-
-_Heading = tuple[str, str, tuple[int, ...], tuple[str, ...]]
-_Row = tuple[int, Robustness]
-"""A message with its index."""
-
-
-def _parse(payload: bytes, index: int) -> Robustness:
-    try:
-        return Robustness.FromString(payload)
-    except DecodeError as error:
-        raise LogError(
-            f"message {index} of {len(payload)} bytes is not a spatial_replay.Robustness; "
-            "write the annotated log again from its source"
-        ) from error
-
-
-def _heading(message: Robustness) -> _Heading:
-    ids = tuple(node.id for node in message.nodes)
-    return message.specification, message.object, ids, tuple(node.name for node in message.nodes)
-
-
-def _joined(heading: _Heading, rows: Sequence[_Row]) -> RobustnessSeries:
-    name, object, ids, names = heading
-    numbers = [[(node.value, node.now, node.lower, node.upper) for node in each.nodes] for _, each in rows]
-    codes = np.array([[node.standing for node in each.nodes] for _, each in rows], np.uint8)
-    if unknown := set(np.unique(codes).tolist()) - set(Standing.values()):
-        raise LogError(
-            f"a standing of {name!r} has the number {min(unknown)}, which this version does not know; "
-            "read the log with the version that wrote it"
+            ids, names = tuple(node.id for node in message.nodes), tuple(node.name for node in message.nodes)
+            heading = (
+                message.specification,
+                message.object or None,
+                ids,
+                tuple(each or None for each in names),
+            )
+            rows.setdefault(heading, []).append(message)
+    return [
+        RobustnessSeries(
+            name,
+            object,
+            np.array(ids, np.int64),
+            names,
+            np.array([each.time_ns for each in own], np.uint64).astype(np.int64),
+            np.array(
+                [[(node.value, node.now, node.lower, node.upper) for node in each.nodes] for each in own]
+            ).transpose(1, 2, 0),
         )
-    return RobustnessSeries(
-        specification=name,
-        object=object or None,
-        ids=np.array(ids, np.int64),
-        names=tuple(node or None for node in names),
-        messages=np.array([index for index, _ in rows], np.int64),
-        times_ns=np.array([each.time_ns for _, each in rows], np.uint64).astype(np.int64),
-        series=np.ascontiguousarray(
-            np.array(numbers, np.float64).reshape(len(rows), -1, 4).transpose(1, 2, 0)
-        ),
-        codes=np.ascontiguousarray(codes.reshape(len(rows), -1).T),
-    )
+        for (name, object, ids, names), own in rows.items()
+    ]
 
 
 MOST_POINTS: Final = 2_000

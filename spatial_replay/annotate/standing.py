@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -129,7 +130,7 @@ class StandingEncoder:
         self._least, self._least_ns = [math.inf] * len(trees), [0] * len(trees)
         self._first_ns: int | None = None
         self._written_ns: int | None = None
-        self._templates: dict[_Layout, WireTemplate] = {}
+        self._template = lru_cache(_MOST_TEMPLATES)(self._made_template)
         self.outcomes: tuple[FinalStanding, ...] = ()
 
     def encode(
@@ -280,15 +281,8 @@ class StandingEncoder:
                 numbers.append(numbered[identifier, 0 if looks_ahead(node) else 1, :, None])
         return marks, [_finite(each) for each in numbers]
 
-    def _template(self, layout: _Layout) -> WireTemplate:
-        if layout not in self._templates:
-            if len(self._templates) >= _MOST_TEMPLATES:
-                self._templates.clear()
-            self._templates[layout] = WireTemplate.of(self._message(layout))
-        return self._templates[layout]
-
-    def _message(self, layout: _Layout) -> StandingUpdate:
-        """Return a message with a value in every field that differs between samples."""
+    def _made_template(self, layout: _Layout) -> WireTemplate:
+        """Return a template with a value in every field that differs between samples."""
         worst, words, violated, final = layout
         message = StandingUpdate(time_ns=1, worst=self._trees[worst].title, final=final)
         for tree, said in zip(self._trees, words, strict=True):
@@ -304,7 +298,7 @@ class StandingEncoder:
             message.violated.add(name=tree.title, since=1.0, by=1.0, unit=unit, over=over, at=1.0)
         if not violated:
             message.violated.add(name="nothing is violated")
-        return message
+        return WireTemplate.of(message)
 
 
 def named_parts(tree: ReportedTree) -> dict[str, tuple[int, Formula]]:

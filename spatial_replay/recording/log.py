@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Protocol, TypeAlia
 import numpy as np
 
 from spatial_replay import __version__
-from spatial_replay.annotate.automaton_state import SpecAutomaton
+from spatial_replay.annotate.automaton_state import SpecAutomaton, automata_attachments
 from spatial_replay.annotate.certificate import EvaluationHashes, specifications_json
 from spatial_replay.annotate.evaluation import AnnotatedEvaluation
 from spatial_replay.annotate.events import (
@@ -119,8 +119,8 @@ class Recording:
         self._hashes = EvaluationHashes([(tree.name, tree.object) for tree in self._evaluation.trees])
         sink.add_metadata(METADATA, _metadata(files, about or {}))
         if self._evaluation.trees:
-            sink.add_metadata(AUTOMATA, self._evaluation.automata_metadata())
-        automata = self._evaluation.automata_attachments(RECORDED_PREFIX)
+            sink.add_metadata(AUTOMATA, {each.name: each.summary for each in self.automata})
+        automata = automata_attachments(self.automata, RECORDED_PREFIX)
         for attachment in [*specification_attachments(files, RECORDED_PREFIX), *automata]:
             sink.add_attachment(attachment.name, attachment.media_type, attachment.data)
 

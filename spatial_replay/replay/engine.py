@@ -243,14 +243,12 @@ class Replay:
         """The automaton of each of `trees`, or the reason why it has none."""
         return self._evaluation.automata
 
-    def automata_metadata(self) -> Mapping[str, str]:
-        """Return for each spec how large its automaton is, or why it has none."""
-        return self._evaluation.automata_metadata()
-
     def attachments(self) -> list[Attachment]:
         """Return the texts and automata of the specifications, as an annotated log stores them."""
+        from spatial_replay.annotate.automaton_state import automata_attachments
+
         texts = specification_attachments(self.files, REPLAYED_PREFIX)
-        return [*texts, *self._evaluation.automata_attachments(REPLAYED_PREFIX)]
+        return [*texts, *automata_attachments(self.automata, REPLAYED_PREFIX)]
 
     def layout(self) -> Attachment:
         """Return the viewer layout of the annotated log; call it after `run`."""
@@ -564,7 +562,7 @@ def _begin(sink: Sink, source: Source, replay: Replay, options: ReplayOptions, *
     if not is_replayed and "options" in before:
         recorded["recorded_options"] = before["options"]
     sink.add_metadata(METADATA, {**about, **recorded})
-    sink.add_metadata(AUTOMATA, replay.automata_metadata())
+    sink.add_metadata(AUTOMATA, {each.name: each.summary for each in replay.automata})
     if not layer:
         _copy_attached(sink, source)
     for attachment in replay.attachments():

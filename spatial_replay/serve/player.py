@@ -9,9 +9,10 @@ from concurrent.futures import Future, InvalidStateError
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import Enum, auto
+from functools import partial
 from queue import SimpleQueue
 from threading import Condition, Lock
-from typing import Any, Final, NamedTuple, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 
 import numpy as np
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
@@ -37,6 +38,9 @@ from spatial_replay.logs.topics import (
 )
 from spatial_replay.replay.loaded_log import EditedFiles, Evaluated, LoadedLog, Playback, constant_values
 from spatial_replay.text import nearest_hint
+
+if TYPE_CHECKING:
+    from spatial_replay.serve.server import LiveServer
 
 MOST_LATE_S: Final = 0.15
 """The most time that passes between two turns; viewers can take what is played in that time at once."""
@@ -190,8 +194,8 @@ class Questions:
             wait_for_evaluation: returns what is shown; see `Session.wait_for_evaluation`.
         """
         self._wait_for_evaluation = wait_for_evaluation
-        self._waiting: SimpleQueue[_Question | None] = SimpleQueue()
-        self._open: list[_Question] = []
+        self._waiting: SimpleQueue[tuple[Future[Any], Callable[[], Any]] | None] = SimpleQueue()
+        self._open: list[Future[Any]] = []
         self._changing = Lock()
         self._is_over = False
 
@@ -201,61 +205,43 @@ class Questions:
         Raises:
             UsageError: too many questions are open, or the session is over.
         """
-        question = _Question(work, self._wait_for_evaluation())
+        evaluated, answer = self._wait_for_evaluation(), Future[_Answer]()
         with self._changing:
             if self._is_over:
                 raise session_over()
             if len(self._open) >= MOST_OPEN:
                 raise UsageError(f"{MOST_OPEN} questions are open already; ask again when they are answered")
-            self._open.append(question)
-            self._waiting.put(question)
-        answer: _Answer = question.answer.result()
-        return answer
+            self._open.append(answer)
+            self._waiting.put((answer, partial(work, evaluated)))
+        return answer.result()
 
     def run(self) -> None:
         """Answer questions until `stop`."""
         while (question := self._waiting.get()) is not None:
-            question.settle()
+            answer, work = question
+            # it may be refused before it is computed, or while it is
+            with suppress(InvalidStateError):
+                if not answer.done():
+                    try:
+                        answer.set_result(work())
+                    except Exception as error:
+                        answer.set_exception(error)
             with self._changing:
-                self._open.remove(question)
+                self._open.remove(answer)
 
     def stop(self) -> None:
         """Refuse all open questions, and any more."""
         with self._changing:
             self._is_over = True
-            for question in self._open:
-                question.refuse()
+            for answer in self._open:
+                with suppress(InvalidStateError):
+                    answer.set_exception(session_over())
             self._waiting.put(None)
 
 
 def session_over() -> UsageError:
     """Return the error of a request that comes too late."""
     return UsageError("the server is stopping")
-
-
-@dataclass(frozen=True, eq=False)
-class _Question:
-    """Something to compute from an evaluation, and the place for the answer."""
-
-    work: Callable[[Evaluated], Any]
-    evaluated: Evaluated
-    answer: Future[Any] = field(default_factory=Future)
-
-    def settle(self) -> None:
-        """Compute the answer, unless it was refused."""
-        if self.answer.done():
-            return
-        # it may be refused while it is computed
-        with suppress(InvalidStateError):
-            try:
-                self.answer.set_result(self.work(self.evaluated))
-            except Exception as error:
-                self.answer.set_exception(error)
-
-    def refuse(self) -> None:
-        """Answer that it comes too late, also if it is being computed."""
-        with suppress(InvalidStateError):
-            self.answer.set_exception(session_over())
 
 
 PLAYBACK: Final = ("playback.time", "playback.play", "playback.speed", "playback.loop")
@@ -656,34 +642,6 @@ class Note(NamedTuple):
     text: str
 
 
-class Viewers(Protocol):
-    """All viewers together. No method waits for a viewer, or fails because of one."""
-
-    def wants(self, topic: str) -> bool:
-        """Say whether a viewer has subscribed to a topic."""
-
-    def publish(self, messages: Messages) -> None:
-        """Send messages to the viewers that have subscribed to their topics."""
-
-    def send_state(self, state: PlaybackState) -> None:
-        """Send the state of the playback, if it is not the reply to a viewer."""
-
-    def send_time(self, time_ns: int) -> None:
-        """Send the present time of the log."""
-
-    def send_values(self, values: Values) -> None:
-        """Send the constants, if they are not the reply to a viewer."""
-
-    def send_playback(self) -> None:
-        """Send the parameters of the playback, if they are not the reply to a viewer."""
-
-    def send_note(self, note: Note) -> None:
-        """Send a note."""
-
-    def remove_note(self, about: str) -> None:
-        """Remove the note about a subject."""
-
-
 _MOST_NAMED: Final = 10
 """The most results that a note lists."""
 
@@ -708,7 +666,7 @@ _MOST_SAMPLES: Final = 4_096
 class Player:
     """All the work of a session, on one thread: a playback needs no locks."""
 
-    def __init__(self, playback: Playback, session: Session, viewers: Viewers) -> None:
+    def __init__(self, playback: Playback, session: Session, viewers: LiveServer) -> None:
         self._playback = playback
         self._session = session
         self._viewers = viewers

@@ -22,21 +22,6 @@ VIEWERS: Final = ("https://app.foxglove.dev", "https://studio.foxglove.dev", "fi
 _TOKEN_BYTES: Final = 16
 
 
-def checked_origins(origins: Iterable[str]) -> tuple[str, ...]:
-    """Return origins as browsers write them.
-
-    Raises:
-        UsageError: a text that is no origin.
-    """
-    for origin in origins:
-        parts = urlsplit(origin)
-        if not parts.scheme or not parts.netloc or parts.path.strip("/") or parts.query:
-            raise UsageError(
-                f"{origin!r} is not the origin of a page; give it as in https://viewer.example.org:8080"
-            )
-    return tuple(origin.rstrip("/").lower() for origin in origins)
-
-
 def is_loopback(host: str) -> bool:
     """Return whether only programs on this machine reach a host."""
     try:
@@ -64,8 +49,15 @@ class Gate:
         Raises:
             UsageError: a text that is no origin.
         """
-        token = None if is_loopback(host) else secrets.token_urlsafe(_TOKEN_BYTES)
-        return cls(frozenset((*VIEWERS, *checked_origins(tuple(origins)))), token)
+        allowed = set(VIEWERS)
+        for origin in origins:
+            parts = urlsplit(origin)
+            if not parts.scheme or not parts.netloc or parts.path.strip("/") or parts.query:
+                raise UsageError(
+                    f"{origin!r} is not the origin of a page; give it as in https://viewer.example.org:8080"
+                )
+            allowed.add(origin.rstrip("/").lower())
+        return cls(frozenset(allowed), None if is_loopback(host) else secrets.token_urlsafe(_TOKEN_BYTES))
 
     def refusal(self, head: bytes) -> str | None:
         """Return the status that answers a request that may not come in; None for one that may."""
@@ -82,10 +74,6 @@ class Gate:
             if not hmac.compare_digest(given.encode(), self.token.encode()):
                 return "401 Token Missing Or Wrong"
         return None
-
-    def without_token(self, head: bytes) -> bytes:
-        """Return a request as it is passed on."""
-        return b"GET / HTTP/1.1\r\n" + head.partition(b"\r\n")[2]
 
     def _is_allowed(self, origin: str) -> bool:
         if origin.lower() in self.origins:
@@ -180,7 +168,7 @@ class Relay:
             writer.close()
             await writer.wait_closed()
             return
-        request = self._gate.without_token(request)
+        request = b"GET / HTTP/1.1\r\n" + request.partition(b"\r\n")[2]
         offered = {each.strip() for found in _OFFER.findall(request) for each in found.decode().split(",")}
         is_old = OLD_PROTOCOL in offered
         if is_old and PROTOCOL not in offered:

@@ -22,6 +22,7 @@ from foxglove import websocket as protocol
 from jsonschema import Draft202012Validator
 from jsonschema.exceptions import best_match
 
+from spatial_replay.annotate.automaton_state import automata_attachments
 from spatial_replay.errors import SpatialReplayError, UsageError, system_reason
 from spatial_replay.logs.messages import Channel, Messages, Schema
 from spatial_replay.logs.topics import EVENT_LOG, EVENTS, LAYOUT
@@ -47,59 +48,17 @@ from spatial_replay.trace.trace import duration_ns_from_text
 _MOST_BYTES: Final = 1 << 16
 
 
-class Computing(NamedTuple):
-    """A service that computes something from what is shown.
+class _Served(NamedTuple):
+    """A service of a session.
 
     Attributes:
         request, response: JSON schemas.
-        answer: computes the response from an evaluation and a request.
+        answer: computes the response to a request.
     """
 
     request: Mapping[str, Any]
     response: Mapping[str, Any]
-    answer: Callable[[Evaluated, Mapping[str, Any]], Mapping[str, Any]]
-
-
-class Steering(NamedTuple):
-    """A service that steers the playback.
-
-    Attributes:
-        request: a JSON schema.
-        values: returns the parameters of the playback that a request sets (see `PLAYBACK`).
-    """
-
-    request: Mapping[str, Any]
-    values: Callable[[Mapping[str, Any]], Mapping[str, float | bool]]
-
-
-def steered(name: str, payload: bytes) -> Mapping[str, float | bool]:
-    """Return the parameters of the playback that a request sets.
-
-    Args:
-        name: one of `STEERING`.
-        payload: the request, a JSON object; may be empty for an object without members.
-
-    Raises:
-        UsageError: an invalid request.
-    """
-    service = STEERING[name]
-    return service.values(_request(name, payload, service.request))
-
-
-def answer(name: str, evaluated: Evaluated, payload: bytes) -> bytes:
-    """Answer a request.
-
-    Args:
-        name: one of `SERVICES`.
-        payload: the request, a JSON object; may be empty for an object without members.
-
-    Raises:
-        UsageError: an invalid request.
-        SpecificationError: constants that make a specification invalid.
-    """
-    service = SERVICES[name]
-    request = _request(name, payload, service.request)
-    return json.dumps(service.answer(evaluated, request), ensure_ascii=False, allow_nan=False).encode()
+    answer: Callable[[LiveServer, Mapping[str, Any]], Mapping[str, Any]]
 
 
 def _request(name: str, payload: bytes, schema: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -149,14 +108,30 @@ _CONSTANTS = {
     "additionalProperties": {"type": ["number", "string"]},
 }
 
-SERVICES: Final[Mapping[str, Computing]] = MappingProxyType(
+_TIME, _PLAY, _SPEED, _ = PLAYBACK
+_SECONDS = {"description": "Seconds after the first sample.", "type": "number", "minimum": 0}
+_TIMES = {
+    "description": "Seconds of the log in a second.",
+    "type": "number",
+    "minimum": SLOWEST,
+    "maximum": FASTEST,
+}
+_PLAYBACK_STATE: Final[Mapping[str, Any]] = _object(
+    "spatial_replay.PlaybackState",
+    time=_SECONDS,
+    play={"type": "boolean"},
+    speed=_TIMES,
+    loop={"type": "boolean"},
+)
+
+_SERVICES: Final[Mapping[str, _Served]] = MappingProxyType(
     {
-        "evaluate": Computing(
+        "evaluate": _Served(
             _object("spatial_replay.EvaluateRequest", constants=_CONSTANTS),
             {"title": "spatial_replay.EvaluateResponse", "type": "object", "properties": {}},
-            _evaluate,
+            lambda server, request: server.ask(_evaluate, request),
         ),
-        "explain": Computing(
+        "explain": _Served(
             _object(
                 "spatial_replay.ExplainRequest",
                 node={"description": "Name of a spec, wherever it stands.", "type": "string"},
@@ -169,54 +144,40 @@ SERVICES: Final[Mapping[str, Computing]] = MappingProxyType(
                     "explanations": {"type": "array", "items": {"type": "object", "properties": {}}}
                 },
             },
-            _explain,
+            lambda server, request: server.ask(_explain, request),
         ),
-        "write_constants": Computing(
+        "write_constants": _Served(
             _object("spatial_replay.WriteConstantsRequest", constants=_CONSTANTS),
             {
                 "title": "spatial_replay.WriteConstantsResponse",
                 "type": "object",
                 "properties": {"written": _CONSTANTS},
             },
-            _write_constants,
+            lambda server, request: server.ask(_write_constants, request),
         ),
-    }
-)
-
-
-_TIME, _PLAY, _SPEED, _ = PLAYBACK
-_SECONDS = {"description": "Seconds after the first sample.", "type": "number", "minimum": 0}
-_TIMES = {
-    "description": "Seconds of the log in a second.",
-    "type": "number",
-    "minimum": SLOWEST,
-    "maximum": FASTEST,
-}
-
-STEERING: Final[Mapping[str, Steering]] = MappingProxyType(
-    {
-        "play": Steering(_object("spatial_replay.PlayRequest"), lambda _: {_PLAY: True}),
-        "pause": Steering(_object("spatial_replay.PauseRequest"), lambda _: {_PLAY: False}),
-        "seek": Steering(
+        # for viewers without controls of their own
+        "play": _Served(
+            _object("spatial_replay.PlayRequest"),
+            _PLAYBACK_STATE,
+            lambda server, _: server.steer(_PLAY, True),
+        ),
+        "pause": _Served(
+            _object("spatial_replay.PauseRequest"),
+            _PLAYBACK_STATE,
+            lambda server, _: server.steer(_PLAY, False),
+        ),
+        "seek": _Served(
             {**_object("spatial_replay.SeekRequest", time=_SECONDS), "required": ["time"]},
-            lambda request: {_TIME: request["time"]},
+            _PLAYBACK_STATE,
+            lambda server, request: server.steer(_TIME, request["time"]),
         ),
-        "speed": Steering(
+        "speed": _Served(
             {**_object("spatial_replay.SpeedRequest", speed=_TIMES), "required": ["speed"]},
-            lambda request: {_SPEED: request["speed"]},
+            _PLAYBACK_STATE,
+            lambda server, request: server.steer(_SPEED, request["speed"]),
         ),
     }
 )
-"""Services for viewers without controls of their own; each answers with the playback as it is then."""
-
-PLAYBACK_STATE: Final[Mapping[str, Any]] = _object(
-    "spatial_replay.PlaybackState",
-    time=_SECONDS,
-    play={"type": "boolean"},
-    speed=_TIMES,
-    loop={"type": "boolean"},
-)
-"""The JSON schema of their answer."""
 
 _PREFIX = "spatial-replay://"
 
@@ -235,7 +196,7 @@ def asset(evaluated: Evaluated, uri: str) -> bytes | None:
     if kind == "specification":
         return {file.filename: file.source.encode() for file in evaluated.edited.files}.get(name)
     if kind == "automaton" and name.endswith(".dot"):
-        automata = evaluated.evaluation.automata_attachments("")
+        automata = automata_attachments(evaluated.evaluation.automata, "")
         return {each.name.rpartition("/")[2]: each.data for each in automata}.get(name)
     return None
 
@@ -274,7 +235,8 @@ _CAPABILITIES: Final = (
 class PublishingServer:
     """A server that viewers connect to over WebSocket, for messages while they are made.
 
-    A viewer that reads too slowly loses the oldest messages; one that reads nothing is disconnected.
+    No method waits for a viewer, or fails because of one. A viewer that reads too slowly loses the oldest
+    messages; one that reads nothing is disconnected.
     """
 
     def __init__(
@@ -291,7 +253,6 @@ class PublishingServer:
             UsageError: nothing can listen there, or a text that is no origin.
         """
         self._gate = Gate.of(host, origins)
-        self._name = name
         self._context = foxglove.Context()
         self._sent: dict[tuple[str, str, Schema | None], foxglove.Channel] = {}
         self._channels: dict[Channel, foxglove.Channel] = {}
@@ -300,7 +261,15 @@ class PublishingServer:
         self._host = f"[{host}]" if _is_v6(host) else host
         self._started: Future[protocol.WebSocketServer] = Future()
         self._behind = _inner_host()
-        self._started.set_result(self._start())
+        started = foxglove.start_server(
+            name=name,
+            host=self._behind,
+            port=0,
+            supported_encodings=["json"],
+            context=self._context,
+            **self._options(),
+        )
+        self._started.set_result(started)
         try:
             self._relay = Relay(host, port, (self._behind, self._server.port), self._gate)
         except (OSError, UnicodeError) as error:
@@ -329,11 +298,11 @@ class PublishingServer:
             channel.close()
 
     def wants(self, topic: str) -> bool:
-        """See `Viewers.wants`."""
+        """Say whether a viewer has subscribed to a topic."""
         return any(sent.has_sinks() for channel, sent in self._channels.items() if channel.topic == topic)
 
     def publish(self, messages: Messages) -> None:
-        """See `Viewers.publish`."""
+        """Send messages to the viewers that have subscribed to their topics."""
         wanted = {
             number: sent
             for number, channel in messages.channels.items()
@@ -345,15 +314,15 @@ class PublishingServer:
                 wanted[number].log(payload, log_time=time_ns)
 
     def send_time(self, time_ns: int) -> None:
-        """See `Viewers.send_time`."""
+        """Send the present time of the log."""
         self._server.broadcast_time(time_ns)
 
     def send_note(self, note: Note) -> None:
-        """See `Viewers.send_note`."""
+        """Send a note."""
         self._server.publish_status(note.text[:_LONGEST_NOTE], foxglove.StatusLevel.Error, note.about)
 
     def remove_note(self, about: str) -> None:
-        """See `Viewers.remove_note`."""
+        """Remove the note about a subject."""
         self._server.remove_status([about])
 
     @property
@@ -361,14 +330,9 @@ class PublishingServer:
         """The server; a fast viewer may send a request before the SDK has returned it."""
         return self._started.result()
 
-    def _start(self) -> protocol.WebSocketServer:
-        return foxglove.start_server(
-            name=self._name,
-            host=self._behind,
-            port=0,
-            capabilities=[protocol.Capability.Time],
-            context=self._context,
-        )
+    def _options(self) -> dict[str, Any]:
+        """Return what distinguishes the server from others, as the SDK takes it."""
+        raise NotImplementedError
 
     def _advertise(self, channel: Channel) -> None:
         """Offer a channel if viewers can decode it: with a schema, or in JSON."""
@@ -390,8 +354,8 @@ class PublishingServer:
         )
 
 
-class LiveServer(PublishingServer):
-    """A session that viewers connect to; see `Viewers`."""
+class LiveServer(PublishingServer, protocol.ServerListener):
+    """A session that viewers connect to; their requests come on threads of the SDK."""
 
     def __init__(
         self,
@@ -417,7 +381,7 @@ class LiveServer(PublishingServer):
         super().__init__(f"spatial-replay: {session.name}", channels, host, port, origins)
 
     def send_note(self, note: Note) -> None:
-        """See `Viewers.send_note`. Some viewers keep notes, so rejected values are in a parameter."""
+        """Send a note. Some viewers keep notes, so rejected values are in a parameter."""
         if note.about not in (CONSTANTS, ARROW):
             super().send_note(note)
         elif note.text != self._rejected:
@@ -425,7 +389,7 @@ class LiveServer(PublishingServer):
             self.send_playback()
 
     def remove_note(self, about: str) -> None:
-        """See `Viewers.remove_note`."""
+        """Remove the note about a subject."""
         if about not in (CONSTANTS, ARROW):
             super().remove_note(about)
         elif self._rejected:
@@ -433,15 +397,15 @@ class LiveServer(PublishingServer):
             self.send_playback()
 
     def send_state(self, state: PlaybackState) -> None:
-        """See `Viewers.send_state`."""
+        """Send the state of the playback, if it is not the reply to a viewer."""
         self._server.broadcast_playback_state(_playback_state(state, None))
 
     def send_values(self, values: Values) -> None:
-        """See `Viewers.send_values`."""
+        """Send the constants, if they are not the reply to a viewer."""
         self._server.publish_parameter_values(_constants(values))
 
     def send_playback(self) -> None:
-        """See `Viewers.send_playback`."""
+        """Send the parameters of the playback, if they are not the reply to a viewer."""
         self._server.publish_parameter_values(_parameters(self.steering))
 
     @property
@@ -449,36 +413,82 @@ class LiveServer(PublishingServer):
         """The parameters that are no constants."""
         return {**self._session.playback, ARROW: self._session.arrow, _REJECTED: self._rejected}
 
-    def _start(self) -> protocol.WebSocketServer:
-        return foxglove.start_server(
-            name=self._name,
-            host=self._behind,
-            port=0,
-            supported_encodings=["json"],
-            capabilities=list(_CAPABILITIES),
-            server_listener=_Listener(self._session, self),
-            services=[*map(self._service, SERVICES), *map(self._steering, STEERING)],
-            asset_handler=lambda uri: asset(self._session.wait_for_evaluation(), uri),
-            context=self._context,
-            playback_time_range=self._session.span_ns,
+    def ask(
+        self,
+        compute: Callable[[Evaluated, Mapping[str, Any]], Mapping[str, Any]],
+        request: Mapping[str, Any],
+    ) -> Mapping[str, Any]:
+        """Compute something from what is shown, in its turn among the questions of all viewers."""
+        return self._questions.ask(lambda evaluated: compute(evaluated, request))
+
+    def steer(self, name: str, value: float | bool) -> Mapping[str, float | bool]:
+        """Set a parameter of the playback; return its state."""
+        self.send_state(self._session.steer({name: value}))
+        self.send_playback()
+        return {key.partition(".")[2]: each for key, each in self._session.playback.items()}
+
+    def _options(self) -> dict[str, Any]:
+        return {
+            "capabilities": list(_CAPABILITIES),
+            "server_listener": self,
+            "services": [self._service(name, *served) for name, served in _SERVICES.items()],
+            "asset_handler": lambda uri: asset(self._session.wait_for_evaluation(), uri),
+            "playback_time_range": self._session.span_ns,
+        }
+
+    def _service(
+        self,
+        name: str,
+        request: Mapping[str, Any],
+        response: Mapping[str, Any],
+        answer: Callable[[LiveServer, Mapping[str, Any]], Mapping[str, Any]],
+    ) -> Service:
+        def handle(given: ServiceRequest) -> bytes:
+            answered = answer(self, _request(name, given.payload, request))
+            return json.dumps(answered, ensure_ascii=False, allow_nan=False).encode()
+
+        return _json_service(name, request, response, handle)
+
+    def on_subscribe(self, client: protocol.Client, channel: protocol.ChannelView) -> None:
+        self._session.resend(channel.topic)
+
+    def on_get_parameters(
+        self, client: protocol.Client, param_names: list[str], request_id: str | None = None
+    ) -> list[Parameter]:
+        chosen = [*_parameters(self.steering), *_constants(self._session.values)]
+        return [each for each in chosen if each.name in param_names] if param_names else chosen
+
+    def on_set_parameters(
+        self, client: protocol.Client, parameters: list[Parameter], request_id: str | None = None
+    ) -> list[Parameter]:
+        self.remove_note(CONSTANTS)
+        self.remove_note(ARROW)
+        try:
+            values = {each.name: _value(each) for each in parameters if each.name != _REJECTED}
+            playback = {name: value for name, value in values.items() if name in PLAYBACK}
+            constants = {
+                name: value for name, value in values.items() if name not in PLAYBACK and name != ARROW
+            }
+            if ARROW in values:
+                self._session.point_at(values[ARROW])
+            if constants:
+                self._session.set_constants(_as_written(constants, self._session.values))
+            if playback:
+                self.send_state(self._session.steer(playback))
+        except SpatialReplayError as error:
+            self.send_note(Note(CONSTANTS, str(error)))
+        return self.on_get_parameters(client, [])
+
+    def on_playback_control_request(
+        self, playback_control_request: protocol.PlaybackControlRequest
+    ) -> protocol.PlaybackState:
+        request = playback_control_request
+        state = self._session.control(
+            is_playing=request.playback_command == protocol.PlaybackCommand.Play,
+            speed=request.playback_speed,
+            seek_ns=request.seek_time,
         )
-
-    def _service(self, name: str) -> Service:
-        described = SERVICES[name]
-
-        def handle(request: ServiceRequest) -> bytes:
-            return self._questions.ask(lambda evaluated: answer(name, evaluated, request.payload))
-
-        return _json_service(name, described.request, described.response, handle)
-
-    def _steering(self, name: str) -> Service:
-        def handle(request: ServiceRequest) -> bytes:
-            self.send_state(self._session.steer(steered(name, request.payload)))
-            self.send_playback()
-            state = {key.partition(".")[2]: value for key, value in self._session.playback.items()}
-            return json.dumps(state).encode()
-
-        return _json_service(name, STEERING[name].request, PLAYBACK_STATE, handle)
+        return _playback_state(state, request.request_id)
 
 
 class RunServer(PublishingServer, protocol.ServerListener):
@@ -503,7 +513,7 @@ class RunServer(PublishingServer, protocol.ServerListener):
         super().__init__("spatial-replay: live", channels, host, port, origins)
 
     def publish(self, messages: Messages) -> None:
-        """See `Viewers.publish`; channels that are new are offered first."""
+        """Send messages; channels that are new are offered first."""
         for channel in messages.channels.values():
             if channel not in self._channels:
                 self._advertise(channel)
@@ -528,19 +538,10 @@ class RunServer(PublishingServer, protocol.ServerListener):
                 sent.log(payload, log_time=self._time_ns)
             self.send_time(self._time_ns)
 
-    def _start(self) -> protocol.WebSocketServer:
+    def _options(self) -> dict[str, Any]:
         services = [] if self._fire is None else [_trigger_service(self._fire)]
         capabilities = [protocol.Capability.Time, *([protocol.Capability.Services] if services else [])]
-        return foxglove.start_server(
-            name=self._name,
-            host=self._behind,
-            port=0,
-            supported_encodings=["json"],
-            capabilities=capabilities,
-            services=services,
-            server_listener=self,
-            context=self._context,
-        )
+        return {"capabilities": capabilities, "services": services, "server_listener": self}
 
 
 def _is_state(channel: Channel) -> bool:
@@ -596,55 +597,6 @@ class _FailureError(Exception):
     """Why a service fails; viewers are shown the name of the class before the reason."""
 
     __qualname__ = "failed"
-
-
-class _Listener(protocol.ServerListener):
-    """Pass on the requests of viewers; called on threads of the SDK."""
-
-    def __init__(self, session: Session, server: LiveServer) -> None:
-        self._session = session
-        self._server = server
-
-    def on_subscribe(self, client: protocol.Client, channel: protocol.ChannelView) -> None:
-        self._session.resend(channel.topic)
-
-    def on_get_parameters(
-        self, client: protocol.Client, param_names: list[str], request_id: str | None = None
-    ) -> list[Parameter]:
-        chosen = [*_parameters(self._server.steering), *_constants(self._session.values)]
-        return [each for each in chosen if each.name in param_names] if param_names else chosen
-
-    def on_set_parameters(
-        self, client: protocol.Client, parameters: list[Parameter], request_id: str | None = None
-    ) -> list[Parameter]:
-        self._server.remove_note(CONSTANTS)
-        self._server.remove_note(ARROW)
-        try:
-            values = {each.name: _value(each) for each in parameters if each.name != _REJECTED}
-            playback = {name: value for name, value in values.items() if name in PLAYBACK}
-            constants = {
-                name: value for name, value in values.items() if name not in PLAYBACK and name != ARROW
-            }
-            if ARROW in values:
-                self._session.point_at(values[ARROW])
-            if constants:
-                self._session.set_constants(_as_written(constants, self._session.values))
-            if playback:
-                self._server.send_state(self._session.steer(playback))
-        except SpatialReplayError as error:
-            self._server.send_note(Note(CONSTANTS, str(error)))
-        return [*_parameters(self._server.steering), *_constants(self._session.values)]
-
-    def on_playback_control_request(
-        self, playback_control_request: protocol.PlaybackControlRequest
-    ) -> protocol.PlaybackState:
-        request = playback_control_request
-        state = self._session.control(
-            is_playing=request.playback_command == protocol.PlaybackCommand.Play,
-            speed=request.playback_speed,
-            seek_ns=request.seek_time,
-        )
-        return _playback_state(state, request.request_id)
 
 
 def _playback_state(state: PlaybackState, request: str | None) -> protocol.PlaybackState:

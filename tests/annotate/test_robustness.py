@@ -78,8 +78,7 @@ def test_interleaved_specifications_come_apart(first, second):
     by_name = {read.specification: read for read in decode_robustness([payload for _, payload in tagged])}
     assert by_name.keys() == {name for name, _ in tagged}
     for name, read in by_name.items():
-        assert {tagged[index][0] for index in read.messages.tolist()} == {name}
-        times = [Robustness.FromString(tagged[index][1]).time_ns for index in read.messages.tolist()]
+        times = [Robustness.FromString(payload).time_ns for of, payload in tagged if of == name]
         assert read.times_ns.tolist() == times
 
 
@@ -90,7 +89,6 @@ def test_a_writer_that_leaves_out_zeros_is_read_too():
     [read] = decode_robustness([message.SerializeToString(), *full])
     assert read.times_ns.tolist() == [0, 7]
     assert read.series[0].T.tolist() == [[1.5, 0.0, -2.0, 2.0], [1.0, 2.0, 3.0, 4.0]]
-    assert read.codes[0].tolist() == [0, SATISFIED]
 
 
 def test_what_is_no_message_of_ours_is_named():
@@ -104,10 +102,3 @@ def test_the_message_about_the_finished_log_is_no_sample():
     final = encode_robustness("s", None, [None], np.array([7]), series, final=True)
     [read] = decode_robustness([*once, *final])
     assert read.times_ns.tolist() == [7]
-
-
-def test_a_standing_of_another_version_is_named():
-    message = Robustness(specification="s")
-    message.nodes.add(standing=9)
-    with pytest.raises(LogError, match="number 9"):
-        decode_robustness([message.SerializeToString()])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +11,8 @@ import pytest
 
 from cli.program import run_program
 from replay.runs import SPECIFICATION, content_of, record, run, write_tracks
-from spatial_replay.annotate.robustness import decode_robustness
 from spatial_replay.cli import run as run_in_process
-from spatial_replay.logs.schemas.Robustness_pb2 import SATISFIED, UNKNOWN, VIOLATED
+from spatial_replay.logs.schemas.Robustness_pb2 import SATISFIED, UNKNOWN, VIOLATED, Robustness
 from spatial_replay.logs.topics import METADATA, ROBUSTNESS
 
 REPLAY = ("replay", "run.jsonl", "--spec", "blocks.spatial")
@@ -68,12 +68,10 @@ def test_an_annotated_log_names_its_semantics_and_is_replayed_with_the_default(f
     assert run_in_process(["replay", "run.mcap", *options]) == 4
     written = content_of(Path("out.mcap"))
     assert dict(written.metadata)[METADATA]["semantics"] == "paper"
-    series = decode_robustness([message[-1] for message in written.of(ROBUSTNESS)])
-    for each in series:
-        value = each.series[:, 0]
-        assert ((each.codes == UNKNOWN) == (value != value)).all()
-        assert ((each.codes == SATISFIED) == (value >= 0)).all()
-        assert ((each.codes == VIOLATED) == (value < 0)).all()
+    messages = [Robustness.FromString(message[-1]) for message in written.of(ROBUSTNESS)]
+    for node in [node for each in messages if not each.final for node in each.nodes]:
+        decided = SATISFIED if node.value >= 0 else VIOLATED
+        assert node.standing == (UNKNOWN if math.isnan(node.value) else decided)
     assert run_in_process(["replay", "out.mcap", "-o", "again.mcap"]) == 4
     assert dict(content_of(Path("again.mcap")).metadata)[METADATA]["semantics"] == "ltlf"
 

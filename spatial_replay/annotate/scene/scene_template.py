@@ -691,16 +691,13 @@ def _add_region(entity: SceneEntity, region: Region, depth: float = 0.0) -> None
 def _encoded_object(drawn: DrawnObject, lift: float) -> bytes:
     """Encode an object: most of those in a layout are in the one before, too."""
     message = SceneUpdate()
-    _add_object(_add_entity(message, OBJECT + drawn.name), drawn, lift)
-    return _encoded(message)
-
-
-def _add_object(entity: SceneEntity, drawn: DrawnObject, lift: float) -> None:
     rings = [np.full((length, 2), SLOT) for length in drawn.form.rings]
     elevation = Elevation(lift * (1.0 + drawn.level / LEVELS), None, 2.5 * lift)
     if drawn.form.has_height:
         elevation = Elevation(SLOT, (SLOT, SLOT), SLOT)
+    entity = _add_entity(message, OBJECT + drawn.name)
     draw(entity, drawn.label, rings, rings, (SLOT, SLOT), elevation, OBJECT_OPACITY)
+    return _encoded(message)
 
 
 def _add_banner(entity: SceneEntity, banner: Banner, lift: float) -> None:
