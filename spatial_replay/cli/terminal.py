@@ -159,7 +159,9 @@ def show_message(severity: str, message: str, colour: str) -> None:
     """Print "spatial-replay: SEVERITY: MESSAGE" to standard error; further lines are indented."""
     first, *others = message.split("\n")
     label = Coloured(f"{severity}:", colour)
-    show((f"{PROGRAM}: ", label, f" {first}"), *(f"  {line.lstrip()}" for line in others), err=True)
+    # carets stand below what they point at
+    indented = (line if line.startswith("  ") else f"  {line}" for line in others)
+    show((f"{PROGRAM}: ", label, f" {first}"), *indented, err=True)
 
 
 def warn(*messages: str) -> None:
