@@ -15,8 +15,8 @@ from examples import ALL
 
 # a law is about values, not about how busy the machine is
 settings.register_profile("thorough", deadline=None, max_examples=ALL, print_blob=True)
-# a fifth finds nearly all that is wrong with a change; CI tries the same examples each time
-settings.register_profile("quick", settings.get_profile("thorough"), max_examples=ALL // 5)
+# a tenth finds nearly all that is wrong with a change; CI tries the same examples each time
+settings.register_profile("quick", settings.get_profile("thorough"), max_examples=ALL // 10)
 settings.register_profile("ci", settings.get_profile("quick"), derandomize=True)
 settings.load_profile("ci" if os.environ.get("CI") else "quick")
 
@@ -58,7 +58,7 @@ def _unannounced() -> Iterator[None]:
         yield
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def data_folder() -> Path:
     """The folder of recordings to compare with; the test skips where there is none."""
     folder = os.environ.get("SPATIAL_REPLAY_DATA")

@@ -104,7 +104,7 @@ def test_several_processes_and_workers_of_xdist_give_the_same_outcomes(
     alone = pytester.runpytest_inprocess(*options).parseoutcomes()
     environment = os.environ | {"SPATIAL_REPLAY_KERNELS": "interpreted"}
     for more in (["--replay-jobs=2"], ["-n", "2", "--dist", "loadgroup"]):
-        command = [sys.executable, "-m", "pytest", "-q", *options, *more]
+        command = [sys.executable, "-m", "pytest", "-q", "--assert=plain", *options, *more]
         done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
         assert f"{alone['failed']} failed, {alone['passed']} passed" in done.stdout
 

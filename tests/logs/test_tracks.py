@@ -297,6 +297,6 @@ def test_lines_without_end_that_are_blank_are_not_read_to_their_end(tmp_path):
         for _ in range(11):
             stream.write(b"\n" * 1_000_000)
         stream.write(b"{")
-    with pytest.raises(LogError, match="gz:10000002: it has more than 10,000,000 blank lines"):
-        read_trace(path)
-    assert len(read_trace(path, allow_damage=True)) == 1
+    trace = read_trace(path, allow_damage=True)
+    assert len(trace) == 1
+    assert "gz:10000002: it has more than 10,000,000 blank lines" in trace.faults[-1]
