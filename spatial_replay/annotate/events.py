@@ -28,7 +28,6 @@ from spatial_replay.compiled import kernel
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.online.codes import low_and_high
-from spatial_replay.monitor.online.rewriting import looks_ahead
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.sentences import amount_text, uncertain_text
@@ -37,7 +36,7 @@ from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Formula, Quantified, Specification, iter_nodes, operator_of
 from spatial_replay.spec.relations import RELATION_NAMES
-from spatial_replay.spec.walks import declared_unit, substitute
+from spatial_replay.spec.walks import declared_unit, looks_ahead, substitute
 from spatial_replay.text import requirement_text, time_text, with_unit
 from spatial_replay.trace.sample import LATEST_NS
 

@@ -38,9 +38,9 @@ from spatial_replay.logs.topics import (
     STANDING,
     topic_of_camera,
 )
-from spatial_replay.monitor.online.rewriting import looks_ahead
 from spatial_replay.palette import CURVES, HOLDING, NEGATIVE, NEUTRAL, POSITIVE, hexadecimal, lighter
 from spatial_replay.spec.formula import Formula
+from spatial_replay.spec.walks import looks_ahead
 from spatial_replay.text import number_text
 from spatial_replay.trace.units import OUR_AXES, Axes
 

@@ -25,9 +25,9 @@ from spatial_replay.logs.schemas.Robustness_pb2 import (
 )
 from spatial_replay.logs.topics import CURVES_TOPIC, protobuf_channel
 from spatial_replay.logs.wire import WireTemplate, words_of
-from spatial_replay.monitor.online.rewriting import looks_ahead
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.spec.formula import Formula, iter_nodes
+from spatial_replay.spec.walks import looks_ahead
 
 Codes = NDArray[np.uint8]
 

@@ -26,9 +26,9 @@ from spatial_replay.logs.schemas.Robustness_pb2 import (
     StandingUpdate,
 )
 from spatial_replay.logs.wire import WireTemplate, placed, rounded, words_of
-from spatial_replay.monitor.online.rewriting import looks_ahead
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.spec.formula import Formula, iter_nodes
+from spatial_replay.spec.walks import looks_ahead
 from spatial_replay.trace.sample import LATEST_NS
 
 _MOST_TEMPLATES: Final = 1024

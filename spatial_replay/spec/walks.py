@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from spatial_replay.spec.format import format_number, format_relation, format_term
 from spatial_replay.spec.formula import (
+    FUTURE_OPERATORS,
     Atom,
     Boolean,
     Centre,
@@ -173,6 +174,13 @@ def iter_formulas(formula: Formula) -> Iterator[Formula]:
 def is_spatial(formula: Formula) -> bool:
     """Return whether a formula is about one sample: no operator in it looks ahead or back."""
     return not any(isinstance(each, Temporal) for each in iter_formulas(formula))
+
+
+def looks_ahead(formula: Formula) -> bool:
+    """Return whether a formula contains a future operator."""
+    return any(
+        isinstance(each, Temporal) and each.operator in FUTURE_OPERATORS for each in iter_formulas(formula)
+    )
 
 
 def iter_terms(formulas: Iterable[Formula]) -> Iterator[Term]:

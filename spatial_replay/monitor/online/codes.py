@@ -53,10 +53,7 @@ PAST_WINDOW_MAX, PAST_WINDOW_MIN = 11, 12
 PAST_DELAY = 13
 PAST_WINDOWS = (PAST_WINDOW_MAX, PAST_WINDOW_MIN)
 PAST = (PAST_SINCE, PAST_TRIGGER, *PAST_WINDOWS, PAST_DELAY)
-ANCHORED_UNTIL, ANCHORED_RELEASE = 14, 15  # window [low, high] counted from the first sample
-BINARY_NODES = (
-    PART_AND, PART_OR, UNTIL, RELEASE, PAST_SINCE, PAST_TRIGGER, ANCHORED_UNTIL, ANCHORED_RELEASE,
-)  # fmt: skip
+BINARY_NODES = (PART_AND, PART_OR, UNTIL, RELEASE, PAST_SINCE, PAST_TRIGGER)
 
 # columns of parts: their nodes' rows, the kind, numbers of variables and tables, the corner that ends a run,
 # and where the table begins in each channel (of parts without windows)
@@ -81,11 +78,6 @@ REPORT_WIDTH = 5
 # codes of reports: a row is a node as written, so that here, alone, `xor`, `->` and `<->` have codes;
 # rows for their expansions would cost eight numbers a sample each
 REPORT_SIGNAL, REPORT_PART = 0, 1
-# a past operator that is, at the first sample, its operand; now it is a signal, or what a part is at first
-REPORT_PAST = 9
-# an until whose left operand never falls, by what it waits for, which is a part (see `after_lasting`); where
-# its rule is `NOW_LAST_OPERAND`, its right operand is an alternative
-REPORT_LASTING = 10
 REPORT_NOT, REPORT_AND, REPORT_OR, REPORT_XOR, REPORT_IMPLIES, REPORT_IFF, REPORT_SPEC = 2, 3, 4, 5, 6, 7, 8
 REPORT_OF_BOOLEAN = MappingProxyType(
     {
@@ -99,7 +91,6 @@ REPORT_OF_BOOLEAN = MappingProxyType(
     }
 )
 NOW_LAST_OPERAND, NOW_EITHER, NOW_TRUE, NOW_FALSE, NOW_OF_PART = 0, 1, 2, 3, 4
-NOW_OF_SIGNAL, NOW_OF_VALUE = 5, 6  # of `REPORT_PAST`
 
 # columns of the first row of a program: where its rows stand, and how many there are
 HEAD_SIGNALS_AT, HEAD_SIGNALS, HEAD_PARTS_AT, HEAD_PARTS, HEAD_REPORTS_AT, HEAD_REPORTS = range(6)

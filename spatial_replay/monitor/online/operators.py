@@ -15,7 +15,6 @@ import numpy as np
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.monitor.online import codes
-from spatial_replay.monitor.online.rewriting import from_all, from_first, looks_ahead, merged, simplified
 from spatial_replay.spec.formula import (
     FUTURE_OPERATORS,
     Atom,
@@ -28,6 +27,7 @@ from spatial_replay.spec.formula import (
     expand,
     operands_of,
 )
+from spatial_replay.spec.walks import looks_ahead
 
 Row = tuple[int, ...]
 """A row of a table, its columns as `codes` lists them."""
@@ -196,24 +196,17 @@ MAX_VARIABLES = 12
 LAST = (1 << 63) - 1
 """No sample comes later, in samples or in ns."""
 
-_ANCHORED = (codes.ANCHORED_UNTIL, codes.ANCHORED_RELEASE)
 _RUNNING = (codes.UNTIL, codes.RELEASE)
 _RECURRENT_PAST = (codes.PAST_SINCE, codes.PAST_TRIGGER)
 
 
 def part_of(signals: SignalTable, node: Temporal) -> WindowedPart:
-    """Return the part of a node: anchored if possible, since that is cheaper to run.
+    """Return the part of a node that looks ahead.
 
     Raises:
         UsageError: more than `MAX_VARIABLES` unbounded future operators.
     """
-    bounded = node.operator in FUTURE_OPERATORS and (node.bound is not None or node.operator in ("X", "WX"))
-    node = merged(node) if bounded else from_all(node)
-    part = WindowedPart(signals, node, anchored=bounded)
-    if bounded and not part.is_flat:
-        # at the first sample, what looks back is another formula
-        asked = node if part.looks_back else from_first(node)
-        part = WindowedPart(signals, asked, anchored=False, ends=True)
+    part = WindowedPart(signals, node)
     if part.variables > MAX_VARIABLES:
         raise UsageError(
             f"a formula nests {part.variables} unbounded temporal operators under one {node.operator}; "
@@ -236,7 +229,6 @@ class PartRows:
         self.tables = 1
         self._rows: dict[Row, int] = {}
         self._is_past = False
-        self._has_window_signals = False
 
     def rows(self) -> tuple[Row, ...]:
         """Return rows with the numbers of their variable and table, and whether they depend on either."""
@@ -261,18 +253,10 @@ class PartRows:
     @property
     def is_flat(self) -> bool:
         """Whether one sample settles everything but the variables: no window, shift or past operator."""
-        flat = (codes.LITERAL, codes.PART_AND, codes.PART_OR, *_ANCHORED)
+        flat = (codes.LITERAL, codes.PART_AND, codes.PART_OR)
         # what a past operator is now is asked for, too, although nothing past is left of `H[0,5] G G x`
         is_flat = all(row[0] in flat or (row[0] in _RUNNING and row[-1]) for row in self._rows)
         return is_flat and not self._is_past
-
-    @property
-    def looks_back(self) -> bool:
-        """Whether a past operator over a future one is left, so that not the first sample alone matters."""
-        # a root with a window of its own stands at the first sample alone
-        return self._is_past or (
-            not self._has_window_signals and any(row[0] in codes.PAST for row in self._rows)
-        )
 
     @property
     def end_corner(self) -> int:
@@ -303,24 +287,15 @@ class PartRows:
 class WindowedPart(PartRows):
     """The rows of a node that looks ahead, in negation normal form."""
 
-    def __init__(self, signals: SignalTable, root: Temporal, *, anchored: bool, ends: bool = False) -> None:
-        """Build the part of a node that looks ahead.
-
-        Args:
-            signals: receives the subformulas that do not look ahead.
-            anchored: whether the root is a bounded operator that is only needed at the first sample. Its
-                window is a fixed stretch of the run then, and needs no history.
-            ends: whether such a root over a future operator is an unbounded operator that joins no more than
-                its window. Its closed positions are kept as one table then.
-        """
+    def __init__(self, signals: SignalTable, root: Temporal) -> None:
+        """Build the part of a node that looks ahead; `signals` receives the subformulas that do not."""
         super().__init__()
         self._signals = signals
         self._is_past = root.operator not in FUTURE_OPERATORS
         self._added: dict[tuple[int, bool], tuple[Formula, int]] = {}
-        if anchored:
-            self._anchored(root, True)
-        elif ends:
-            self._ending(root)
+        is_bounded = root.bound is not None or root.operator in ("X", "WX")
+        if is_bounded and not self._is_past:
+            self._ending(root, True)
         else:
             self._add(root, True)
 
@@ -339,8 +314,6 @@ class WindowedPart(PartRows):
 
     def _built(self, formula: Formula, positive: bool) -> int:
         if isinstance(formula, Boolean | Temporal) and looks_ahead(formula):
-            if isinstance(formula, Temporal):
-                formula = simplified(formula)
             operands = [self._add(each, positive) for each in formula.operands]
             if isinstance(formula, Boolean):
                 is_both = (formula.operator == "and") == positive
@@ -395,50 +368,37 @@ class WindowedPart(PartRows):
                 result = self._join(before, result, is_both=is_since)
         return result if within is None else self._join(within, result, is_both=is_since)
 
-    def _ending(self, root: Temporal) -> int:
-        formula, positive = expand(root), True
-        if isinstance(formula, Boolean) and formula.operator == "not":
-            formula, positive = formula.operands[0], False
-        if not isinstance(formula, Temporal) or formula.operator not in "FGUX":
-            return self._add(root, True)
-        unit, low, high = window_of(Bound(1, 1, "samples") if formula.operator == "X" else formula.bound)
-        if not high:
-            return self._add(root, True)
-        operands = [self._add(each, positive) for each in formula.operands]
-        left, body, _ = _as_until(formula.operator, operands, formula.bound)
-        is_until = (formula.operator != "G") == positive
-        code, weak = codes.UNTIL if is_until else codes.RELEASE, int(not is_until)
-        # in an until, say, positions outside the window are -inf, and so is the operand that has to hold so
-        # far where the window ends: later samples are out of reach
-        self._has_window_signals, sign = True, -1 if is_until else 1
-        outside = [self._elapsed(unit, low, -sign)] if low > 0 else []
-        outside += [self._elapsed(unit, high + 1, sign)] if high < LAST else []
-        body = reduce(partial(self._join, is_both=is_until), outside, body)
-        return self.row(code, self._until_elapsed(left, unit, high, sign), body, weak, variable=True)
+    def _ending(self, formula: Formula, positive: bool) -> int:
+        """Return the row of a bounded operator of which only the value at the first sample is needed.
 
-    def _until_elapsed(self, left: int, unit: int, distance: int, sign: int) -> int:
-        """Return the row of a root's left operand that is an infinity from a distance on."""
-        end = self._elapsed(unit, distance, sign)
-        return end if left == NOTHING else self._join(left, end, is_both=sign < 0)
+        Its window is a fixed stretch of the run. In an until, say, positions outside the window are -inf, and
+        so is the operand that has to hold so far where the window ends: later samples are out of reach.
+        """
+        formula = expand(formula)
+        if isinstance(formula, Boolean) and formula.operator == "not":
+            return self._ending(formula.operands[0], not positive)
+        if not isinstance(formula, Temporal):
+            # W is U or G
+            sides = [self._ending(each, positive) for each in operands_of(formula)]
+            return reduce(partial(self._join, is_both=not positive), sides)
+        operands = [self._add(each, positive) for each in formula.operands]
+        left, body, bound = _as_until(formula.operator, operands, formula.bound)
+        unit, low, high = window_of(bound)
+        is_until = (formula.operator != "G") == positive
+        sign = -1 if is_until else 1
+        if low > 0:
+            body = self._join(body, self._elapsed(unit, low, -sign), is_both=is_until)
+        if high is not None:
+            end = self._elapsed(unit, high, sign)
+            left = end if left == NOTHING else self._join(left, end, is_both=is_until)
+            if high < LAST:
+                body = self._join(body, self._elapsed(unit, high + 1, sign), is_both=is_until)
+        code = codes.UNTIL if is_until else codes.RELEASE
+        return self.row(code, left, body, int(not is_until), variable=True)
 
     def _elapsed(self, unit: int, distance: int, sign: int) -> int:
         """Return the row of an infinity that changes its sign a distance from the first sample on."""
         return self.row(codes.LITERAL, self._signals.elapsed(unit, distance, sign))
-
-    def _anchored(self, formula: Formula, positive: bool) -> int:
-        formula = expand(formula)
-        if isinstance(formula, Temporal):
-            operands = [self._add(each, positive) for each in formula.operands]
-            left, right, bound = _as_until(formula.operator, operands, formula.bound)
-            unit, low, high = window_of(bound)
-            is_until = (formula.operator != "G") == positive
-            code = codes.ANCHORED_UNTIL if is_until else codes.ANCHORED_RELEASE
-            end = NOTHING if high is None else high
-            return self.row(code, left, right, int(not is_until), unit, low, end, variable=True)
-        if isinstance(formula, Boolean) and formula.operator == "not":
-            return self._anchored(formula.operands[0], not positive)
-        windows = [self._anchored(each, positive) for each in operands_of(formula)]
-        return reduce(partial(self._join, is_both=not positive), windows)
 
 
 def _as_until(operator: str, operands: list[int], bound: Bound | None) -> tuple[int, int, Bound | None]:

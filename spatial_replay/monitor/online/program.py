@@ -35,7 +35,6 @@ from spatial_replay.monitor.online.operators import (
     operand_rows,
     part_of,
 )
-from spatial_replay.monitor.online.rewriting import after_lasting, at_last, looks_ahead
 from spatial_replay.spec.formula import (
     FUTURE_OPERATORS,
     Atom,
@@ -45,6 +44,7 @@ from spatial_replay.spec.formula import (
     Temporal,
     iter_nodes,
 )
+from spatial_replay.spec.walks import looks_ahead
 
 NEVER = codes.SAMPLES, NOTHING
 """The end of a root that has none."""
@@ -230,16 +230,8 @@ def compile_formula(formula: Formula) -> Program:
             reports.append((codes.REPORT_SIGNAL, signals.add(node), 0, *ends))
         elif isinstance(node, Boolean):
             reports.append((codes.REPORT_OF_BOOLEAN[node.operator], 0, 0, *ends))
-        elif isinstance(node, Temporal) and (awaited := after_lasting(node)) is not None:
-            reports.append((codes.REPORT_LASTING, parts.add(awaited, signals), _now_rule(node), *ends))
         elif isinstance(node, Temporal):
-            last = None if node.operator in FUTURE_OPERATORS else at_last(node)
-            if isinstance(last, Temporal) and looks_ahead(last):
-                reports.append((codes.REPORT_PAST, parts.add(last, signals), codes.NOW_OF_VALUE, *ends))
-            elif last is not None:
-                reports.append((codes.REPORT_PAST, signals.add(last), codes.NOW_OF_SIGNAL, *ends))
-            else:
-                reports.append((codes.REPORT_PART, parts.add(node, signals), _now_rule(node), *ends))
+            reports.append((codes.REPORT_PART, parts.add(node, signals), _now_rule(node), *ends))
     signal_rows, report_rows = signals.array(parts.literals), array_of_rows(reports, codes.REPORT_WIDTH)
     return Program(
         leaves=tuple(signals.leaves),

@@ -115,23 +115,14 @@ def report(
         for r in range(used):
             into, part, mirror = own + NUMBERS * n + r, NUMBERS * index + r, _mirror(r, channels)
             channel, is_now = _channel(r, channels), r == 1 if channels == 1 else r in (2, 3)
-            if is_now and (
-                code == codes.REPORT_SIGNAL or (code == codes.REPORT_PAST and rule == codes.NOW_OF_SIGNAL)
-            ):
+            if is_now and code == codes.REPORT_SIGNAL:
                 for k in range(count):
                     work[into, k] = history[channel, index, begin + k]
             elif code == codes.REPORT_SIGNAL:  # settled by the first sample
                 _fill(work, into, memory[channel, rows[0, codes.HEAD_SIGNALS] + index], count)
-            elif code == codes.REPORT_PAST:
-                # what it is now is what the part is at the first sample
-                _copy(work, part - used // 4 if is_now else two + r, into, count)
-            elif code in (codes.REPORT_PART, codes.REPORT_LASTING):
+            elif code == codes.REPORT_PART:
                 if not is_now or rule == codes.NOW_OF_PART:
                     _copy(work, part, into, count)
-                    if code == codes.REPORT_LASTING:
-                        _join(codes.REPORT_AND, work, into, one + r, count)
-                        if rule == codes.NOW_LAST_OPERAND:
-                            _join(codes.REPORT_OR, work, into, two + r, count)
                 elif rule in (codes.NOW_LAST_OPERAND, codes.NOW_EITHER):
                     _copy(work, two + r, into, count)
                     if rule == codes.NOW_EITHER:
@@ -212,9 +203,8 @@ def run_samples(
             table = 2 * signals + rows[part, codes.PART_TABLE_START]
             for channel in range(channels if rows[part, codes.PART_KIND] == codes.TABLE else 0):
                 says = run_table(
-                    rows, part, history, channel, times, memory, table, work, top, position, begin, count,
-                    start_ns,
-                )  # fmt: skip
+                    rows, part, history, channel, memory, table, work, top, position, begin, count
+                )
                 for mode in range(3):
                     row = said_in(mode, channel, channels)
                     if row >= 0:

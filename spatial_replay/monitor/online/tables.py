@@ -100,26 +100,15 @@ def _run_simple(
     memory[channel, table], memory[channel, table + 1] = low, high
 
 
-@inlined
-def _is_anchored(code: int) -> bool:
-    return code in (codes.ANCHORED_UNTIL, codes.ANCHORED_RELEASE)
-
-
-@inlined
-def _now(rows: Integers, row: int, position: int, elapsed_ns: int) -> int:
-    return position if rows[row, codes.NODE_UNIT] == codes.SAMPLES else elapsed_ns
-
-
 @piece
 def run_table(
-    rows: Integers, part: int, history: Floats, channel: int, times: Integers, memory: Floats, table: int,
-    work: Floats, top: int, position: int, begin: int, count: int, start_ns: int,
+    rows: Integers, part: int, history: Floats, channel: int, memory: Floats, table: int, work: Floats,
+    top: int, position: int, begin: int, count: int,
 ) -> int:  # fmt: skip
     """Substitute samples into the table of a part without windows, in one channel.
 
     Args:
         part: its row.
-        times: the first row has those of the recent samples.
         table: where it begins in the `memory` of the channel.
         top: the first row of `work` that there is room in.
         position: of the first of the `count` samples; they stand at `begin` in the history.
@@ -148,7 +137,6 @@ def run_table(
         _run_simple(rows, end - 1, end_corner, memory, channel, table, work, top, says, count)
         return int(says)
     for k in range(count):
-        elapsed_ns = times[0, begin + k] - start_ns
         for d in range(nodes):
             # what depends on no variable is the same at every corner
             if not rows[first + d, codes.NODE_DEPENDS]:
@@ -163,32 +151,16 @@ def run_table(
                 elif code == codes.PART_OR:
                     value = max(work[values, a], work[values, b])
                 else:
-                    variable, counts = rows[row, codes.NODE_VARIABLE], True
-                    is_until = code in (codes.UNTIL, codes.ANCHORED_UNTIL)
-                    if _is_anchored(code):
-                        # its right operand counts inside its window only
-                        now, high = _now(rows, row, position + k, elapsed_ns), rows[row, codes.NODE_HIGH]
-                        counts = rows[row, codes.NODE_LOW] <= now and (high < 0 or now <= high)
+                    variable, is_until = rows[row, codes.NODE_VARIABLE], code == codes.UNTIL
                     value = np.inf if corner >> variable & 1 else -np.inf
                     if a >= 0:
                         value = min(work[values, a], value) if is_until else max(work[values, a], value)
-                    if counts:
-                        value = max(work[values, b], value) if is_until else min(work[values, b], value)
+                    value = max(work[values, b], value) if is_until else min(work[values, b], value)
                     work[point, variable] = value
                 work[values, row - first] = value
             work[fresh, corner] = read_table(memory, channel, table, variables, work, point)
         for corner in range(corners):
             memory[channel, table + corner] = work[fresh, corner]
-        for row in range(first, end):
-            # settle the anchored operators whose window no later sample can fall into
-            high = rows[row, codes.NODE_HIGH]
-            if _is_anchored(rows[row, codes.NODE_CODE]) and 0 <= high <= _now(
-                rows, row, position + k, elapsed_ns
-            ):
-                bit = 1 << rows[row, codes.NODE_VARIABLE]
-                for corner in range(corners):
-                    settled = corner | bit if rows[row, codes.NODE_WEAK] else corner & ~bit
-                    memory[channel, table + corner] = memory[channel, table + settled]
         work[says, k] = memory[channel, table + end_corner]
         work[says + 1, k], work[says + 2, k] = memory[channel, table], memory[channel, table + corners - 1]
     return int(says)
