@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import reduce
-from typing import NamedTuple, TypeAlias, overload
+from typing import Any, NamedTuple, TypeAlias
 
 from spatial_replay.errors import NoAutomatonError
 from spatial_replay.spec.format import format_formula
@@ -526,13 +526,7 @@ class Successors(Sequence[tuple[int, ...]]):
     def __len__(self) -> int:
         return len(self._moves)
 
-    @overload
-    def __getitem__(self, state: int) -> tuple[int, ...]: ...
-
-    @overload
-    def __getitem__(self, state: slice) -> tuple[tuple[int, ...], ...]: ...
-
-    def __getitem__(self, state: int | slice) -> tuple[int, ...] | tuple[tuple[int, ...], ...]:
+    def __getitem__(self, state: Any) -> Any:
         if isinstance(state, slice):
             return tuple(self[each] for each in range(len(self))[state])
         if not -len(self) <= state < len(self):

@@ -10,9 +10,6 @@ import numpy as np
 from spatial_replay.automata.guards import LEAF, Diagrams
 from spatial_replay.geometry.arrays import Flags, Integers
 
-_ROUNDS = 8
-"""How often all states are compared at once, before only those that a split concerns are."""
-
 
 @dataclass(frozen=True, eq=False)
 class Machine:
@@ -62,9 +59,8 @@ def _machine(
 
 def merged(machine: Machine) -> Machine:
     """Return a machine that accepts the same runs, without equivalent states."""
-    classes = _classes(machine)
+    _, firsts, classes = np.unique(_split_classes(machine), return_index=True, return_inverse=True)
     places, decisions = _relabelled(machine, classes)
-    firsts = np.unique(classes, return_index=True)[1]
     moves = places[machine.moves[firsts]]
     return Machine(moves, decisions, machine.accepting[firsts], int(places[machine.start]))
 
@@ -173,26 +169,15 @@ def _levels(decisions: Integers) -> Iterator[Integers]:
     yield from np.split(order, bounds)
 
 
-def _classes(machine: Machine) -> Integers:
-    """Return the class of each state: states of one class accept the same runs, the empty one included."""
-    classes = np.unique(machine.accepting, return_inverse=True)[1].ravel().astype(np.int64)
-    for _ in range(_ROUNDS):
-        places = _relabelled(machine, classes)[0]
-        keys = classes * (2 * len(places) + 2) + places[machine.moves] + len(places)
-        after = np.unique(keys, return_inverse=True)[1].ravel().astype(np.int64)
-        if after.max() == classes.max():
-            return classes
-        classes = after
-    return np.unique(_split_classes(machine, classes.tolist()), return_inverse=True)[1].ravel()
+def _split_classes(machine: Machine) -> list[int]:
+    """Return the class of each state: states of one class accept the same runs, the empty one included.
 
-
-def _split_classes(machine: Machine, classes: list[int]) -> list[int]:
-    """Split classes until the moves of all members of one lead to the same ones.
-
+    Classes are split until the moves of all members of one lead to the same ones.
     The largest part of a class keeps its number, so that few states are checked again (Hopcroft, 1971).
     """
     moves, rows = machine.moves.tolist(), machine.decisions.tolist()
-    parts: list[dict[int, set[int]]] = [{} for _ in range(max(classes) + 1)]
+    classes: list[int] = machine.accepting.astype(np.int64).tolist()
+    parts: list[dict[int, set[int]]] = [{}, {}]
     leading: dict[int, int] = {}
     above = above_of(moves, rows)
     diagrams = Diagrams()
