@@ -86,6 +86,11 @@ class Target:
     robustness: float
 
     @property
+    def pose(self) -> tuple[float, float, float]:
+        """x, y and turn."""
+        return self.x, self.y, self.turn
+
+    @property
     def length(self) -> float:
         """Length of the path, in footprint units."""
         return sum(math.dist(one, other) for one, other in pairwise(self.waypoints))

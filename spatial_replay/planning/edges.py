@@ -378,7 +378,7 @@ class Attempts:
         self._left: dict[Edge, int] = {}
         self._last: dict[Edge, str] = {}
         self._motions: list[FailedMotion] = []
-        self._begin: tuple[Sample, Settings] | None = None
+        self._begin: tuple[Sample, Settings]
 
     @property
     def are_any(self) -> bool:
@@ -408,13 +408,16 @@ class Attempts:
         self, aim: Consideration, target: Target, outcome: Outcome, states: Sequence[int], sample: Sample
     ) -> None:
         """Take the outcome of a motion, and the automaton's states and the newest sample after it."""
-        refused = self._begin is not None and self._begin[0] is sample and not outcome.succeeded
+        before, settings = self._begin
+        refused = before is sample and not outcome.succeeded
         self.motions += not refused
         if not outcome.succeeded:
             said = (outcome.reason, "no sample came during the motion" if refused else "")
             self._last[aim.edge] = "; ".join(filter(None, said))
-            failed = self._kept(target, outcome, sample, refused)
-            if failed is None or self._is_about_place(failed):
+            stayed = _stands(target.name, before, sample, settings)
+            self._motions.append(FailedMotion(target, before, stayed, refused, outcome.at))
+            # another place may help
+            if outcome.at in (None, "place") and not (settings.skill == "push" and stayed):
                 self._places[target.name] = (*self.places_of(target.name), (target.x, target.y))
         elif tuple(states) == aim.edge[1:]:
             del self._failed[aim.edge]
@@ -422,20 +425,6 @@ class Attempts:
             # one of several motions, and fewer are left than ever before
             self._left[aim.edge] = len(aim.motions)
             self._failed[aim.edge] -= 1
-
-    def _kept(self, target: Target, outcome: Outcome, sample: Sample, refused: bool) -> FailedMotion | None:
-        """Keep a motion that failed, and return it."""
-        if self._begin is None:
-            return None
-        before, settings = self._begin
-        stayed = _stands(target.name, before, sample, settings)
-        self._motions.append(FailedMotion(target, before, stayed, refused, outcome.at))
-        return self._motions[-1]
-
-    def _is_about_place(self, failed: FailedMotion) -> bool:
-        """Return whether another place may help after a failed motion."""
-        pushes = self._begin is not None and self._begin[1].skill == "push"
-        return failed.at in (None, "place") and not (pushes and failed.stayed)
 
     def places_of(self, name: str) -> tuple[tuple[float, float], ...]:
         """Return the places (x, y) where moving an object failed, whatever it was for."""

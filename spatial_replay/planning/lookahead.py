@@ -21,7 +21,6 @@ from typing import Final, TypeAlias
 
 import numpy as np
 
-from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.guards import Transition
 from spatial_replay.geometry.arrays import Booleans, Floats
 from spatial_replay.geometry.footprint import TrackedObject, centre_of, moved_object, radius_of
@@ -30,7 +29,6 @@ from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.planning.decisions import Candidate, Consideration, Edge, Reason, Target
 from spatial_replay.planning.edges import (
     LATER,
-    Attempts,
     Budget,
     Demand,
     Pose,
@@ -46,7 +44,15 @@ from spatial_replay.planning.edges import (
     with_objects,
 )
 from spatial_replay.planning.maps import AVOIDED_CELLS, concerns, gradient_map, proposition_maps
-from spatial_replay.planning.motions import Expectations, MotionOrder, Movables, PredictedState, by_cost
+from spatial_replay.planning.motions import (
+    Expectations,
+    MotionOrder,
+    Moved,
+    Ordered,
+    PredictedState,
+    by_cost,
+    with_chosen,
+)
 from spatial_replay.planning.settings import Grid, Settings, Workspace
 from spatial_replay.planning.targets import nearest_meeting
 from spatial_replay.spec.format import format_formula
@@ -609,27 +615,19 @@ _STILL_TURN: Final = math.radians(1.0)
 class Lookahead:
     """Possible motions from one sample on; made for one decision."""
 
-    def __init__(
-        self,
-        automaton: Automaton,
-        formulas: Sequence[Formula],
-        regions: Mapping[str, Outline],
-        settings: Settings,
-        attempts: Attempts,
-        budget: Budget,
-    ) -> None:
-        """Begin with what is known about a run.
-
-        Args:
-            attempts: the motions so far.
-            budget: of the whole decision.
-        """
-        self._expected = Expectations(automaton, formulas, regions, settings, attempts, budget)
-        self._automaton, self._formulas, self._regions = automaton, formulas, regions
-        self._settings, self._attempts = settings, attempts
+    def __init__(self, expected: Expectations, sample: Sample) -> None:
+        """Begin with what is known about a run, and its newest sample."""
+        self._expected, self._first = expected, PredictedState(sample)
+        self._automaton, self._formulas, self._regions = (
+            expected.automaton,
+            expected.formulas,
+            expected.regions,
+        )
+        self._settings = expected.settings
+        self.movables = expected.movables(self._first)
+        """The movable objects of the newest sample."""
         self._pruned: set[Edge] = set()
-        self._known: dict[tuple[int, tuple[tuple[str, Pose], ...]], tuple[Target, ...] | None] = {}
-        self._first: PredictedState | None = None
+        self._known: dict[tuple[int, Moved], tuple[Target, ...] | None] = {}
         self._why: dict[str, None] = {}
         self._unordered = ""
         self._ruled_out: frozenset[Edge] = frozenset()
@@ -638,41 +636,39 @@ class Lookahead:
         self,
         consideration: Consideration,
         path: tuple[Transition, ...],
-        movables: Movables,
         pruned: Collection[Edge],
         *,
         together: bool = False,
     ) -> Consideration:
         """Return an edge with the candidate with which acceptance can be reached, or pruned.
 
+        Where one object is moved for an edge at most, nothing is looked ahead.
+
         Args:
             consideration: the edge with the candidates that can take it by one motion, or pruned.
             path: that begins with the edge.
-            movables: of the newest sample.
             pruned: the edges given up so far.
             together: whether several motions may take the edge, or move an object twice.
         """
-        self._first = scene = self._expected.begin(movables)
+        if self._settings.motions == 1:
+            return consideration
         self._pruned = set(pruned)
         self._why.clear()
-        state = path[0].source
-        for motions, after in islice(self._joint(scene, path, consideration), 4) if together else ():
-            rest = self._ahead(*after)
-            if rest is not None:
-                return self._begun(consideration, motions, rest, movables)
-        for number in by_cost(consideration.candidates, self._settings):
-            target = consideration.candidates[number].target
-            if target is None or (rest := self._after(scene, state, (target,), path[0].target)) is None:
+        for found in islice(self._joint(self._first, path, consideration), 4) if together else ():
+            if (rest := self._ahead(found.scene, found.state)) is not None:
+                return self._begun(consideration, found.motions, rest)
+        order = by_cost(consideration.candidates, self._settings)
+        for number, target in order.items():
+            if (rest := self._after(target, path[0])) is None:
                 continue
             names = [target.name, *(each.name for each in rest)]
             if together or len(set(names)) == len(names):
-                return _chosen(consideration, number, (target, *rest))
-        if not by_cost(consideration.candidates, self._settings):
+                return with_chosen(consideration, number, (target, *rest))
+        if not order:
             return consideration
         why = "; ".join(islice(self._why, 3)) or "no sequence of motions was found"
-        unmarked = tuple(replace(each, is_chosen=False) for each in consideration.candidates)
         reason = Reason(LATER, why if together else f"not by one motion: {why}")
-        return replace(consideration, candidates=unmarked, pruned=reason)
+        return replace(with_chosen(consideration, None), pruned=reason)
 
     # ------------------------------------------------------------------------------------ one at a time
 
@@ -698,23 +694,23 @@ class Lookahead:
             if ahead := idle.along(path):
                 return self._ahead(scene, ahead[-1])
             consideration = consideration_of(automaton, path, pruned, symbol)
-            for motions, after in self._ways(scene, path, consideration):
-                if (rest := self._ahead(*after)) is not None:
-                    return (*motions, *rest)
+            for found in self._ways(scene, path, consideration):
+                if (rest := self._ahead(found.scene, found.state)) is not None:
+                    return (*found.motions, *rest)
             looked_into.append((path, consideration))
             pruned.add(consideration.edge)
             pruned |= set(equivalent_edges(automaton, consideration, idle, pruned, symbol))
         # edges that nothing can take are worked out when one motion after the other does not lead on
         self._ruled_out = self._hopeless
         for path, consideration in looked_into:
-            for motions, after in islice(self._joint(scene, path, consideration), 2):
-                if (rest := self._ahead(*after)) is not None:
-                    return (*motions, *rest)
+            for found in islice(self._joint(scene, path, consideration), 2):
+                if (rest := self._ahead(found.scene, found.state)) is not None:
+                    return (*found.motions, *rest)
         return None
 
     def _ways(
         self, scene: PredictedState, path: tuple[Transition, ...], consideration: Consideration
-    ) -> Iterator[tuple[tuple[Target, ...], tuple[PredictedState, int]]]:
+    ) -> Iterator[Ordered]:
         """Yield single motions that take the first edge of a path, and where they lead."""
         movables = self._expected.movables(scene)
         candidates: list[Candidate] = []
@@ -723,35 +719,27 @@ class Lookahead:
             if not self._expected.budget.spend():
                 return
             candidates.append(movables.candidate(name, consideration, later))
-        for number in by_cost(candidates, self._settings):
-            target = candidates[number].target
-            if target is not None:
-                after = scene.after(target)
-                states = self._automaton.step_set({path[0].source}, self._expected.symbol(after))
-                if states == {path[0].target}:
-                    yield (target,), (after, path[0].target)
+        for target in by_cost(candidates, self._settings).values():
+            after = scene.after(target.name, target.pose)
+            if self._expected.states_after(after, path[0].source) == {path[0].target}:
+                yield Ordered((target,), after, path[0].target)
         if not any(each.target for each in candidates):
             causes = "; ".join(f"{each.name}: {each.rejected}" for each in candidates)
             self._why[f"{consideration.progress}: {causes or 'nothing that can be moved matters to it'}"] = (
                 None
             )
 
-    def _after(
-        self, scene: PredictedState, state: int, motions: tuple[Target, ...], aim: int
-    ) -> tuple[Target, ...] | None:
-        """Return the motions that follow some others to acceptance; none if what is seen does not say."""
-        for target in motions:
-            scene = scene.after(target)
-        states = self._automaton.step_set({state}, self._expected.symbol(scene))
-        if len(states) > 1:
-            return ()
-        return self._ahead(scene, aim if aim in states else min(states))
+    def _after(self, target: Target, edge: Transition) -> tuple[Target, ...] | None:
+        """Return the motions that follow the first one to acceptance; none if what is seen does not say."""
+        scene = self._first.after(target.name, target.pose)
+        states = self._expected.states_after(scene, edge.source)
+        return () if len(states) > 1 else self._ahead(scene, *states)
 
     # ------------------------------------------------------------------------------------ all together
 
     def _joint(
         self, scene: PredictedState, path: tuple[Transition, ...], consideration: Consideration
-    ) -> Iterator[tuple[tuple[Target, ...], tuple[PredictedState, int]]]:
+    ) -> Iterator[Ordered]:
         """Yield motions of several objects that lead along a path, or take its first edge."""
         if self._settings.motions < 2:
             return
@@ -768,7 +756,7 @@ class Lookahead:
                 found: Iterable[dict[str, Pose]] = islice(
                     about.arrangements(self._settings.motions), _MOST_ORDERED
                 )
-                if self._attempts.are_any:
+                if self._expected.attempts.are_any:
                     # a motion may fail by chance: places where one did come again, after all others
                     found = sorted(found, key=self._is_near_failure)
                 for poses in found:
@@ -798,7 +786,7 @@ class Lookahead:
         return any(
             (x - u) ** 2 + (y - v) ** 2 <= near**2
             for name, (x, y, _) in poses.items()
-            for u, v in self._attempts.places_of(name)
+            for u, v in self._expected.attempts.places_of(name)
         )
 
     def _ordered_from(
@@ -809,13 +797,14 @@ class Lookahead:
         about: Arranger,
         poses: Mapping[str, Pose],
         least: float,
-    ) -> Iterator[tuple[tuple[Target, ...], tuple[PredictedState, int]]]:
+    ) -> Iterator[Ordered]:
         """Yield the motions to an arrangement, in an order in which each is possible."""
         poses = self._without_staying(scene, about, poses)
         robustness = self._expected.robustness(with_moved(scene.sample, poses), aims[0].guard)
-        order = MotionOrder(self._expected, scene, aims, consideration, poses, robustness, least)
+        never = consideration.constraints.cubes
+        order = MotionOrder(self._expected, scene, aims, never, poses, robustness, least)
         if (found := order.found()) is not None:
-            yield found.motions, (found.scene, found.state)
+            yield found
         elif scene is self._first and len(poses) > 1 and not self._unordered:
             self._unordered = " and ".join(sorted(poses))
 
@@ -837,14 +826,12 @@ class Lookahead:
         consideration: Consideration,
         motions: tuple[Target, ...],
         rest: tuple[Target, ...],
-        movables: Movables,
     ) -> Consideration:
         """Return an edge with the first of several motions as its chosen candidate."""
-        first = motions[0]
+        first, sample = motions[0], self._first.sample
         # what is parked first goes to its own place later
-        poses = {each.name: (each.x, each.y, each.turn) for each in motions[1:] if each.name != first.name}
-        sample = movables.sample
-        settings, now = self._settings, movables.maps_of(first.name)
+        poses = {each.name: each.pose for each in motions[1:] if each.name != first.name}
+        settings, now = self._settings, self.movables.maps_of(first.name)
         then = proposition_maps(
             self._formulas,
             self._regions,
@@ -855,10 +842,10 @@ class Lookahead:
         )
         cubes = consideration.progress.cubes, consideration.constraints.cubes
         gradient = gradient_map(now, *cubes, settings.workspace, settings.constraint_margin, then)
-        there = with_moved(sample, {**poses, first.name: (first.x, first.y, first.turn)})
+        there = with_moved(sample, {**poses, first.name: first.pose})
         target = replace(first, robustness=self._expected.robustness(there, consideration.progress.cubes))
         if all(each.name != first.name for each in motions[1:]):
-            target = self._refined(target, consideration, movables, poses, (*motions[1:], *rest))
+            target = self._refined(target, consideration, poses, (*motions[1:], *rest))
         candidate = Candidate(first.name, gradient, target, is_chosen=True)
         kept = (each for each in consideration.candidates if each.name != first.name)
         others = tuple(replace(each, is_chosen=False) for each in kept)
@@ -871,16 +858,16 @@ class Lookahead:
         self,
         target: Target,
         consideration: Consideration,
-        movables: Movables,
         poses: Mapping[str, Pose],
         rest: tuple[Target, ...],
     ) -> Target:
         """Return the first of several motions with a refined target, if the others lead on as before."""
         here, *way, there = target.waypoints
         way = way if self._settings.skill == "push" else []
-        found = movables.refined(replace(target, waypoints=(here, *way, there)), consideration, None, poses)
-        ways = movables.with_way(found, consideration.constraints.cubes)
-        if isinstance(ways, str) or movables.is_repeated(ways) or found.robustness <= target.robustness:
+        straight = replace(target, waypoints=(here, *way, there))
+        found = self.movables.refined(straight, consideration, None, poses)
+        ways = self.movables.with_way(found, consideration.constraints.cubes)
+        if isinstance(ways, str) or self.movables.is_repeated(ways) or found.robustness <= target.robustness:
             return target
         state = consideration.edge[0]
         before, after = (self._states_along((each, *rest), state) for each in (target, ways))
@@ -890,10 +877,9 @@ class Lookahead:
         """Return the states after each of some motions, from the newest sample on."""
         scene, states, visited = self._first, frozenset({state}), []
         for each in motions:
-            scene = scene.after(each) if scene is not None else None
-            if scene is not None:
-                states = self._automaton.step_set(states, self._expected.symbol(scene))
-                visited.append(states)
+            scene = scene.after(each.name, each.pose)
+            states = self._automaton.step_set(states, self._expected.symbol(scene))
+            visited.append(states)
         return visited
 
     # --------------------------------------------------------------------------------------- what is seen
@@ -916,7 +902,7 @@ class Lookahead:
     @cached_property
     def _hopeless_literals(self) -> tuple[tuple[int, bool], ...]:
         """The values of propositions that no arrangement of the objects can bring about."""
-        if self._first is None or not self._automaton.is_listable:
+        if not self._automaton.is_listable:
             return ()
         symbol = self._expected.symbol(self._first)
         literals = {
@@ -938,8 +924,6 @@ class Lookahead:
 
         Or else, which objects have places to which no order of motions was found; "" without either.
         """
-        if self._first is None:
-            return ""
         for literal in self._hopeless_literals:
             if next(self._automaton.paths(state, self._needing({literal})), None) is None:
                 return self._why_never(self._first.sample, literal)
@@ -988,10 +972,3 @@ class Lookahead:
 def _text_of(demand: Demand) -> str:
     text = format_formula(demand.formula)
     return text if demand.wanted else f"not ({text})"
-
-
-def _chosen(consideration: Consideration, number: int, motions: tuple[Target, ...]) -> Consideration:
-    marked = tuple(
-        replace(each, is_chosen=place == number) for place, each in enumerate(consideration.candidates)
-    )
-    return replace(consideration, candidates=marked, motions=motions)

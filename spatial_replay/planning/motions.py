@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
-from typing import Final, NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import Final, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -23,7 +23,6 @@ from spatial_replay.planning.edges import (
     Attempts,
     Budget,
     Demand,
-    IdleTransitions,
     Pose,
     Symbol,
     demands_of,
@@ -35,6 +34,7 @@ from spatial_replay.planning.edges import (
 from spatial_replay.planning.maps import (
     FREE,
     OCCUPIED,
+    Cube,
     Cubes,
     GradientMap,
     MapParts,
@@ -70,40 +70,31 @@ _LONGEST_NAME: Final = 60
 """The most characters of one of them."""
 
 
+@dataclass(eq=False)
 class Movables:
     """The movable objects of one sample.
 
     An object's propositions are measured over the grid once and used for every edge.
     """
 
-    def __init__(
-        self,
-        propositions: Sequence[Formula],
-        regions: Mapping[str, Outline],
-        sample: Sample,
-        settings: Settings,
-        attempts: Attempts,
-    ) -> None:
-        self._propositions, self._regions = propositions, regions
-        self._sample, self._settings, self._attempts = sample, settings, attempts
-        self._maps: dict[str, PropositionMaps] = {}
-
-    @property
-    def sample(self) -> Sample:
-        """The sample."""
-        return self._sample
+    propositions: Sequence[Formula]
+    regions: Mapping[str, Outline]
+    sample: Sample
+    settings: Settings
+    attempts: Attempts
+    _maps: dict[str, PropositionMaps] = field(default_factory=dict)
 
     @property
     def names(self) -> list[str]:
         """The movable objects, in the order of the settings."""
-        movable, present = self._settings.movable, self._sample.objects
+        movable, present = self.settings.movable, self.sample.objects
         return [name for name in (sorted(present) if movable is None else movable) if name in present]
 
     def names_for(self, progress: Guards) -> list[str]:
         """Return the movable objects that a progress set depends on, in the order of the settings."""
         about = {number for cube in progress.cubes for number, _ in cube}
         return [
-            name for name in self.names if any(concerns(self._propositions[number], name) for number in about)
+            name for name in self.names if any(concerns(self.propositions[number], name) for number in about)
         ]
 
     def candidate(
@@ -121,19 +112,16 @@ class Movables:
             refine: refine the target, if the settings want that.
 
         """
-        tracked = self._sample.objects[name]
-        settings, maps = self._settings, self.maps_of(name)
-        cubes = consideration.progress.cubes, consideration.constraints.cubes
-        gradient = gradient_map(maps, *cubes, settings.workspace, settings.constraint_margin)
-        keeps_all = settings.room_from == "all" or name in later or self._attempts.needs_room(name)
+        tracked, settings = self.sample.objects[name], self.settings
+        gradient = self.gradient(name, consideration.progress.cubes, consideration.constraints.cubes)
+        keeps_all = settings.room_from == "all" or name in later or self.attempts.needs_room(name)
         room_from = None if keeps_all else later
-        failed = self._attempts.places_of(name)
+        failed = self.attempts.places_of(name)
         # if it cannot be picked up, no other target helps
         target: Target | str = "it could not be picked up where it lies"
-        if not self._attempts.failed_pick(name, self._sample, settings):
-            target = find_target(
-                gradient, tracked, settings, maps.room(room_from), failed, self.failed_here(name)
-            )
+        if not self.attempts.failed_pick(name, self.sample, settings):
+            room = gradient.made_of.now.room(room_from)
+            target = find_target(gradient, tracked, settings, room, failed, self.failed_here(name))
         if isinstance(target, Target) and refine:
             target = self.refined(target, consideration, room_from)
         if isinstance(target, Target):
@@ -145,16 +133,16 @@ class Movables:
 
     def failed_here(self, name: str) -> tuple[Target, ...]:
         """Return the targets for which motions of an object failed while everything stood as it does."""
-        return self._attempts.failed_here(name, self._sample, self._settings)
+        return self.attempts.failed_here(name, self.sample, self.settings)
 
     def is_repeated(self, target: Target) -> bool:
         """Return whether a motion to a target would repeat one that failed while everything stood as now."""
         failures = self.failed_here(target.name)
-        if self._settings.skill == "place":
-            if self._attempts.failed_pick(target.name, self._sample, self._settings):
+        if self.settings.skill == "place":
+            if self.attempts.failed_pick(target.name, self.sample, self.settings):
                 return True
-            return is_repeated(target, failures, self._settings)
-        return begins_as(target, failures, self._sample.objects[target.name])
+            return is_repeated(target, failures, self.settings)
+        return begins_as(target, failures, self.sample.objects[target.name])
 
     def refined(
         self,
@@ -169,12 +157,12 @@ class Movables:
             room_from: the objects to keep room from; None for everything.
             then: where other objects are moved to later, for the robustness, and as obstacles.
         """
-        settings, name = self._settings, target.name
+        settings, name = self.settings, target.name
         if not settings.refine:
             return target
         failures = () if settings.skill == "push" else self.failed_here(name)
         measured = self._measures(name, consideration, room_from, then)
-        found = refined(target, self._sample.objects[name], settings, measured, failures)
+        found = refined(target, self.sample.objects[name], settings, measured, failures)
         is_kept = settings.skill == "place" or self._is_pushed_to(found, consideration.constraints.cubes)
         return found if is_kept else target
 
@@ -186,14 +174,14 @@ class Movables:
         then: Mapping[str, Pose] | None = None,
     ) -> Measured:
         """Return what measures maps of an object for an edge over any grid; see `refined`."""
-        settings = self._settings
+        settings = self.settings
         progress, constraints = consideration.progress.cubes, consideration.constraints.cubes
-        later = self._sample if then is None else with_moved(self._sample, then)
+        later = self.sample if then is None else with_moved(self.sample, then)
 
         def measured(grid: Grid, yaws: tuple[float, ...]) -> tuple[GradientMap, Floats]:
             workspace = replace(settings.workspace, yaws=yaws, keeps_yaw=False)
-            about = self._propositions, self._regions
-            now = proposition_maps(*about, self._sample, name, workspace, grid)
+            about = self.propositions, self.regions
+            now = proposition_maps(*about, self.sample, name, workspace, grid)
             after = now if then is None else proposition_maps(*about, later, name, workspace, grid)
             gradient = gradient_map(
                 now, progress, constraints, settings.workspace, settings.constraint_margin, after
@@ -205,17 +193,13 @@ class Movables:
 
     def _is_pushed_to(self, target: Target, constraints: Cubes) -> bool:
         """Return whether nothing is in the way on the last stretch of a path, and while turning there."""
-        settings, maps = self._settings, self.maps_of(target.name)
-        gradient = gradient_map(maps, ((),), constraints, settings.workspace, settings.constraint_margin)
-        last = (
-            gradient.grid.cell(*each)
-            for each in points_along(target.waypoints[-2:], gradient.grid.cell_size / 2)
-        )
+        gradient = self.gradient(target.name, ((),), constraints)
+        size = gradient.grid.cell_size
+        last = (gradient.grid.cell(*each) for each in points_along(target.waypoints[-2:], size / 2))
         if any(gradient.blocked[0][cell] != FREE for cell in last):
             return False
-        size = gradient.grid.cell_size
         spot = Grid(target.x - size / 2, target.y - size / 2, size, 1, 1)
-        return bool(can_turn_in(spot, gradient, target.turn, settings).all())
+        return bool(can_turn_in(spot, gradient, target.turn, self.settings).all())
 
     def with_way(self, target: Target, constraints: Cubes) -> Target | str:
         """Return the target of a carried object with a way that keeps the constraints, or why there is none.
@@ -223,13 +207,13 @@ class Movables:
         Where no constraint is about the object, its way does not matter. On the way, constraints stay away
         from holding by the margin and half a cell; where there is no such way, by the margin; else at all.
         """
-        settings, name = self._settings, target.name
+        settings, name = self.settings, target.name
         about = sorted({number for cube in constraints for number, _ in cube})
-        is_bound = any(concerns(self._propositions[number], name) for number in about)
+        is_bound = any(concerns(self.propositions[number], name) for number in about)
         if settings.skill == "push" or settings.lift is None or not is_bound:
             return target
         danger, grid, parts = self._danger_on_the_way(target, constraints, about)
-        away = np.hypot(*(grid.centres() - np.array(settings.workspace.base)).T).reshape(grid.shape)
+        away = distance_to([settings.workspace.base], grid)
         reached = (away >= settings.workspace.nearest) & (away <= settings.workspace.farthest)
         (here, there), goals = target.waypoints, np.zeros(grid.shape, np.bool_)
         goals[grid.cell(*there)] = True
@@ -260,32 +244,37 @@ class Movables:
 
         Also return the grid, and the maps that this was computed from, with the object turned last.
         """
-        settings, tracked = self._settings, self._sample.objects[target.name]
+        settings, tracked = self.settings, self.sample.objects[target.name]
         if tracked.height is not None and settings.lift:
             low, high = tracked.height
             tracked = replace(tracked, height=(low + settings.lift, high + settings.lift))
         here = centre_of(tracked.footprint)
         grid = settings.workspace.grid.reaching(*here)
         # nothing that is carried over stands in the way
-        free = Workspace(grid, supports=frozenset(self._sample.objects))
-        formulas = [self._propositions[number] for number in about]
+        free = Workspace(grid, supports=frozenset(self.sample.objects))
+        formulas = [self.propositions[number] for number in about]
         places = {number: place for place, number in enumerate(about)}
         cubes = tuple(tuple((places[n], wanted) for n, wanted in cube) for cube in constraints)
         moved = (moved_object(tracked, *here, turn) for turn in dict.fromkeys((0.0, target.turn)))
-        samples = (with_objects(self._sample, {target.name: each}) for each in moved)
-        maps = [proposition_maps(formulas, self._regions, each, target.name, free) for each in samples]
+        samples = (with_objects(self.sample, {target.name: each}) for each in moved)
+        maps = [proposition_maps(formulas, self.regions, each, target.name, free) for each in samples]
         danger = np.maximum.reduce([danger_of(each, cubes)[0] for each in maps])
         return danger, grid, MapParts(maps[-1], maps[-1], (), cubes)
+
+    def gradient(self, name: str, progress: Cubes, constraints: Cubes) -> GradientMap:
+        """Return the map of an object for a progress and a constraint set."""
+        workspace, margin = self.settings.workspace, self.settings.constraint_margin
+        return gradient_map(self.maps_of(name), progress, constraints, workspace, margin)
 
     def maps_of(self, name: str) -> PropositionMaps:
         """Return the maps of all propositions over the cells of an object."""
         if name not in self._maps:
-            workspace = self._settings.workspace
-            pushes = self._settings.skill == "push"
+            workspace = self.settings.workspace
+            pushes = self.settings.skill == "push"
             # a pushed object crosses all cells from where it lies, which may be outside the workspace
-            here = centre_of(self._sample.objects[name].footprint)
+            here = centre_of(self.sample.objects[name].footprint)
             grid = workspace.grid.reaching(*here) if pushes else workspace.grid
-            about = self._propositions, self._regions, self._sample, name
+            about = self.propositions, self.regions, self.sample, name
             self._maps[name] = proposition_maps(*about, workspace, grid)
         return self._maps[name]
 
@@ -307,25 +296,34 @@ def with_choice(
         causes = "; ".join(f"{each.name}: {each.rejected}" for each in candidates)
         kind = "no object can do it" if causes else "no object that can be moved matters to it"
         return replace(consideration, candidates=tuple(candidates), pruned=Reason(kind, causes))
-    chosen = order[0]
-    marked = (replace(each, is_chosen=number == chosen) for number, each in enumerate(candidates))
-    return replace(consideration, candidates=tuple(marked))
+    return with_chosen(replace(consideration, candidates=tuple(candidates)), next(iter(order)))
 
 
-def by_cost(candidates: Sequence[Candidate], settings: Settings) -> list[int]:
-    """Return the candidates that have a target, by number, the best first."""
-    costs = {
-        number: each.target.length if settings.skill == "push" else -each.target.robustness
-        for number, each in enumerate(candidates)
-        if each.target is not None
-    }
-    return sorted(costs, key=costs.__getitem__)
+def with_chosen(
+    consideration: Consideration, number: int | None, motions: tuple[Target, ...] = ()
+) -> Consideration:
+    """Return an edge with one of its candidates or none chosen, and the motions planned with that."""
+    marked = tuple(
+        replace(each, is_chosen=place == number) for place, each in enumerate(consideration.candidates)
+    )
+    return replace(consideration, candidates=marked, motions=motions)
+
+
+def by_cost(candidates: Sequence[Candidate], settings: Settings) -> dict[int, Target]:
+    """Return the targets of those candidates that have one, by number, the best first."""
+    pushes = settings.skill == "push"
+    found = [(number, each.target) for number, each in enumerate(candidates) if each.target is not None]
+    return dict(sorted(found, key=lambda each: each[1].length if pushes else -each[1].robustness))
 
 
 # ----------------------------------------------------------------------------------------------- expectations
 
 _LOOK: Final = 0.25
 """Cost of looking at one sample, in maps."""
+
+
+Moved: TypeAlias = tuple[tuple[str, Pose], ...]
+"""Poses of objects that were moved, by name and in order."""
 
 
 class PredictedState(NamedTuple):
@@ -336,17 +334,17 @@ class PredictedState(NamedTuple):
     """
 
     sample: Sample
-    moved: tuple[tuple[str, Pose], ...] = ()
+    moved: Moved = ()
 
-    def after(self, target: Target) -> PredictedState:
-        """Return the scene after a motion."""
-        pose = target.x, target.y, target.turn
-        moved = dict(self.moved)
-        *_, turned = moved.get(target.name, (0.0, 0.0, 0.0))
-        moved[target.name] = target.x, target.y, turned + target.turn
-        return PredictedState(with_moved(self.sample, {target.name: pose}), tuple(sorted(moved.items())))
+    def after(self, name: str, pose: Pose) -> PredictedState:
+        """Return the scene after a motion of an object."""
+        (x, y, turn), moved = pose, dict(self.moved)
+        *_, turned = moved.get(name, (0.0, 0.0, 0.0))
+        moved[name] = x, y, turned + turn
+        return PredictedState(with_moved(self.sample, {name: pose}), tuple(sorted(moved.items())))
 
 
+@dataclass(eq=False)
 class Expectations:
     """The samples that one decision expects, each looked at once.
 
@@ -356,27 +354,14 @@ class Expectations:
         budget: the maps that may still be computed.
     """
 
-    def __init__(
-        self,
-        automaton: Automaton,
-        formulas: Sequence[Formula],
-        regions: Mapping[str, Outline],
-        settings: Settings,
-        attempts: Attempts,
-        budget: Budget,
-    ) -> None:
-        """Begin with no scene."""
-        self.automaton, self.formulas, self.regions = automaton, formulas, regions
-        self.settings, self.attempts, self.budget = settings, attempts, budget
-        self._movables: dict[tuple[tuple[str, Pose], ...], Movables] = {}
-        self._symbols: dict[tuple[tuple[str, Pose], ...], Symbol] = {}
-        self._relations: dict[Cubes, list[tuple[Demand, ...]]] = {}
-        self._about: dict[tuple[str, Cubes], tuple[list[Formula], Cubes]] = {}
-
-    def begin(self, movables: Movables) -> PredictedState:
-        """Return the scene of the newest sample, of which some maps are known."""
-        self._movables[()] = movables
-        return PredictedState(movables.sample)
+    automaton: Automaton
+    formulas: Sequence[Formula]
+    regions: Mapping[str, Outline]
+    settings: Settings
+    attempts: Attempts
+    budget: Budget
+    _movables: dict[Moved, Movables] = field(default_factory=dict)
+    _symbols: dict[Moved, Symbol] = field(default_factory=dict)
 
     def symbol(self, scene: PredictedState) -> Symbol:
         """Return the value of each proposition in a scene."""
@@ -405,10 +390,6 @@ class Expectations:
             self._movables[scene.moved] = Movables(*about)
         return self._movables[scene.moved]
 
-    def idle(self, scene: PredictedState, state: int) -> IdleTransitions:
-        """Return the transitions that time alone takes from a state while a scene stays as it is."""
-        return idle_transitions(self.automaton, state, self.symbol(scene))
-
     def states_after(self, scene: PredictedState, state: int) -> frozenset[int]:
         """Return the states that the automaton can be in after a sample like a scene."""
         return self.automaton.step_set({state}, self.symbol(scene))
@@ -420,17 +401,11 @@ class Expectations:
 
     def relations(self, constraints: Cubes) -> list[tuple[Demand, ...]]:
         """Return relations of which no conjunction must hold."""
-        if constraints not in self._relations:
-            each_cube = (demands_of(cube, self.formulas, 0.0) for cube in constraints)
-            self._relations[constraints] = [each for demands in each_cube for each in demands]
-        return self._relations[constraints]
+        return [each for cube in constraints for each in demands_of(cube, self.formulas, 0.0)]
 
     def relations_about(self, name: str, constraints: Cubes) -> tuple[list[Formula], Cubes]:
         """Return relations, and the conjunctions of them about an object of which none must hold."""
-        if (name, constraints) not in self._about:
-            about = [each for each in self.relations(constraints) if _concerned(each, [name])]
-            self._about[name, constraints] = _cubes_of(about)
-        return self._about[name, constraints]
+        return _cubes_of([each for each in self.relations(constraints) if _concerned(each, [name])])
 
     def traps(self, state: int) -> Cubes:
         """Return the guards of the transitions by which acceptance is lost."""
@@ -463,44 +438,41 @@ class Ordered(NamedTuple):
     state: int
 
 
+@dataclass(eq=False)
 class MotionOrder:
-    """The search for an order of the motions that bring objects to their places."""
+    """The search for an order of the motions that bring objects to their places.
 
-    def __init__(
-        self,
-        expected: Expectations,
-        scene: PredictedState,
-        aims: Sequence[Transition],
-        consideration: Consideration,
-        places: Mapping[str, Pose],
-        robustness: float,
-        least: float,
-    ) -> None:
-        """Begin in a scene.
+    Attributes:
+        begin: the scene before them.
+        aims: the transitions that the motions are to take: a whole path to acceptance, or one edge.
+        constraints: what must not hold on the way to the first of them.
+        places: where each object is to go.
+        robustness: of the progress set with all objects there.
+        least: how many maps the search leaves to the decision.
+    """
 
-        Args:
-            aims: the transitions that the motions are to take: a whole path to acceptance, or one edge.
-            consideration: the first of them, with what must not hold on the way.
-            places: where each object is to go.
-            robustness: of the progress set with all objects there.
-            least: how many maps the search leaves to the decision.
-        """
-        self._expected, self._begin, self._aims = expected, scene, aims
-        self._constraints, self._places = consideration.constraints.cubes, places
-        self._robustness = robustness
-        self._dead: set[tuple[frozenset[str], tuple[tuple[str, Pose], ...]]] = set()
-        self._idle = set(expected.idle(scene, aims[0].source).states)
-        self._targets: dict[tuple[tuple[tuple[str, Pose], ...], int, str], Target | None] = {}
-        self._most_parked = _MOST_PARKED
-        self._has_parked = False
-        self._least = least
+    expected: Expectations
+    begin: PredictedState
+    aims: Sequence[Transition]
+    constraints: Cubes
+    places: Mapping[str, Pose]
+    robustness: float
+    least: float
+    _dead: set[tuple[frozenset[str], Moved]] = field(default_factory=set)
+    _targets: dict[tuple[Moved, int, str], Target | None] = field(default_factory=dict)
+    _most_parked: int = _MOST_PARKED
+    _has_parked: bool = False
+
+    def __post_init__(self) -> None:
+        symbol = self.expected.symbol(self.begin)
+        self._idle = idle_transitions(self.expected.automaton, self.aims[0].source, symbol).states
 
     def found(self) -> Ordered | None:
         """Return the first order found, with as few objects brought aside as possible; None without one."""
         for self._most_parked in range(_MOST_PARKED + 1):
             self._dead.clear()
             self._has_parked = self._most_parked == 0
-            found = self._motions(self._begin, self._aims[0].source, frozenset(self._places))
+            found = self._motions(self.begin, self.aims[0].source, frozenset(self.places))
             if found is not None or not self._has_parked:
                 return found
         return None
@@ -513,12 +485,13 @@ class MotionOrder:
             return Ordered((), scene, state) if self._is_done(state) else None
         if (left, scene.moved) in self._dead or not self._spend(0):
             return None
-        is_first = len(left) == len(self._places)
+        is_first = len(left) == len(self.places)
         for name in sorted(left):
             key = scene.moved, state, name
             if key not in self._targets:
                 # where the automaton goes is known sooner than how the object gets there
-                leads_on = self._reached(self._with(scene, name), state, is_first) >= 0
+                there = scene.after(name, self._place_of(scene, name))
+                leads_on = self._reached(there, state, is_first) >= 0
                 self._targets[key] = self._target(scene, state, name, is_first) if leads_on else None
             target = self._targets[key]
             still = tuple(each for each in parked if each != name)
@@ -526,10 +499,9 @@ class MotionOrder:
                 return found
         if len(parked) < self._most_parked:
             # what stands elsewhere does not keep an object from taking another edge
-            able = (
-                each for each in left if self._reached(self._with(scene, each), state, is_first) != _ASTRAY
-            )
-            for name in sorted(able):
+            places = {each: scene.after(each, self._place_of(scene, each)) for each in sorted(left)}
+            able = [each for each in places if self._reached(places[each], state, is_first) != _ASTRAY]
+            for name in able:
                 for other, target in self._aside(scene, state, name, left, parked, is_first):
                     more, self._has_parked = (*parked, other), True
                     if other not in parked and (
@@ -551,25 +523,25 @@ class MotionOrder:
         """Return a motion and those of the objects left after it; None if either is not possible."""
         if target is None:
             return None
-        after = scene.after(target)
+        after = scene.after(target.name, target.pose)
         if (reached := self._reached(after, state, is_first)) < 0:
             return None
         rest = self._motions(after, reached, left, parked)
         return None if rest is None else Ordered((target, *rest.motions), rest.scene, rest.state)
 
     def _is_done(self, state: int) -> bool:
-        automaton = self._expected.automaton
-        if len(self._aims) > 1:
+        automaton = self.expected.automaton
+        if len(self.aims) > 1:
             return state in automaton.accepting
-        return state == self._aims[0].target or (state in automaton.can_accept and state not in self._idle)
+        return state == self.aims[0].target or (state in automaton.can_accept and state not in self._idle)
 
     def _reached(self, scene: PredictedState, state: int, is_first: bool) -> int:
         """Return the state after a motion; `_LOST` or `_ASTRAY` if that is not one on the way."""
-        aim, is_strict = self._aims[0].target, is_first or len(self._aims) == 1
-        for _ in range(len(self._aims)):
-            states = self._expected.states_after(scene, state)
+        aim, is_strict = self.aims[0].target, is_first or len(self.aims) == 1
+        for _ in range(len(self.aims)):
+            states = self.expected.states_after(scene, state)
             (after,) = states if len(states) == 1 else (_LOST,)
-            if after not in self._expected.automaton.can_accept:
+            if after not in self.expected.automaton.can_accept:
                 return _LOST
             if is_strict and after != aim and after not in self._idle:
                 return _ASTRAY
@@ -580,76 +552,62 @@ class MotionOrder:
             is_strict = is_strict and state != aim
         return state
 
-    def _with(self, scene: PredictedState, name: str) -> PredictedState:
-        """Return a scene with an object at its place."""
-        x, y, turn = self._place_of(scene, name)
-        return scene.after(Target(name, x, y, turn, None, (), 0.0))
-
     def _stays_done(self, scene: PredictedState, left: frozenset[str], parked: str) -> bool:
         """Return whether the aims hold in the end if an object without a place of its own stays aside."""
-        if parked in self._places:
+        if parked in self.places:
             return True
         there = with_moved(scene.sample, {name: self._place_of(scene, name) for name in left})
-        return all(self._expected.robustness(there, each.guard) >= 0.0 for each in self._aims)
+        return all(self.expected.robustness(there, each.guard) >= 0.0 for each in self.aims)
 
     def _place_of(self, scene: PredictedState, name: str) -> Pose:
         """Return where an object is to go, with the turn from how it is oriented in a scene."""
-        (x, y, turn), still = self._places[name], (0.0, 0.0, 0.0)
-        turned = dict(scene.moved).get(name, still)[2] - dict(self._begin.moved).get(name, still)[2]
+        (x, y, turn), still = self.places[name], (0.0, 0.0, 0.0)
+        turned = dict(scene.moved).get(name, still)[2] - dict(self.begin.moved).get(name, still)[2]
         return x, y, turn - turned
 
     def _constraints_at(self, state: int, is_first: bool) -> Cubes:
         """Return what must not hold on the way of the next motion."""
-        is_strict = is_first or len(self._aims) == 1
-        return self._constraints if is_strict else self._expected.traps(state)
+        is_strict = is_first or len(self.aims) == 1
+        return self.constraints if is_strict else self.expected.traps(state)
 
     def _spend(self, maps: int) -> bool:
         """Count maps; return whether there are any left for this search."""
-        self._expected.budget.spend(maps)
-        return self._expected.budget.left >= self._least
+        self.expected.budget.spend(maps)
+        return self.expected.budget.left >= self.least
 
     def _target(self, scene: PredictedState, state: int, name: str, is_first: bool) -> Target | None:
         """Return the motion of an object to its place; None if it is not possible now."""
-        settings, constraints = self._expected.settings, self._constraints_at(state, is_first)
+        settings, constraints = self.expected.settings, self._constraints_at(state, is_first)
         tracked = scene.sample.objects[name]
         if settings.skill == "place":
             return self._placed(scene, name, tracked, constraints)
         if not self._spend(1):
             return None
-        movables = self._expected.movables(scene)
-        cubes = self._aims[0].guard, constraints
-        gradient = gradient_map(
-            movables.maps_of(name), *cubes, settings.workspace, settings.constraint_margin
-        )
-        found = target_in(
-            gradient, tracked, settings, self._place_of(scene, name), movables.failed_here(name)
-        )
-        if isinstance(found, Target):
-            found = movables.with_way(found, constraints)
+        movables, place = self.expected.movables(scene), self._place_of(scene, name)
+        gradient = movables.gradient(name, self.aims[0].guard, constraints)
+        found = target_in(gradient, tracked, settings, place, movables.failed_here(name))
         if isinstance(found, str) or movables.is_repeated(found):
             return None
-        return replace(found, robustness=self._robustness)
+        return replace(found, robustness=self.robustness)
 
     def _placed(
         self, scene: PredictedState, name: str, tracked: TrackedObject, constraints: Cubes
     ) -> Target | None:
         """Return the motion of an object that is carried, if there is room for it at its place."""
-        settings, (x, y, turn) = self._expected.settings, self._place_of(scene, name)
+        settings, (x, y, turn) = self.expected.settings, self._place_of(scene, name)
         there = with_moved(scene.sample, {name: (x, y, turn)})
         others = [each for each in there.objects if each != name and each not in settings.workspace.supports]
         if (
-            min(self._expected.clearances(there, name, others), default=math.inf)
+            min(self.expected.clearances(there, name, others), default=math.inf)
             <= settings.workspace.clearance
         ):
             return None
-        lower, upper = self._expected.values(there)
-        for cube in constraints:
-            danger = min((upper[n] if w else -lower[n] for n, w in cube), default=0.0)
-            if danger >= -settings.constraint_margin:
-                return None
+        lower, upper = self.expected.values(there)
+        if any(_danger(cube, lower, upper) >= -settings.constraint_margin for cube in constraints):
+            return None
         yaw = None if tracked.yaw is None else tracked.yaw + turn
-        target = Target(name, x, y, turn, yaw, (centre_of(tracked.footprint), (x, y)), self._robustness)
-        movables = self._expected.movables(scene)
+        target = Target(name, x, y, turn, yaw, (centre_of(tracked.footprint), (x, y)), self.robustness)
+        movables = self.expected.movables(scene)
         found = movables.with_way(target, constraints)
         return None if isinstance(found, str) or movables.is_repeated(found) else found
 
@@ -665,9 +623,9 @@ class MotionOrder:
         is_first: bool,
     ) -> Iterator[tuple[str, Target]]:
         """Yield motions that bring aside what is in the way of an object, or on its place."""
-        constraints, settings = self._constraints_at(state, is_first), self._expected.settings
-        names = [each for each in self._expected.movables(scene).names if each != name]
-        names = [each for each in names if each in left or each not in {*parked, *self._places}]
+        constraints, settings = self._constraints_at(state, is_first), self.expected.settings
+        names = [each for each in self.expected.movables(scene).names if each != name]
+        names = [each for each in names if each in left or each not in {*parked, *self.places}]
         if settings.skill == "push" and not self._spend(1):
             return
         way = self._way_past(scene, name, names, constraints)
@@ -675,12 +633,13 @@ class MotionOrder:
             return
         bound = self._bound_by(scene, {name: way}, constraints)
         beside = self._beside(scene, name, names)
-        clearances = self._expected.clearances(with_objects(scene.sample, {name: way}), name, names)
+        clearances = self.expected.clearances(with_objects(scene.sample, {name: way}), name, names)
         for other, clearance in zip(names, clearances, strict=True):
             in_way = other in beside or clearance <= settings.workspace.clearance
             if (in_way or other in bound) and self._spend(3):
                 for target in self._parked(scene, state, other, {name: way}, left, is_first, other in beside):
-                    after, movables = scene.after(target), self._expected.movables(scene)
+                    after = scene.after(target.name, target.pose)
+                    movables = self.expected.movables(scene)
                     # a constraint may hold wherever the other object stands
                     if not in_way and other in self._bound_by(after, {name: way}, constraints):
                         continue
@@ -694,16 +653,16 @@ class MotionOrder:
         self, scene: PredictedState, name: str, others: Sequence[str], constraints: Cubes
     ) -> TrackedObject | None:
         """Return all that an object covers on its way as if none of some others was in it."""
-        settings, tracked = self._expected.settings, scene.sample.objects[name]
+        settings, tracked = self.expected.settings, scene.sample.objects[name]
         place = self._place_of(scene, name)
         if settings.skill == "place":
             return moved_object(tracked, *place)
         workspace = settings.workspace
-        kept = [each for each in self._expected.relations(constraints) if not _concerned(each, others)]
+        kept = [each for each in self.expected.relations(constraints) if not _concerned(each, others)]
         formulas, constraints = _cubes_of(kept)
         free = replace(workspace, supports=workspace.supports.union(others))
-        about = formulas, self._expected.regions, scene.sample, name, free
-        maps = proposition_maps(*about, self._expected.movables(scene).maps_of(name).grid)
+        about = formulas, self.expected.regions, scene.sample, name, free
+        maps = proposition_maps(*about, self.expected.movables(scene).maps_of(name).grid)
         gradient = gradient_map(maps, ((),), constraints, workspace, settings.constraint_margin)
         target = target_in(gradient, tracked, settings, place)
         if isinstance(target, str):
@@ -723,34 +682,29 @@ class MotionOrder:
     ) -> set[str]:
         """Return the objects because of which a constraint would hold with another one where it is to go."""
         ((name, way),) = covered.items()
-        relations, cubes = self._expected.relations_about(name, constraints)
-        lower, upper = self._expected.values(with_objects(scene.sample, {name: way}), relations)
-        first = len(self._expected.formulas)
-        bound: set[str] = set()
-        for cube in cubes:
-            danger = min((upper[first + n] if w else -lower[first + n] for n, w in cube), default=0.0)
-            if danger >= -self._expected.settings.constraint_margin:
-                bound |= {
-                    each
-                    for each in scene.sample.objects
-                    if any(concerns(relations[n], each) for n, _ in cube)
-                }
-        return bound
+        relations, cubes = self.expected.relations_about(name, constraints)
+        lower, upper = self.expected.values(with_objects(scene.sample, {name: way}), relations)
+        own = lower[len(self.expected.formulas) :], upper[len(self.expected.formulas) :]
+        margin = self.expected.settings.constraint_margin
+        held = {number for cube in cubes if _danger(cube, *own) >= -margin for number, _ in cube}
+        return {
+            each for each in scene.sample.objects if any(concerns(relations[number], each) for number in held)
+        }
 
     def _beside(self, scene: PredictedState, name: str, others: Sequence[str]) -> set[str]:
         """Return the objects so near to one that could not be moved that they may be why."""
-        if not self._expected.movables(scene).failed_here(name):
+        if not self.expected.movables(scene).failed_here(name):
             return set()
         near = BESIDE * radius_of(scene.sample.objects[name])
-        clearances = zip(others, self._expected.clearances(scene.sample, name, others), strict=True)
+        clearances = zip(others, self.expected.clearances(scene.sample, name, others), strict=True)
         return {each for each, clearance in clearances if clearance <= near}
 
     def _is_kept(
         self, sample: Sample, name: str, grid: Grid, formulas: Sequence[Formula], constraints: Cubes
     ) -> tuple[Booleans, PropositionMaps]:
         """Return (A, rows, columns) where an object is clear and no constraint holds, and its maps."""
-        settings = self._expected.settings
-        maps = proposition_maps(formulas, self._expected.regions, sample, name, settings.workspace, grid)
+        settings = self.expected.settings
+        maps = proposition_maps(formulas, self.expected.regions, sample, name, settings.workspace, grid)
         is_kept = danger_of(maps, constraints) < -settings.constraint_margin
         return np.asarray(is_kept & (maps.clearance > settings.workspace.clearance)), maps
 
@@ -769,21 +723,20 @@ class MotionOrder:
         There, nothing that must not hold does, neither now nor with the others where they are to go.
         Neighbours of an object that could not be moved are moved away from it.
         """
-        settings, constraints = self._expected.settings, self._constraints_at(state, is_first)
+        settings, constraints = self.expected.settings, self._constraints_at(state, is_first)
         tracked = scene.sample.objects[name]
-        movables = self._expected.movables(scene)
-        now, workspace = movables.maps_of(name), settings.workspace
-        gradient = gradient_map(now, self._aims[0].guard, constraints, workspace, settings.constraint_margin)
+        movables = self.expected.movables(scene)
+        now, gradient = movables.maps_of(name), movables.gradient(name, self.aims[0].guard, constraints)
         places = {each: self._place_of(scene, each) for each in left if each != name}
         there = with_moved(scene.sample, places)
-        later = self._expected.relations_about(name, self._constraints_at(state, is_first=False))
+        later = self.expected.relations_about(name, self._constraints_at(state, is_first=False))
         clear, maps = self._is_kept(with_objects(there, covered), name, now.grid, *later)
         good = (gradient.blocked == FREE) & clear
         after = np.ones_like(good)
         if settings.skill == "push":
             after, _ = self._is_kept(there, name, now.grid, *later)
             onwards = _reachable_from(centre_of(tracked.footprint), now.grid, gradient.blocked == FREE)
-            if name in self._places:
+            if name in self.places:
                 # behind those that are at their places by then, it would stay away from its own
                 onwards &= _reachable_from(self._place_of(scene, name)[:2], now.grid, after)
             after &= onwards
@@ -832,6 +785,11 @@ def _cubes_of(ways: Sequence[tuple[Demand, ...]]) -> tuple[list[Formula], Cubes]
     """Return the relations of conjunctions, and these as cubes over them."""
     formulas = list(dict.fromkeys(each.formula for way in ways for each in way))
     return formulas, tuple(tuple((formulas.index(each.formula), each.wanted) for each in way) for way in ways)
+
+
+def _danger(cube: Cube, lower: Sequence[float], upper: Sequence[float]) -> float:
+    """Return the greatest robustness that a conjunction may have, by bounds of its members."""
+    return min((upper[number] if wanted else -lower[number] for number, wanted in cube), default=0.0)
 
 
 def _concerned(demands: Sequence[Demand], names: Iterable[str]) -> set[str]:

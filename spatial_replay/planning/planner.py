@@ -43,7 +43,7 @@ from spatial_replay.planning.edges import (
 )
 from spatial_replay.planning.lookahead import MOST_MAPS, Lookahead
 from spatial_replay.planning.maps import concerns, refuse_delays, refuse_unknown
-from spatial_replay.planning.motions import Movables, with_choice
+from spatial_replay.planning.motions import Expectations, Movables, with_choice
 from spatial_replay.planning.settings import Settings, Workspace, kind_faults, refuse_faults
 from spatial_replay.spec.formula import Specification, Temporal
 from spatial_replay.spec.walks import iter_formulas
@@ -306,7 +306,6 @@ class Planner:
         """Return the step for the first edge, over the paths by length, that can be taken."""
         idle = idle_transitions(self.automaton, state, self._symbol)
         budget = Budget(MOST_MAPS)
-        movables = self._movables(self._attempts)
         foresight = self._foresight(self._attempts, budget)
         considered: list[Consideration] = []
         undecided: dict[int, tuple[Consideration, tuple[Transition, ...], frozenset[Edge]]] = {}
@@ -320,10 +319,10 @@ class Planner:
                 considered.append(replace(aim, pruned=exhausted))
                 self._passed.discard(aim.edge)
             else:
-                aim = self._considered(aim, path, movables)
+                aim = self._considered(aim, path, foresight.movables)
                 before = pruned | given_up
                 undecided[len(considered)] = aim, path, before
-                considered.append(foresight.decide(aim, path, movables, before) if foresight else aim)
+                considered.append(foresight.decide(aim, path, before))
                 self._passed.add(aim.edge)
             if (reason := considered[-1].pruned) is None:
                 return self._running_step(considered)
@@ -331,13 +330,12 @@ class Planner:
             pruned |= {aim.edge, *equivalent_edges(self.automaton, aim, idle, pruned, self._symbol)}
         # what takes several motions, or one that failed before, comes after all that one motion takes
         for number, (alone, way, before) in undecided.items():
-            found = foresight.decide(alone, way, movables, before, together=True) if foresight else alone
+            found = foresight.decide(alone, way, before, together=True)
             if found.pruned and self._attempts.motions > 0:
                 # a motion may fail by chance: without any other, one that failed is made again
-                forgiven = self._attempts.forgiven()
-                again, ahead = self._movables(forgiven), self._foresight(forgiven, budget)
-                repeated = self._considered(alone, way, again)
-                repeated = ahead.decide(repeated, way, again, before, together=True) if ahead else repeated
+                again = self._foresight(self._attempts.forgiven(), budget)
+                repeated = self._considered(alone, way, again.movables)
+                repeated = again.decide(repeated, way, before, together=True)
                 found = found if repeated.pruned else repeated
             considered[number] = found
             if found.pruned is None:
@@ -348,19 +346,16 @@ class Planner:
             considered.append(consideration_of(self._words, path, pruned, self._symbol))
             return self._waiting_step(considered, idle.along(path))
         why = ""
-        if foresight is not None and not self._attempts.are_any:
-            first = considered[0].pruned if considered else None
+        if considered and self.settings.motions > 1 and not self._attempts.are_any:
+            first = considered[0].pruned
             is_later = any(each.kind == LATER for each in self._pruned.values())
             why = foresight.why_not(state) or ("" if first is None or is_later else first.detail)
         said = why_no_path(self.automaton, state, self._pruned, why)
         return self._decided("no path", considered, said)
 
-    def _movables(self, attempts: Attempts) -> Movables:
-        return Movables(self._formulas, self._regions, self._newest(), self.settings, attempts)
-
-    def _foresight(self, attempts: Attempts, budget: Budget) -> Lookahead | None:
+    def _foresight(self, attempts: Attempts, budget: Budget) -> Lookahead:
         about = self.automaton, self._formulas, self._regions, self.settings
-        return Lookahead(*about, attempts, budget) if self.settings.motions > 1 else None
+        return Lookahead(Expectations(*about, attempts, budget), self._newest())
 
     def _considered(
         self, consideration: Consideration, path: tuple[Transition, ...], movables: Movables
