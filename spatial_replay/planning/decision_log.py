@@ -51,14 +51,14 @@ from spatial_replay.planning.decisions import (
     Candidate,
     Consideration,
     Guards,
-    Kind,
     Outcome,
     Reason,
     Step,
     Target,
+    either,
     wait_outcome,
 )
-from spatial_replay.planning.maps import MOST_LAYERS, CauseKind, GradientMap, MapLayers, map_layers, room_cost
+from spatial_replay.planning.maps import MOST_LAYERS, GradientMap, MapLayers, map_layers, room_cost
 from spatial_replay.planning.planner import Planner
 from spatial_replay.planning.settings import Settings, text_from_settings
 from spatial_replay.text import counted, json_number, time_text
@@ -66,23 +66,17 @@ from spatial_replay.trace.sample import Sample
 
 # ------------------------------------------------------------------------------------------------------- maps
 
-_CELL: Final = np.dtype([("robustness", "<f4"), ("colour", "u1", (4,))])
-"""Fields of every cell of a map: robustness (NaN if blocked), red, green, blue and alpha."""
-
 _COLOURS: Final = ("red", "green", "blue", "alpha")
-_DEPTH: Final = 0.1
-"""Depth of a map below the plane, in cells, so that it does not hide the regions in the plane."""
-
-_CAUSES: MappingProxyType[CauseKind, PlanCause.Kind.ValueType] = MappingProxyType(
+_FIELD_TYPES: Final[Mapping[str, PackedElementField.NumericType.ValueType]] = MappingProxyType(
     {
-        "constraint": PlanCause.KIND_CONSTRAINT,
-        "object": PlanCause.KIND_OBJECT,
-        "obstacle": PlanCause.KIND_OBSTACLE,
-        "reach": PlanCause.KIND_REACH,
-        "unknown": PlanCause.KIND_UNKNOWN,
-        "failed": PlanCause.KIND_FAILED,
+        "<f4": PackedElementField.FLOAT32,
+        "<u2": PackedElementField.UINT16,
+        "|u1": PackedElementField.UINT8,
     }
 )
+"""Types of the fields of a cell, by those of numpy."""
+_DEPTH: Final = 0.1
+"""Depth of a map below the plane, in cells, so that it does not hide the regions in the plane."""
 
 
 class TurnedMap(NamedTuple):
@@ -117,15 +111,13 @@ def map_digest(gradient: GradientMap) -> bytes:
 
 
 def map_message(turned: TurnedMap, time_ns: int, layers: MapLayers) -> GridMessage:
-    """Return a map as a message, drawn under the scene; blocked cells are transparent."""
+    """Return a map as a message, drawn under the scene; blocked cells are NaN, and transparent."""
     gradient = turned.candidate.map
     grid, values = gradient.grid, gradient.values[turned.turn]
-    added = dict(_fields(turned, layers))
-    kinds = [(name, values.dtype.str) for name, values in added.items()]
-    cells = np.empty(values.shape, np.dtype([*_CELL.descr, *kinds]))
-    cells["robustness"] = values
-    cells["colour"] = cell_colours(values)
-    for name, own in added.items():
+    colours = dict(zip(_COLOURS, np.moveaxis(cell_colours(values), -1, 0), strict=True))
+    fields = {"robustness": values.astype("<f4"), **colours, **dict(_fields(turned, layers))}
+    cells = np.empty(values.shape, [(name, own.dtype.str) for name, own in fields.items()])
+    for name, own in fields.items():
         cells[name] = own
     size = cells.dtype.itemsize
     message = GridMessage(
@@ -140,13 +132,9 @@ def map_message(turned: TurnedMap, time_ns: int, layers: MapLayers) -> GridMessa
     message.pose.position.z = -_DEPTH * grid.cell_size
     message.pose.orientation.w = 1.0
     message.cell_size.x = message.cell_size.y = grid.cell_size
-    message.fields.add(name="robustness", offset=0, type=PackedElementField.FLOAT32)
-    for offset, name in enumerate(_COLOURS, 4):
-        message.fields.add(name=name, offset=offset, type=PackedElementField.UINT8)
-    offset = _CELL.itemsize
-    for name, own in added.items():
-        kind = PackedElementField.FLOAT32 if own.dtype.kind == "f" else PackedElementField.UINT16
-        message.fields.add(name=name, offset=offset, type=kind)
+    offset = 0
+    for name, own in fields.items():
+        message.fields.add(name=name, offset=offset, type=_FIELD_TYPES[own.dtype.str])
         offset += own.dtype.itemsize
     return message
 
@@ -177,13 +165,8 @@ def map_fields(message: GridMessage) -> dict[str, np.ndarray]:
     rows = len(message.data) // row if row else 0
     if not rows or not columns or cell * columns > row:
         return {}
-    types = {
-        # a field without a type is a number
-        PackedElementField.UNKNOWN: "<f4",
-        PackedElementField.FLOAT32: "<f4",
-        PackedElementField.UINT16: "<u2",
-        PackedElementField.UINT8: "u1",
-    }
+    # a field without a type is a number
+    types = {PackedElementField.UNKNOWN: "<f4"} | {kind: name for name, kind in _FIELD_TYPES.items()}
     return {
         field.name: np.ndarray((rows, columns), types[field.type], message.data, field.offset, (row, cell))
         for field in message.fields
@@ -201,7 +184,8 @@ def explain(message: PlanCandidate, candidate: Candidate, layers: MapLayers, set
         at_target = None if place is None else float(layers.robustness[number][place])
         message.conjuncts.append(PlanConjunct(text=text, limits=counts[number], at_target=at_target))
     for cause in layers.causes:
-        message.causes.append(PlanCause(kind=_CAUSES[cause.kind], text=cause.name, cells=cause.cells))
+        kind = PlanCause.Kind.Value(f"KIND_{cause.kind.upper()}")
+        message.causes.append(PlanCause(kind=kind, text=cause.name, cells=cause.cells))
     if target is not None and (cost := room_cost(candidate, target, settings)) is not None:
         room = PlanRoom(wanted=settings.room, possible=cost.robustness, clearance=cost.room)
         message.room.CopyFrom(room)
@@ -223,15 +207,6 @@ _MAPS: Final = protobuf_channel(GRADIENT_MAP, GridMessage)
 _PATHS: Final = protobuf_channel(PLAN_PATH, SceneUpdate)
 _TIMINGS: Final = protobuf_channel(EVENT_LOG, Log)
 _CHANNELS: Final = (_DECISIONS, _MAPS, _PATHS, _TIMINGS)
-
-_KINDS: MappingProxyType[Kind, PlanDecision.Kind.ValueType] = MappingProxyType(
-    {
-        "execute": PlanDecision.KIND_EXECUTE,
-        "hold": PlanDecision.KIND_HOLD,
-        "wait": PlanDecision.KIND_WAIT,
-        "no path": PlanDecision.KIND_NO_PATH,
-    }
-)
 
 _PATH, _TRAVELLED = "plan/way", "plan/travelled"
 _PIXELS = 3.0
@@ -426,7 +401,7 @@ def decision_message(step: Step, specification: str = "", first_map: int = 0) ->
         time_ns=step.time_ns,
         number=step.number,
         specification=specification,
-        kind=_KINDS[step.kind],
+        kind=PlanDecision.Kind.Value(f"KIND_{step.kind.upper().replace(' ', '_')}"),
         states=step.states,
         considered=[_edge(each, numbers) for each in step.considered],
         target=None if step.target is None else _target(step.target),
@@ -629,16 +604,12 @@ def _place_text(target: PlanTarget) -> str:
     return f"{target.object} to ({target.x:.4g}, {target.y:.4g})"
 
 
-def _either(texts: Sequence[str]) -> str:
-    return " or ".join(f"({text})" for text in texts) if len(texts) > 1 else "".join(texts)
-
-
 def _some(texts: Sequence[str]) -> str:
     """Return alternatives, or the first of them and the number of the others."""
     ends = list(accumulate(map(len, texts)))
     count = max(1, sum(end <= _LONGEST for end in ends))
     more = f" or {len(texts) - count} more" if count < len(texts) else ""
-    return (f"({texts[0]})" if more and count == 1 else _either(texts[:count])) + more
+    return (f"({texts[0]})" if more and count == 1 else either(texts[:count])) + more
 
 
 def candidate_lines(candidate: PlanCandidate) -> Iterator[tuple[str, str]]:
@@ -660,16 +631,12 @@ def candidate_lines(candidate: PlanCandidate) -> Iterator[tuple[str, str]]:
 
 def cause_text(cause: PlanCause) -> str:
     """Return what keeps an object out of cells."""
-    match cause.kind:
-        case cause.KIND_CONSTRAINT | cause.KIND_OBJECT:
-            return cause.text
-        case cause.KIND_OBSTACLE:
-            return "an obstacle of the workspace"
-        case cause.KIND_REACH:
-            return "the robot's reach"
-        case cause.KIND_FAILED:
-            return "a motion that failed there"
-    return "something unknown"
+    texts = {
+        cause.KIND_OBSTACLE: "an obstacle of the workspace",
+        cause.KIND_REACH: "the robot's reach",
+        cause.KIND_FAILED: "a motion that failed there",
+    }
+    return cause.text or texts.get(cause.kind, "something unknown")
 
 
 def decision_rows(decisions: Sequence[PlanDecision]) -> list[dict[str, Any]]:

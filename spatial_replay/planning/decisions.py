@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import TYPE_CHECKING, Literal, Protocol, TypeAlias, get_args
@@ -61,7 +62,12 @@ class Guards:
     texts: tuple[str, ...]
 
     def __str__(self) -> str:
-        return " or ".join(f"({text})" for text in self.texts) if len(self.texts) > 1 else "".join(self.texts)
+        return either(self.texts)
+
+
+def either(texts: Sequence[str]) -> str:
+    """Return alternatives as one text."""
+    return " or ".join(f"({text})" for text in texts) if len(texts) > 1 else "".join(texts)
 
 
 @dataclass(frozen=True, slots=True)

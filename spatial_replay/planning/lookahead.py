@@ -43,7 +43,7 @@ from spatial_replay.planning.edges import (
     with_moved,
     with_objects,
 )
-from spatial_replay.planning.maps import AVOIDED_CELLS, concerns, gradient_map, proposition_maps
+from spatial_replay.planning.maps import AVOIDED_CELLS, concerns, distance_to, gradient_map, proposition_maps
 from spatial_replay.planning.motions import (
     Expectations,
     MotionOrder,
@@ -454,8 +454,7 @@ class Arranger:
             return score - np.where(is_last, behind, 0.0)
         if settings.skill == "place":
             return np.asarray(np.minimum(room, 1e9))
-        here = np.array(centre_of(self._movable[name].footprint))
-        away = np.hypot(*(self._grid.centres() - here).T).reshape(self._grid.shape)
+        away = distance_to([centre_of(self._movable[name].footprint)], self._grid)
         return np.asarray(np.broadcast_to(-away, field.clearance.shape))
 
     # ------------------------------------------------------------------------------------------ poses
@@ -784,9 +783,9 @@ class Lookahead:
         """Return whether an arrangement brings an object near a place where that failed."""
         near = AVOIDED_CELLS * self._settings.workspace.grid.cell_size
         return any(
-            (x - u) ** 2 + (y - v) ** 2 <= near**2
-            for name, (x, y, _) in poses.items()
-            for u, v in self._expected.attempts.places_of(name)
+            math.dist(pose[:2], place) <= near
+            for name, pose in poses.items()
+            for place in self._expected.attempts.places_of(name)
         )
 
     def _ordered_from(

@@ -78,24 +78,14 @@ def reachable(free: Booleans, cell: tuple[int, int]) -> Booleans:
     found[cell] = True
     while True:
         count = np.count_nonzero(found)
-        for axis in (0, 1):
-            for step in (1, -1):
-                order = (
-                    (slice(None, None, step), slice(None))
-                    if axis == 0
-                    else (slice(None), slice(None, None, step))
-                )
-                found[order] |= _onwards(free[order], found[order], axis)
+        for turns in range(4):
+            # free cells that follow one that is found, with no other cell between
+            open_cells, view = np.rot90(free, turns), np.rot90(found, turns)
+            place = np.arange(len(view))[:, None]
+            last_found = np.maximum.accumulate(np.where(view, place, -1))
+            view |= last_found > np.maximum.accumulate(np.where(open_cells, -1, place))
         if np.count_nonzero(found) == count:
             return found
-
-
-def _onwards(free: Booleans, found: Booleans, axis: int) -> Booleans:
-    """Return the free cells that follow one that is found, with no other cell between."""
-    place = np.arange(free.shape[axis]).reshape((-1, 1) if axis == 0 else (1, -1))
-    last_found = np.maximum.accumulate(np.where(found, place, -1), axis=axis)
-    last_blocked = np.maximum.accumulate(np.where(free, -1, place), axis=axis)
-    return np.asarray(last_found > last_blocked)
 
 
 def _bordered(cells: Booleans) -> NDArray[np.int8]:

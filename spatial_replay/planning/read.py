@@ -353,20 +353,23 @@ def recompute_decisions(source: Source, advance: Callable[[int], None] = lambda 
     extent, comparison = _run_extent(source), _Comparison(rerun_of(source))
     faults: list[str] = []
     samples = 0
-
-    for sample, messages in iter_moments(_iter_blocks(source, faults, advance)):
+    for sample, recorded in iter_moments(_iter_blocks(source, faults, advance)):
         if sample is not None:
             comparison.rerun.box.observe(sample)
             samples += 1
-        comparison.compare(messages)
+        # they all have the sample's time, unless the log has lost samples
+        for time_ns, messages in groupby(recorded, key=lambda each: each.time_ns):
+            comparison.compare(time_ns, list(messages))
     # a log of which parts are missing has other differences than that it is incomplete
-    if not faults and extent.is_part(samples) and (extent.is_cut or comparison.began_within):
+    is_part = extent.is_copy if extent.samples is None else samples < extent.samples
+    if not faults and is_part and (extent.is_cut or comparison.began_within):
         raise UsageError(
             f"{source.name} begins within the run, and decisions depend on all samples before; verify the "
             "log that it was made from, or name that one: --source SOURCE"
         )
-    if not faults and extent.is_whole(samples):
-        comparison.compare_end()
+    is_whole = samples == extent.samples and not extent.was_interrupted
+    if not faults and not comparison.differences and is_whole:
+        comparison.differences += _missing(comparison.rerun)
     return Recomputed(comparison.decisions, comparison.maps, tuple(comparison.differences), tuple(faults))
 
 
@@ -393,13 +396,8 @@ class _Comparison:
         self.decisions = self.maps = 0
         self.differences: list[str] = []
 
-    def compare(self, recorded: list[PlannerMessage]) -> None:
-        """Compare the messages that follow the newest sample."""
-        # they all have its time, unless the log has lost samples
-        for time_ns, messages in groupby(recorded, key=lambda each: each.time_ns):
-            self._compare_at(time_ns, list(messages))
-
-    def _compare_at(self, time_ns: int, recorded: list[PlannerMessage]) -> None:
+    def compare(self, time_ns: int, recorded: list[PlannerMessage]) -> None:
+        """Compare the messages of one time, after the newest sample was observed."""
         # a planner that took another decision is in another state, so all later messages would differ
         if self.differences:
             return
@@ -426,28 +424,21 @@ class _Comparison:
             self.maps += len(maps_of(self.rerun.last))
         return iter(()) if messages is None else planner_messages(messages)
 
-    def compare_end(self) -> None:
-        """Add what a log lacks that goes on to the end of its run."""
-        if not self.differences and (missing := self._missing()):
-            self.differences.append(missing)
 
-    def _missing(self) -> str:
-        last = self.rerun.last
-        if last is None:
-            return "the log has no decision, and a planned run has at least one"
-        which = f"decision {last.number} at {_seconds(last.time_ns)}"
-        if self.rerun.is_moving:
-            return f"the log has no outcome of {which}"
-        if not _can_end_run(last, self.rerun.box.planner):
-            return f"the log has no decision after {which}, which did not end the run"
-        return ""
-
-
-def _can_end_run(step: Step, planner: Planner) -> bool:
-    """Return whether a decision can be the last one of a complete run."""
-    if step.kind == "hold":
-        return planner.is_accepting or planner.is_doubtful
-    return step.kind == "no path" or (step.kind == "wait" and planner.next_step() is step)
+def _missing(rerun: Rerun) -> Iterator[str]:
+    """Yield what a log lacks that goes on to the end of its run."""
+    last, planner = rerun.last, rerun.box.planner
+    if last is None:
+        yield "the log has no decision, and a planned run has at least one"
+        return
+    which = f"decision {last.number} at {_seconds(last.time_ns)}"
+    if rerun.is_moving:
+        yield f"the log has no outcome of {which}"
+        return
+    is_satisfied = last.kind == "hold" and (planner.is_accepting or planner.is_doubtful)
+    waits = last.kind == "wait" and planner.next_step() is last
+    if not (is_satisfied or waits or last.kind == "no path"):
+        yield f"the log has no decision after {which}, which did not end the run"
 
 
 def _differences(topic: str, recorded: list[bytes], recomputed: list[bytes]) -> Iterator[str]:
@@ -483,14 +474,6 @@ class _RunExtent(NamedTuple):
     was_interrupted: bool
     is_copy: bool
     is_cut: bool
-
-    def is_whole(self, samples: int) -> bool:
-        """Return whether a log of so many samples goes on to the regular end of the run."""
-        return samples == self.samples and not self.was_interrupted
-
-    def is_part(self, samples: int) -> bool:
-        """Return whether a log of so many samples may lack some of the run."""
-        return self.is_copy if self.samples is None else samples < self.samples
 
 
 def _run_extent(source: Source) -> _RunExtent:
@@ -617,7 +600,10 @@ def _maps_side_by_side(redone: Replanned, column: int) -> Iterator[str]:
     if redone.recorded is None or redone.redone is None:
         return
     messages = redone.recorded.message, redone.redone.message
-    sides = [{each.object: each for each in _last_candidates(message)} for message in messages]
+    sides = [
+        {each.object: each for edge in message.considered[-1:] for each in edge.candidates}
+        for message in messages
+    ]
     for name in dict.fromkeys((*sides[0], *sides[1])):
         yield f"{f'map of {name}':<13}{'recorded':<{column}}redone"
         rows = [_map_rows(side.get(name)) for side in sides]
@@ -630,10 +616,6 @@ def _maps_side_by_side(redone: Replanned, column: int) -> Iterator[str]:
 
 def _cut(text: str, column: int) -> str:
     return text if len(text) < column else f"{text[: column - 2]}…"
-
-
-def _last_candidates(message: PlanDecision) -> list[PlanCandidate]:
-    return list(message.considered[-1].candidates) if message.considered else []
 
 
 def _map_rows(candidate: PlanCandidate | None) -> dict[str, list[str]]:
@@ -689,10 +671,17 @@ def redo_decisions(
     changed = (*_specification_changes(old, planner), *changes_text(old.settings, settings))
     faults: list[str] = []
 
-    redoing = _Redoing(source, planner, changed)
+    redoing = _Redoing(source, planner, bool(changed))
     for sample, messages in iter_moments(_iter_blocks(source, faults, advance)):
         redoing.take(sample, messages)
-    return redoing.redone(tuple(faults))
+    if redoing.redone is not None and not changed and not faults:
+        raise LogError(
+            f"the decisions in {source.name} do not follow from its samples; "
+            "`spatial-replay verify --decisions` shows what differs"
+        )
+    counts = redoing.decisions, redoing.same, redoing.alike
+    both = redoing.recorded, redoing.redone
+    return Replanned(source.name, changed, *counts, *both, merge(redoing.messages), tuple(faults))
 
 
 def _specification_changes(old: Planner, new: Planner) -> Iterator[str]:
@@ -707,28 +696,28 @@ def _specification_changes(old: Planner, new: Planner) -> Iterator[str]:
 
 
 class _Redoing:
-    """A run whose decisions are repeated as recorded, and redone beside."""
+    """A run whose decisions are repeated as recorded, and redone beside; attributes as of `Replanned`."""
 
-    def __init__(self, source: Source, planner: Planner, changes: tuple[str, ...]) -> None:
-        self._source, self._changes = source, changes
+    def __init__(self, source: Source, planner: Planner, is_changed: bool) -> None:
+        self._source, self._is_changed = source, is_changed
         self._old = rerun_of(source)
         self._new = Rerun(planner)
-        self._decisions = self._same = self._alike = 0
-        self._recorded: LoggedStep | None = None
-        self._redone: LoggedStep | None = None
-        self._messages: list[Messages] = []
+        self.decisions = self.same = self.alike = 0
+        self.recorded: LoggedStep | None = None
+        self.redone: LoggedStep | None = None
+        self.messages: list[Messages] = []
 
     def take(self, sample: Sample | None, recorded: list[PlannerMessage]) -> None:
         """Take a sample and the recorded messages that follow it."""
         decisions = [decision_from_payload(each.payload) for each in recorded if each.topic == PLAN_DECISION]
         made = [each for each in decisions if not each.HasField("outcome")]
-        self._decisions += len(made)
-        if self._redone is not None or sample is None:
+        self.decisions += len(made)
+        if self.redone is not None or sample is None:
             return
         self._old.box.observe(sample)
         self._new.box.observe(sample)
         waiting = self._new.last is not None and self._new.last.kind == "wait"
-        if self._changes and waiting and not made:
+        if self._is_changed and waiting and not made:
             # what it decides now comes before anything in the log
             step, messages = self._new.box.decide()
             if step is not self._new.last:
@@ -743,12 +732,11 @@ class _Redoing:
         before = self._new.last
         self._old.repeat(decision)
         messages = self._new.repeat(decision)
-        if messages is None or decision.HasField("outcome"):
-            if messages is not None:
-                self._messages.append(_on_redone_topics(messages))
-            return True
         old, new = self._old.last, self._new.last
-        if old is None or new is None:
+        if messages is None or old is None or new is None:
+            return True
+        if decision.HasField("outcome"):
+            self.messages.append(_on_redone_topics(messages))
             return True
         refuse_other(self._source, old, decision)
         if new is before or not _does_the_same(old, new):
@@ -758,48 +746,22 @@ class _Redoing:
             explained = explained_decision(old, self._old.box.planner, first)
             self._differ(sample, LoggedStep(old, explained, sample), new, messages)
             return False
-        self._messages.append(_on_redone_topics(messages))
-        if self._same == self._alike and _has_all(recorded, messages):
-            self._same += 1
-        self._alike += 1
+        self.messages.append(_on_redone_topics(messages))
+        if self.same == self.alike and _has_all(recorded, messages):
+            self.same += 1
+        self.alike += 1
         return True
 
     def _differ(self, sample: Sample, recorded: LoggedStep | None, step: Step, messages: Messages) -> None:
-        self._recorded = recorded
-        self._redone = LoggedStep(step, explained_decision(step, self._new.box.planner), sample)
-        self._messages.append(_on_redone_topics(messages))
-
-    def redone(self, faults: tuple[str, ...]) -> Replanned:
-        """Return what was found.
-
-        Raises:
-            LogError: nothing was changed, and another decision was made nevertheless.
-        """
-        if self._redone is not None and not self._changes and not faults:
-            raise LogError(
-                f"the decisions in {self._source.name} do not follow from its samples; "
-                "`spatial-replay verify --decisions` shows what differs"
-            )
-        return Replanned(
-            self._source.name,
-            self._changes,
-            self._decisions,
-            self._same,
-            self._alike,
-            self._recorded,
-            self._redone,
-            merge(self._messages),
-            faults,
-        )
+        self.recorded = recorded
+        self.redone = LoggedStep(step, explained_decision(step, self._new.box.planner), sample)
+        self.messages.append(_on_redone_topics(messages))
 
 
 def _does_the_same(old: Step, new: Step) -> bool:
     """Return whether two decisions have the robot do the same."""
-    if old.kind != new.kind or (old.target is None) != (new.target is None):
-        return False
-    if old.target is None or new.target is None:
-        return True
-    return replace(old.target, robustness=0.0) == replace(new.target, robustness=0.0)
+    targets = [each.target and replace(each.target, robustness=0.0) for each in (old, new)]
+    return old.kind == new.kind and targets[0] == targets[1]
 
 
 def _has_all(recorded: list[PlannerMessage], redone: Messages) -> bool:

@@ -167,8 +167,18 @@ class Workspace:
         yield from kind_faults("yaws", self.yaws, tuple, "a tuple of angles in radians") or number_faults(
             {f"yaws[{place}]": yaw for place, yaw in enumerate(self.yaws)}
         )
-        yield from point_faults("base", self.base)
-        yield from self._size_faults()
+        base: Any = self.base
+        if isinstance(base, tuple) and len(base) == 2:
+            yield from number_faults({"base[0]": base[0], "base[1]": base[1]})
+        else:
+            yield f"base is {base!r}; give (x, y)"
+        if isinstance(self.grid, Grid) and isinstance(self.yaws, tuple):
+            cells, angles = self.grid.columns * self.grid.rows, len(self.yaws)
+            if cells * angles > MOST_CELLS:
+                yield (
+                    f"a grid of {cells:,} cells in {angles:,} orientations; give at most {MOST_CELLS:,} "
+                    "cells over all of them"
+                )
         faults = number_faults({"nearest": self.nearest}, 0)
         yield from faults
         if not is_number(self.farthest):
@@ -178,15 +188,6 @@ class Workspace:
         yield from member_faults("obstacles", self.obstacles, tuple, Footprint, "a tuple of footprints")
         yield from member_faults("supports", self.supports, frozenset, str, "a frozenset of names")
         yield from number_faults({"clearance": self.clearance}, 0)
-
-    def _size_faults(self) -> Iterator[str]:
-        if isinstance(self.grid, Grid) and isinstance(self.yaws, tuple):
-            cells, angles = self.grid.columns * self.grid.rows, len(self.yaws)
-            if cells * angles > MOST_CELLS:
-                yield (
-                    f"a grid of {cells:,} cells in {angles:,} orientations; give at most {MOST_CELLS:,} "
-                    "cells over all of them"
-                )
 
     @classmethod
     def around(cls, sample: Sample) -> Workspace:
@@ -249,13 +250,6 @@ def number_faults(values: Mapping[str, Any], least: float = -math.inf) -> list[s
         for name, value in values.items()
         if not (is_number(value) and math.isfinite(value) and value >= least)
     ]
-
-
-def point_faults(name: str, value: Any) -> list[str]:
-    """Return what keeps a value from being a point (x, y) of finite numbers."""
-    if not isinstance(value, tuple) or len(value) != 2:
-        return [f"{name} is {value!r}; give (x, y)"]
-    return number_faults({f"{name}[{place}]": number for place, number in enumerate(value)})
 
 
 def count_faults(values: Mapping[str, Any]) -> list[str]:
@@ -404,20 +398,13 @@ def _settings(read: dict[str, Any]) -> Settings:
     xmin, ymin, cell_size, columns, rows = read["grid"]
     workspace = Workspace(
         Grid(float(xmin), float(ymin), float(cell_size), int(columns), int(rows)),
-        yaws=tuple(map(float, read["yaws"])),
-        base=(float(read["base"][0]), float(read["base"][1])),
-        nearest=float(read["nearest"]),
-        farthest=math.inf if read["farthest"] is None else float(read["farthest"]),
         obstacles=tuple(
             Footprint(tuple(ConvexPart(vertices, radius) for vertices, radius in parts))
             for parts in read["obstacles"]
         ),
-        supports=frozenset(read["supports"]),
-        clearance=float(read["clearance"]),
+        **{key: value(read[key]) for key, value in _OF_WORKSPACE.items() if key != "obstacles"},
     )
-    plain = {name: read[name] for name in _PLAIN}
-    movable = None if read["movable"] is None else tuple(read["movable"])
-    return Settings(workspace, **{**plain, "movable": movable})
+    return Settings(workspace, **{key: _plain(key, read[key]) for key in _PLAIN})
 
 
 # ------------------------------------------------------------------------------------- files and options
@@ -446,10 +433,8 @@ def parse_settings(text: str, name: str = "settings") -> Mapping[str, Any]:
     Raises:
         UsageError: the text is not valid; all errors are listed.
     """
-    document = checked_document(
-        text, name, schema_of("planning", "settings"), lambda document: [], "a settings file"
-    )
-    value: Any = document.value
+    schema = schema_of("planning", "settings")
+    value: Any = checked_document(text, name, schema, lambda document: [], "a settings file").value
     return dict(value)
 
 
@@ -460,7 +445,8 @@ def parse_setting(key: str, text: str) -> Mapping[str, Any]:
         UsageError: the value is not valid.
     """
     kind = schema_of("planning", "settings")["properties"][key]
-    is_list = kind.get("type") == "array" or any("names" in each.get("$ref", "") for each in _options(kind))
+    options = [kind, *kind.get("anyOf", ())]
+    is_list = kind.get("type") == "array" or any("names" in each.get("$ref", "") for each in options)
     if is_list and text.strip() != "null" and not text.strip().startswith("["):
         text = f"[{text}]"
     option = f"--{key.replace('_', '-')}"
@@ -470,10 +456,6 @@ def parse_setting(key: str, text: str) -> Mapping[str, Any]:
         # there is one line, and the option names the key
         message = str(error).replace(f"{option}:1: {key}", option, 1).replace(f"{option}:1", option)
         raise UsageError(message) from None
-
-
-def _options(kind: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    return [kind, *kind.get("anyOf", ())]
 
 
 def changed_settings(base: Settings | None, changes: Mapping[str, Any]) -> Settings:
@@ -495,14 +477,12 @@ def _changed_grid(grid: Grid | None, changes: Mapping[str, Any]) -> Grid:
         raise UsageError("where to plan is not known; give area: [xmin, ymin, xmax, ymax], and cell_size")
     if grid is not None and not {"area", "cell_size"} & changes.keys():
         return grid
-    cell_size = float(changes["cell_size"]) if grid is None or "cell_size" in changes else grid.cell_size
-    if grid is None or "area" in changes:
-        box = tuple(map(float, changes["area"]))
-    else:
+    if grid is not None:
         xmax, ymax = grid.xmin + grid.columns * grid.cell_size, grid.ymin + grid.rows * grid.cell_size
-        box = (grid.xmin, grid.ymin, xmax, ymax)
-    xmin, ymin, xmax, ymax = box
-    return Grid.over(xmin, ymin, xmax, ymax, cell_size)
+        before = {"area": (grid.xmin, grid.ymin, xmax, ymax), "cell_size": grid.cell_size}
+        changes = {**before, **changes}
+    xmin, ymin, xmax, ymax = map(float, changes["area"])
+    return Grid.over(xmin, ymin, xmax, ymax, float(changes["cell_size"]))
 
 
 def _plain(key: str, value: Any) -> Any:

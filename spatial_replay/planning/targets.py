@@ -24,6 +24,7 @@ from spatial_replay.planning.maps import (
     GradientMap,
     avoided_cells,
     danger_of,
+    distance_to,
     proposition_maps,
 )
 from spatial_replay.planning.paths import Path, shortest_path
@@ -81,7 +82,9 @@ def find_target(
                 good = untried
                 break
         wanted = min(settings.room, float(room[good].max())) if failures else settings.room
-        return _best_cell(gradient, good & (room >= wanted), good, tracked)
+        roomy = good & (room >= wanted)
+        values = np.where(roomy if roomy.any() else good, gradient.robustness, -np.inf)
+        return _best_target(gradient, values, tracked)
     return _nearest_cell(gradient, good, tracked, settings, failures)
 
 
@@ -115,11 +118,8 @@ def nearest_target(
         return "there is no place for it"
     if settings.skill == "push":
         return _nearest_cell(gradient, good, tracked, settings, failures)
-    here = centre_of(tracked.footprint)
-    away = np.hypot(*(gradient.grid.centres() - np.array(here)).T).reshape(gradient.grid.shape)
-    values = np.where(good, -away, -np.inf)
-    turn, row, column = (int(index) for index in np.unravel_index(int(np.argmax(values)), values.shape))
-    return _target(gradient, tracked, (turn, row, column), (here, gradient.grid.centre(row, column)))
+    away = distance_to([centre_of(tracked.footprint)], gradient.grid)
+    return _best_target(gradient, np.where(good, -away, -np.inf), tracked)
 
 
 def points_along(waypoints: Sequence[tuple[float, float]], step: float) -> Iterator[tuple[float, float]]:
@@ -130,8 +130,7 @@ def points_along(waypoints: Sequence[tuple[float, float]], step: float) -> Itera
         yield from ((u + k / count * (x - u), v + k / count * (y - v)) for k in range(1, count + 1))
 
 
-def _best_cell(gradient: GradientMap, roomy: np.ndarray, good: np.ndarray, tracked: TrackedObject) -> Target:
-    values = np.where(roomy if roomy.any() else good, gradient.robustness, -np.inf)
+def _best_target(gradient: GradientMap, values: Floats, tracked: TrackedObject) -> Target:
     turn, row, column = (int(index) for index in np.unravel_index(int(np.argmax(values)), values.shape))
     here, there = centre_of(tracked.footprint), gradient.grid.centre(row, column)
     return _target(gradient, tracked, (turn, row, column), (here, there))
@@ -154,16 +153,16 @@ def _nearest_cell(
         return "no free path leads into reach" + _but_for(failures)
     row, column = entry.cells[-1].tolist()
     free = (gradient.blocked[0] == FREE) & ~towards
-    path, turned = shortest_path(free, (row, column), good[0]), 0
-    if path is None:
+    paths = {0: shortest_path(free, (row, column), good[0])}
+    if paths[0] is None:
         # it is turned at the end of its path, and only if that is needed
         for layer in range(1, len(gradient.turns)):
             goals = _turnable(gradient, layer, good[layer] & free, settings)
-            other = shortest_path(free, (row, column), goals)
-            if other is not None and (path is None or other.length < path.length):
-                path, turned = other, layer
-    if path is None:
+            paths[layer] = shortest_path(free, (row, column), goals)
+    found = [(path.length, layer, path) for layer, path in paths.items() if path is not None]
+    if not found:
         return "no free path leads to a good place" + _but_for(failures)
+    _, turned, path = min(found, key=lambda each: each[0])
     cells = [(row, column) for row, column in (*entry.cells.tolist(), *path.cells[1:].tolist())]
     # an object off the middle of its cell need not visit that middle first
     first = 1 if cells[0] == cell and len(cells) > 1 else 0
@@ -306,7 +305,7 @@ def refined(
     """
     size = settings.workspace.grid.cell_size
     spacing, turning, halved = _COARSEST * size, _widest_turn(target, tracked, settings) / 2.0, 0
-    pose, best, least = (target.x, target.y, target.turn), target.robustness, -math.inf
+    pose, best, least = target.pose, target.robustness, -math.inf
     apart = _spread(settings)
     if is_repeated(target, failures, settings):
         # any other place that is good enough is better
@@ -333,9 +332,9 @@ def refined(
             break
         else:
             spacing, turning, halved = spacing / 2.0, turning / 2.0, halved + 1
-    x, y, turn = pose
-    if (x, y, turn) == (target.x, target.y, target.turn):
+    if pose == target.pose:
         return target
+    x, y, turn = pose
     yaw = None if tracked.yaw is None else tracked.yaw + turn
     return Target(target.name, x, y, turn, yaw, (*target.waypoints[:-1], (x, y)), best)
 

@@ -13,15 +13,10 @@ from hypothesis import strategies as st
 import spatial_replay as sr
 from examples import examples
 from spatial_replay import Planner, Settings
-from spatial_replay.planning import (
-    MOST_MOTIONS,
-    Grid,
-    Outcome,
-    Workspace,
-    centre_of,
-    moved_object,
-    proposition_maps,
-)
+from spatial_replay.geometry.footprint import centre_of
+from spatial_replay.planning import Grid, Outcome, Workspace, moved_object
+from spatial_replay.planning.edges import MOST_MOTIONS
+from spatial_replay.planning.maps import proposition_maps
 
 TEXTS = (
     "a leftof b",

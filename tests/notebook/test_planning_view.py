@@ -8,15 +8,8 @@ from pages import shown
 from planning.kinematics import BLOCKS, PUSHING, block, run
 from planning.plans import PUSH, record_plan_of
 from spatial_replay import LogError, Planner, Settings, UsageError
-from spatial_replay.planning import (
-    FREE,
-    Grid,
-    Workspace,
-    gradient_map,
-    proposition_maps,
-    read_steps,
-    redo_decisions,
-)
+from spatial_replay.planning import Grid, Workspace, read_steps, redo_decisions
+from spatial_replay.planning.maps import FREE, gradient_map, proposition_maps
 from spatial_replay.sources import open_source
 
 SAMPLE = sr.Sample(

@@ -18,17 +18,10 @@ from spatial_replay import LogError, Settings, UsageError, load_specification
 from spatial_replay.logs import LogWriter
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.topics import GRADIENT_MAP, PLAN_METADATA, PLAN_PATH
-from spatial_replay.planning import (
-    Grid,
-    Reason,
-    Workspace,
-    map_fields,
-    planner_of,
-    read_decisions,
-    recompute_decisions,
-    settings_from_text,
-    text_from_settings,
-)
+from spatial_replay.planning import Grid, Reason, Workspace, read_decisions, recompute_decisions
+from spatial_replay.planning.decision_log import map_fields
+from spatial_replay.planning.read import planner_of
+from spatial_replay.planning.settings import settings_from_text, text_from_settings
 from spatial_replay.replay.engine import load_files, run_replay
 from spatial_replay.replay.selection import ReplayOptions, Window
 from spatial_replay.replay.verification import verify_certificate

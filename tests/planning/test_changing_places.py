@@ -12,7 +12,8 @@ import pytest
 import spatial_replay as sr
 from planning.kinematics import Table, block, run
 from spatial_replay import Planner, Settings
-from spatial_replay.planning import Grid, Outcome, Workspace, centre_of
+from spatial_replay.geometry.footprint import centre_of
+from spatial_replay.planning import Grid, Outcome, Workspace
 
 TABLE = Settings(Workspace(Grid.over(0, 0, 10, 7, 0.25), clearance=0.05), margin=0.02, constraint_margin=0.02)
 PLACES = {"a": (2.0, 2.0), "b": (6.0, 2.0), "c": (4.0, 5.0)}

@@ -14,7 +14,8 @@ from planning.kinematics import block
 from planning.plans import record_plan_of
 from spatial_replay import Settings
 from spatial_replay.logs.topics import GRADIENT_MAP
-from spatial_replay.planning import Grid, Workspace, map_fields, read_decisions, recompute_decisions
+from spatial_replay.planning import Grid, Workspace, read_decisions, recompute_decisions
+from spatial_replay.planning.decision_log import map_fields
 from spatial_replay.sources import open_source
 
 SPEC = """

@@ -7,8 +7,16 @@ import pytest
 
 import spatial_replay as sr
 from spatial_replay import UsageError
-from spatial_replay.planning import FREE, Grid, Workspace, centre_of, gradient_map, proposition_maps
-from spatial_replay.planning.maps import CONSTRAINED, OCCUPIED, OUT_OF_REACH
+from spatial_replay.geometry.footprint import centre_of
+from spatial_replay.planning import Grid, Workspace
+from spatial_replay.planning.maps import (
+    CONSTRAINED,
+    FREE,
+    OCCUPIED,
+    OUT_OF_REACH,
+    gradient_map,
+    proposition_maps,
+)
 
 CUP = sr.TrackedObject(sr.Footprint.box(0, 0, 1, 1))
 SAMPLE = sr.Sample(0, {"cup": CUP, "mat": sr.Footprint.box(4, 4, 8, 8), "jug": sr.Footprint.disc(1, 6, 1)})

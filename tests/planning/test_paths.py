@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from spatial_replay import UsageError
-from spatial_replay.planning import shortest_path
+from spatial_replay.planning.paths import shortest_path
 
 ROOT_2 = math.sqrt(2.0)
 

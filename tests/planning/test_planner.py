@@ -10,7 +10,8 @@ import pytest
 import spatial_replay as sr
 from planning.kinematics import BLOCKS, PUSHING, Table, block, run
 from spatial_replay import NoAutomatonError, Planner, Settings, TraceError, UsageError
-from spatial_replay.planning import MOST_MOTIONS, Grid, Outcome, Reason, Workspace, moved_object
+from spatial_replay.planning import Grid, Outcome, Reason, Workspace, moved_object
+from spatial_replay.planning.edges import MOST_MOTIONS
 
 PUSH = Settings(
     Workspace(Grid.over(0.3, -0.225, 0.75, 0.225, 0.005)), "push", margin=0.01, constraint_margin=0.005

@@ -26,8 +26,8 @@ from spatial_replay.planning import (
     read_decisions,
     recompute_decisions,
     redo_decisions,
-    text_from_settings,
 )
+from spatial_replay.planning.settings import text_from_settings
 from spatial_replay.report.write import write_report
 from spatial_replay.sources import open_source
 

@@ -21,16 +21,9 @@ import spatial_replay as sr
 from planning.kinematics import BLOCKS, Table, block, run
 from planning.plans import record_plan_of
 from spatial_replay import Planner, Settings
-from spatial_replay.planning import (
-    Grid,
-    Workspace,
-    centre_of,
-    moved_object,
-    read_decisions,
-    recompute_decisions,
-    settings_from_text,
-    text_from_settings,
-)
+from spatial_replay.geometry.footprint import centre_of
+from spatial_replay.planning import Grid, Workspace, moved_object, read_decisions, recompute_decisions
+from spatial_replay.planning.settings import settings_from_text, text_from_settings
 from spatial_replay.sources import open_source
 
 TABLE = Settings(

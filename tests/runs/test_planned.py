@@ -10,8 +10,9 @@ from pathlib import Path
 import pytest
 
 import spatial_replay as sr
+from spatial_replay.geometry.footprint import centre_of
 from spatial_replay.logs.schemas.BehaviourTree_pb2 import BehaviourTree
-from spatial_replay.planning import centre_of, read_decisions, recompute_decisions
+from spatial_replay.planning import read_decisions, recompute_decisions
 from spatial_replay.replay.engine import load_files, run_replay
 from spatial_replay.replay.verification import verify_certificate
 from spatial_replay.runs.planned import PlannedRun, record_plan, settings_for

@@ -12,16 +12,9 @@ import numpy as np
 
 import spatial_replay as sr
 from spatial_replay.automata.compile import automaton
-from spatial_replay.planning import (
-    Grid,
-    Workspace,
-    gradient_map,
-    map_layers,
-    moved_object,
-    proposition_maps,
-    redo_decisions,
-    shortest_path,
-)
+from spatial_replay.planning import Grid, Workspace, map_layers, moved_object, redo_decisions
+from spatial_replay.planning.maps import gradient_map, proposition_maps
+from spatial_replay.planning.paths import shortest_path
 from spatial_replay.sources import open_source
 
 RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
