@@ -389,7 +389,9 @@ def _flip(
     limit = f"exactly {number}" if threshold.is_exact else f"{number} {side}"
     if threshold.is_written:
         limit = f"{limit} instead of {format_number(threshold.value)}"
-        return f"{would} with {limit} {_place(deciding, threshold)}."
+        is_idle = witness.missed is not None and witness.missed.is_condition
+        why = ", as the condition would not hold there" if is_idle else ""
+        return f"{would} with {limit} {_place(deciding, threshold)}{why}."
     unit = declared_unit(deciding.atom, witness.units, is_scaled=False)
     margin = format_number(abs(threshold.flips_at)) + ("" if unit in ("", "1") else f" {unit}")
     how = "were allowed to fail by" if threshold.flips_at < 0.0 else "had to hold by"
