@@ -52,11 +52,8 @@ _MOST_AT_ONCE = 1_000_000
 """Samples between the messages of one step: all are in memory at once."""
 
 
-class Assembler:
-    """Assembles the samples of one log from its messages.
-
-    Add thousands of messages at once, because it works on columns. The samples do not depend on how the
-    messages are divided.
+class _Assembling:
+    """Assembles samples from messages, of a log or of a system that runs.
 
     Args:
         name: of the log, for errors and remarks.
@@ -65,10 +62,9 @@ class Assembler:
             before and after the window may be added, and count.
         on_time_jump: whether a log whose time jumps back by more than the plan's `late_ns` is refused, or
             ends there.
-        arrived: takes the messages of each topic as they arrive: its reader, their times on its clock, and
-            their contents, decoded where frames matter.
-        faults: takes what is lost, in place of a new list.
     """
+
+    _is_live = False
 
     def __init__(
         self,
@@ -80,15 +76,12 @@ class Assembler:
         end_ns: int | None = None,
         on_time_jump: OnTimeJump = "error",
         concave: Concave = "decompose",
-        arrived: Callable[[TopicReader, Integers, Sequence[Any]], None] | None = None,
-        faults: FaultList | None = None,
     ) -> None:
         self._plan = plan
-        self._arrived = arrived
         self._name = name
         self._window_ns = start_ns or 0, FOREVER if end_ns is None else end_ns
         self._on_time_jump = on_time_jump
-        self._faults = FaultList() if faults is None else faults
+        self._faults = FaultKinds() if self._is_live else FaultList()
         for topic, reason in plan.lost:
             # some reasons start with the topic already
             what = reason.removeprefix(f"topic {topic!r}: ")
@@ -105,7 +98,7 @@ class Assembler:
                 classes,
                 mapping_name=plan.mapping.name,
                 needs_frame=plan.mapping.fixed_frame is not None,
-                decodes_early=arrived is not None,
+                decodes_early=self._is_live,
                 report=self._add_fault,
             )
             for topic in plan.planned
@@ -126,8 +119,7 @@ class Assembler:
         self._begin_ns: int | None = None
         self._newest_ns = -1
         self._latest_ns = self._settled_ns = self._forgot_ns = -1
-        self._count = self._bytes = self._recorded = 0
-        self._step = _FIRST_STEP
+        self._recorded = 0
         self.jump: Sentence | None = None
         """Where time jumped back so far that the log is taken to end there."""
 
@@ -135,42 +127,6 @@ class Assembler:
     def is_finished(self) -> bool:
         """Whether no further message counts: after a jump that splits the log, or past the window."""
         return self.jump is not None or self._settled_ns >= self._window_ns[1] - 1
-
-    def add(self, messages: Sequence[Message] | MessageColumns) -> Trace:
-        """Add messages in the order of the log; return the samples that are final now.
-
-        Raises:
-            LogError: time jumps back too far, and `on_time_jump` is "error".
-            UsageError: the mapping does not fit what the messages hold.
-        """
-        columns = messages if isinstance(messages, MessageColumns) else self._columns(messages)
-        traces: list[Trace] = []
-        ends = np.cumsum(np.fromiter(map(len, columns.payloads), np.int64, len(columns)))
-        begin = 0
-        while begin < len(columns) and not self.is_finished:
-            read = int(ends[begin - 1]) if begin else 0
-            by_size = int(np.searchsorted(ends, read + _STEP_BYTES - self._bytes)) + 1
-            stop = min(begin + self._step - self._count, by_size, len(columns))
-            self._add_step(select(columns, slice(begin, stop)))
-            self._count += stop - begin
-            self._bytes += int(ends[stop - 1]) - read
-            begin = stop
-            if self._count == self._step or self._bytes >= _STEP_BYTES:
-                self._count = self._bytes = 0
-                self._step = min(2 * self._step, _LONGEST_STEP)
-                traces.append(self.settle(self._newest_ns - self._plan.margin_ns))
-        return traces[0] if len(traces) == 1 else Trace.concatenate(traces)
-
-    def know_static(self, messages: Iterable[Message]) -> None:
-        """Take the static transforms of the whole log, before any message is added."""
-        self._knows_static = True
-        for topic, log_ns, publish_ns, _, payload in messages:
-            reader = self._readers[topic]
-            good = np.ones(1, np.bool_)
-            contents = reader.decode([payload], [log_ns], good)
-            if good[0]:
-                times_ns = {"log": log_ns, "publish": publish_ns, "header": None}
-                self._add_transforms(reader, times_ns[reader.planned.clock], log_ns, contents[0])
 
     def _add_transforms(self, reader: TopicReader, clock_ns: int | None, log_ns: int, message: Any) -> None:
         if reader.transforms is None:
@@ -181,74 +137,25 @@ class Assembler:
         except MISFITS as error:
             self._add_fault(reader.name, log_ns, f"its transforms cannot be read: {error}")
 
-    def take_in(self, messages: Sequence[Message]) -> None:
-        """Add messages in the order in which they came, without looking for samples; see `settle`.
-
-        Raises:
-            UsageError: the mapping does not fit what the messages hold.
-        """
-        if messages and not self.is_finished:
-            self._add_step(self._columns(messages))
-
-    @property
-    def newest_ns(self) -> int:
-        """How far the messages have come, on the clocks of their topics; -1 before the first."""
-        return self._newest_ns
-
-    @property
-    def settled_ns(self) -> int:
-        """Up to when samples are final; -1 before the first."""
-        return self._settled_ns
-
-    @property
-    def frames(self) -> FrameTree:
-        """The transforms so far."""
-        return self._tree
-
-    def lose(self, topics: Collection[str]) -> Trace:
-        """Return the samples so far and one right after them, in which what some topics reported is unknown.
-
-        It stays unknown until they report it again.
-        """
-        so_far = self.settle(self._newest_ns)
-        lost_ns = self._settled_ns + 1
-        if not self._sample_times.note(lost_ns):
-            return so_far
-        self._tracker.lose(lost_ns, topics)
-        if any(self._readers[topic].transforms is not None for topic in topics):
-            self._tree.forget_moving()
-        self._settled_ns = lost_ns
-        lost = self._tracker.trace(np.array([lost_ns], np.int64), lost_ns)
-        self._tracker.forget(lost_ns)
-        return Trace.concatenate([so_far, lost])
-
     def finish(self) -> Trace:
         """End the log; return the remaining samples.
 
         Raises:
             UsageError: the mapping fits no message of a topic, or the log has no such fixed frame.
         """
-        trace = self.settle(max(self._newest_ns, self._latest_ns))
-        if self._arrived is None:
+        trace = self._settle(max(self._newest_ns, self._latest_ns))
+        if not self._is_live:
             self._remarks.add_pauses()
         for text in self._tree.remarks():
             self._remarks.add(text)
         # of a system that runs, there is no log to cut
-        if self.jump is not None and self._arrived is None:
+        if self.jump is not None and not self._is_live:
             what_follows = ": the log is taken to end there; cut it to evaluate what comes after"
             self._remarks.add(Sentence(self.jump, what_follows))
         for reader in self._readers.values():
             reader.finish()
-            if reader.extractor is not None and reader.extractor.is_by_place:
-                self._remarks.add(f"{reader.name}: {BY_PLACE}")
-            if reader.extractor is not None and reader.extractor.cornerless:
-                outlines = counted(reader.extractor.cornerless, "outline")
-                what = "other than two corners" if reader.extractor.is_bounds else "fewer than three corners"
-                hint = "" if reader.extractor.is_bounds else "; `bounds` reads two opposite corners of a box"
-                self._remarks.add(f"{reader.name}: {outlines} with {what}: objects are unknown there{hint}")
-            if reader.extractor is not None:
-                for doubt in _doubtful_turns(reader.extractor):
-                    self._remarks.add(f"{reader.name}: {doubt}")
+            for doubt in () if reader.extractor is None else _doubts_of(reader.extractor):
+                self._remarks.add(f"{reader.name}: {doubt}")
             for signal, texts in reader.unnamed.items():
                 listed = ", ".join(map(repr, texts))
                 what = f"`names` of the signal {signal!r} lacks {listed}; it is unknown there"
@@ -274,7 +181,7 @@ class Assembler:
     def _check_fixed_frame(self) -> None:
         """Raise UsageError if a whole log has frames, but not the fixed one."""
         mapping = self._plan.mapping
-        is_whole = self._arrived is None and self._window_ns == (0, FOREVER) and self.jump is None
+        is_whole = not self._is_live and self._window_ns == (0, FOREVER) and self.jump is None
         if mapping.fixed_frame is None or not is_whole or self._plan.lost:
             return
         extractors = (reader.extractor for reader in self._readers.values())
@@ -291,10 +198,6 @@ class Assembler:
     def take_faults(self, *, last: bool = False) -> tuple[str, ...]:
         """Return what was lost since the last call, each with its place."""
         return self._faults.take(last=last or self._settled_ns == LATEST_NS)
-
-    def move_faults(self, other: FaultList) -> None:
-        """Move what `take_faults` would return to another list, with the count of faults beyond its limit."""
-        self._faults.move_to(other)
 
     def take_remarks(self) -> tuple[str, ...]:
         """Return counts of stale objects and missing transforms; none before `finish`, when they are
@@ -385,8 +288,8 @@ class Assembler:
 
     def _put(self, stamped: _Stamped, arrived: MessageColumns) -> None:
         reader = stamped.reader
-        if self._arrived is not None and len(stamped.times_ns):
-            self._arrived(reader, stamped.times_ns, stamped.contents)
+        if len(stamped.times_ns):
+            self._note_arrived(reader, stamped.times_ns, stamped.contents)
         log_times_ns = arrived.log_time_ns[stamped.places]
         if reader.transforms is not None and not (self._knows_static and reader.planned.is_static):
             for time_ns, log_ns, message in zip(
@@ -400,11 +303,11 @@ class Assembler:
             sequences, recorded = arrived.sequence[stamped.places], arrived.place[stamped.places]
             reader.pending.add(times_ns, sequences, log_times_ns, recorded, stamped.contents)
 
-    def settle(self, upto_ns: int) -> Trace:
+    def _settle(self, upto_ns: int) -> Trace:
         """Return the samples up to a time; messages before it that come later count from then on.
 
         Raises:
-            LogError, UsageError: as `add`.
+            LogError, UsageError: as `Assembler.add`.
         """
         if upto_ns <= self._settled_ns:
             return Trace.empty()
@@ -423,6 +326,9 @@ class Assembler:
             self._forgot_ns = upto_ns
         return trace
 
+    def _note_arrived(self, reader: TopicReader, times_ns: Integers, contents: Sequence[Any]) -> None:
+        """Note messages of a topic with their times on its clock, decoded where frames matter."""
+
     def _columns(self, messages: Sequence[Message]) -> MessageColumns:
         if not messages:
             return MessageColumns()
@@ -437,11 +343,69 @@ class Assembler:
         self._faults.add(Sentence(f"{self._name}: {topic} at ", Instant(log_time_ns, 0), f": {what}"))
 
 
+class Assembler(_Assembling):
+    """Assembles the samples of one log from its messages; for the arguments see `_Assembling`.
+
+    Add thousands of messages at once, because it works on columns. The samples do not depend on how the
+    messages are divided.
+    """
+
+    _step, _count, _bytes = _FIRST_STEP, 0, 0
+
+    def add(self, messages: Sequence[Message] | MessageColumns) -> Trace:
+        """Add messages in the order of the log; return the samples that are final now.
+
+        Raises:
+            LogError: time jumps back too far, and `on_time_jump` is "error".
+            UsageError: the mapping does not fit what the messages hold.
+        """
+        columns = messages if isinstance(messages, MessageColumns) else self._columns(messages)
+        traces: list[Trace] = []
+        ends = np.cumsum(np.fromiter(map(len, columns.payloads), np.int64, len(columns)))
+        begin = 0
+        while begin < len(columns) and not self.is_finished:
+            read = int(ends[begin - 1]) if begin else 0
+            by_size = int(np.searchsorted(ends, read + _STEP_BYTES - self._bytes)) + 1
+            stop = min(begin + self._step - self._count, by_size, len(columns))
+            self._add_step(select(columns, slice(begin, stop)))
+            self._count += stop - begin
+            self._bytes += int(ends[stop - 1]) - read
+            begin = stop
+            if self._count == self._step or self._bytes >= _STEP_BYTES:
+                self._count = self._bytes = 0
+                self._step = min(2 * self._step, _LONGEST_STEP)
+                traces.append(self._settle(self._newest_ns - self._plan.margin_ns))
+        return traces[0] if len(traces) == 1 else Trace.concatenate(traces)
+
+    def know_static(self, messages: Iterable[Message]) -> None:
+        """Take the static transforms of the whole log, before any message is added."""
+        self._knows_static = True
+        for topic, log_ns, publish_ns, _, payload in messages:
+            reader = self._readers[topic]
+            good = np.ones(1, np.bool_)
+            contents = reader.decode([payload], [log_ns], good)
+            if good[0]:
+                times_ns = {"log": log_ns, "publish": publish_ns, "header": None}
+                self._add_transforms(reader, times_ns[reader.planned.clock], log_ns, contents[0])
+
+    def move_faults(self, other: FaultList) -> None:
+        """Move what `take_faults` would return to another list, with the count of faults beyond its limit."""
+        self._faults.move_to(other)
+
+
 _MOST_TURNED = 4 * pi
 """Angles that robots reach in radians, who count whole turns."""
 
 
-def _doubtful_turns(extractor: Extractor) -> Iterator[str]:
+def _doubts_of(extractor: Extractor) -> Iterator[str]:
+    if extractor.namer.is_by_place:
+        yield BY_PLACE
+    if extractor.cornerless:
+        is_bounds = extractor.layout.is_bounds
+        what = "other than two corners" if is_bounds else "fewer than three corners"
+        hint = "" if is_bounds else "; `bounds` reads two opposite corners of a box"
+        outlines = counted(extractor.cornerless, "outline")
+        yield f"{outlines} with {what}: objects are unknown there{hint}"
     if extractor.widest_turn > _MOST_TURNED:
         yield (
             f"its angles reach {number_text(extractor.widest_turn)} and are read as radians;"
@@ -595,13 +559,15 @@ class _Held(NamedTuple):
     until_s: float
 
 
-class LiveAssembler:
+class LiveAssembler(_Assembling):
     """Assembles the samples of a running system; callers pass the time of their clock, `now_s`, in seconds.
 
     Attributes:
         overdue: observations whose transforms did not come in time, so that they are unknown.
         overdue_frame: the topic and the frame of the last of them.
     """
+
+    _is_live = True
 
     def __init__(
         self,
@@ -612,19 +578,10 @@ class LiveAssembler:
         max_delay_s: float,
         concave: Concave = "decompose",
     ) -> None:
-        self._plan = plan
+        super().__init__(plan, decoder, name=name, on_time_jump="split", concave=concave)
         self._max_delay_s = max_delay_s
         self._patience_s = _MOMENT_S if plan.by_log_time else max_delay_s
-        moving = [each.name for each in plan.planned if each.is_transforms and not each.is_static]
-        self._assembler = Assembler(
-            plan,
-            decoder,
-            name=name,
-            on_time_jump="split",
-            concave=concave,
-            arrived=self._note_arrived,
-            faults=FaultKinds(),
-        )
+        moving = (each.name for each in plan.planned if each.is_transforms and not each.is_static)
         self._moving = frozenset(moving)
         # what is sent once and stays is not waited for
         self._in_step = [
@@ -633,10 +590,10 @@ class LiveAssembler:
             if not (each.is_lasting or each.is_latched)
             and (each.mapping is not None or each.name == plan.sampled_topic)
         ]
-        self._follows_frames = bool(moving) and any(
+        self._follows_frames = bool(self._moving) and any(
             each.is_static and each.mapping is not None for each in plan.planned
         )
-        self._latest_ns = dict.fromkeys((each.name for each in plan.planned), -1)
+        self._latest_of = dict.fromkeys((each.name for each in plan.planned), -1)
         self._silent: deque[tuple[float, int]] = deque()
         self._patient_ns = -1
         self._held: list[_Held] = []
@@ -651,16 +608,6 @@ class LiveAssembler:
         """The topics that samples depend on, but those that are sent once and stay."""
         return tuple(each.name for each in self._plan.planned if not (each.is_lasting or each.is_latched))
 
-    @property
-    def is_finished(self) -> bool:
-        """Whether time has jumped back, so that no further message counts."""
-        return self._assembler.is_finished
-
-    @property
-    def jump(self) -> Sentence | None:
-        """Where time has jumped back."""
-        return self._assembler.jump
-
     def add(self, messages: Sequence[Message], now_s: float) -> Trace:
         """Add messages as they came; return the samples that are final now.
 
@@ -670,54 +617,49 @@ class LiveAssembler:
         """
         self._now_s = now_s
         self._lost.difference_update(message.topic for message in messages)
-        self._assembler.take_in(messages)
-        newest_ns = self._assembler.newest_ns
-        if messages and (not self._silent or self._silent[-1][1] < newest_ns):
-            self._silent.append((now_s + self._patience_s, newest_ns))
-        return self._assembler.settle(self._upto_ns(now_s))
+        if messages and not self.is_finished:
+            self._add_step(self._columns(messages))
+        if messages and (not self._silent or self._silent[-1][1] < self._newest_ns):
+            self._silent.append((now_s + self._patience_s, self._newest_ns))
+        return self._settle(self._upto_ns(now_s))
 
     def due_s(self) -> float | None:
         """Return when to `add` again, even without messages; None if nothing waits."""
         times = [each.until_s for each in self._held]
-        is_settled = self._assembler.settled_ns >= self._assembler.newest_ns
+        is_settled = self._settled_ns >= self._newest_ns
         if self._silent and self._silent[-1][1] > self._patient_ns and not is_settled:
             times.append(self._silent[0][0])
         return min(times, default=None)
 
     def lose(self, topics: Collection[str], now_s: float) -> Trace:
-        """Return the samples so far, and one in which what some topics reported is unknown.
+        """Return the samples so far and one right after them, in which what some topics reported is unknown.
 
-        Nothing of what they reported holds on: not while a connection is lost, nor after silence.
+        Nothing of what they reported holds on: not while a connection is lost, nor after silence. It stays
+        unknown until they report it again.
         """
-        gone = set(topics) & set(self._latest_ns) - self._lost
+        gone = set(topics) & set(self._latest_of) - self._lost
         if not gone:
             return Trace.empty()
         self._now_s = now_s
         self._lost |= gone
         self._held = [each for each in self._held if each.topic not in gone]
-        self._patient_ns = self._assembler.newest_ns
+        self._patient_ns = self._newest_ns
         self._silent.clear()
-        return self._assembler.lose(gone)
-
-    def finish(self) -> Trace:
-        """End the run; return the remaining samples.
-
-        Raises:
-            UsageError: the mapping fits no message of a topic.
-        """
-        return self._assembler.finish()
-
-    def take_remarks(self) -> tuple[str, ...]:
-        """Return counts of stale objects and missing transforms, after `finish`."""
-        return self._assembler.take_remarks()
-
-    def take_faults(self, *, last: bool = False) -> tuple[str, ...]:
-        """Return what was lost since the last call, the first of each kind; at last, how many more."""
-        return self._assembler.take_faults(last=last)
+        so_far = self._settle(self._newest_ns)
+        lost_ns = self._settled_ns + 1
+        if not self._sample_times.note(lost_ns):
+            return so_far
+        self._tracker.lose(lost_ns, gone)
+        if any(self._readers[topic].transforms is not None for topic in gone):
+            self._tree.forget_moving()
+        self._settled_ns = lost_ns
+        lost = self._tracker.trace(np.array([lost_ns], np.int64), lost_ns)
+        self._tracker.forget(lost_ns)
+        return Trace.concatenate([so_far, lost])
 
     def _note_arrived(self, reader: TopicReader, times_ns: Integers, contents: Sequence[Any]) -> None:
         name = reader.name
-        self._latest_ns[name] = max(self._latest_ns[name], int(times_ns.max()))
+        self._latest_of[name] = max(self._latest_of[name], int(times_ns.max()))
         if name in self._moving:
             self._are_transforms_new = True
         if not self._moving or len(self._held) >= _MOST_HELD:
@@ -744,9 +686,9 @@ class LiveAssembler:
 
     def _upto_ns(self, now_s: float) -> int:
         """Return the time up to which nothing is waited for any more."""
-        newest_ns = self._assembler.newest_ns
+        newest_ns = self._newest_ns
         # several programs send transforms, often at the same time; another topic has one message at a time
-        reached = (self._latest_ns[topic] - (topic in self._moving) for topic in self._in_step)
+        reached = (self._latest_of[topic] - (topic in self._moving) for topic in self._in_step)
         upto_ns = min(reached, default=newest_ns)
         if self._plan.by_log_time:
             upto_ns = max(upto_ns, newest_ns - 1)
@@ -771,9 +713,9 @@ class LiveAssembler:
 
     def _placeable(self) -> list[bool]:
         """Return whether the transforms of each observation that waits have come."""
-        fixed, tree = self._plan.mapping.fixed_frame or "", self._assembler.frames
+        fixed, tree = self._plan.mapping.fixed_frame or "", self._tree
         known = [False] * len(self._held)
-        reached_ns = min((self._latest_ns[topic] for topic in self._moving), default=-1)
+        reached_ns = min((self._latest_of[topic] for topic in self._moving), default=-1)
         kinds: dict[tuple[str, bool], list[int]] = {}
         for place, each in enumerate(self._held):
             if each.frame:

@@ -88,45 +88,31 @@ def footprints_from_solids(solids: Solids, count: int) -> FootprintBatch:
     Args:
         count: R.
     """
-    if not _MAYBE_BOXES.isdisjoint(solids.kind.tolist()):
-        solids = _with_boxes(solids)
+    solids = _with_boxes(solids)
     kind, size = solids.kind, solids.size
-    # few solids are of few kinds, and what is not there need not be looked for
-    present = set(kind.tolist())
-    boxes, polygons, hulls = (
-        np.flatnonzero(kind == each) if each in present else _NO_SOLIDS for each in (BOX, POLYGON, HULL)
+    boxes, polygons, hulls, rounds = map(
+        np.flatnonzero, (kind == BOX, kind == POLYGON, kind == HULL, _IS_ROUND[kind])
     )
-    tilted = boxes[~np.isnan(size[boxes, 2])] if len(boxes) else _NO_SOLIDS
-    if len(tilted):
-        tilted = tilted[~is_upright(solids.rotation[tilted])]
-    flat = np.setdiff1d(boxes, tilted, assume_unique=True) if len(tilted) else boxes
+    is_tilted = ~np.isnan(size[boxes, 2]) & ~is_upright(solids.rotation[boxes])
+    flat, tilted = boxes[~is_tilted], boxes[is_tilted]
     rings = [_ring(solids, piece) for piece in hulls.tolist()]
     vertex_counts = _VERTICES[kind]
-    if len(tilted):
-        vertex_counts[tilted] = 6
-    if len(polygons):
-        vertex_counts[polygons] = counts_from_starts(solids.point_start)[polygons]
-    if len(hulls):
-        vertex_counts[hulls] = [len(ring) for ring in rings]
+    vertex_counts[tilted] = 6
+    vertex_counts[polygons] = counts_from_starts(solids.point_start)[polygons]
+    vertex_counts[hulls] = [len(ring) for ring in rings]
     start = starts_from_counts(vertex_counts)
     vertices = np.empty((int(start[-1]), 2))
     radius = np.zeros(len(kind))
-    if len(boxes) + len(polygons) + len(hulls) < len(kind):
-        rounds = np.flatnonzero(_IS_ROUND[kind])
-        vertices[start[rounds]] = solids.position[rounds, :2]
-        radius[rounds] = size[rounds, 0] / 2
-    for pieces, corners in ((flat, _rectangles), (tilted, _hexagons)):
-        if len(pieces):
-            _fill(vertices, start, pieces, corners(solids, size, pieces))
-    if len(polygons):
-        _fill_polygons(vertices, start, solids, polygons)
+    vertices[start[rounds]] = solids.position[rounds, :2]
+    radius[rounds] = size[rounds, 0] / 2
+    for pieces, corners in ((flat, _rectangles(solids, flat)), (tilted, _hexagons(solids, tilted))):
+        vertices[flat_index(start[pieces], vertex_counts[pieces])] = corners.reshape(-1, 2)
+    _fill_polygons(vertices, start, solids, polygons)
     for piece, ring in zip(hulls.tolist(), rings, strict=True):
         vertices[start[piece] : start[piece] + len(ring)] = ring
-    bottom, top = _height_intervals(solids, size, count)
-    is_single = len(kind) == count and (solids.owner == np.arange(count)).all()
-    parts = np.ones(count, np.int64) if is_single else np.bincount(solids.owner, minlength=count)
+    bottom, top = _height_intervals(solids, count)
     return FootprintBatch.trusted(
-        part_start=starts_from_counts(parts),
+        part_start=starts_from_counts(np.bincount(solids.owner, minlength=count)),
         vertex_start=start,
         vertices=vertices,
         radius=radius,
@@ -136,8 +122,6 @@ def footprints_from_solids(solids: Solids, count: int) -> FootprintBatch:
 
 
 _VERTICES = np.array([4, 1, 1, 1, 0, 0], np.int64)
-_MAYBE_BOXES = frozenset({CYLINDER, SPHERE})
-_NO_SOLIDS = np.empty(0, np.int64)
 _IS_ROUND = np.array([False, True, True, True, False, False])
 
 
@@ -154,32 +138,23 @@ def _with_boxes(solids: Solids) -> Solids:
     return replace(solids, kind=kinds)
 
 
-def _fill(vertices: Floats, start: Integers, pieces: Integers, corners: Floats) -> None:
-    """Write the corners (K, C, 2) of some solids to their places in `vertices`."""
-    if len(vertices) == corners.shape[0] * corners.shape[1]:
-        vertices[:] = corners.reshape(-1, 2)
-        return
-    counts = np.full(len(pieces), corners.shape[1])
-    vertices[flat_index(start[pieces], counts)] = corners.reshape(-1, 2)
-
-
-def _rectangles(solids: Solids, size: Floats, pieces: Integers) -> Floats:
+def _rectangles(solids: Solids, pieces: Integers) -> Floats:
     """Return the corners (K, 4, 2), seen from above, of boxes that are flat or upright."""
-    along = solids.rotation[pieces, :2, 0] * (size[pieces, 0, None] / 2)
-    across = solids.rotation[pieces, :2, 1] * (size[pieces, 1, None] / 2)
+    along = solids.rotation[pieces, :2, 0] * (solids.size[pieces, 0, None] / 2)
+    across = solids.rotation[pieces, :2, 1] * (solids.size[pieces, 1, None] / 2)
     centre = solids.position[pieces, :2]
     front, back = centre + along, centre - along
     return np.stack((back - across, front - across, front + across, back + across), axis=1)
 
 
-def _hexagons(solids: Solids, size: Floats, pieces: Integers) -> Floats:
+def _hexagons(solids: Solids, pieces: Integers) -> Floats:
     """Return the outlines (K, 6, 2) of tilted boxes, seen from above.
 
     The projection of a box is the Minkowski sum of its three projected axes. With the axes turned into the
     upper half plane and ordered by angle, the outline runs from the lowest corner along each of them, and
     back.
     """
-    axes = np.swapaxes(solids.rotation[pieces, :2, :] * (size[pieces, None, :] / 2), 1, 2)
+    axes = np.swapaxes(solids.rotation[pieces, :2, :] * (solids.size[pieces, None, :] / 2), 1, 2)
     down = (axes[..., 1] < 0) | ((axes[..., 1] == 0) & (axes[..., 0] < 0))
     axes = np.where(down[..., None], -axes, axes)
     order = np.argsort(np.arctan2(axes[..., 1], axes[..., 0]), axis=1, kind="stable")
@@ -212,24 +187,22 @@ def _ring(solids: Solids, piece: int) -> Floats:
     return hull[:-1] if len(hull) > 1 and (hull[0] == hull[-1]).all() else hull
 
 
-def _height_intervals(solids: Solids, size: Floats, count: int) -> tuple[Floats, Floats]:
+def _height_intervals(solids: Solids, count: int) -> tuple[Floats, Floats]:
     """Return the bottom and the top (R,) of objects; NaN if one of their solids is flat."""
-    is_flat_box = (solids.kind == BOX) & np.isnan(size[:, 2])
+    is_flat_box = (solids.kind == BOX) & np.isnan(solids.size[:, 2])
     has_height = (solids.kind != DISC) & (solids.kind != POLYGON) & ~is_flat_box
     if not has_height.any():
         return np.full(count, np.nan), np.full(count, np.nan)
     up = solids.rotation[:, 2, :]
     # half the extent along z of a box in any orientation
-    half = np.einsum("ij,ij->i", np.abs(up), np.nan_to_num(size)) / 2
-    half = np.where(solids.kind == SPHERE, size[:, 0] / 2, half)
+    half = np.einsum("ij,ij->i", np.abs(up), np.nan_to_num(solids.size)) / 2
+    half = np.where(solids.kind == SPHERE, solids.size[:, 0] / 2, half)
     half = np.where(has_height, half, np.nan)
     lowest, highest = solids.position[:, 2] - half, solids.position[:, 2] + half
     for piece in np.flatnonzero(solids.kind == HULL).tolist():
         points = solids.points[solids.point_start[piece] : solids.point_start[piece + 1]]
         heights = points @ solids.rotation[piece, 2] + solids.position[piece, 2]
         lowest[piece], highest[piece] = heights.min(initial=np.inf), heights.max(initial=-np.inf)
-    if len(lowest) == count:
-        return lowest, highest
     bottom, top = np.full(count, np.inf), np.full(count, -np.inf)
     # NaN prevails: one solid without a height leaves the object without
     np.minimum.at(bottom, solids.owner, lowest)

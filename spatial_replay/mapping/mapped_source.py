@@ -7,7 +7,7 @@ The raw messages and their definitions go into copies of the log, so that viewer
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
@@ -101,7 +101,7 @@ class MappedSource:
         plan = self._plan(reader, topics)
         mapped = frozenset(plan.topics)
         kept = [topic.name for topic in topics if is_kept(topic.name, self.keep, mapped)]
-        copied = _CopiedMessages(reader.channels(kept), _WAITING_BYTES)
+        copied = _CopiedMessages(reader.channels(kept))
         read = mapped | copied.topics
         assembler = Assembler(
             plan,
@@ -112,7 +112,7 @@ class MappedSource:
             on_time_jump=self.on_time_jump,
             concave=self.concave,
         )
-        blocks = _Blocks(assembler, reader, copied, start_ns, end_ns)
+        blocks = _Blocks(assembler, reader, copied, start_ns or 0, end_ns)
         blocks.remarks.extend(
             f"{self.name}: it has no topic {topic!r}, which {self.mapping.name} marks as optional"
             for topic in plan.absent
@@ -187,45 +187,37 @@ class MappedSource:
         return reader.attachments(), reader.metadata()
 
 
+@dataclass(slots=True)
 class _Blocks:
     """Makes blocks of samples and messages, with all faults so far."""
 
-    def __init__(
-        self,
-        assembler: Assembler,
-        reader: MessageReader,
-        copied: _CopiedMessages,
-        start_ns: int | None,
-        end_ns: int | None,
-    ) -> None:
-        self._assembler = assembler
-        self._reader = reader
-        self._copied = copied
-        self._window = start_ns or 0, end_ns
-        self._faults = FaultList()
-        self.remarks: list[str] = []
-        self.any_sample = False
-        self.first_fault: str | None = None
+    assembler: Assembler
+    reader: MessageReader
+    copied: _CopiedMessages
+    start_ns: int
+    end_ns: int | None
+    faults: FaultList = field(default_factory=FaultList)
+    remarks: list[str] = field(default_factory=list)
+    any_sample: bool = False
+    first_fault: str | None = None
 
     def of(self, trace: Trace, messages: MessageColumns, *, last: bool = False) -> Iterator[Block]:
         """Yield a block, or nothing while there is nothing to yield."""
-        start_ns, end_ns = self._window
-        if start_ns or end_ns is not None:
-            inside = messages.log_time_ns >= start_ns
-            if end_ns is not None:
-                inside &= messages.log_time_ns < end_ns
+        if self.start_ns or self.end_ns is not None:
+            inside = messages.log_time_ns >= self.start_ns
+            if self.end_ns is not None:
+                inside &= messages.log_time_ns < self.end_ns
             messages = select(messages, np.flatnonzero(inside))
-        self._copied.add(messages)
         for fault in trace.faults:
-            self._faults.add(fault)
-        self._reader.move_faults(self._faults)
-        self._assembler.move_faults(self._faults)
-        faults = self._faults.take(last=last)
+            self.faults.add(fault)
+        self.reader.move_faults(self.faults)
+        self.assembler.move_faults(self.faults)
+        faults = self.faults.take(last=last)
         self.any_sample = self.any_sample or len(trace) > 0
         self.first_fault = self.first_fault or next(iter(faults), None)
-        remarks = (*self.remarks, *self._reader.take_remarks(), *self._assembler.take_remarks())
+        remarks = (*self.remarks, *self.reader.take_remarks(), *self.assembler.take_remarks())
         self.remarks = []
-        copied = self._copied.take(trace, last=last)
+        copied = self.copied.passed_on(messages, trace, last=last)
         if len(trace) or len(copied) or faults or remarks:
             yield Block(replace(trace, faults=faults), copied, remarks)
 
@@ -233,7 +225,7 @@ class _Blocks:
 class _CopiedMessages:
     """Holds raw messages until the samples made of them are ready, and returns them in the order of time."""
 
-    def __init__(self, channels: Mapping[int, Channel], most_bytes: int) -> None:
+    def __init__(self, channels: Mapping[int, Channel]) -> None:
         self._channels = MappingProxyType(
             {
                 number: channel
@@ -243,23 +235,19 @@ class _CopiedMessages:
             }
         )
         self.topics = frozenset(channel.topic for channel in self._channels.values())
-        self._most_bytes = most_bytes
         self._waiting: list[MessageColumns] = []
         self._waiting_bytes = 0
 
-    def add(self, messages: MessageColumns) -> None:
-        """Add messages; those of topics that are not copied are left out."""
-        messages = messages.of_topics(self.topics)
-        self._waiting.append(messages)
-        self._waiting_bytes += sum(map(len, messages.payloads))
-
-    def take(self, trace: Trace, *, last: bool = False) -> Messages:
-        """Return the messages up to the last of some new samples; with `last`, all that wait.
+    def passed_on(self, messages: MessageColumns, trace: Trace, *, last: bool = False) -> Messages:
+        """Hold messages; return those up to the last of some new samples, or with `last` all.
 
         Beyond a number of bytes all are returned, because log times and header stamps may be far apart.
         """
-        is_all = last or self._waiting_bytes > self._most_bytes
-        if not self._waiting or not (is_all or len(trace)):
+        messages = messages.of_topics(self.topics)
+        self._waiting.append(messages)
+        self._waiting_bytes += sum(map(len, messages.payloads))
+        is_all = last or self._waiting_bytes > _WAITING_BYTES
+        if not (is_all or len(trace)):
             return Messages()
         waiting = concatenated(self._waiting)
         times = waiting.log_time_ns
@@ -269,14 +257,7 @@ class _CopiedMessages:
         taken, rest = select(waiting, slice(ready)), select(waiting, slice(ready, None))
         self._waiting = [rest] if len(rest) else []
         self._waiting_bytes = sum(map(len, rest.payloads))
-        return Messages(
-            channels=self._channels,
-            channel=taken.channel,
-            sequence=taken.sequence,
-            log_time_ns=taken.log_time_ns,
-            publish_time_ns=taken.publish_time_ns,
-            payloads=taken.payloads,
-        )
+        return taken.raw(self._channels)
 
 
 def _unread(name: str, topics: Sequence[Topic], plan: ReadingPlan) -> list[str]:

@@ -254,7 +254,7 @@ def _mapping(document: Document, name: str) -> LogMapping:
     sample = value.get("sample", {})
     # the hash ignores layout and comments: the same mapping has the same hash
     canonical = json.dumps(value, ensure_ascii=False, separators=(",", ":"), allow_nan=True)
-    fixed_frame = value.get("fixed_frame")
+    fixed_frame, origin = value.get("fixed_frame"), value.get("origin")
     topics = tuple(_topic_mapping(topic, entry or {}, shapes) for topic, entry in value["topics"].items())
     units = {signal.name: signal.unit for topic in topics for signal in topic.signals if signal.unit}
     return LogMapping(
@@ -266,7 +266,7 @@ def _mapping(document: Document, name: str) -> LogMapping:
         sampling=Sampling(sample.get("topic"), duration_ns(sample["every"]) if "every" in sample else None),
         max_age_ns=age_ns(value["max_age"]) if "max_age" in value else None,
         max_gap_ns=duration_ns(value["max_gap"]) if "max_gap" in value else None,
-        origin=_origin(value.get("origin")),
+        origin=(float(origin[0]), float(origin[1])) if origin else None,
         axes=Axes(
             value.get("axes", {}).get("y", "up"),
             float(value.get("scale", 1.0)),
@@ -356,10 +356,6 @@ def _topic_mapping(topic: str, entry: Table[str, Any], shapes: Table[str, Any]) 
         has_zeros_left_out="missing" in entry,
         optional=entry.get("optional", False),
     )
-
-
-def _origin(value: Any) -> tuple[float, float] | None:
-    return None if value is None else (float(value[0]), float(value[1]))
 
 
 def _class(value: Any) -> str | ClassMapping | None:

@@ -346,9 +346,9 @@ class Extractor:
         """The greatest angle that is read as radians."""
         self.turned, self.unturned = 0, 0
         """Poses with an orientation, and those whose quaternion is zeros."""
-        self._layout = layout
+        self.layout = layout
         self._classes = classes
-        self._namer = Namer(NameTemplate.of(layout.name), mapping.topic, names, mapping.only, mapping.without)
+        self.namer = Namer(NameTemplate.of(layout.name), mapping.topic, names, mapping.only, mapping.without)
         self._needs_frame = needs_frame
         self._path = FieldPath.of(layout.objects) if layout.objects else None
         self._list: Get | None = None
@@ -356,16 +356,6 @@ class Extractor:
         self._time: TimeGetter | None = None
         self._time_of_empty: TimeGetter | None = None
         self._is_time_bound = False
-
-    @property
-    def is_bounds(self) -> bool:
-        """Whether outlines are boxes by two of their corners."""
-        return self._layout.is_bounds
-
-    @property
-    def is_by_place(self) -> bool:
-        """Whether nothing but their places in a list distinguished some objects."""
-        return self._namer.is_by_place
 
     @property
     def is_bound(self) -> bool:
@@ -402,7 +392,7 @@ class Extractor:
         time = self._time
         if time is None or not time.path.from_message:
             if self._time_of_empty is None:
-                own = [each for each in self._layout.stamp if FieldPath.of(each.field).from_message]
+                own = [each for each in self.layout.stamp if FieldPath.of(each.field).from_message]
                 self._time_of_empty = bind_time(own, message, message)
             time = self._time_of_empty
         return None if time is None else time.nanoseconds([message])[0]
@@ -420,19 +410,19 @@ class Extractor:
         values, index, order = self._flatten(messages)
         style = style_of(messages[0]) if messages else "attributes"
         deleted: list[tuple[int, int]] = []
-        if self._layout.solids == "scene":
+        if self.layout.solids == "scene":
             deleted = self._deleted_entities(messages)
-        of_message = [messages[number] for number in index] if self._namer.needs_messages else None
-        objects = _Objects(values, index, self._namer.codes(values, order, style, of_message))
-        if self._layout.solids == "marker":
+        of_message = [messages[number] for number in index] if self.namer.needs_messages else None
+        objects = _Objects(values, index, self.namer.codes(values, order, style, of_message))
+        if self.layout.solids == "marker":
             objects, deleted = _split_deleted_markers(objects)
-        if self._namer.is_filtering:
-            objects = objects.where(self._namer.wanted(objects.name))
+        if self.namer.is_filtering:
+            objects = objects.where(self.namer.wanted(objects.name))
         chunk = DetectionChunk(places, deleted)
         if objects.values:
             if self._binding is None:
                 example, message = objects.values[0], messages[objects.message[0]]
-                self._binding = bind(self._layout, example, message, needs_frame=self._needs_frame)
+                self._binding = bind(self.layout, example, message, needs_frame=self._needs_frame)
                 self._bind_time(example, message)
             self._fill(chunk, self._binding, messages, objects)
             paths = [FieldPath.of(each) for each in self.unseen]
@@ -442,23 +432,23 @@ class Extractor:
 
     def detections(self, chunks: Sequence[DetectionChunk], good: Booleans) -> Detections:
         """Join the chunks of a batch; see `detections_from_chunks`."""
-        return detections_from_chunks(self._layout, self._binding, chunks, good)
+        return detections_from_chunks(self.layout, self._binding, chunks, good)
 
     def _fill(
         self, chunk: DetectionChunk, binding: Binding, messages: Sequence[object], objects: _Objects
     ) -> None:
         cornerless = 0
-        if self._layout.solids:
-            get, solids_of = lenient_getter(binding.style), _SOLIDS_OF[self._layout.solids]
+        if self.layout.solids:
+            get, solids_of = lenient_getter(binding.style), _SOLIDS_OF[self.layout.solids]
             solids = [solids_of(each, get) for each in objects.values]
             chunk.solids = [each for each in solids if each]
             chunk.skipped = len(solids) - len(chunk.solids)
             objects = objects.where([bool(each) for each in solids])
-            if self._layout.stays:
+            if self.layout.stays:
                 chunk.locked = [bool(get(each, "frame_locked")) for each in objects.values]
         elif binding.polygon is not None:
             corners = [binding.polygon(each) for each in objects.values]
-            outlines = outlines_from_lists(corners, is_bounds=self._layout.is_bounds)
+            outlines = outlines_from_lists(corners, is_bounds=self.layout.is_bounds)
             chunk.corner_counts, chunk.corners, cornerless = outlines
         values = objects.values
         if binding.numbers is not None:
@@ -468,11 +458,11 @@ class Extractor:
                 is_turned = chunk.numbers[:, list(binding.orientation)].any(axis=1)
                 self.turned += len(values)
                 self.unturned += len(values) - int(is_turned.sum())
-            elif binding.yaw is not None and self._layout.angle_scale == 1.0:
+            elif binding.yaw is not None and self.layout.angle_scale == 1.0:
                 turns = np.abs(chunk.numbers[:, binding.yaw])
                 self.widest_turn = float(np.fmax.reduce(turns, initial=self.widest_turn))
-        chunk.covariance = covariances(self._layout, binding, values)
-        chunk.class_code = class_codes(self._layout, binding, values, self._classes)
+        chunk.covariance = covariances(self.layout, binding, values)
+        chunk.class_code = class_codes(self.layout, binding, values, self._classes)
         chunk.frames = self._frames(binding, messages, objects)
         chunk.stamps = self._stamps(messages, objects)
         if binding.lifetime is not None:
@@ -489,15 +479,10 @@ class Extractor:
             list(iter_elements(self._path, messages[0]))
             self._list = list_getter(self._path, style_of(messages[0])) or self._elements
         lists = list(map(self._list, messages)) if self._list is not None else []
-        counts = [len(each) for each in lists]
-        index = np.repeat(np.arange(len(counts)), counts).tolist()
-        order: list[int | str] = list(chain.from_iterable(map(range, counts)))
-        if any(isinstance(each, Mapping) for each in lists):
-            keys = (map(str, keys_of(e)) if isinstance(e, Mapping) else range(len(e)) for e in lists)
-            order = list(chain.from_iterable(keys))
-            lists = list(map(elements_of, lists))
-            counts = [len(each) for each in lists]
-            index = np.repeat(np.arange(len(counts)), counts).tolist()
+        keys = (map(str, keys_of(e)) if isinstance(e, Mapping) else range(len(e)) for e in lists)
+        order: list[int | str] = list(chain.from_iterable(keys))
+        lists = list(map(elements_of, lists))
+        index = np.repeat(np.arange(len(lists)), list(map(len, lists))).tolist()
         return list(chain.from_iterable(lists)), index, order
 
     def _elements(self, message: object) -> list[object]:
@@ -512,20 +497,20 @@ class Extractor:
                 if get(deletion, "type") == DELETE_ALL_ENTITIES:
                     deleted.append((number, EVERY_OBJECT))
                 else:
-                    (code,) = self._namer.codes([deletion], [0], style_of(deletion), [message])
+                    (code,) = self.namer.codes([deletion], [0], style_of(deletion), [message])
                     deleted.append((number, code))
         return deleted
 
     def _bind_time(self, example: object, message: object) -> None:
         if not self._is_time_bound:
-            self._time = bind_time(self._layout.stamp, example, message)
+            self._time = bind_time(self.layout.stamp, example, message)
             self._is_time_bound = True
 
     def _frames(self, binding: Binding, messages: Sequence[object], objects: _Objects) -> list[str] | None:
         """Return the frame of each object; None if all are in the fixed frame."""
-        if self._layout.frame_name is not None:
-            self.noted_frames.add(self._layout.frame_name)
-            return [self._layout.frame_name] * len(objects.values) if self._needs_frame else None
+        if self.layout.frame_name is not None:
+            self.noted_frames.add(self.layout.frame_name)
+            return [self.layout.frame_name] * len(objects.values) if self._needs_frame else None
         if binding.frame is None or not objects.values:
             return None
         get, from_message = binding.frame

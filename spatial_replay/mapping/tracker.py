@@ -296,39 +296,30 @@ class _Following(NamedTuple):
     place: int
 
 
+@dataclass
 class Tracker:
     """The state of every object and signal, carried from one stretch of a log to the next.
 
-    Args:
+    Attributes:
         names, classes: codes that all topics share.
         window_ns: only samples from the first time up to, not including, the second are wanted.
         report: receives each observation that is lost.
     """
 
-    def __init__(
-        self,
-        plan: ReadingPlan,
-        readers: Mapping[str, TopicReader],
-        names: Codes,
-        classes: Codes,
-        tree: FrameTree,
-        remarks: Remarks,
-        *,
-        window_ns: tuple[int, int],
-        concave: Concave,
-        report: ReportFault,
-    ) -> None:
-        self._plan = plan
-        self._readers = readers
-        self._names, self._classes = names, classes
-        self._tree = tree
-        self._remarks = remarks
-        self._window_ns = window_ns
-        self._concave = concave
-        self._report = report
+    plan: ReadingPlan
+    readers: Mapping[str, TopicReader]
+    names: Codes
+    classes: Codes
+    tree: FrameTree
+    remarks: Remarks
+    window_ns: tuple[int, int]
+    concave: Concave
+    report: ReportFault
+
+    def __post_init__(self) -> None:
         self._rows = ObservationRows.blank(np.empty(0, np.int64))
         self._added: list[ObservationRows] = []
-        self._events = {name: Events.none() for name in readers}
+        self._events = {name: Events.none() for name in self.readers}
         self._reported: dict[str, Integers] = {}
         self._following: dict[int, _Following] = {}
         self._signals: dict[tuple[str, int], tuple[Integers, Floats]] = {}
@@ -339,7 +330,7 @@ class Tracker:
         """Process the pending messages up to a time; return the times of those that may be sampled."""
         self._advances += 1
         sampled = [np.empty(0, np.int64)]
-        for name, reader in self._readers.items():
+        for name, reader in self.readers.items():
             if not reader.pending:
                 continue
             times_ns, log_times_ns, contents = reader.pending.take(upto_ns)
@@ -355,14 +346,14 @@ class Tracker:
             if reader.is_mapped and not (reader.planned.is_lasting or reader.planned.is_latched):
                 before = self._reported.get(name, times_ns[:0])
                 self._reported[name] = np.concatenate([before[-1:], times_ns])
-                start_ns, end_ns = self._window_ns
+                start_ns, end_ns = self.window_ns
                 is_inside = (times_ns >= start_ns) & (times_ns < end_ns)
-                self._remarks.note_messages(
-                    name, times_ns[is_inside], is_sampled=name == self._plan.sampled_topic
+                self.remarks.note_messages(
+                    name, times_ns[is_inside], is_sampled=name == self.plan.sampled_topic
                 )
             if reader.extractor is not None:
-                self._remarks.note_frames(reader.extractor.noted_frames)
-            if self._plan.sampled_topic in (None, name):
+                self.remarks.note_frames(reader.extractor.noted_frames)
+            if self.plan.sampled_topic in (None, name):
                 sampled.append(times_ns)
         self._store_added()
         return np.concatenate(sampled)
@@ -377,7 +368,7 @@ class Tracker:
             return Trace.empty()
         codes, rows, classes = self._states(times_ns, newest_ns)
         self._store_added()
-        names = [self._names.by_code[code] for code in codes.tolist()]
+        names = [self.names.by_code[code] for code in codes.tolist()]
         appears = (rows != ABSENT).any(axis=0).tolist()
         order = sorted((i for i in range(len(names)) if appears[i]), key=names.__getitem__)
         rows, classes = rows[:, order], classes[:, order]
@@ -388,10 +379,10 @@ class Tracker:
         if is_stale.any():
             # of stale objects only the class is known: one blank row for each class, after the others
             numbered = np.where(is_stale, -2 - (len(stored) + classes), numbered)
-            blank = ObservationRows.blank(np.arange(len(self._classes), dtype=np.int64))
+            blank = ObservationRows.blank(np.arange(len(self.classes), dtype=np.int64))
             stored = concatenated([stored, blank])
         # codes follow the log; a trace must not depend on the order of its messages
-        by_code = self._classes.by_code
+        by_code = self.classes.by_code
         ordered = sorted(range(len(by_code)), key=lambda i: (by_code[i] is not None, by_code[i] or ""))
         rank = np.zeros(len(by_code), np.int64)
         rank[ordered] = np.arange(len(by_code))
@@ -449,7 +440,7 @@ class Tracker:
         self, reader: TopicReader, times_ns: Integers, log_times_ns: Integers, detections: Detections
     ) -> None:
         if detections.skipped:
-            self._remarks.skipped[reader.name] += detections.skipped
+            self.remarks.skipped[reader.name] += detections.skipped
         self._claim_names(reader.name, detections.name)
         layout = reader.planned.layout
         is_complete = layout is not None and layout.complete
@@ -459,7 +450,7 @@ class Tracker:
             self._report_object(reader.name, log_times_ns[detections.message[index]], detections, index, what)
 
         transforms = self._transforms(reader, detections, times_ns, log_times_ns)
-        rows = rows_from_detections(detections, transforms, self._plan.mapping.axes, self._concave, report)
+        rows = rows_from_detections(detections, transforms, self.plan.mapping.axes, self.concave, report)
         number = self._add(rows)
         for place in self._follows(reader, detections).tolist():
             frame = (detections.frames or ())[place]
@@ -487,10 +478,10 @@ class Tracker:
 
     def _placed(self, topic: str, following: _Following, times_ns: Integers) -> Integers:
         """Return the rows of an object that stays in a frame, where that is at some times."""
-        mapping, (frame, detections, index) = self._plan.mapping, following
-        fixed, longest_ns = mapping.fixed_frame or "", self._readers[topic].planned.between_ns
-        log_ns = times_ns if self._plan.by_log_time else None
-        found = self._tree.between(
+        mapping, (frame, detections, index) = self.plan.mapping, following
+        fixed, longest_ns = mapping.fixed_frame or "", self.readers[topic].planned.between_ns
+        log_ns = times_ns if self.plan.by_log_time else None
+        found = self.tree.between(
             fixed, frame, times_ns, by_stamp=False, log_ns=log_ns, longest_ns=longest_ns, holds=True
         )
         self._count_missing(topic, frame, times_ns[~found.known])
@@ -498,27 +489,27 @@ class Tracker:
         changed = _changes(found)
         repeated, moved = detections.repeated(index, len(changed)), found.select(changed)
         # faults were reported when it arrived
-        rows = rows_from_detections(repeated, moved, mapping.axes, self._concave, lambda index, what: None)
+        rows = rows_from_detections(repeated, moved, mapping.axes, self.concave, lambda index, what: None)
         return self._add(rows)[np.searchsorted(changed, np.arange(len(times_ns)), "right") - 1]
 
     def _report_object(
         self, topic: str, log_time_ns: int, detections: Detections, index: int, what: str
     ) -> None:
-        name = self._names.by_code[int(detections.name[index])]
-        self._report(topic, int(log_time_ns), f"object {name!r}{what}")
+        name = self.names.by_code[int(detections.name[index])]
+        self.report(topic, int(log_time_ns), f"object {name!r}{what}")
 
     def _count_missing(self, topic: str, frame: str, times_ns: Integers) -> None:
         if len(times_ns):
-            is_known = frame in self._tree.names
-            self._remarks.missing.add((topic, frame, is_known), times_ns)
+            is_known = frame in self.tree.names
+            self.remarks.missing.add((topic, frame, is_known), times_ns)
 
     def _count_replaced(self, topic: str, times_ns: Integers, replaced: Integers) -> None:
         """Count messages of which nothing, or not all, counts, because a later one has the same time."""
-        start_ns, end_ns = self._window_ns
+        start_ns, end_ns = self.window_ns
         at = times_ns[replaced]
         at = at[(at >= start_ns) & (at < end_ns)]
         if len(at):
-            self._remarks.replaced.add(topic, at)
+            self.remarks.replaced.add(topic, at)
 
     def _store_added(self) -> None:
         if self._added:
@@ -536,15 +527,15 @@ class Tracker:
             owner = self._topic_of_name.setdefault(code, topic)
             if owner != topic:
                 raise UsageError(
-                    f"{self._plan.mapping.name}: both {owner} and {topic} have an object"
-                    f" {self._names.by_code[code]!r}; give one of them another `name`"
+                    f"{self.plan.mapping.name}: both {owner} and {topic} have an object"
+                    f" {self.names.by_code[code]!r}; give one of them another `name`"
                 )
 
     def _transforms(
         self, reader: TopicReader, detections: Detections, times_ns: Integers, log_times_ns: Integers
     ) -> Transforms | None:
         """Return fixed_from_frame of each object; None if everything is in the fixed frame."""
-        fixed = self._plan.mapping.fixed_frame
+        fixed = self.plan.mapping.fixed_frame
         if detections.frames is None or fixed is None:
             return None
         codes = Codes()
@@ -566,7 +557,7 @@ class Tracker:
                 if not len(chosen):
                     continue
                 at, log = (stamp_ns if by_stamp else clock_ns)[chosen], log_ns[chosen]
-                between = self._tree.between(
+                between = self.tree.between(
                     fixed, frame, at, by_stamp=by_stamp, log_ns=log, longest_ns=reader.planned.between_ns
                 )
                 result.put(chosen, between)
@@ -576,7 +567,7 @@ class Tracker:
 
     def _follows(self, reader: TopicReader, detections: Detections) -> Integers:
         """Return the indices of objects that stay in frames that may move."""
-        if detections.frames is None or self._plan.mapping.fixed_frame is None:
+        if detections.frames is None or self.plan.mapping.fixed_frame is None:
             return np.empty(0, np.int64)
         if reader.planned.is_static:
             return np.arange(len(detections.name))
@@ -584,7 +575,7 @@ class Tracker:
 
     def _is_relevant(self, reader: TopicReader, times_ns: Integers) -> Booleans:
         """Return whether observations at some times may be valid in the window."""
-        start_ns, end_ns = self._window_ns
+        start_ns, end_ns = self.window_ns
         return (times_ns < end_ns) & (times_ns >= start_ns - reader.planned.max_age_ns)
 
     def _take_signal(self, key: tuple[str, int], times_ns: Integers, values: Floats) -> None:
@@ -593,10 +584,10 @@ class Tracker:
 
     def _in_gap(self, topic: str, times_ns: Integers, newest_ns: int) -> Booleans:
         """Return at which times a topic pauses for longer than `max_gap`."""
-        most_ns, known = self._plan.mapping.max_gap_ns, self._reported.get(topic)
+        most_ns, known = self.plan.mapping.max_gap_ns, self._reported.get(topic)
         if most_ns is None or known is None or not len(known):
             return np.zeros(len(times_ns), np.bool_)
-        first = self._readers[topic].pending.first_ns
+        first = self.readers[topic].pending.first_ns
         # where no message follows, the time up to now shows whether this is a pause
         following = newest_ns if first is None else first
         after = np.searchsorted(known, times_ns, "right")
@@ -608,12 +599,12 @@ class Tracker:
         """Return the states of the objects of all topics, as `Events.state` does."""
         states = []
         for topic, events in self._events.items():
-            state = events.state(times_ns, self._readers[topic].planned.max_age_ns)
+            state = events.state(times_ns, self.readers[topic].planned.max_age_ns)
             rows, in_gap = state[1], self._in_gap(topic, times_ns, newest_ns)
             rows[in_gap[:, None] & (rows >= 0)] = STALE
             for column in np.flatnonzero((rows == STALE).any(axis=0)).tolist():
-                name = self._names.by_code[int(state[0][column])]
-                self._remarks.count_stale(topic, name, times_ns, rows[:, column] == STALE, in_gap)
+                name = self.names.by_code[int(state[0][column])]
+                self.remarks.count_stale(topic, name, times_ns, rows[:, column] == STALE, in_gap)
             self._place_following(topic, times_ns, state[1])
             states.append(state)
         codes, states_of, classes = zip(*states, strict=True)
@@ -623,7 +614,7 @@ class Tracker:
         columns: dict[str, Floats] = {}
         unknown: list[tuple[str, str, Booleans, Booleans]] = []
         for (topic, index), (reported_ns, values) in self._signals.items():
-            planned = self._readers[topic].planned
+            planned = self.readers[topic].planned
             if planned.mapping is None:
                 continue
             at = np.searchsorted(reported_ns, times_ns, "right") - 1
@@ -636,7 +627,7 @@ class Tracker:
             first = columns.get(name, column)
             columns[name] = np.where(np.isnan(first), column, first)
         for topic, name, is_stale, in_gap in unknown:
-            self._remarks.count_stale(topic, name, times_ns, is_stale & np.isnan(columns[name]), in_gap)
+            self.remarks.count_stale(topic, name, times_ns, is_stale & np.isnan(columns[name]), in_gap)
         return columns
 
 

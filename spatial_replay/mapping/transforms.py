@@ -81,9 +81,7 @@ def matrices_from_yaw(yaw: Floats) -> Floats:
 
 def no_rotations(count: int) -> Floats:
     """Return identity matrices (count, 3, 3)."""
-    matrices = np.zeros((count, 9))
-    matrices[:, ::4] = 1.0
-    return matrices.reshape(count, 3, 3)
+    return np.tile(np.eye(3), (count, 1, 1))
 
 
 def yaw_of(matrices: Floats) -> Floats:
@@ -559,22 +557,17 @@ class FrameTree:
         texts += self._contradictions.values()
         doubtful = [child.restart for child in self._children.values()]
         if restarts := [each for each in self._restarts if each not in doubtful]:
-            (old, new), count = restarts[0], len(restarts)
-            times = "" if count == 1 else f" {count} times, first"
-            step = f"step back{times} by {(old.stamp_ns - new.stamp_ns) / 1e9:.3f} s at "
             rule = "earlier ones do not count from there on; cut the log there to evaluate each run by itself"
             why = f", as when a simulation restarts: {rule}"
-            texts.append(Sentence(f"the stamps of transforms {step}", Instant(new.clock_ns, 0), why))
+            texts.append(_stepping("transforms", len(restarts), *restarts[0], why))
         if self._steps:
             name, (count, old, new) = min(self._steps.items(), key=lambda each: each[1][2].clock_ns)
-            times = "" if count == 1 else f" {count} times, first"
             others = len(self._steps) - 1
             of = f"{name!r} and {counted(others, 'other frame')}" if others else repr(name)
-            step = f"step back{times} by {(old.stamp_ns - new.stamp_ns) / 1e9:.3f} s at "
-            why = (
-                ": they are sorted by stamp, as if of two senders; if a clock was set back, cut the log there"
+            rule = (
+                "they are sorted by stamp, as if of two senders; if a clock was set back, cut the log there"
             )
-            texts.append(Sentence(f"the stamps of {of} {step}", Instant(new.clock_ns, 0), why))
+            texts.append(_stepping(of, count, old, new, f": {rule}"))
         for name, (count, most, old, new) in sorted(self._jumps.items()):
             if count < _MANY_JUMPS:
                 continue
@@ -653,6 +646,12 @@ def _why_ignored(child: str, entry: _Entry) -> str | None:
     if abs(length * length - 1) > _OFF_LENGTH:
         return f"its quaternion has the length {length:.3g}, so it is not a rotation"
     return None
+
+
+def _stepping(of: str, count: int, old: _Entry, new: _Entry, why: str) -> Sentence:
+    times = "" if count == 1 else f" {count} times, first"
+    back = f"{(old.stamp_ns - new.stamp_ns) / 1e9:.3f} s"
+    return Sentence(f"the stamps of {of} step back{times} by {back} at ", Instant(new.clock_ns, 0), why)
 
 
 def _place(entry: _Entry) -> str:
