@@ -23,7 +23,7 @@ from spatial_replay.bags.sqlite import (
     ZSTD_MAGIC,
     BagMetadata,
     SqliteBag,
-    bag_metadata_from_text,
+    bag_metadata_from_bytes,
     temporary_folder,
     unpack_file,
     unpacked,
@@ -32,7 +32,6 @@ from spatial_replay.bags.sqlite import (
 from spatial_replay.errors import LogError, MissingFileError
 from spatial_replay.geometry.arrays import select
 from spatial_replay.logs.messages import Attachment, Channel
-from spatial_replay.logs.read_options import FaultList
 from spatial_replay.logs.remote import LogFile, open_file
 from spatial_replay.logs.topics import MAGIC
 from spatial_replay.text import Instant, Sentence
@@ -53,8 +52,8 @@ def files_of_bag_around(path: Path) -> tuple[str, ...]:
     """Return the names of all files of the bag that a file is in; none where no metadata lists it."""
     try:
         with path.with_name(METADATA_FILE).open("rb") as stream:
-            listed = bag_metadata_from_text(stream.read(LARGEST_METADATA + 1).decode()).files
-    except (OSError, UnicodeDecodeError, LogError):
+            listed = bag_metadata_from_bytes(stream.read(LARGEST_METADATA + 1)).files
+    except (OSError, LogError):
         return ()
     return listed if path.name in listed else ()
 
@@ -69,14 +68,11 @@ class BagFolder(MessageReader):
         path = self._path / METADATA_FILE
         try:
             with path.open("rb") as stream:
-                text = stream.read(LARGEST_METADATA + 1).decode()
-            return bag_metadata_from_text(text)
+                return bag_metadata_from_bytes(stream.read(LARGEST_METADATA + 1))
         except FileNotFoundError:
             what = "is missing: its recorder was interrupted"
         except OSError as error:
             raise MissingFileError.of(path, error) from None
-        except UnicodeDecodeError:
-            what = "is not UTF-8"
         except LogError as error:
             what = f"cannot be used: {error}"
         self._faults.add(f"{self.name}: {METADATA_FILE} {what}; the files in the folder were read without it")
@@ -110,7 +106,12 @@ class BagFolder(MessageReader):
 
     @cached_property
     def _topics(self) -> tuple[Topic, ...]:
-        present = [topic for file in self._files for topic in self._described(file)]
+        present: list[Topic] = []
+        for file in self._files:
+            try:
+                present += file.topics()
+            except LogError as error:
+                self._faults.add(f"{self.name}: {error}")
         declared = self._metadata
         named = topics_by_name(present, self._distribution)
         if declared is None:
@@ -211,11 +212,10 @@ class BagFolder(MessageReader):
             with path.open("rb") as stream:
                 head = stream.read(len(SQLITE_MAGIC))
             if head.startswith(ZSTD_MAGIC):
-                damage = FaultList()
-                file = self._opened(unpack_file(path, self._unpacked_files, damage))
-                for fault in damage.take(last=True):
-                    self._faults.add(f"{self.name}: {fault}")
-                return file
+                unpacked_file, damage = unpack_file(path, self._unpacked_files)
+                if damage:
+                    self._faults.add(f"{self.name}: {damage}")
+                return self._opened(unpacked_file)
         except OSError as error:
             raise MissingFileError.of(path, error) from None
         except LogError as error:
@@ -227,13 +227,6 @@ class BagFolder(MessageReader):
             return McapLog(path)
         self._faults.add(f"{self.name}: {path.name!r} is neither SQLite nor MCAP; what it holds is lost")
         return None
-
-    def _described(self, file: _File) -> tuple[Topic, ...]:
-        try:
-            return file.topics()
-        except LogError as error:
-            self._faults.add(f"{self.name}: {error}")
-            return ()
 
     def _unpacked(self, packed: MessageColumns, plain: set[str]) -> MessageColumns:
         payloads: list[bytes] = []

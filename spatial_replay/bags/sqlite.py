@@ -39,7 +39,6 @@ from spatial_replay.logs.mcap.index import LARGEST_CHUNK
 from spatial_replay.logs.mcap.read import ALWAYS_ALLOWED, MOST_TIMES_LARGER
 from spatial_replay.logs.messages import Channel, Schema
 from spatial_replay.logs.output_file import open_output, output_error
-from spatial_replay.logs.read_options import FaultList
 from spatial_replay.text import Instant, Sentence
 
 Compression = Literal["", "file", "message"]
@@ -68,13 +67,16 @@ class BagMetadata:
     distribution: str | None
 
 
-def bag_metadata_from_text(text: str) -> BagMetadata:
-    """Parse a metadata.yaml.
+def bag_metadata_from_bytes(data: bytes) -> BagMetadata:
+    """Parse a metadata.yaml; of a file, `LARGEST_METADATA` bytes and one more are enough.
 
     Raises:
         LogError: it is not YAML, or does not describe a bag.
     """
-    document = _plain(text)
+    try:
+        document = _plain(data.decode())
+    except UnicodeDecodeError:
+        raise LogError("it is not UTF-8") from None
     about = document.get("rosbag2_bagfile_information", document) if isinstance(document, dict) else None
     if not isinstance(about, dict):
         raise LogError("it does not describe a bag; it has no 'rosbag2_bagfile_information'")
@@ -185,11 +187,11 @@ def copy_beginning(path: Path, size: int, folder: Path) -> Path:
     return target
 
 
-def unpack_file(packed: Path, folder: Path, faults: FaultList) -> Path:
-    """Decompress a file into a folder; return its path there, without the suffix of the compression.
+def unpack_file(packed: Path, folder: Path) -> tuple[Path, str]:
+    """Decompress a file into a folder.
 
-    Args:
-        faults: takes where it breaks off.
+    Returns:
+        its path there, without the suffix of the compression; where it breaks off, or "".
 
     Raises:
         LogError: it does not decompress, or to something absurdly large.
@@ -220,9 +222,7 @@ def unpack_file(packed: Path, folder: Path, faults: FaultList) -> Path:
         damage = f"does not decompress to its end ({error})"
     if not written:
         raise LogError(f"{packed.name} {damage or 'is empty'}; nothing in it can be decompressed")
-    if damage:
-        faults.add(f"{packed.name} {damage}; {written} bytes could be decompressed")
-    return target
+    return target, f"{packed.name} {damage}; {written} bytes could be decompressed" if damage else ""
 
 
 def _decompressed(source: BinaryIO) -> Iterator[tuple[bytes, bool]]:
@@ -632,7 +632,7 @@ def _metadata(database: sqlite3.Connection) -> BagMetadata | None:
     for row in _records(database, "metadata"):
         text = row.get("metadata")
         if isinstance(text, str) and text.strip():
-            return bag_metadata_from_text(text)
+            return bag_metadata_from_bytes(text.encode())
     return None
 
 

@@ -67,7 +67,10 @@ def open_source(path: str | PathLike[str], **reading: Unpack[Reading]) -> Source
         LogError: the file is in none of the known formats.
         RemoteError: an address does not answer.
     """
-    _require_path(path)
+    given: object = path
+    if not isinstance(given, (str, PathLike)):
+        remedy = "give the path of a log; Trace.from_samples(samples) takes samples"
+        raise UsageError(f"path is {shortened(given)}; {remedy}")
     options = ReadOptions(**reading)
     path = readable_file(path)
     if isinstance(path, Path) and is_bag_folder(path):
@@ -115,12 +118,6 @@ def read_trace(path: str | PathLike[str], *, allow_damage: bool = False, **readi
         more = f"\n… and {others} more" if others else ""
         raise LogError(f"{faults[0]}{more}; allow_damage=True reads the rest")
     return replace(trace, remarks=remarks, faults=faults, units=axes_of(source).units)
-
-
-def _require_path(value: object) -> None:
-    if not isinstance(value, (str, PathLike)):
-        remedy = "give the path of a log; Trace.from_samples(samples) takes samples"
-        raise UsageError(f"path is {shortened(value)}; {remedy}")
 
 
 def readable_file(path: str | PathLike[str]) -> LogFile:
@@ -188,17 +185,17 @@ def bag_files_at(metadata: RemoteFile) -> list[RemoteFile]:
         LogError: the metadata cannot be used.
         MissingFileError, RemoteError: it cannot be read.
     """
-    from spatial_replay.bags.sqlite import LARGEST_METADATA, bag_metadata_from_text
+    from spatial_replay.bags.sqlite import LARGEST_METADATA, bag_metadata_from_bytes
 
     folder = os.fspath(metadata).removesuffix(BAG_METADATA)
     try:
-        listed = bag_metadata_from_text(metadata.read(0, LARGEST_METADATA + 1).decode()).files
+        listed = bag_metadata_from_bytes(metadata.read(0, LARGEST_METADATA + 1)).files
     except MissingFileError as error:
         raise MissingFileError(
             f"{error}; a ROS 2 bag is the address of its folder, and any other log that of one file, such as "
             "s3://bucket/run.mcap"
         ) from None
-    except (LogError, UnicodeDecodeError) as error:
+    except LogError as error:
         raise LogError(f"{metadata} cannot be used: {error}; copy the bag to this machine") from None
     if is_web(metadata):
         listed = tuple(map(quote, listed))
@@ -209,9 +206,8 @@ def downloaded_bag(metadata: RemoteFile) -> Path:
     """Return the folder with a copy of the ROS 2 bag at an address; see `downloaded`."""
     shown = str(metadata).removesuffix(BAG_METADATA)
     name = shown.rstrip("/").rpartition("/")[2].strip(".") or "bag"
-    return downloaded_folder(
-        bag_files_at(metadata), name, shown, "the files of a ROS 2 bag are read together"
-    )
+    reason = "the files of a ROS 2 bag are read together"
+    return downloaded_folder(bag_files_at(metadata), shown, reason, name)
 
 
 def format_of(path: LogFile) -> str | None:

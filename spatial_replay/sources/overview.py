@@ -239,7 +239,6 @@ class _Counter:
         self.examples: dict[str, list[object]] = {}
         self._remarks: list[str] = []
         self._undecodable: dict[str, tuple[int, Sentence]] = {}
-        self._looked_at: dict[str, int] = {}
         self._decoders: dict[str, Decoder] = {}
         self.missing = {topic.name for topic in topics if topic.count != 0}
         for topic in topics:
@@ -269,25 +268,21 @@ class _Counter:
         self._bytes[topic] += len(message.payload)
         if self.counts[topic] > 1 and self._bytes[topic] > _EXAMPLE_BYTES:
             return
-        self._looked_at[topic] = self._looked_at.get(topic, 0) + 1
         try:
             self.examples[topic].append(self._decoders[topic](message.payload))
         except LogError as error:
-            here = Sentence(f"{error}, at ", Instant(message.log_time_ns, 0))
+            start = f"topic {topic!r}: "
+            what = f"{start}{str(error).removeprefix(start)}, at "
+            here = Sentence(what, Instant(message.log_time_ns, 0))
             count, first = self._undecodable.get(topic, (0, here))
             self._undecodable[topic] = count + 1, first
 
     def take_remarks(self) -> list[str]:
         """Return remarks on topics, and on messages looked at, that cannot be decoded."""
         return self._remarks + [
-            Sentence(_of_topic(topic, first), f" ({count} of {self._looked_at[topic]} messages looked at)")
+            Sentence(first, f" ({count} of {count + len(self.examples[topic])} messages looked at)")
             for topic, (count, first) in self._undecodable.items()
         ]
-
-
-def _of_topic(name: str, what: Sentence) -> Sentence:
-    start = f"topic {name!r}: "
-    return what if what.startswith(start) else Sentence(start, what)
 
 
 @dataclass(frozen=True, slots=True)
