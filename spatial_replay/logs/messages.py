@@ -121,21 +121,13 @@ def merge(streams: Sequence[Messages]) -> Messages:
 
 def join(streams: Sequence[Messages]) -> Messages:
     """Join messages, one stream after the other."""
-    channels = sorted(
-        {
-            (_rank(channel), id(channel)): channel
-            for stream in streams
-            for channel in stream.channels.values()
-        }.items()
-    )
-    number: dict[int, int] = {}
-    merged: dict[int, Channel] = {}
-    for (rank, identity), channel in channels:
-        if not merged or _rank(merged[len(merged) - 1]) != rank:
-            merged[len(merged)] = channel
-        number[identity] = len(merged) - 1
-    renumbered = [replace(stream, channel=_renumbered(stream, number)) for stream in streams]
-    return replace(concatenated([Messages(), *renumbered]), channels=merged)
+    known = {id(channel): channel for stream in streams for channel in stream.channels.values()}
+    by_rank = {_rank(channel): channel for channel in known.values()}
+    number = {rank: place for place, rank in enumerate(sorted(by_rank))}
+    own = {identity: number[_rank(channel)] for identity, channel in known.items()}
+    renumbered = [replace(stream, channel=_renumbered(stream, own)) for stream in streams]
+    channels = {place: by_rank[rank] for rank, place in number.items()}
+    return replace(concatenated([Messages(), *renumbered]), channels=channels)
 
 
 def _rank(channel: Channel) -> tuple[str, str, str, str, bytes, tuple[tuple[str, str], ...]]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from itertools import count
 
 import numpy as np
 from google.protobuf.message import DecodeError, Message
@@ -23,7 +23,7 @@ from spatial_replay.geometry.arrays import (
     starts_from_counts,
 )
 from spatial_replay.geometry.footprint import Concave, FootprintBatch
-from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectState, ObjectStates
+from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.wire import Bytes, LayoutError, WireTemplate, Words, payloads_of, rows_of
 from spatial_replay.text import Instant, Sentence
 from spatial_replay.trace.observations import Observations, trace_from_observations
@@ -49,7 +49,6 @@ class SlotLayout:
         coordinates: (2 V,) slots of x, y, x, y …
         radius: (P,) slots.
         yaw, bottom, top, uncertainty: (J,) slots.
-        stated: slots of yaw and height that the message holds, and (of the same length) whose they are.
         signals: slot of each signal's value.
     """
 
@@ -64,8 +63,6 @@ class SlotLayout:
     bottom: Integers
     top: Integers
     uncertainty: Integers
-    stated: Integers
-    stated_by: Integers
     signals: dict[str, int]
 
 
@@ -94,74 +91,37 @@ def layout_of(message: ObjectStates) -> SlotLayout:
     Raises:
         WrongMessageError: a signal without a name, or with one that another has.
     """
-    slots = _Slots()
-    time = slots.next_if(message.HasField("time_ns"), UNKNOWN)
-    objects = [_object_slots(state, slots) for state in message.objects]
-    signals = {signal.name: slots.next_if(signal.HasField("value"), ZERO) for signal in message.signals}
+    slots = count()
+
+    def slot(present: bool, otherwise: int) -> int:
+        return next(slots) if present else otherwise
+
+    time = slot(message.HasField("time_ns"), UNKNOWN)
+    names = ("coordinates", "radius", "yaw", "bottom", "top", "uncertainty")
+    columns: dict[str, list[int]] = {name: [] for name in names}
+    for state in message.objects:
+        # in the order of the fields
+        for part in state.parts:
+            columns["coordinates"] += (next(slots) for _ in part.coordinates)
+            columns["radius"].append(slot(part.HasField("radius"), ZERO))
+        columns["yaw"].append(slot(state.HasField("yaw"), UNKNOWN))
+        absent = ZERO if state.HasField("height") else UNKNOWN
+        columns["bottom"].append(slot(state.height.HasField("bottom"), absent))
+        columns["top"].append(slot(state.height.HasField("top"), absent))
+        columns["uncertainty"].append(slot(state.HasField("uncertainty"), ZERO))
+    signals = {signal.name: slot(signal.HasField("value"), ZERO) for signal in message.signals}
     if "" in signals or len(signals) < len(message.signals):
         raise WrongMessageError("a signal has no name, or one that another signal has")
-    slots_by = [(slot, index) for index, s in enumerate(objects) for slot in (s.yaw, s.bottom, s.top)]
-    stated = [(slot, index) for slot, index in slots_by if slot != UNKNOWN]
+    counts = (len(part.coordinates) // 2 for state in message.objects for part in state.parts)
     return SlotLayout(
         time=time,
         names=tuple(state.name for state in message.objects),
         classes=tuple(s.class_name if s.HasField("class_name") else None for s in message.objects),
-        part_counts=_integers(len(state.radius) for state in objects),
-        vertex_counts=_integers(len(part.coordinates) // 2 for s in message.objects for part in s.parts),
-        coordinates=_integers(slot for state in objects for slot in state.coordinates),
-        radius=_integers(slot for state in objects for slot in state.radius),
-        yaw=_integers(state.yaw for state in objects),
-        bottom=_integers(state.bottom for state in objects),
-        top=_integers(state.top for state in objects),
-        uncertainty=_integers(state.uncertainty for state in objects),
-        stated=_integers(slot for slot, _ in stated),
-        stated_by=_integers(index for _, index in stated),
+        part_counts=np.array([len(state.parts) for state in message.objects], np.int64),
+        vertex_counts=np.fromiter(counts, np.int64),
         signals=signals,
+        **{name: np.array(slots_of, np.int64) for name, slots_of in columns.items()},
     )
-
-
-class _ObjectSlots(NamedTuple):
-    coordinates: list[int]
-    radius: list[int]
-    yaw: int
-    bottom: int
-    top: int
-    uncertainty: int
-
-
-def _object_slots(state: ObjectState, slots: _Slots) -> _ObjectSlots:
-    """Return the slots of one object, taken in the order of the fields."""
-    coordinates, radius = list[int](), list[int]()
-    for part in state.parts:
-        coordinates += [slots.next_if(True, UNKNOWN) for _ in part.coordinates]
-        radius.append(slots.next_if(part.HasField("radius"), ZERO))
-    absent = ZERO if state.HasField("height") else UNKNOWN
-    return _ObjectSlots(
-        coordinates,
-        radius,
-        yaw=slots.next_if(state.HasField("yaw"), UNKNOWN),
-        bottom=slots.next_if(state.height.HasField("bottom"), absent),
-        top=slots.next_if(state.height.HasField("top"), absent),
-        uncertainty=slots.next_if(state.HasField("uncertainty"), ZERO),
-    )
-
-
-class _Slots:
-    """Hands out slots one after the other."""
-
-    def __init__(self) -> None:
-        self._next = 0
-
-    def next_if(self, present: bool, otherwise: int) -> int:
-        """Return the next slot for a number that is present, the given place for one that is not."""
-        if not present:
-            return otherwise
-        self._next += 1
-        return self._next - 1
-
-
-def _integers(values: Iterable[int]) -> Integers:
-    return np.fromiter(values, np.int64)
 
 
 SAMPLES_PER_LAYOUT = 32
@@ -382,8 +342,8 @@ def _invalid(group: _Group) -> NDArray[np.bool_]:
     """Return (K * J,) where an orientation or a height is stated, but not finite."""
     layout = group.layout
     invalid = np.zeros((len(group.samples), len(layout.names)), np.bool_)
-    for slot, owner in zip(layout.stated.tolist(), layout.stated_by.tolist(), strict=True):
-        invalid[:, owner] |= ~np.isfinite(group.numbers[:, slot])
+    for slots in (layout.yaw, layout.bottom, layout.top):
+        invalid |= (slots != UNKNOWN) & ~np.isfinite(group.numbers[:, slots])
     return invalid.ravel()
 
 

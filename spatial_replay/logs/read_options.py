@@ -121,12 +121,10 @@ def late_ns(text: object) -> int:
     Raises:
         UsageError: anything else.
     """
-    if text == "all":
-        return LATEST_NS
-    match = _LATENESS.fullmatch(text) if isinstance(text, str) else None
-    if match is None:
+    late = LATEST_NS if text == "all" else _nanoseconds(text)
+    if late is None:
         raise UsageError(f"max_lateness is {shortened(text)}; give a duration such as 2s or 500ms, or all")
-    return int(Fraction(match[1]) * (10**9 if match[2] == "s" else 10**6))
+    return late
 
 
 def gap_ns(text: object) -> int | None:
@@ -135,13 +133,15 @@ def gap_ns(text: object) -> int | None:
     Raises:
         UsageError: anything else.
     """
-    if text is None:
-        return None
-    match = _LATENESS.fullmatch(text) if isinstance(text, str) else None
-    gap = int(Fraction(match[1]) * (10**9 if match[2] == "s" else 10**6)) if match else 0
-    if not gap:
+    gap = _nanoseconds(text)
+    if text is not None and not gap:
         raise UsageError(f"max_gap is {shortened(text)}; give a duration above 0, such as 2s or 500ms")
     return gap
+
+
+def _nanoseconds(text: object) -> int | None:
+    match = _LATENESS.fullmatch(text) if isinstance(text, str) else None
+    return int(Fraction(match[1]) * (10**9 if match[2] == "s" else 10**6)) if match else None
 
 
 _REASONS = {

@@ -8,7 +8,6 @@ import logging
 import os
 import shutil
 import tempfile
-from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -23,7 +22,7 @@ from os import PathLike, fspath
 from pathlib import Path
 from threading import Lock
 from types import MappingProxyType
-from typing import Any, BinaryIO, Final, Protocol, TypeAlias, cast
+from typing import Any, BinaryIO, Final, TypeAlias, cast
 from urllib.parse import unquote, urlsplit
 
 from spatial_replay.errors import (
@@ -47,24 +46,10 @@ _WASTE: Final = 0.08
 """The share of bytes that may be read between ranges, unused, to save requests."""
 
 
-class FileInParts(Protocol):
-    """A file that gives ranges of its bytes."""
-
-    @property
-    def size(self) -> int:
-        """In bytes."""
-
-    def read(self, begin: int, end: int) -> bytes:
-        """Return a range, less where the file ends before that."""
-
-    def fetch(self, ranges: Iterable[Range]) -> None:
-        """Read ranges, to be held until they are asked for."""
-
-
 class RangeStream(io.RawIOBase):
     """A position in a file, and the ranges that are going to be read from it, in batches."""
 
-    def __init__(self, file: FileInParts) -> None:
+    def __init__(self, file: RemoteFile) -> None:
         super().__init__()
         self._file = file
         self._position = 0
@@ -162,9 +147,7 @@ class HeldBytes:
     """Parts of a file that do not overlap; the oldest are dropped when there are too many."""
 
     def __init__(self) -> None:
-        self._begins: list[int] = []
         self._parts: dict[int, bytes] = {}
-        self._size = 0
 
     def missing(self, begin: int, end: int) -> list[Range]:
         """Return the parts of a range that are not held."""
@@ -184,21 +167,14 @@ class HeldBytes:
     def add(self, begin: int, data: bytes) -> None:
         """Take in what is not held of a part."""
         for start, end in self.missing(begin, begin + len(data)):
-            self._begins.insert(bisect_right(self._begins, start), start)
-            self._parts[start] = data if end - start == len(data) else data[start - begin : end - begin]
-            self._size += end - start
-        while self._size > MOST_HELD_BYTES and len(self._parts) > 1:
-            oldest = next(iter(self._parts))
-            self._size -= len(self._parts.pop(oldest))
-            self._begins.remove(oldest)
+            self._parts[start] = data[start - begin : end - begin]
+        while len(self._parts) > 1 and sum(map(len, self._parts.values())) > MOST_HELD_BYTES:
+            del self._parts[next(iter(self._parts))]
 
-    def _overlapping(self, begin: int, end: int) -> Iterator[tuple[int, bytes]]:
-        index = max(bisect_right(self._begins, begin) - 1, 0)
-        while index < len(self._begins) and self._begins[index] < end:
-            start = self._begins[index]
-            if start + len(self._parts[start]) > begin:
-                yield start, self._parts[start]
-            index += 1
+    def _overlapping(self, begin: int, end: int) -> list[tuple[int, bytes]]:
+        """Return the parts that reach into a range, in order, with where they begin."""
+        parts = self._parts.items()
+        return sorted((start, data) for start, data in parts if start < end and start + len(data) > begin)
 
 
 _CREDENTIALS: Final = {
@@ -442,9 +418,8 @@ class RemoteFile(PathLike[str]):
                 return self._without_suffix(head)
         if first != version:
             raise self._changed()
-        for place, data in ((begin, tail), (0, beginning)):
-            for gap_begin, gap_end in self._held.missing(place, place + len(data)):
-                self._held.add(gap_begin, data[gap_begin - place : gap_end - place])
+        self._held.add(begin, tail)
+        self._held.add(0, beginning)
         return version
 
     def _without_suffix(self, head: Future[tuple[FileVersion, int, bytes]]) -> FileVersion:
@@ -625,20 +600,16 @@ def downloaded(file: RemoteFile, reason: str = "") -> Path:
         MissingFileError, RemoteError: it cannot be read.
         OutputError: the disk cannot take it.
     """
-    return _copied([file], str(file), reason) / _name(file)
+    return downloaded_folder([file], str(file), reason) / _name(file)
 
 
-def downloaded_folder(files: Sequence[RemoteFile], name: str, shown: str, reason: str) -> Path:
-    """Return a folder of this name with copies of remote files; see `downloaded`.
+def downloaded_folder(files: Sequence[RemoteFile], shown: str, reason: str, below: str = "") -> Path:
+    """Return the folder that holds copies of remote files; see `downloaded`.
 
     Args:
         shown: the address of the folder, for messages.
+        below: the name of the folder, if it matters.
     """
-    return _copied(files, shown, reason, name)
-
-
-def _copied(files: Sequence[RemoteFile], shown: str, reason: str, below: str = "") -> Path:
-    """Return the folder that holds copies of files."""
     versions, limit = [file.version for file in files], gigabytes(_LIMIT, _DEFAULT_GIGABYTES)
     size = sum(version.size for version in versions)
     parent = user_cache_folder("downloads")

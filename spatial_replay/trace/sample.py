@@ -54,14 +54,13 @@ _EXAMPLES = MappingProxyType(
 
 def _signal_value(name: str, value: Any) -> float:
     """Return a number as it is, and that of a text that is none."""
-    is_number = not isinstance(value, (bool, np.bool_, bytes))
     try:
-        number = float(value) if is_number else None
+        number = float(value)
     except (TypeError, ValueError, OverflowError) as error:
         if isinstance(value, str):
             return text_number(value)
         raise TraceError(f"signal {name!r} is {shortened(value)}; give a number or a text") from error
-    if number is None or isinstance(value, str):
+    if isinstance(value, (str, bytes, bool, np.bool_)):
         raise TraceError(f"signal {name!r} is {shortened(value)}; give a number, such as 1.0 for true")
     return number
 

@@ -227,15 +227,8 @@ class Trace(Displayed):
     @property
     def nbytes(self) -> int:
         """The size of its arrays in bytes, without the cache."""
-        arrays = [
-            self.times_ns,
-            self.rows,
-            self.yaw,
-            self.uncertainty,
-            self.class_code,
-            *self.signals.values(),
-        ]
-        return self.footprints.nbytes + sum(array.nbytes for array in arrays)
+        columns = (self.times_ns, self.rows, self.yaw, self.uncertainty, self.class_code)
+        return self.footprints.nbytes + sum(each.nbytes for each in (*columns, *self.signals.values()))
 
     @property
     def unreadable_count(self) -> int:
@@ -286,23 +279,22 @@ class Trace(Displayed):
         number = {name: index for index, name in enumerate(names)}
         rows = np.full((len(listed), len(names)), ABSENT, np.int64)
         observed: list[TrackedObject] = []
+        # what is known of an object that is not known where: its class, in a row after the others
+        blank: list[tuple[int, str, str | None]] = []
         for index, sample in enumerate(listed):
             for name in sorted(sample.objects):
                 rows[index, number[name]] = len(observed)
                 observed.append(sample.objects[name])
-        # what is known of an object that is not known where: its class, in a row after the others
-        blank: list[str | None] = []
-        for index, sample in enumerate(listed):
-            for name in sorted(sample.unknown):
-                rows[index, number[name]] = -2 - (len(observed) + len(blank))
-                blank.append(sample.unknown[name])
-        named = [*(tracked.class_name for tracked in observed), *blank]
+            blank += ((index, name, sample.unknown[name]) for name in sorted(sample.unknown))
+        for row, (index, name, _) in enumerate(blank, len(observed)):
+            rows[index, number[name]] = -2 - row
+        named = [*(tracked.class_name for tracked in observed), *(class_name for *_, class_name in blank)]
         classes = _class_order(named)
-        footprints, heights = [each.footprint for each in observed], [each.height for each in observed]
         columns = {name: [sample.signals.get(name, np.nan) for sample in listed] for name in signals}
-        shapes = FootprintBatch.from_footprints(footprints, heights)
-        if blank:
-            shapes = FootprintBatch.concatenate([shapes, FootprintBatch.unknown(len(blank))])
+        known = FootprintBatch.from_footprints(
+            [each.footprint for each in observed], [each.height for each in observed]
+        )
+        shapes = FootprintBatch.concatenate([known, FootprintBatch.unknown(len(blank))])
         yaws = [*(np.nan if each.yaw is None else each.yaw for each in observed), *(np.nan for _ in blank)]
         return cls(
             times_ns=np.array([sample.time_ns for sample in listed], np.int64),
@@ -406,20 +398,18 @@ class Trace(Displayed):
             sample += len(trace)
             row += len(trace.footprints)
         unknown = {len(trace): np.full(len(trace), np.nan) for trace in traces}
+        codes = (np.array([code[n] for n in trace.classes], np.int64)[trace.class_code] for trace in traces)
         return cls(
-            times_ns=_joined_integers(trace.times_ns for trace in traces),
+            times_ns=np.concatenate([np.empty(0, np.int64), *(trace.times_ns for trace in traces)]),
             names=names,
             rows=rows,
             footprints=FootprintBatch.concatenate([trace.footprints for trace in traces]),
-            yaw=_joined_floats(trace.yaw for trace in traces),
-            uncertainty=_joined_floats(trace.uncertainty for trace in traces),
-            class_code=_joined_integers(
-                np.array([code[name] for name in trace.classes], np.int64)[trace.class_code]
-                for trace in traces
-            ),
+            yaw=np.concatenate([np.empty(0), *(trace.yaw for trace in traces)]),
+            uncertainty=np.concatenate([np.empty(0), *(trace.uncertainty for trace in traces)]),
+            class_code=np.concatenate([np.empty(0, np.int64), *codes]),
             classes=classes,
             signals={
-                name: _joined_floats(trace.signals.get(name, unknown[len(trace)]) for trace in traces)
+                name: np.concatenate([trace.signals.get(name, unknown[len(trace)]) for trace in traces])
                 for name in signals
             },
             faults=tuple(fault for trace in traces for fault in trace.faults),
@@ -515,14 +505,6 @@ def renumbered(rows: Integers) -> tuple[Integers, Integers]:
 
 def _class_order(classes: Iterable[str | None]) -> tuple[str | None, ...]:
     return tuple(sorted(set(classes), key=lambda name: (name is not None, name or "")))
-
-
-def _joined_integers(arrays: Iterable[Integers]) -> Integers:
-    return np.concatenate([np.empty(0, np.int64), *arrays])
-
-
-def _joined_floats(arrays: Iterable[Floats]) -> Floats:
-    return np.concatenate([np.empty(0, np.float64), *arrays])
 
 
 LONG_PAUSE: Final = 5

@@ -250,11 +250,6 @@ class _Obstacle:
     moving: dict[int, ObstacleState] = field(default_factory=dict)
     fixed: ObstacleState | None = None
 
-    def report(self, step: int) -> ObjectReport | None:
-        """Return the obstacle at a time step; None if it is not there."""
-        state = self.fixed or self.moving.get(step)
-        return None if state is None else state.report(self.name, self.class_name, self.parts)
-
 
 def iter_scenario(path: Path, faults: FaultList, *, concave: Concave = "decompose") -> Iterator[Trace]:
     """Yield the time steps of a CommonRoad scenario in blocks.
@@ -284,8 +279,9 @@ def _iter_samples(
         if time_ns > LATEST_NS:
             faults.add(f"{path.name}: time step {step} lies beyond what a time can be; it is left out")
             continue
-        reports = [report for each in obstacles if (report := each.report(step)) is not None]
-        yield time_ns, f"{path.name}: time step {step}", reports, {}
+        states = ((each, each.fixed or each.moving.get(step)) for each in obstacles)
+        reports = [state.report(each.name, each.class_name, each.parts) for each, state in states if state]
+        yield ReportedSample(time_ns, f"{path.name}: time step {step}", reports, {})
 
 
 def _step_size(path: Path, root: Element) -> Fraction:
@@ -330,23 +326,14 @@ def _obstacle(name: str, element: Element, report: ReportFault) -> _Obstacle:
     if element.name == "phantomObstacle":
         # it may be there or not: an object of every open group, about which nothing is known
         return _Obstacle(name, class_name, [], dict.fromkeys(_moving_states(element, [], report), UNKNOWN))
-    shape = element.child("shape")
-    if shape is None:
-        raise ScenarioError("it has no <shape>; give it one")
-    outline = _parts_of(shape)
+    outline = _parts_of(_required(element, "shape"))
     if element.name == "environmentObstacle":
         return _Obstacle(name, class_name, outline, fixed=ObstacleState())
-    if _is_static(element):
-        initial = element.child("initialState")
-        if initial is None:
-            raise ScenarioError("it has no <initialState>; give it one")
+    role = element.child("role")
+    if element.name == "staticObstacle" or (role is not None and role.text == "static"):
+        initial = _required(element, "initialState")
         return _Obstacle(name, class_name, outline, fixed=_state_or_unknown(initial, outline, report))
     return _Obstacle(name, class_name, outline, _moving_states(element, outline, report))
-
-
-def _is_static(element: Element) -> bool:
-    role = element.child("role")
-    return element.name == "staticObstacle" or (role is not None and role.text == "static")
 
 
 def _moving_states(

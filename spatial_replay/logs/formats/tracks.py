@@ -9,19 +9,19 @@ from __future__ import annotations
 import csv
 import gzip
 import json
+import struct
 import zlib
-from array import array
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from math import cos, inf, isfinite, nan, sin
 from pathlib import Path
-from typing import Any, BinaryIO, TypeAlias, cast
+from typing import Any, BinaryIO, NamedTuple, TypeAlias, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from spatial_replay.errors import LogError
-from spatial_replay.geometry.arrays import Floats, Integers, starts_from_counts
+from spatial_replay.geometry.arrays import Integers, flat_index, starts_from_counts
 from spatial_replay.geometry.footprint import Concave, FootprintBatch
 from spatial_replay.logs.messages import BLOCK_SAMPLES
 from spatial_replay.logs.read_options import FaultList, Lost, frame_times
@@ -101,63 +101,38 @@ class ObjectReport:
     invalid: bool = False
 
 
-ReportedSample: TypeAlias = tuple[int, str, list[ObjectReport], dict[str, float]]
-"""Time, place in the file, objects and signals."""
+class ReportedSample(NamedTuple):
+    """A sample as a file reports it; `place` says where it is there."""
+
+    time_ns: int
+    place: str
+    reports: list[ObjectReport]
+    signals: dict[str, float]
 
 
-class ReportColumns:
-    """Collects samples for the trace of a block."""
-
-    def __init__(self) -> None:
-        self.times: list[int] = []
-        self.places: list[str] = []
-        self._reports: list[ObjectReport] = []
-        self._counts: list[int] = []
-        self._signals: list[dict[str, float]] = []
-
-    def __len__(self) -> int:
-        return len(self.times)
-
-    @property
-    def report_count(self) -> int:
-        return len(self._reports)
-
-    def add(self, time_ns: int, place: str, reports: list[ObjectReport], signals: dict[str, float]) -> None:
-        """Add one sample; `place` says where it is in its file."""
-        self.times.append(time_ns)
-        self.places.append(place)
-        self._reports += reports
-        self._counts.append(len(reports))
-        self._signals.append(signals)
-
-    def trace(self, *, concave: Concave) -> tuple[Trace, list[str]]:
-        """Return the samples that can be used, and what is wrong with the others, each with its place."""
-        trace, faults = trace_from_observations(self._observations(), concave=concave)
-        return trace, [f"{self.places[index]}: {what}" for index, what in sorted(faults.items())]
-
-    def _observations(self) -> Observations:
-        reports = self._reports
-        names = {name: index for index, name in enumerate(dict.fromkeys(r.name for r in reports))}
-        ordered = sorted({r.class_name for r in reports}, key=lambda c: (c is not None, c or ""))
-        classes = {name: index for index, name in enumerate(ordered)}
-        signals = sorted({name for values in self._signals for name in values})
-        require_few(names, signals)
-        return Observations(
-            times_ns=np.array(self.times, np.int64),
-            sample=np.repeat(np.arange(len(self.times)), self._counts),
-            name=np.array([names[r.name] for r in reports], np.int64),
-            names=list(names),
-            class_code=np.array([classes[r.class_name] for r in reports], np.int64),
-            classes=tuple(ordered),
-            yaw=np.array([r.yaw for r in reports], np.float64),
-            uncertainty=np.array([r.uncertainty for r in reports], np.float64),
-            shapes=_shapes(reports),
-            invalid=np.array([r.invalid for r in reports], np.bool_),
-            signals={
-                name: np.array([values.get(name, nan) for values in self._signals], np.float64)
-                for name in signals
-            },
-        )
+def _reported(samples: Sequence[ReportedSample]) -> Observations:
+    reports = [report for sample in samples for report in sample.reports]
+    names = {name: index for index, name in enumerate(dict.fromkeys(r.name for r in reports))}
+    ordered = sorted({r.class_name for r in reports}, key=lambda c: (c is not None, c or ""))
+    classes = {name: index for index, name in enumerate(ordered)}
+    signals = sorted({name for sample in samples for name in sample.signals})
+    require_few(names, signals)
+    return Observations(
+        times_ns=np.array([sample.time_ns for sample in samples], np.int64),
+        sample=np.repeat(np.arange(len(samples)), [len(sample.reports) for sample in samples]),
+        name=np.array([names[r.name] for r in reports], np.int64),
+        names=list(names),
+        class_code=np.array([classes[r.class_name] for r in reports], np.int64),
+        classes=tuple(ordered),
+        yaw=np.array([r.yaw for r in reports], np.float64),
+        uncertainty=np.array([r.uncertainty for r in reports], np.float64),
+        shapes=_shapes(reports),
+        invalid=np.array([r.invalid for r in reports], np.bool_),
+        signals={
+            name: np.array([sample.signals.get(name, nan) for sample in samples], np.float64)
+            for name in signals
+        },
+    )
 
 
 def _shapes(reports: list[ObjectReport]) -> FootprintBatch:
@@ -193,20 +168,21 @@ def iter_traces(
     Args:
         most_reports: objects after which a block is closed, however few its samples are.
     """
-    columns = ReportColumns()
+    block, count = list[ReportedSample](), 0
     for sample in samples:
-        columns.add(*sample)
-        if len(columns) == BLOCK_SAMPLES or columns.report_count >= most_reports:
-            yield _trace_of(columns, faults, concave)
-            columns = ReportColumns()
-    if len(columns):
-        yield _trace_of(columns, faults, concave)
+        block.append(sample)
+        count += len(sample.reports)
+        if len(block) == BLOCK_SAMPLES or count >= most_reports:
+            yield _trace_of(block, faults, concave)
+            block, count = [], 0
+    if block:
+        yield _trace_of(block, faults, concave)
 
 
-def _trace_of(columns: ReportColumns, faults: FaultList, concave: Concave) -> Trace:
-    trace, left_out = columns.trace(concave=concave)
-    for fault in left_out:
-        faults.add(fault)
+def _trace_of(samples: Sequence[ReportedSample], faults: FaultList, concave: Concave) -> Trace:
+    trace, left_out = trace_from_observations(_reported(samples), concave=concave)
+    for index, what in sorted(left_out.items()):
+        faults.add(f"{samples[index].place}: {what}")
     return trace
 
 
@@ -224,7 +200,7 @@ def _jsonl_samples(path: Path, faults: FaultList) -> Iterator[ReportedSample]:
             faults.add(Sentence(f"{place}: ", *error.args))
             continue
         latest = time_ns
-        yield time_ns, place, reports, signals
+        yield ReportedSample(time_ns, place, reports, signals)
 
 
 def _sample(line: str) -> tuple[int, list[ObjectReport], dict[str, float]]:
@@ -361,10 +337,6 @@ def _shorten(text: str) -> str:
 CSV_COLUMNS = ("time_ns", "name", "class", "x", "y", "yaw", "length", "width")
 
 
-class _NoObjectError(Exception):
-    """A line that is not an object; the text says why and what to give instead."""
-
-
 def iter_csv(path: Path, faults: FaultList, *, concave: Concave = "decompose") -> Iterator[Trace]:
     """Yield the samples of a track CSV in blocks.
 
@@ -388,24 +360,24 @@ def _csv_samples(path: Path, faults: FaultList) -> Iterator[ReportedSample]:
             if at < time_ns:
                 this, last = times_apart(at, time_ns)
                 what = Sentence("its time is ", this, ", before ", last, "; give times that do not go back")
-                raise _NoObjectError(what)
-        except _NoObjectError as error:
+                raise _NoSampleError(what)
+        except _NoSampleError as error:
             faults.add(Sentence(f"{here}: ", *error.args))
             continue
         if at > time_ns:
             if reports and not broken:
-                yield time_ns, place, list(reports.values()), {}
+                yield ReportedSample(time_ns, place, list(reports.values()), {})
             time_ns, place, reports, broken = at, here, {}, False
         try:
             report = _row_report(row)
             if report.name in reports:
-                raise _NoObjectError(f"object {report.name!r} is there twice; name each object once a sample")
+                raise _NoSampleError(f"object {report.name!r} is there twice; name each object once a sample")
             reports[report.name] = report
-        except _NoObjectError as error:
+        except _NoSampleError as error:
             faults.add(Sentence(f"{here}: {error}; the sample at ", Instant(at, 0), " is left out"))
             broken = True
     if reports and not broken:
-        yield time_ns, place, list(reports.values()), {}
+        yield ReportedSample(time_ns, place, list(reports.values()), {})
 
 
 def _column_order(path: Path, header: str) -> list[str]:
@@ -422,9 +394,9 @@ def _row(line: str, order: list[str]) -> dict[str, str]:
     try:
         cells = next(csv.reader([line], strict=True))
     except (csv.Error, StopIteration) as error:
-        raise _NoObjectError(f"the line is not CSV ({error}); a quoted cell ends on its own line") from None
+        raise _NoSampleError(f"the line is not CSV ({error}); a quoted cell ends on its own line") from None
     if len(cells) != len(order):
-        raise _NoObjectError(f"the line has {len(cells)} cells; give {len(order)}")
+        raise _NoSampleError(f"the line has {len(cells)} cells; give {len(order)}")
     return dict(zip(order, cells, strict=True))
 
 
@@ -434,17 +406,17 @@ def _time(text: str) -> int:
     except ValueError:
         time_ns = -1
     if not 0 <= time_ns <= LATEST_NS:
-        raise _NoObjectError(f"time_ns is {text[:60]!r}; give integer nanoseconds from 0 to 2**63 - 1")
+        raise _NoSampleError(f"time_ns is {text[:60]!r}; give integer nanoseconds from 0 to 2**63 - 1")
     return time_ns
 
 
 def _row_report(row: dict[str, str]) -> ObjectReport:
     if not row["name"]:
-        raise _NoObjectError("the name is empty; give each object a name")
+        raise _NoSampleError("the name is empty; give each object a name")
     x, y, length, width = (_cell(row, column) for column in ("x", "y", "length", "width"))
     yaw = _cell(row, "yaw") if row["yaw"].strip() else nan
     if length < 0 or width < 0:
-        raise _NoObjectError(f"length and width are {length:g} and {width:g}; give sizes of at least 0")
+        raise _NoSampleError(f"length and width are {length:g} and {width:g}; give sizes of at least 0")
     # the cosine and sine of an orientation that is not finite make the box unknown
     c, s = (1.0, 0.0) if not row["yaw"].strip() else (cos(yaw), sin(yaw)) if isfinite(yaw) else (nan, nan)
     vertices: list[float] = []
@@ -460,7 +432,7 @@ def _cell(row: dict[str, str], column: str) -> float:
         return float(text) if text else nan
     except ValueError:
         wanted = "a number, or nothing where it is not known"
-        raise _NoObjectError(f"{column} is {text[:60]!r}; give {wanted}") from None
+        raise _NoSampleError(f"{column} is {text[:60]!r}; give {wanted}") from None
 
 
 FRAMES_A_SECOND = 30.0
@@ -472,12 +444,13 @@ _LARGEST = 10**18 - 1
 """Any integer of so many digits fits 64 bits."""
 
 
+_PACKED = struct.Struct("<qqq?4d")
+_BOX = np.dtype([("id", "<i8"), ("frame", "<i8"), ("label", "<i8"), ("lost", "?"), ("corners", "<f8", 4)])
+"""A line as a row of numbers; corners are xmin, ymin, xmax and ymax."""
+_Boxes: TypeAlias = NDArray[np.void]
+
 _BLOCK_BOXES = 2**16
 """A block is closed when it holds this many, however few its frames are."""
-
-
-class _NoBoxError(Exception):
-    """A line that is not a box; the text says why and what to give instead."""
 
 
 def is_annotations(head: bytes) -> bool:
@@ -506,96 +479,72 @@ def iter_annotations(
         rate: frames a second; frame 0 is at time 0.
         lost: whether rows marked as out of the picture are dropped or kept.
     """
-    boxes, broken = _read_boxes(path, faults, _last_frame(rate))
-    frames, starts = np.unique(boxes.frame, return_index=True)
+    boxes, labels, broken = _read_boxes(path, faults, _last_frame(rate))
+    frames, starts = np.unique(boxes["frame"], return_index=True)
     sound = ~np.isin(frames, np.fromiter(broken, np.int64))
-    frames, starts, ends = frames[sound], starts[sound], np.append(starts[1:], len(boxes.frame))[sound]
+    frames, starts, ends = frames[sound], starts[sound], np.append(starts[1:], len(boxes))[sound]
+    classes = tuple(label or None for label in labels)
     after = 0
     while after < len(frames):
         first = after
         filled = int(np.searchsorted(ends, starts[first] + _BLOCK_BOXES, side="right"))
         after = min(first + BLOCK_SAMPLES, max(filled, first + 1))
         block = slice(first, after)
-        observations = _observations(boxes, frames[block], starts[block], ends[block], rate, lost)
+        observations = _observations(boxes, classes, frames[block], starts[block], ends[block], rate, lost)
         trace, left_out = trace_from_observations(observations, concave=concave)
         for index, what in sorted(left_out.items()):
             faults.add(f"{path.name}: frame {frames[first + index]}: {what}")
         yield trace
 
 
-class _Boxes:
-    """The lines of a file as columns, in the order of frames once `in_order` was called."""
+def _read_boxes(path: Path, faults: FaultList, last_frame: int) -> tuple[_Boxes, list[str], set[int]]:
+    """Read every line that can be read.
 
-    def __init__(self) -> None:
-        self._numbers = {name: array("q") for name in ("id", "frame", "label")}
-        self._corners = array("d")
-        self._lost = array("b")
-        self.labels: dict[str, int] = {}
-        self.id = self.frame = self.label = np.zeros(0, np.int64)
-        self.corners = np.zeros((0, 4))
-        self.lost: NDArray[np.bool_] = np.zeros(0, np.bool_)
-
-    def add(self, number: int, corners: list[float], frame: int, lost: bool, label: str) -> None:
-        """Add one line."""
-        code = self.labels.setdefault(label, len(self.labels))
-        for name, value in (("id", number), ("frame", frame), ("label", code)):
-            self._numbers[name].append(value)
-        self._corners.extend(corners)
-        self._lost.append(lost)
-
-    def in_order(self) -> None:
-        """Sort by frame, keeping the file's order within each."""
-        frame = np.frombuffer(self._numbers["frame"], np.int64)
-        order = np.argsort(frame, kind="stable")
-        columns = (np.frombuffer(self._numbers[name], np.int64)[order] for name in ("id", "frame", "label"))
-        self.id, self.frame, self.label = columns
-        self.corners = np.frombuffer(self._corners, np.float64).reshape(-1, 4)[order]
-        self.lost = np.frombuffer(self._lost, np.int8)[order].astype(np.bool_)
-        self._numbers, self._corners, self._lost = {}, array("d"), array("b")
-
-
-def _read_boxes(path: Path, faults: FaultList, last_frame: int) -> tuple[_Boxes, set[int]]:
-    """Read every line that can be read; return the boxes, and the frames of the lines that cannot be read."""
-    boxes = _Boxes()
-    broken = set[int]()
+    Returns:
+        the boxes by frame, in the file's order within each; their labels; the frames of lines that cannot be
+        read.
+    """
+    packed, labels, broken = bytearray(), dict[str, int](), set[int]()
     for number, line in iter_lines(path, faults):
         cells = line.split(None, len(DRONE_COLUMNS) - 1)
         try:
             if len(cells) != len(DRONE_COLUMNS):
-                raise _NoBoxError(f"the line has {len(cells)} columns; give {' '.join(DRONE_COLUMNS)}")
+                raise _NoSampleError(f"the line has {len(cells)} columns; give {' '.join(DRONE_COLUMNS)}")
             frame = _integer(cells[5], "frame", last_frame)
-        except _NoBoxError as error:
+        except _NoSampleError as error:
             faults.add(f"{path.name}:{number}: {error}")
             continue
         try:
-            boxes.add(*_box(cells, frame))
-        except _NoBoxError as error:
+            identity, corners, is_lost, label = _box(cells)
+        except _NoSampleError as error:
             faults.add(f"{path.name}:{number}: {error}; frame {frame} is left out")
             broken.add(frame)
-    boxes.in_order()
-    return boxes, broken
+            continue
+        packed += _PACKED.pack(identity, frame, labels.setdefault(label, len(labels)), is_lost, *corners)
+    boxes = np.frombuffer(packed, _BOX)
+    return boxes[np.argsort(boxes["frame"], kind="stable")], list(labels), broken
 
 
-def _box(cells: list[str], frame: int) -> tuple[int, list[float], int, bool, str]:
+def _box(cells: list[str]) -> tuple[int, list[float], bool, str]:
     number = _integer(cells[0], "id", _LARGEST)
     try:
         corners = [float(cell) for cell in cells[1:5]]
     except ValueError:
-        raise _NoBoxError(f"the box is {' '.join(cells[1:5])[:60]!r}; give four numbers") from None
+        raise _NoSampleError(f"the box is {' '.join(cells[1:5])[:60]!r}; give four numbers") from None
     if corners[0] > corners[2] or corners[1] > corners[3]:
-        raise _NoBoxError(f"the box is {' '.join(cells[1:5])[:60]!r}; give xmin ymin xmax ymax")
+        raise _NoSampleError(f"the box is {' '.join(cells[1:5])[:60]!r}; give xmin ymin xmax ymax")
     if cells[6] not in ("0", "1"):
-        raise _NoBoxError(f"lost is {cells[6][:60]!r}; give 0 or 1")
+        raise _NoSampleError(f"lost is {cells[6][:60]!r}; give 0 or 1")
     label = cells[9].strip()
     if len(label) >= 2 and label[0] == label[-1] == '"':
         label = label[1:-1]
-    return number, corners, frame, cells[6] == "1", label
+    return number, corners, cells[6] == "1", label
 
 
 def _integer(text: str, what: str, last: int) -> int:
     is_number = len(text) <= len(str(_LARGEST)) and text.isascii() and text.isdecimal()
     if not is_number or int(text) > last:
-        raise _NoBoxError(f"{what} is {text[:60]!r}; give an integer from 0 to {last}")
+        raise _NoSampleError(f"{what} is {text[:60]!r}; give an integer from 0 to {last}")
     return int(text)
 
 
@@ -606,42 +555,43 @@ def _last_frame(rate: float) -> int:
 
 
 def _observations(
-    boxes: _Boxes, frames: Integers, starts: Integers, ends: Integers, rate: float, lost: Lost
+    boxes: _Boxes,
+    classes: tuple[str | None, ...],
+    frames: Integers,
+    starts: Integers,
+    ends: Integers,
+    rate: float,
+    lost: Lost,
 ) -> Observations:
     """Return the boxes of some frames, those from `starts` up to `ends`."""
     counts = ends - starts
     sample = np.repeat(np.arange(len(frames), dtype=np.int64), counts)
-    rows = np.concatenate([np.zeros(0, np.int64), *map(np.arange, starts, ends)])
+    boxes = boxes[flat_index(starts, counts)]
     if lost == "drop":
-        visible = ~boxes.lost[rows]
-        sample, rows = sample[visible], rows[visible]
-    numbers, name = np.unique(boxes.id[rows], return_inverse=True)
+        sample, boxes = sample[~boxes["lost"]], boxes[~boxes["lost"]]
+    numbers, name = np.unique(boxes["id"], return_inverse=True)
+    count, corners = len(boxes), boxes["corners"]
     period = frame_times(rate)
     return Observations(
         times_ns=np.array([round(frame * period) for frame in frames.tolist()], np.int64),
         sample=sample,
         name=name,
         names=[str(number) for number in numbers.tolist()],
-        class_code=boxes.label[rows],
-        classes=tuple(label or None for label in boxes.labels),
-        yaw=np.full(len(rows), np.nan),
-        uncertainty=np.zeros(len(rows)),
-        shapes=_box_shapes(boxes.corners[rows]),
-        invalid=np.zeros(len(rows), np.bool_),
+        class_code=boxes["label"],
+        classes=classes,
+        yaw=np.full(count, np.nan),
+        uncertainty=np.zeros(count),
+        # counter-clockwise where y grows upwards
+        shapes=FootprintBatch(
+            part_start=np.arange(count + 1, dtype=np.int64),
+            vertex_start=np.arange(count + 1, dtype=np.int64) * 4,
+            vertices=corners[:, [0, 1, 2, 1, 2, 3, 0, 3]].reshape(-1, 2),
+            radius=np.zeros(count),
+            bottom=np.full(count, np.nan),
+            top=np.full(count, np.nan),
+        ),
+        invalid=np.zeros(count, np.bool_),
         signals={},
-    )
-
-
-def _box_shapes(corners: Floats) -> FootprintBatch:
-    """Return boxes from (R, 4) xmin, ymin, xmax, ymax, counter-clockwise where y grows upwards."""
-    count = len(corners)
-    return FootprintBatch(
-        part_start=np.arange(count + 1, dtype=np.int64),
-        vertex_start=np.arange(count + 1, dtype=np.int64) * 4,
-        vertices=corners[:, [0, 1, 2, 1, 2, 3, 0, 3]].reshape(-1, 2),
-        radius=np.zeros(count),
-        bottom=np.full(count, np.nan),
-        top=np.full(count, np.nan),
     )
 
 
