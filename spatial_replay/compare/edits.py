@@ -22,7 +22,6 @@ from spatial_replay.spec.formula import (
     Atom,
     Boolean,
     DerivedTerm,
-    Expression,
     Formula,
     Group,
     Outline,
@@ -31,7 +30,6 @@ from spatial_replay.spec.formula import (
     Span,
     Specification,
     Temporal,
-    Term,
     Truth,
     iter_nodes,
     operands_of,
@@ -70,7 +68,7 @@ def unify_regions(
         joined[renamed.get(name, name)] = outline
     if not renamed:
         return list(formulas), joined
-    change = partial(_with_region, renamed=renamed)
+    change = partial(_renamed, regions=renamed)
 
     def changed(atom: Atom) -> Atom:
         expression = map_leaves(atom.expression, partial(changed_leaf, change=change))
@@ -79,44 +77,15 @@ def unify_regions(
     return [rewritten(formula, changed) for formula in formulas], joined
 
 
-@dataclass(frozen=True, slots=True)
-class SharedNames:
-    """Puts one name in place of all that stand for the same.
-
-    Attributes:
-        regions: for each region, the first one of its shape.
-    """
-
-    regions: Mapping[str, str]
-
-    @classmethod
-    def of(cls, regions: Mapping[str, Outline]) -> SharedNames:
-        """Find the regions of one shape."""
-        first: dict[Outline, str] = {}
-        return cls({name: first.setdefault(outline, name) for name, outline in regions.items()})
-
-    def expression(self, expression: Expression) -> Expression:
-        """Return an expression whose groups are known by their members, and regions by their shapes."""
-        return map_leaves(expression, partial(changed_leaf, change=self.term))
-
-    def term(self, term: Any) -> Any:
-        """Return a term of the same kind."""
-        if isinstance(term, Group):
-            return replace(term, name="")
-        if isinstance(term, RegionName):
-            return RegionName(self.regions.get(term.name, term.name))
-        if not isinstance(term, DerivedTerm):
-            return term
-        return replace(term, term=self.term(term.term))
-
-
-def _with_region(term: Term, renamed: Mapping[str, str]) -> Term:
+def _renamed(term: Any, regions: Mapping[str, str], *, without_groups: bool = False) -> Any:
+    """Return a term with other names of regions and, on request, with groups known by their members alone."""
+    if isinstance(term, Group) and without_groups:
+        return replace(term, name="")
     if isinstance(term, RegionName):
-        return RegionName(renamed.get(term.name, term.name))
-    if not isinstance(term, DerivedTerm):
-        return term
-    inner: Any = _with_region(term.term, renamed)
-    return replace(term, term=inner)
+        return RegionName(regions.get(term.name, term.name))
+    if isinstance(term, DerivedTerm):
+        return replace(term, term=_renamed(term.term, regions, without_groups=without_groups))
+    return term
 
 
 DeclarationKind: TypeAlias = Literal["constant", "region", "group", "definition"]
@@ -186,13 +155,20 @@ class TextVersions:
         )
         self._known: dict[tuple[bool, frozenset[int]], Specification | None] = {}
 
-    def applied(self, changes: Collection[int]) -> Specification | None:
-        """Return the old text with some declarations of the new one, by number; None if it has errors."""
-        return self._version(frozenset(changes), is_old=True)
+    def version(self, changes: Collection[int], *, is_undone: bool) -> Specification | None:
+        """Return the old text with some declarations of the new one, by number; None if it has errors.
 
-    def undone(self, changes: Collection[int]) -> Specification | None:
-        """Return the new text with some declarations of the old one, by number; None if it has errors."""
-        return self._version(frozenset(changes), is_old=False)
+        Args:
+            is_undone: return the new text with these of the old one instead.
+        """
+        version = is_undone, frozenset(changes)
+        if version not in self._known:
+            keys = [self._keys[number] for number in changes]
+            # what is exchanged may need declarations that only the other text has
+            texts = (self._exchanged(keys, is_undone, is_strict) for is_strict in (True, False))
+            found = (self._parsed(text, keys, is_undone) for text in texts)
+            self._known[version] = next((each for each in found if each is not None), None)
+        return self._known[version]
 
     def edited_lines(
         self, specs: Sequence[tuple[str, str]], spans: tuple[Span | None, Span | None]
@@ -221,18 +197,9 @@ class TextVersions:
         blocks = [(old[a:b], new[c:d]) for kind, a, b, c, d in codes if kind != "equal"]
         return _chosen(max(blocks, key=lambda block: sum(line.is_wanted for line in (*block[0], *block[1]))))
 
-    def _version(self, changes: frozenset[int], *, is_old: bool) -> Specification | None:
-        if (is_old, changes) not in self._known:
-            keys = [self._keys[number] for number in changes]
-            # what is exchanged may need declarations that only the other text has
-            texts = (self._exchanged(keys, is_old, is_strict) for is_strict in (True, False))
-            found = (self._parsed(text, keys, is_old) for text in texts)
-            self._known[is_old, changes] = next((each for each in found if each is not None), None)
-        return self._known[is_old, changes]
-
-    def _exchanged(self, keys: Collection[_Key], is_old: bool, is_strict: bool) -> str:
-        base, other = self._statements if is_old else self._statements[::-1]
-        file, source = (self.old, self.new) if is_old else (self.new, self.old)
+    def _exchanged(self, keys: Collection[_Key], is_undone: bool, is_strict: bool) -> str:
+        base, other = self._statements[::-1] if is_undone else self._statements
+        file, source = (self.new, self.old) if is_undone else (self.old, self.new)
         pieces: list[tuple[Span, str]] = []
         first = []
         for key in self._keys:
@@ -247,8 +214,8 @@ class TextVersions:
             text = text[: span.start] + piece + text[span.end :]
         return "\n".join((*first, text))
 
-    def _parsed(self, text: str, keys: Iterable[_Key], is_old: bool) -> Specification | None:
-        file, other = (self.old, self.new) if is_old else (self.new, self.old)
+    def _parsed(self, text: str, keys: Iterable[_Key], is_undone: bool) -> Specification | None:
+        file, other = (self.new, self.old) if is_undone else (self.old, self.new)
         profile = other.profile if any(word == "USE" for word, _ in keys) else file.profile
         with suppress(SpecificationError, UsageError):
             return with_numbers(
@@ -415,7 +382,7 @@ class Place:
         for operand in operands_of(self.node):
             specs = self.specs if operand.name is None else (operand.name, *self.specs)
             found.append(Place(operand, identifier, specs, self.depth + 1))
-            identifier += sum(1 for _ in iter_nodes(operand))
+            identifier += _size(operand)
         return found
 
     def members(self, operator: str, *, through_names: bool = False) -> list[Place]:
@@ -452,13 +419,13 @@ class FoundSite(NamedTuple):
     @property
     def ids(self) -> tuple[range, range]:
         """The ids of the nodes that differ; of those with another window or name, only their own."""
-        old, new = (_ids(place, self._is_alone) for place in (self.old, self.new))
-        return old, new
-
-    @property
-    def _is_alone(self) -> bool:
         is_window = self.kind == "constant" and self.new is not None and isinstance(self.new.node, Temporal)
-        return self.kind == "renamed" or is_window
+        is_alone = self.kind == "renamed" or is_window
+        old, new = (
+            range(0) if place is None else range(place.id, place.id + (1 if is_alone else _size(place.node)))
+            for place in (self.old, self.new)
+        )
+        return old, new
 
     def follows_from(self, origin: Origin) -> bool:
         """Say whether an edit of the texts changed it."""
@@ -466,31 +433,25 @@ class FoundSite(NamedTuple):
             origin.old.isdisjoint(self.ids[0]) and origin.new.isdisjoint(self.ids[1])
         )
 
-    def only(self, kind: EditKind) -> Iterator[Place]:
-        """Yield the node if that is the kind, added or removed."""
-        yield from (place for place in (self.old, self.new) if place is not None and self.kind == kind)
 
-
-def _ids(place: Place | None, is_alone: bool) -> range:
-    if place is None:
-        return range(0)
-    return range(place.id, place.id + (1 if is_alone else sum(1 for _ in iter_nodes(place.node))))
+def _size(formula: Formula) -> int:
+    return sum(1 for _ in iter_nodes(formula))
 
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """A place where the trees differ; `edit` is its number once sites of one edit are joined."""
+    """A place where the trees differ, by its number."""
 
-    edit: int
+    site: int
     old: Formula | None
     new: Formula | None
 
 
 @dataclass(frozen=True, slots=True)
 class Inner:
-    """A node of both trees with operands that differ, or, if `edit` is given, with another window."""
+    """A node of both trees with operands that differ, or, if `site` is given, with another window."""
 
-    edit: int | None
+    site: int | None
     old: Boolean | Temporal
     new: Boolean | Temporal
     operands: tuple[Merged, ...]
@@ -509,6 +470,7 @@ class TreeDiff:
 
     units: tuple[tuple[Edit, ...], ...]
     _merged: Merged = field(repr=False)
+    _unit_of_site: Mapping[int, int] = field(repr=False)
 
     @property
     def edits(self) -> tuple[Edit, ...]:
@@ -522,31 +484,21 @@ class TreeDiff:
 
     def formula(self, units: Collection[int]) -> Formula:
         """Return the old formula with only these of the units made, by number."""
-        built = _built(self._merged, frozenset(units))
+        sites = frozenset(site for site, unit in self._unit_of_site.items() if unit in units)
+        built = _built(self._merged, sites)
         return Truth(True) if built is None else built
 
 
 def _built(merged: Merged, chosen: frozenset[int]) -> Formula | None:
     if isinstance(merged, Site):
-        return merged.new if merged.edit in chosen else merged.old
+        return merged.new if merged.site in chosen else merged.old
     if not isinstance(merged, Inner):
         return merged
-    head = merged.new if merged.edit in chosen else merged.old
+    head = merged.new if merged.site in chosen else merged.old
     operands = tuple(each for operand in merged.operands if (each := _built(operand, chosen)) is not None)
     if head.operator in ("and", "or") and len(operands) < 2:
         return operands[0] if operands else Truth(head.operator == "and")
     return replace(head, operands=operands)
-
-
-def renumbered(merged: Merged, numbers: Mapping[int, int]) -> Merged:
-    """Return merged trees whose edits have other numbers."""
-    if isinstance(merged, Site):
-        return replace(merged, edit=numbers[merged.edit])
-    if not isinstance(merged, Inner):
-        return merged
-    operands = tuple(renumbered(operand, numbers) for operand in merged.operands)
-    edit = None if merged.edit is None else numbers[merged.edit]
-    return replace(merged, edit=edit, operands=operands)
 
 
 def kind_of(old: Formula, new: Formula) -> tuple[EditKind, str | None]:
@@ -570,12 +522,7 @@ def _without_numbers(atom: Atom) -> Hashable:
     texts = tuple(each for each in atom.parameters if isinstance(each, str))
     # the number of a signal's comparison is a text too: NAME, comparison, number
     texts = texts[:2] if atom.relation == "signal" else texts
-    return texts, len(atom.parameters), tuple(_without_radius(term) for term in atom.terms)
-
-
-def _without_radius(term: Term) -> Hashable:
-    base = base_of(term)
-    return type(term).__name__, format_term(base)
+    return texts, len(atom.parameters), tuple((type(term), format_term(base_of(term))) for term in atom.terms)
 
 
 def similarity(old: Formula, new: Formula) -> float:
@@ -628,7 +575,9 @@ class _Comparison:
     def __init__(
         self, regions: Mapping[str, Outline], specs: tuple[Collection[str], Collection[str]] = ((), ())
     ) -> None:
-        self._names = SharedNames.of(regions)
+        first: dict[Outline, str] = {}
+        shapes = {name: first.setdefault(outline, name) for name, outline in regions.items()}
+        self._alike = partial(_renamed, regions=shapes, without_groups=True)
         self._specs = specs
         self._renamed: set[tuple[str | None, str | None]] = set()
         self._numbers: dict[Hashable, int] = {}
@@ -648,9 +597,9 @@ class _Comparison:
             case Truth():
                 key = node.value
             case Atom():
-                key = self._names.expression(node.expression)
+                key = map_leaves(node.expression, partial(changed_leaf, change=self._alike))
             case Quantified():
-                group = self._names.term(node.group)
+                group = self._alike(node.group)
                 key = (node.quantifier, len(node.variables), group, self.meaning(without_variables(node)))
             case Boolean(operator="spec"):
                 return self.meaning(node.operands[0])
@@ -691,10 +640,10 @@ class _Comparison:
             case Boolean(), Boolean() if old.node.operator == new.node.operator:
                 return Inner(None, old.node, new.node, self._pairwise(old, new))
             case Temporal(), Temporal() if old.node.operator == new.node.operator:
-                edit = None
+                site = None
                 if old.node.bound != new.node.bound:
-                    edit = self._site(FoundSite("constant", old, new)).edit
-                return Inner(edit, old.node, new.node, self._pairwise(old, new))
+                    site = self._site(FoundSite("constant", old, new)).site
+                return Inner(site, old.node, new.node, self._pairwise(old, new))
             case Quantified(), Quantified() if _ranges_alike(old.node, new.node):
                 kind, subject = kind_of(old.node, new.node)
                 return self._site(FoundSite(kind, old, new, subject, self._parts(old, new)))
@@ -744,13 +693,19 @@ class _Comparison:
             tuple(
                 tuple(self._unit(sites, [declared[index] for index in own], text)) for _, sites, own in units
             ),
-            renumbered(merged, numbers),
+            merged,
+            numbers,
         )
 
     def _joined(self, found: Sequence[FoundSite]) -> Iterable[list[int]]:
         """Join places that follow from one edit of the text of the specs, by number."""
         removed, added = (
-            {self.meaning(place.node) for each in found for place in each.only(kind)}
+            {
+                self.meaning(place.node)
+                for each in found
+                for place in (each.old, each.new)
+                if place is not None and each.kind == kind
+            }
             for kind in ("removed", "added")
         )
         joined: dict[Hashable, list[int]] = {}

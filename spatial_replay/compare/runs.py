@@ -13,9 +13,8 @@ import numpy as np
 
 from spatial_replay.annotate.automaton_state import AutomatonRun
 from spatial_replay.automata.compile import automaton
-from spatial_replay.compiled import elementwise, kernel
 from spatial_replay.errors import NoAutomatonError, UsageError
-from spatial_replay.geometry.arrays import Booleans, Floats, Integers
+from spatial_replay.geometry.arrays import Booleans, Floats, Integers, count_in_rows
 from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.geometry.measure import MeasureRequest, Operand, measure
 from spatial_replay.lazy import Displayed
@@ -422,65 +421,41 @@ def _object_diff(a: Trace, one: Integers, b: Trace, other: Integers) -> tuple[Bo
         Which differ, the squared shift of their vertices' mean, and the signed distance of the two
         footprints; NaN for those that do not differ.
     """
-    both = FootprintBatch.concatenate([a.footprints.select(one), b.footprints.select(other)])
-    first = np.arange(len(one))
-    second = first + len(one)
-    moved, shift = np.zeros(len(one), np.bool_), np.zeros(len(one))
-    shapes = both.part_start, both.vertex_start, both.vertices, both.radius
-    _compare_shapes(*shapes, first, second, moved, shift)
-    columns = [(both.bottom[first], both.bottom[second]), (both.top[first], both.top[second])]
+    first, second = a.footprints.select(one), b.footprints.select(other)
+    moved = ~_are_equal(first, second)
+    columns = [(first.bottom, second.bottom), (first.top, second.top)]
     columns += [(a.yaw[one], b.yaw[other]), (a.uncertainty[one], b.uncertainty[other])]
     for value, beside in columns:
         moved |= (value != beside) & ~(np.isnan(value) & np.isnan(beside))
+    # relative to one vertex, so that coordinates far from the origin do not cancel
+    corner = first.vertices[first.vertex_start[first.part_start[:-1]]]
+    x, y = _mean_vertices(second, corner) - _mean_vertices(first, corner)
     distance = np.full(len(one), np.nan)
-    operands = [Operand(rows[moved, None]) for rows in (first, second)]
+    operands = [Operand(np.flatnonzero(moved)[:, None] + start) for start in (0, len(one))]
+    both = FootprintBatch.concatenate([first, second])
     distance[moved] = measure(both, operands, [MeasureRequest("signed_distance", 0, 1)])[0]
-    return moved, shift, distance
+    return moved, x * x + y * y, distance
 
 
-@elementwise
-@kernel
-def _compare_shapes(
-    part_start: Integers,
-    vertex_start: Integers,
-    vertices: Floats,
-    radius: Floats,
-    first: Integers,
-    second: Integers,
-    differs: Booleans,
-    shift: Floats,
-) -> None:
-    """Fill in for pairs of rows whether shapes differ, and the squared shift of their vertices' mean."""
-    for k in range(len(first)):
-        parts, others = part_start[first[k]], part_start[second[k]]
-        count, other_count = part_start[first[k] + 1] - parts, part_start[second[k] + 1] - others
-        differ = count != other_count
-        for p in range(min(count, other_count)):
-            size = vertex_start[parts + p + 1] - vertex_start[parts + p]
-            other_size = vertex_start[others + p + 1] - vertex_start[others + p]
-            if size != other_size or radius[parts + p] != radius[others + p]:
-                differ = True
-        begin, end = vertex_start[parts], vertex_start[parts + count]
-        other_begin, other_end = vertex_start[others], vertex_start[others + other_count]
-        if not differ:
-            for i in range(end - begin):
-                for axis in range(2):
-                    differ |= vertices[begin + i, axis] != vertices[other_begin + i, axis]
-        differs[k] = differ
-        if not differ or begin == end or other_begin == other_end:
-            continue
-        # relative to one vertex, so that coordinates far from the origin do not cancel
-        x0, y0 = vertices[begin, 0], vertices[begin, 1]
-        x = y = other_x = other_y = 0.0
-        for i in range(begin, end):
-            x += vertices[i, 0] - x0
-            y += vertices[i, 1] - y0
-        for i in range(other_begin, other_end):
-            other_x += vertices[i, 0] - x0
-            other_y += vertices[i, 1] - y0
-        x = other_x / (other_end - other_begin) - x / (end - begin)
-        y = other_y / (other_end - other_begin) - y / (end - begin)
-        shift[k] = x * x + y * y
+def _are_equal(one: FootprintBatch, other: FootprintBatch) -> Booleans:
+    """Return which rows have the same parts."""
+    sizes = [(np.diff(each.part_start), np.diff(each.vertex_start[each.part_start])) for each in (one, other)]
+    alike = (sizes[0][0] == sizes[1][0]) & (sizes[0][1] == sizes[1][1])
+    one, other = (each.select(np.flatnonzero(alike)) for each in (one, other))
+    parts = (np.diff(one.vertex_start) != np.diff(other.vertex_start)) | (one.radius != other.radius)
+    vertices = (one.vertices != other.vertices).any(axis=1)
+    unequal = count_in_rows(parts, one.part_start)
+    unequal += count_in_rows(vertices, one.vertex_start[one.part_start])
+    alike[alike] = unequal == 0
+    return np.asarray(alike)
+
+
+def _mean_vertices(batch: FootprintBatch, origin: Floats) -> Floats:
+    """Return the mean of each row's vertices, (2, R), relative to a point of its own."""
+    counts = np.diff(batch.vertex_start[batch.part_start])
+    rows = np.repeat(np.arange(len(batch)), counts)
+    sums = [np.bincount(rows, each, len(batch)) for each in (batch.vertices - origin[rows]).T]
+    return np.stack(sums) / counts
 
 
 def _listed(names: Sequence[str]) -> str:

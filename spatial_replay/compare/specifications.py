@@ -466,7 +466,7 @@ def compare_specifications(
     @cache
     def by_version(changes: frozenset[int], name: str, *, is_undone: bool) -> Evaluation | None:
         """Evaluate a spec of the new text with declarations undone, or of the old one with some edited."""
-        file = versions.undone(changes) if is_undone else versions.applied(changes)
+        file = versions.version(changes, is_undone=is_undone)
         spec = _spec_named(file, name)
         return None if file is None or spec is None else evaluated([spec], file, file.regions)
 
@@ -566,7 +566,7 @@ def _origins(versions: TextVersions, one: NamedSpec, other: NamedSpec) -> Iterat
     """Yield which nodes of a spec follow from each declaration, and which from the text of the specs."""
     old, new = versions.old, versions.new
     for number, change in enumerate(versions.changes):
-        applied, undone = versions.applied({number}), versions.undone({number})
+        applied, undone = (versions.version({number}, is_undone=each) for each in (False, True))
         yield Origin(
             change,
             _changed(old, one, applied, one.name) or frozenset(),
@@ -575,8 +575,8 @@ def _origins(versions: TextVersions, one: NamedSpec, other: NamedSpec) -> Iterat
     if versions.changes:
         every = range(len(versions.changes))
         nodes = (
-            _changed(old, one, versions.undone(every), other.name),
-            _changed(new, other, versions.applied(every), one.name),
+            _changed(old, one, versions.version(every, is_undone=True), other.name),
+            _changed(new, other, versions.version(every, is_undone=False), one.name),
         )
         # where the two cannot be distinguished, every node may follow from the text
         all_nodes = frozenset(range(MAX_SIZE))
