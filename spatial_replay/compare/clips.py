@@ -19,13 +19,12 @@ from spatial_replay.logs.source import Source
 from spatial_replay.monitor.atoms.delays import look_back
 from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene
-from spatial_replay.monitor.causes import conjuncts_of, find_causes
 from spatial_replay.monitor.offline import OfflineNodes, evaluate_offline
 from spatial_replay.monitor.online.codes import in_channels
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.semantics import require_ltlf
-from spatial_replay.monitor.stream import NEVER
-from spatial_replay.monitor.verdict import Verdict, final_verdict, online_verdict
+from spatial_replay.monitor.stream import InstanceStream
+from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.monitor.witness.path import End, MissedResponse, deciding_path, missed_response
 from spatial_replay.monitor.witness.unfinished import UnfinishedNodes, evaluate_unfinished
 from spatial_replay.replay.engine import Replay, Replayed, run_replay
@@ -74,7 +73,7 @@ def chosen_nodes(results: Sequence[SpecResult], of: Sequence[str]) -> list[KeptN
 
 
 class _Path(NamedTuple):
-    """The decision of a node, which a clip has to repeat.
+    """The decision of a node.
 
     Attributes:
         nodes: the ids on the path to the deciding atom.
@@ -87,6 +86,24 @@ class _Path(NamedTuple):
     decided_ns: int
     number: tuple[float, float]
     missed: MissedResponse | None
+
+
+class _Decision(NamedTuple):
+    """The verdict of a node and its reason, which a clip has to repeat.
+
+    Attributes:
+        certain_ns: the sample that made the verdict certain.
+        cause: the part that failed first.
+        ends: the ends, the nominal ones, too, of the node and of that part.
+        path: to the atom that decides the node over all samples.
+        settled: to the atom that settled that part, or the verdict, when it did.
+    """
+
+    certain_ns: int | None
+    cause: int | None
+    ends: tuple[float, ...]
+    path: _Path
+    settled: _Path
 
 
 class _Part:
@@ -106,16 +123,9 @@ class _Part:
         self._seen_ns: Integers | None = None
         if result.object is not None and trace is not None:
             self._seen_ns = trace.times_ns[_appearances(trace, result.object)]
-        self._certain_ns = result.certain_ns(kept.node)
-        cause = result.first_cause(kept.node)
-        self._cause = None if cause is None else cause.node
-        self._settled_ns = self._certain_ns if cause is None else cause.settled_ns
-        done = self._evaluated(self._leaves, self._times_ns)
-        self._ends = self._ends_of(done)
-        self._verdict = final_verdict(*self._ends[0][:2])
-        self._paths = [self._path(done, self._times_ns, self._node), *self._settled(self._leaves, done)]
-        times_ns = [path.decided_ns for path in self._paths]
-        times_ns += [each for each in (self._certain_ns, self._settled_ns) if each is not None]
+        self._decision = self._decided(result, self._leaves)
+        times_ns = [self._decision.path.decided_ns, self._decision.settled.decided_ns]
+        times_ns += [] if self._decision.certain_ns is None else [self._decision.certain_ns]
         self.span_ns = min(times_ns), max(times_ns)
 
     def holds_over(self, start_ns: int, end_ns: int) -> bool:
@@ -128,19 +138,15 @@ class _Part:
         begin, end = window_of(self._times_ns, start_ns, end_ns + 1)
         if begin == end:
             return False
-        leaves, times_ns = self._within(begin, end, start_ns), self._times_ns[begin:end]
-        done = self._evaluated(leaves, times_ns)
-        return (
-            self._ends_of(done) == self._ends
-            and self._path(done, times_ns, self._node) == self._paths[0]
-            and self._is_certain_alike(leaves, times_ns)
-            and self._first_cause(leaves, times_ns, done) == self._cause
-            and self._settled(leaves, done, times_ns) == self._paths[1:]
-        )
+        leaves = self._within(begin, end, start_ns)
+        stream = InstanceStream(self._result.evidence.instance)
+        block = stream.extend_leaves(leaves, self._times_ns[begin:end])
+        result = SpecResult.from_stream(stream, self._result.evidence, block)
+        return self._decided(result, leaves) == self._decision
 
     def _within(self, begin: int, end: int, first_ns: int) -> Floats:
         """Return the leaves of a window as a log of its own has them: nothing is known before its start."""
-        leaves = self._leaves[:, :, begin:end]
+        leaves = np.ascontiguousarray(self._leaves[:, :, begin:end])
         samples, duration_ns = self._reach
         if self._trace is None or (samples, duration_ns) == (0, 0):
             return leaves
@@ -157,20 +163,26 @@ class _Part:
         leaves[:, :, : len(head)] = in_channels(known, channels)
         return leaves
 
-    def _evaluated(self, leaves: Floats, times_ns: Integers) -> OfflineNodes:
-        return evaluate_offline(self._result.formula, self._order, np.ascontiguousarray(leaves), times_ns)
-
-    def _unfinished(self, leaves: Floats, times_ns: Integers, count: int) -> UnfinishedNodes:
-        """Return the nodes as the first samples alone settle them."""
-        return evaluate_unfinished(self._result.formula, self._order, leaves[:, :, :count], times_ns[:count])
-
-    def _ends_of(self, done: OfflineNodes) -> list[tuple[float, ...]]:
-        """Return the ends, the nominal ones, too, of the node and of the part that failed first."""
-        nodes = [self._node, *(() if self._cause is None else (self._cause,))]
-        return [
-            tuple(float(end[0]) + 0.0 for wide in (True, False) for end in done.ends(node, wide=wide))
-            for node in nodes
-        ]
+    def _decided(self, result: SpecResult, leaves: Floats) -> _Decision:
+        """Return the verdict over the samples of a result, given their leaves, and its reason."""
+        times_ns, certain_ns = result.times_ns, result.certain_ns(self._node)
+        cause = result.first_cause(self._node)
+        part, settled_ns = (self._node, certain_ns) if cause is None else (cause.node, cause.settled_ns)
+        done = evaluate_offline(result.formula, self._order, leaves, times_ns)
+        path = self._path(done, times_ns, self._node)
+        if settled_ns is None:
+            settled = self._path(done, times_ns, part)
+        else:
+            count = int(np.searchsorted(times_ns, settled_ns, side="right"))
+            first = evaluate_unfinished(result.formula, self._order, leaves[:, :, :count], times_ns[:count])
+            settled = self._path(first, times_ns[:count], part)
+        ends = (
+            float(end[0]) + 0.0
+            for node in (self._node, part)
+            for wide in (True, False)
+            for end in done.ends(node, wide=wide)
+        )
+        return _Decision(certain_ns, None if cause is None else part, tuple(ends), path, settled)
 
     def _path(self, done: OfflineNodes | UnfinishedNodes, times_ns: Integers, node: int) -> _Path:
         goes_on = isinstance(done, UnfinishedNodes)
@@ -185,53 +197,6 @@ class _Part:
             (float(low[last.sample]), float(high[last.sample])),
             missed_response(path, self._nodes, done, times_ns) if end is End.HIGH else None,
         )
-
-    def _settled(self, leaves: Floats, done: OfflineNodes, times_ns: Integers | None = None) -> list[_Path]:
-        """Return what decided the part that failed first, or the verdict that became certain, when it did."""
-        times_ns = self._times_ns if times_ns is None else times_ns
-        node = self._node if self._cause is None else self._cause
-        if self._settled_ns is None:
-            return [self._path(done, times_ns, node)]
-        count = int(np.searchsorted(times_ns, self._settled_ns, side="right"))
-        return [self._path(self._unfinished(leaves, times_ns, count), times_ns[:count], node)]
-
-    def _is_certain_alike(self, leaves: Floats, times_ns: Integers) -> bool:
-        """Say whether the verdict becomes certain at the same sample, or at none."""
-        count = len(times_ns)
-        if self._certain_ns is not None:
-            count = int(np.searchsorted(times_ns, self._certain_ns, side="right"))
-            if not count or times_ns[count - 1] != self._certain_ns:
-                return False
-            if self._online_verdict(leaves, times_ns, count) is not self._verdict:
-                return False
-            count -= 1
-        return count == 0 or self._online_verdict(leaves, times_ns, count) is not self._verdict
-
-    def _online_verdict(self, leaves: Floats, times_ns: Integers, count: int) -> Verdict:
-        lower, upper = self._unfinished(leaves, times_ns, count).ends(self._node)
-        return online_verdict(float(lower[0]) + 0.0, float(upper[0]) + 0.0)
-
-    def _first_cause(self, leaves: Floats, times_ns: Integers, done: OfflineNodes) -> int | None:
-        """Return the part that fails first, given that the verdict becomes certain when it did in the log."""
-        if self._cause is None:
-            return None
-        parts = conjuncts_of(self._nodes[self._node], "")
-        conjuncts = [replace(each, node=self._node + each.node) for each in parts]
-        final, values = np.zeros((len(self._nodes), 2)), np.zeros(len(self._nodes))
-        settled_ns = np.full((len(self._nodes), 2), NEVER, np.int64)
-        prefix, certain_ns = None, self._certain_ns or 0
-        if self._certain_ns is not None:
-            count = int(np.searchsorted(times_ns, self._certain_ns, side="right"))
-            prefix = self._unfinished(leaves, times_ns, count)
-        for node in (each.node for each in conjuncts):
-            final[node] = [float(end[0]) + 0.0 for end in done.ends(node)]
-            low, high = (float(end[0]) + 0.0 for end in done.ends(node, wide=False))
-            values[node] = low if low == high else np.nan
-            # no part was settled earlier than the whole, and one that is later does not come first
-            if prefix is not None and prefix.ends(node)[1][0] < 0.0:
-                settled_ns[node, 1] = certain_ns
-        causes = find_causes(conjuncts, values, final, settled_ns)
-        return causes[0].node if causes else None
 
 
 class ClipSearch:

@@ -119,6 +119,10 @@ class InstanceStream:
         positions = np.arange(scene.skip + begin, scene.skip + end, dtype=np.int64)
         first_ns = int(scene.trace.times_ns[0])
         leaves = self._evaluator.leaves_within_log(leaves, positions, times, first_ns)
+        return self.extend_leaves(leaves, times, empty)
+
+    def extend_leaves(self, leaves: Floats, times: Integers, empty: Empty = np.empty) -> SeriesBlock:
+        """Add samples, at least one, by their leaves."""
         series = self._run.extend(leaves, times, empty)
         self.robustness = series[:, 0, -1].copy()
         if self._evaluator.has_open_end:
