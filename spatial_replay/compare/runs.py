@@ -13,6 +13,7 @@ import numpy as np
 
 from spatial_replay.annotate.automaton_state import AutomatonRun
 from spatial_replay.automata.compile import automaton
+from spatial_replay.compare.specifications import EditOutcome, outcome_text
 from spatial_replay.errors import NoAutomatonError, UsageError
 from spatial_replay.geometry.arrays import Booleans, Floats, Integers, count_in_rows
 from spatial_replay.geometry.footprint import FootprintBatch
@@ -82,12 +83,10 @@ class Parting(NamedTuple):
     """Where the paths of two runs through one automaton part: the first states that differ.
 
     Attributes:
-        name: of the result.
         a_ns, b_ns: when each run enters its own; None if it ends before.
         a_states, b_states: these states; () if the run ends before.
     """
 
-    name: str
     a_ns: int | None
     b_ns: int | None
     a_states: tuple[int, ...]
@@ -165,7 +164,6 @@ def parting_of(one: SpecResult, other: SpecResult, files: Sequence[Specification
     if one_end is None and other_end is None:
         return None
     return Parting(
-        one.title,
         None if one_end is None else one_end.time_ns,
         None if other_end is None else other_end.time_ns,
         () if one_end is None else one_end.states,
@@ -462,9 +460,9 @@ def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:8]) + (", …" if len(names) > 8 else "") or "none"
 
 
-def movement_sentence(each: ObjectDiff, start_ns: int, unit: str) -> Sentence:
+def _movement_sentence(each: ObjectDiff, start_ns: int, unit: str) -> Sentence:
     """Return since when an object moved differently, and how far the two are apart."""
-    parts: list[str | Instant] = ["differs since ", Instant(each.first_ns, start_ns)]
+    parts: list[str | Instant] = [f"{each.name}: differs since ", Instant(each.first_ns, start_ns)]
     if each.shift:
         parts.append(f", by up to {with_unit(each.shift, unit)}")
     if each.apart_ns is not None:
@@ -476,9 +474,9 @@ def movement_sentence(each: ObjectDiff, start_ns: int, unit: str) -> Sentence:
     return Sentence(*parts)
 
 
-def signal_sentence(each: SignalDiff, start_ns: int, unit: str) -> Sentence:
+def _signal_sentence(each: SignalDiff, start_ns: int, unit: str) -> Sentence:
     """Return since when a signal has other values, by how much, and whether its unit may be another."""
-    parts: list[str | Instant] = ["differs since ", Instant(each.first_ns, start_ns)]
+    parts: list[str | Instant] = [f"{each.name}: differs since ", Instant(each.first_ns, start_ns)]
     if each.greatest > 0.0 and not names_from_unit(unit):
         parts += [f", by up to {with_unit(each.greatest, unit)} at ", Instant(each.greatest_ns, start_ns)]
     if each.has_other_unit:
@@ -514,13 +512,13 @@ class RunSpecDiff:
     @property
     def is_different(self) -> bool:
         """Whether the verdict or a final number differs."""
-        one, other = ((each.robustness, each.lower, each.upper) for each in (self.a, self.b))
-        return self.is_flipped or not np.array_equal(one, other, equal_nan=True)
+        return not EditOutcome.of(self.a).same_as(EditOutcome.of(self.b))
 
     def sentences(self, starts_ns: tuple[int, int]) -> Iterator[Sentence]:
         """Yield what differs; times of each run count from its own start."""
-        texts = [f"{each.verdict} ({with_unit(each.robustness, each.unit)})" for each in (self.a, self.b)]
-        yield Sentence(" | ".join(texts) + ("" if self.is_different else ", the same"))
+        yield Sentence(
+            " | ".join(map(outcome_text, (self.a, self.b))) + ("" if self.is_different else ", the same")
+        )
         if self.first_ns is not None:
             yield Sentence("the sign of its value differs since ", Instant(self.first_ns, starts_ns[0]))
         if self.parting is not None:
@@ -544,23 +542,15 @@ class RunSpecDiff:
     @property
     def document(self) -> dict[str, Any]:
         """The same as values for JSON."""
-        parting = self.parting
         return {
             "name": self.a.name,
             "object": self.a.object,
             "flipped": self.is_flipped,
-            "a": _result_value(self.a),
-            "b": _result_value(self.b),
+            "a": EditOutcome.of(self.a).document,
+            "b": EditOutcome.of(self.b).document,
             "first_ns": self.first_ns,
             "nodes": [{"id": node, "text": self.a.nodes[node].text} for node in self.nodes],
-            "parting": None
-            if parting is None
-            else {
-                "a_ns": parting.a_ns,
-                "b_ns": parting.b_ns,
-                "a_states": list(parting.a_states),
-                "b_states": list(parting.b_states),
-            },
+            "parting": self.parting and self.parting._asdict(),
             "moved": [each.name for each in self.moved],
         }
 
@@ -640,15 +630,6 @@ def _entered(time_ns: int | None, states: Sequence[int], start_ns: int) -> tuple
     return f"state {', '.join(map(str, states))} at ", Instant(time_ns, start_ns)
 
 
-def _result_value(result: SpecResult) -> dict[str, Any]:
-    return {
-        "verdict": str(result.verdict),
-        "robustness": json_number(result.robustness),
-        "lower": json_number(result.lower),
-        "upper": json_number(result.upper),
-    }
-
-
 class DecisionDiff(NamedTuple):
     """The first decision of two planned runs that differs.
 
@@ -665,6 +646,13 @@ class DecisionDiff(NamedTuple):
     a_ns: int | None
     b_ns: int | None
     maps: tuple[str, ...]
+
+    def lines(self) -> Iterator[str]:
+        """Yield both decisions and what differs."""
+        yield f"A: {self.a}"
+        yield f"B: {self.b}"
+        if self.maps:
+            yield f"gradient maps that differ: {', '.join(self.maps)}"
 
 
 def compare_decisions(sources: tuple[Source, Source]) -> DecisionDiff | None:
@@ -754,12 +742,24 @@ class LogDiff(Displayed):
     has_equal_samples: bool
     faults: tuple[str, ...]
     traces: tuple[Trace, Trace]
-    missing: tuple[Diagnostic, ...] = ()
+    missing: tuple[Diagnostic, ...]
 
     @property
     def is_empty(self) -> bool:
         """Whether nothing differs: no sample, no result, no decision."""
         return self.has_equal_samples and self.decision is None
+
+    @property
+    def movements(self) -> list[Sentence]:
+        """Sentences on `objects`."""
+        unit = self.traces[0].units.get("", "")
+        return [_movement_sentence(each, self.starts_ns[0], unit) for each in self.objects]
+
+    @property
+    def signal_changes(self) -> list[Sentence]:
+        """Sentences on `signals`."""
+        units = self.traces[0].units
+        return [_signal_sentence(each, self.starts_ns[0], units.get(each.name, "")) for each in self.signals]
 
     def lines(self) -> Iterator[str]:
         """Yield the diff as text, as the command `diff` prints it."""
@@ -770,13 +770,10 @@ class LogDiff(Displayed):
         paired = [len(set(rows.tolist())) for rows in (self.alignment.a, self.alignment.b)]
         counts = " | ".join(counted(count, "sample") for count in self.samples)
         yield f"  {counts}; {self.alignment}: {paired[0]:,} of A beside {paired[1]:,} of B"
-        start_ns, units = self.starts_ns[0], self.traces[0].units
-        for each in self.objects[:_MOST_LISTED]:
-            yield f"  {each.name}: {movement_sentence(each, start_ns, units.get('', ''))}"
+        yield from (f"  {sentence}" for sentence in self.movements[:_MOST_LISTED])
         if len(self.objects) > _MOST_LISTED:
             yield f"  and {counted(len(self.objects) - _MOST_LISTED, 'other object')} moved differently"
-        for signal in self.signals[:_MOST_LISTED]:
-            yield f"  {signal.name}: {signal_sentence(signal, start_ns, units.get(signal.name, ''))}"
+        yield from (f"  {sentence}" for sentence in self.signal_changes[:_MOST_LISTED])
         if len(self.signals) > _MOST_LISTED:
             yield f"  and {counted(len(self.signals) - _MOST_LISTED, 'other signal')} with other values"
         for which, names in (("A", self.only_a), ("B", self.only_b)):
@@ -789,10 +786,7 @@ class LogDiff(Displayed):
                 yield from (f"    {sentence}" for sentence in rest)
         if self.decision is not None:
             yield f"  decision {self.decision.number} is the first that differs:"
-            yield f"    A: {self.decision.a}"
-            yield f"    B: {self.decision.b}"
-            if self.decision.maps:
-                yield f"    gradient maps that differ: {', '.join(self.decision.maps)}"
+            yield from (f"    {line}" for line in self.decision.lines())
 
     @property
     def document(self) -> dict[str, Any]:
@@ -877,22 +871,6 @@ def diff_sources(
         known = LogNames()
         known.add(trace)
         missing += selection.missing_names(known)
-    diff = _compare(sources, traces, files, options, align)
-    return replace(diff, missing=tuple(dict.fromkeys(missing)))
-
-
-def _compare(
-    sources: tuple[Source, Source],
-    traces: tuple[Trace, Trace],
-    files: Sequence[Specification],
-    options: tuple[ReplayOptions, ReplayOptions],
-    align: str,
-) -> LogDiff:
-    """Compare two runs and what specifications say of them.
-
-    Args:
-        traces: their samples.
-    """
     a, b = traces
     evaluations = [_evaluated(trace, files, own) for trace, own in zip(traces, options, strict=True)]
     results = _paired(evaluations)
@@ -914,6 +892,7 @@ def _compare(
         not objects and a == b,
         (*_faults(a), *_faults(b)),
         traces,
+        tuple(dict.fromkeys(missing)),
     )
 
 

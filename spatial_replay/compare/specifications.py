@@ -30,7 +30,6 @@ from spatial_replay.monitor.offline import evaluate_offline, new_leaves
 from spatial_replay.monitor.online.codes import in_channels
 from spatial_replay.monitor.paper import PaperRun
 from spatial_replay.monitor.result import SpecResult
-from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.sentences import cause_reason
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.replay.selection import DEFAULT_OPTIONS, LogNames, ReplayOptions, Selection
@@ -39,7 +38,6 @@ from spatial_replay.spec.formula import Atom, Formula, NamedSpec, Outline, Quant
 from spatial_replay.spec.resolve import MAX_SIZE
 from spatial_replay.text import Instant, Sentence, counted, counted_from, json_number, with_unit
 from spatial_replay.trace.sample import FOREVER
-from spatial_replay.trace.trace import Trace
 
 _MOST_EVALUATIONS: Final = 256
 """Formulas that are evaluated to find the cause of one change; the cause found by then stands."""
@@ -238,9 +236,9 @@ class SpecDiff(Displayed):
         Args:
             shown: declarations whose lines need not be repeated.
         """
-        outcome = _outcome_text(self.old)
+        outcome = outcome_text(self.old)
         yield Sentence(
-            f"{outcome} → {_outcome_text(self.new)}" if self.is_different else f"{outcome}, the same"
+            f"{outcome} → {outcome_text(self.new)}" if self.is_different else f"{outcome}, the same"
         )
         if self.first is not None:
             old, new = with_unit(self.first.old, self.old.unit), with_unit(self.first.new, self.new.unit)
@@ -326,14 +324,15 @@ class SpecDiff(Displayed):
         }
 
     def __repr__(self) -> str:
-        return f"<{self.title}: {_outcome_text(self.old)} → {_outcome_text(self.new)}>"
+        return f"<{self.title}: {outcome_text(self.old)} → {outcome_text(self.new)}>"
 
 
 _MOST_LISTED: Final = 8
 """Edits without effect that are listed; JSON has all."""
 
 
-def _outcome_text(result: SpecResult) -> str:
+def outcome_text(result: SpecResult) -> str:
+    """Return a verdict with its robustness: "violated (-0.2 m)"."""
     return f"{result.verdict} ({with_unit(result.robustness, result.unit)})"
 
 
@@ -358,8 +357,8 @@ class SpecificationDiff(Displayed):
     specs: tuple[SpecDiff, ...]
     removed: tuple[str, ...]
     added: tuple[str, ...]
-    faults: tuple[str, ...] = ()
-    missing: tuple[Diagnostic, ...] = ()
+    faults: tuple[str, ...]
+    missing: tuple[Diagnostic, ...]
 
     @property
     def is_empty(self) -> bool:
@@ -415,25 +414,32 @@ class SpecificationDiff(Displayed):
         return "\n".join(self.lines())
 
 
-def compare_specifications(
+def diff_over_source(
+    source: Source,
     old: Specification,
     new: Specification,
-    trace: Trace,
+    options: ReplayOptions = DEFAULT_OPTIONS,
     *,
-    log: str = "trace",
-    start_ns: int = 0,
-    end_ns: int = FOREVER,
-    each: Mapping[str, str] | None = None,
-    semantics: Semantics = "ltlf",
+    advance: Callable[[int], None] = lambda samples: None,
 ) -> SpecificationDiff:
-    """Evaluate two versions of a specification over a trace, and find what changed the results.
+    """Evaluate two versions of a specification over a log, and find what changed the results.
 
     Args:
-        start_ns, end_ns, each, semantics: as for `evaluate`.
+        advance: called with the number of samples of each block that is read.
 
     Raises:
-        UsageError: no spec has a counterpart, another parameter of a template, or what `evaluate` raises.
+        UsageError: no spec has a counterpart, another parameter of a template, no sample in the window, or
+            what `evaluate` raises.
+        LogError: the log cannot be read.
+        SpecificationError: names that the log never has, if names are strict.
     """
+    selection = Selection(source, (old, new), replace(options, keep=()))
+    trace = selection.trace(advance)
+    if not len(selection.inside(trace)):
+        raise selection.nothing_to_evaluate(trace.faults)
+    names = LogNames()
+    names.add(trace)
+    missing = selection.missing_names(names)
     versions = TextVersions(old, new, trace.units)
     old, new = versions.old, versions.new
     pairs, removed, added = _paired(old, new)
@@ -448,17 +454,17 @@ def compare_specifications(
         return evaluate(
             Specification(results, file.profile, dict(shapes), filename=file.filename),
             trace,
-            semantics=semantics,
-            start_ns=start_ns,
-            end_ns=min(end_ns, FOREVER),
-            each=each,
+            semantics=options.semantics,
+            start_ns=options.window.start_ns,
+            end_ns=min(options.window.end_ns, FOREVER),
+            each=options.each,
         )
 
     before, after = evaluated(olds, old), evaluated(news, new)
-    names = {spec.name for spec in old.specs}, {spec.name for spec in new.specs}
+    spec_names = {spec.name for spec in old.specs}, {spec.name for spec in new.specs}
     trees = {
         id(other.formula): compare_trees(
-            one.formula, other.formula, other.name, regions, tuple(_origins(versions, *pair)), names
+            one.formula, other.formula, other.name, regions, tuple(_origins(versions, *pair)), spec_names
         )
         for one, other, pair in zip(olds, news, pairs, strict=True)
     }
@@ -471,7 +477,7 @@ def compare_specifications(
         return None if file is None or spec is None else evaluated([spec], file, file.regions)
 
     return SpecificationDiff(
-        log,
+        source.name,
         len(before.results[0].times_ns) if before.results else 0,
         int(trace.times_ns[0]),
         old,
@@ -483,45 +489,8 @@ def compare_specifications(
         removed,
         added,
         counted_from(trace.faults, int(trace.times_ns[0])),
+        missing,
     )
-
-
-def diff_over_source(
-    source: Source,
-    old: Specification,
-    new: Specification,
-    options: ReplayOptions = DEFAULT_OPTIONS,
-    *,
-    advance: Callable[[int], None] = lambda samples: None,
-) -> SpecificationDiff:
-    """Compare two versions of a specification over a log; see `compare_specifications`.
-
-    Args:
-        advance: called with the number of samples of each block that is read.
-
-    Raises:
-        UsageError: what that raises, no sample in the window. LogError: the log cannot be read.
-        SpecificationError: names that the log never has, if names are strict.
-    """
-    selection = Selection(source, (old, new), replace(options, keep=()))
-    trace = selection.trace(advance)
-    if not len(selection.inside(trace)):
-        raise selection.nothing_to_evaluate(trace.faults)
-    names = LogNames()
-    names.add(trace)
-    missing = selection.missing_names(names)
-    window = options.window
-    diff = compare_specifications(
-        old,
-        new,
-        trace,
-        log=source.name,
-        start_ns=window.start_ns,
-        end_ns=window.end_ns,
-        each=options.each,
-        semantics=options.semantics,
-    )
-    return replace(diff, missing=missing)
 
 
 def _paired(

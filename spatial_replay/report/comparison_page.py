@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from spatial_replay import __version__
-from spatial_replay.compare.runs import LogDiff, movement_sentence, signal_sentence
+from spatial_replay.compare.runs import DecisionDiff, LogDiff
 from spatial_replay.compare.specifications import SpecificationDiff
 from spatial_replay.logs.output_file import replacing
 from spatial_replay.logs.source import Source
@@ -60,6 +60,7 @@ def comparison_page(diff: SpecificationDiff | LogDiff, a: RunReport, b: RunRepor
     """
     one, other = page_data(a), page_data(b)
     labels = _labels(diff)
+    decision = None if isinstance(diff, SpecificationDiff) else diff.decision
     is_same = "nothing differs" if diff.is_empty else "different"
     title = element("div", element("h1", text(" → ".join(labels))), **{"class": "title"})
     about = element(
@@ -72,7 +73,7 @@ def comparison_page(diff: SpecificationDiff | LogDiff, a: RunReport, b: RunRepor
             panel("verdicts", "What differs", *_changes(diff, (a.replayed.first_ns, b.replayed.first_ns))),
             panel("scene-a", labels[0]),
             panel("scene-b", labels[1]),
-            *_decision_panels(diff, labels),
+            *_decision_panels(decision, labels),
             panel("timeline", "Over time"),
             id="main",
             tabindex="-1",
@@ -84,7 +85,7 @@ def comparison_page(diff: SpecificationDiff | LogDiff, a: RunReport, b: RunRepor
         {
             "facts-a": json_text(one.facts),
             "facts-b": json_text(other.facts),
-            "pairs": json_text(_pairs(diff, a, b, labels)),
+            "pairs": json_text({"labels": labels, **_pairs(diff, a, b)}),
         },
         {"numbers-a": one.numbers, "numbers-b": other.numbers},
         "comparison",
@@ -119,38 +120,24 @@ def _changes(diff: SpecificationDiff | LogDiff, first_ns: tuple[int, int]) -> It
         return
     for spec in diff.specs:
         yield _change(spec.a.title, spec.b.verdict, list(spec.sentences(diff.starts_ns)), first_ns)
-    units = diff.traces[0].units
-    moved = [
-        Sentence(f"{each.name}: ", *movement_sentence(each, diff.starts_ns[0], units.get("", "")).parts)
-        for each in diff.objects
-    ]
-    if moved:
-        yield _change("who moved differently", None, moved, first_ns)
+    if diff.objects:
+        yield _change("who moved differently", None, diff.movements, first_ns)
     if diff.signals:
-        signals = [
-            Sentence(
-                f"{each.name}: ", *signal_sentence(each, diff.starts_ns[0], units.get(each.name, "")).parts
-            )
-            for each in diff.signals
-        ]
-        yield _change("signals with other values", None, signals, first_ns)
+        yield _change("signals with other values", None, diff.signal_changes, first_ns)
     for which, names in (("A", diff.only_a), ("B", diff.only_b)):
         if names:
             yield element("p", text(f"Only in {which}: {', '.join(names)}"))
     if diff.decision is not None:
-        decision = diff.decision
-        found = [f"A: {decision.a}", f"B: {decision.b}"]
-        found += [f"gradient maps that differ: {', '.join(decision.maps)}"] if decision.maps else []
-        title = f"decision {decision.number} is the first that differs"
-        yield _change(title, None, [Sentence(each) for each in found], first_ns)
+        title = f"decision {diff.decision.number} is the first that differs"
+        yield _change(title, None, list(map(Sentence, diff.decision.lines())), first_ns)
 
 
-def _decision_panels(diff: SpecificationDiff | LogDiff, labels: tuple[str, str]) -> list[Html]:
+def _decision_panels(decision: DecisionDiff | None, labels: tuple[str, str]) -> list[Html]:
     """Return places for the first decision that differs, of both runs, with its gradient maps."""
-    if isinstance(diff, SpecificationDiff) or diff.decision is None:
+    if decision is None:
         return []
     names = zip(("decision-a", "decision-b"), labels, strict=True)
-    return [panel(name, text(f"{label}: decision {diff.decision.number}")) for name, label in names]
+    return [panel(name, text(f"{label}: decision {decision.number}")) for name, label in names]
 
 
 def _change(
@@ -173,12 +160,10 @@ def _with_run(sentence: Sentence, first_ns: tuple[int, int]) -> Iterator[Html]:
         yield Html(piece.replace("data-time-ns", 'data-run="b" data-time-ns')) if is_b else piece
 
 
-def _pairs(
-    diff: SpecificationDiff | LogDiff, a: RunReport, b: RunReport, labels: tuple[str, str]
-) -> Mapping[str, Any]:
+def _pairs(diff: SpecificationDiff | LogDiff, a: RunReport, b: RunReport) -> dict[str, Any]:
     """Return which curves belong together, how times correspond, and the time at which the page opens."""
-    knots = [[0.0, 0.0]]
     first_ns: int | None = None
+    decision: DecisionDiff | None = None
     nodes: list[dict[str, Any]] = []
     places = [_places(report) for report in (a, b)]
     if isinstance(diff, SpecificationDiff):
@@ -193,14 +178,14 @@ def _pairs(
                     pair = edit.old_nodes[0], edit.new_nodes[0]
                     nodes += _node_pair(f"{spec.title}: {edit.new}", titles, pair, places)
     else:
-        if diff.alignment is not None:
-            knots = [
-                [(knot.a_ns - a.replayed.first_ns) / 1e9, (knot.b_ns - b.replayed.first_ns) / 1e9]
-                for knot in diff.alignment.knots
-            ]
+        decision = diff.decision
+        knots = [
+            [(knot.a_ns - a.replayed.first_ns) / 1e9, (knot.b_ns - b.replayed.first_ns) / 1e9]
+            for knot in diff.alignment.knots
+        ]
         found = (
             [each.apart_ns for each in diff.objects],
-            [] if diff.decision is None else [diff.decision.a_ns],
+            [] if decision is None else [decision.a_ns],
             [spec.first_ns for spec in diff.specs],
             [*(each.first_ns for each in diff.objects), *(each.first_ns for each in diff.signals)],
         )
@@ -210,16 +195,11 @@ def _pairs(
             titles = run_spec.a.title, run_spec.b.title
             nodes += _node_pairs(run_spec.a.title, titles, (run_spec.a, run_spec.b), places)
     return {
-        "labels": list(labels),
         "knots": knots,
         "nodes": nodes,
-        "decision": _decision_number(diff),
+        "decision": decision and decision.number,
         "first": None if first_ns is None else (first_ns - a.replayed.first_ns) / 1e9,
     }
-
-
-def _decision_number(diff: SpecificationDiff | LogDiff) -> int | None:
-    return None if isinstance(diff, SpecificationDiff) or diff.decision is None else diff.decision.number
 
 
 _Places: TypeAlias = Mapping[str, tuple[int, Mapping[int, int]]]
