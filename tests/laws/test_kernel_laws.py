@@ -57,13 +57,15 @@ def in_both_forms(function):
 
 @pytest.mark.parametrize("log", ["push.mcap", "table.jsonl"])
 def test_an_annotated_log_has_the_same_bytes(log, tmp_path):
-    written = []
-    for form in FORMS:
-        output = tmp_path / f"{form}.mcap"
-        specification = RECORDINGS / f"{log.partition('.')[0]}_edited.spatial"
-        replay(RECORDINGS / log, "--spec", specification, "-o", output, SPATIAL_REPLAY_KERNELS=form)
-        written.append(output.read_bytes())
-    assert written[0] == written[1]
+    specification = sr.load_specification(RECORDINGS / f"{log.partition('.')[0]}_edited.spatial")
+
+    def written():
+        output = tmp_path / f"{len(list(tmp_path.iterdir()))}.mcap"
+        sr.replay_log(RECORDINGS / log, specification, output=output)
+        return output.read_bytes()
+
+    interpreted, compiled = in_both_forms(written)
+    assert interpreted == compiled
 
 
 def test_a_log_is_replayed_where_no_cache_can_be_written(tmp_path):
@@ -106,9 +108,9 @@ def test_of_processes_that_need_a_kernel_at_once_one_compiles_it(tmp_path):
     environment = os.environ | {"SPATIAL_REPLAY_CACHE": str(tmp_path / "cache"), "SPATIAL_REPLAY_KERNELS": ""}
     begun = [
         subprocess.Popen([sys.executable, program], env=environment, stdout=subprocess.PIPE, text=True)
-        for _ in range(4)
+        for _ in range(2)
     ]
-    assert sorted(process.communicate()[0] for process in begun) == ["4\n0\n"] + 3 * ["4\n1\n"]
+    assert sorted(process.communicate()[0] for process in begun) == ["4\n0\n", "4\n1\n"]
 
 
 def replay(*arguments, **environment):

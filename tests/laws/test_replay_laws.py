@@ -149,15 +149,16 @@ def test_a_file_depends_neither_on_the_process_nor_on_its_hash_seed(tmp_path: Pa
         "spec s = F (cube ovlp a or cube ovlp z)\nspec t = G exists o in all_of: o ovlp cube\n"
     )
 
-    def program(seed: int, *arguments: str) -> None:
-        command = [sys.executable, "-m", "spatial_replay", *arguments]
-        subprocess.run(command, cwd=tmp_path, env=_environment(seed), check=True, capture_output=True)
-
+    words = (
+        "record tracks run.jsonl --spec a.spatial -o run.mcap",
+        "replay run.mcap -o out.mcap --json out.json --series",
+        "export out.mcap -o out.csv",
+    )
+    program = f"from spatial_replay.cli import run\nassert not any(run(each.split()) for each in {words})"
     files: list[Sequence[bytes]] = []
     for seed in (1, 2):
-        program(seed, "record", "tracks", "run.jsonl", "--spec", "a.spatial", "-o", "run.mcap")
-        program(seed, "replay", "run.mcap", "-o", "out.mcap", "--json", "out.json", "--series")
-        program(seed, "export", "out.mcap", "-o", "out.csv")
+        command = [sys.executable, "-c", program]
+        subprocess.run(command, cwd=tmp_path, env=_environment(seed), check=True, capture_output=True)
         files.append([(tmp_path / f).read_bytes() for f in ("run.mcap", "out.mcap", "out.json", "out.csv")])
     assert files[0] == files[1]
 

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from spatial_replay.cli import run
 from spatial_replay.code_cache import cache_folder
 from spatial_replay.logs.remote import user_cache_folder
 from users import plain_user
@@ -20,8 +21,8 @@ from spatial_replay.compiled import compile_ahead, kernels
 from spatial_replay.cli.warmup import TASKS
 
 compile_ahead()
-for run in TASKS.values():
-    run()
+for task in TASKS.values():
+    task()
 for module in pkgutil.walk_packages(spatial_replay.__path__, "spatial_replay."):
     if not module.name.endswith("__main__"):
         try:
@@ -33,11 +34,10 @@ print(*sorted(f"{each.__module__}.{each.__name__}" for each in kernels() if not 
 """
 
 
-def test_a_warm_up_compiles_every_kernel_and_says_where_the_code_is():
+def test_a_warm_up_compiles_every_kernel_and_says_where_the_code_is(capsys):
     # into the folder that the other tests use, where the code may be already
-    command = [sys.executable, "-m", "spatial_replay", "warmup", "--jobs", "2"]
-    said = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (said.returncode, said.stdout, said.stderr) == (0, f"compiled into {cache_folder()}\n", "")
+    assert run(["warmup", "--jobs", "1"]) == 0
+    assert capsys.readouterr() == (f"compiled into {cache_folder()}\n", "")
     done = subprocess.run([sys.executable, "-c", _EVERY_KERNEL], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout.strip()) == (0, ""), done.stderr
 

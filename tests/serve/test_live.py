@@ -207,7 +207,7 @@ def test_every_seek_leaves_all_that_is_shown_at_its_time(server: Serving) -> Non
     async def looking(own: Viewer) -> None:
         await own.subscribe([SCENE, STANDING, ROBUSTNESS, SPECIFICATION, CURVES_TOPIC])
         draw = random.Random(5)
-        for number in range(100):
+        for number in range(30):
             seek_ns = draw.randrange(END_NS)
             await own.ask(seek_ns=seek_ns, request=f"{number}")
             await own.until(shows(seek_ns, f"{number}"))
