@@ -254,13 +254,13 @@ def simultaneous(
         cameras: frames with increasing times.
         offsets_ns: what is added to the stamps of each camera; nothing unless given.
     """
+    offsets = [*offsets_ns, *[0] * (len(cameras) - len(offsets_ns))]
+    shifted = [_shifted(frames, offset) for frames, offset in zip(cameras, offsets, strict=True)]
     if len(cameras) == 1:
         # nothing to wait for
-        for frame in cameras[0]:
-            yield (frame if not any(offsets_ns) else replace(frame, time_ns=frame.time_ns + offsets_ns[0]),)
+        yield from ((frame,) for frame in shifted[0])
         return
-    offsets = [*offsets_ns, *[0] * (len(cameras) - len(offsets_ns))]
-    coming = [_Coming(iter(frames), offset) for frames, offset in zip(cameras, offsets, strict=True)]
+    coming = [_Coming(frames) for frames in shifted]
     while present := [each for each in coming if each.now is not None]:
         gaps = [each.gap_ns for each in present if each.gap_ns]
         first_ns = min(each.time_ns for each in present)
@@ -270,18 +270,16 @@ def simultaneous(
         )
 
 
+def _shifted(frames: Iterable[Frame], offset_ns: int) -> Iterator[Frame]:
+    return (replace(frame, time_ns=frame.time_ns + offset_ns) if offset_ns else frame for frame in frames)
+
+
 class _Coming:
     """The frames of one camera, of which the next two are known."""
 
-    def __init__(self, frames: Iterator[Frame], offset_ns: int) -> None:
-        self._frames, self._offset_ns = frames, offset_ns
-        self.now, self._later = self._read(), self._read()
-
-    def _read(self) -> Frame | None:
-        frame = next(self._frames, None)
-        if frame is None or not self._offset_ns:
-            return frame
-        return replace(frame, time_ns=frame.time_ns + self._offset_ns)
+    def __init__(self, frames: Iterator[Frame]) -> None:
+        self._frames = frames
+        self.now, self._later = next(frames, None), next(frames, None)
 
     @property
     def time_ns(self) -> int:
@@ -296,7 +294,7 @@ class _Coming:
     def take(self) -> Frame | None:
         """Return the frame that comes next, and go on."""
         taken, self.now = self.now, self._later
-        self._later = None if self.now is None else self._read()
+        self._later = next(self._frames, None)
         return taken
 
 
@@ -540,6 +538,7 @@ class TagObserver:
     Attributes:
         tags: the tags file.
         hold_ns: how long a hidden object is held.
+        frames: how many samples were made.
     """
 
     def __init__(self, tags: TagsFile, *, hold_ns: int | None = None, cameras: Sequence[str] = ("",)) -> None:
@@ -566,7 +565,7 @@ class TagObserver:
         self._outlines = {each.name: _outline(each.footprint) for each in tags.objects}
         self._doubts: dict[str, tuple[str, int]] = {}
         self._apart: dict[str, tuple[float, int]] = {}
-        self._frames = self._last_ns = 0
+        self.frames = self._last_ns = 0
 
     @property
     def fits(self) -> tuple[Fit | None, ...]:
@@ -591,12 +590,12 @@ class TagObserver:
                 f"{counted(len(self._cameras), 'camera')}: give a frame or None of each, not only None"
             )
         time_ns = next(frame.time_ns for frame in frames if frame is not None)
-        if self._frames and time_ns <= self._last_ns:
+        if self.frames and time_ns <= self._last_ns:
             raise UsageError(
                 f"a frame at {time_ns / 1e9:.3f} s follows one at {self._last_ns / 1e9:.3f} s; give frames"
                 " with increasing times"
             )
-        self._frames += 1
+        self.frames += 1
         self._last_ns = time_ns
         views: list[View | None] = []
         poses: list[tuple[int, Mapping[int, ObjectPose]]] = []
@@ -685,11 +684,6 @@ class TagObserver:
         return held
 
     # ------------------------------------------------------------------------------------- remarks
-
-    @property
-    def frames(self) -> int:
-        """How many samples were made."""
-        return self._frames
 
     def remarks(self) -> tuple[str, ...]:
         """Return what is worth knowing about the run: tags that are not in the file, objects never seen."""

@@ -410,7 +410,7 @@ class VideoFile:
                 if first is None:
                     continue
                 if time_ns <= last_ns:
-                    self._add_fault(f"{self.name}: frame {count} is not after the one before it; left out")
+                    self.faults.append(f"{self.name}: frame {count} is not after the one before it; left out")
                     continue
                 widest_ns = max(widest_ns, time_ns - last_ns) if last_ns >= 0 else 0
                 before_ns, last_ns = last_ns, time_ns
@@ -426,7 +426,7 @@ class VideoFile:
                     if first is None
                     else f"after {before_ns / 1e9:.3f} s, within a frame"
                 )
-                self._add_fault(f"{self.name} breaks off {at}")
+                self.faults.append(f"{self.name} breaks off {at}")
                 return
             if kept is not None:
                 yield kept
@@ -434,10 +434,10 @@ class VideoFile:
             # the last frame is shown as long as any other, however uneven they are
             if widest_ns and last_ns + widest_ns * 3 // 2 < length_ns:
                 ends = f"{last_ns / 1e9:.3f} s, though its header says {length_ns / 1e9:.3f} s"
-                self._add_fault(f"{self.name} breaks off after {ends}")
+                self.faults.append(f"{self.name} breaks off after {ends}")
         except (av.FFmpegError, EOFError) as error:
             at = "before its first frame" if last_ns < 0 else f"after {last_ns / 1e9:.3f} s"
-            self._add_fault(f"{self.name} breaks off {at} ({reason(error)})")
+            self.faults.append(f"{self.name} breaks off {at} ({reason(error)})")
         finally:
             self.close()
 
@@ -453,13 +453,13 @@ class VideoFile:
             if self._container.format.name == "avi" and not self._stream.codec_context.has_b_frames:
                 packet.pts = packet.dts
             if packet.is_corrupt:
-                self._add_fault(f"{self.name}: a packet is damaged")
+                self.faults.append(f"{self.name}: a packet is damaged")
             copies: list[bytes] = []
             found = []
             try:
                 found = self._decoder.decode(packet, copies)
             except av.InvalidDataError as error:
-                self._add_fault(f"{self.name}: a frame cannot be decoded ({reason(error)}); left out")
+                self.faults.append(f"{self.name}: a frame cannot be decoded ({reason(error)}); left out")
             # the filter takes the packet's content
             if convert is not None and packet.size:
                 # one that is damaged has been reported above
@@ -487,9 +487,6 @@ class VideoFile:
             )
         stamp: Fraction = frame.pts * frame.time_base / _NS
         return round(stamp)
-
-    def _add_fault(self, text: str) -> None:
-        self.faults.append(text)
 
     def close(self) -> None:
         """Close the file."""
@@ -525,11 +522,7 @@ class H264Encoder:
 
     def encode(self, frame: Frame) -> bytes:
         """Return the next frame, times increasing."""
-        av = load_av()
-        width, height = self._size
-        image = frame.image[:height, :width]
-        form = "gray" if image.ndim == 2 else "bgr24"
-        picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format=form)
+        picture = _to_encode(frame, self._size)
         picture.pts = frame.time_ns // 1000
         picture.time_base = Fraction(1, 1_000_000)
         return b"".join(bytes(packet) for packet in self._context.encode(picture))
@@ -565,13 +558,10 @@ class VideoWriter:
 
     def write(self, frame: Frame) -> None:
         """Add a frame; an odd edge of the picture loses a row or column of pixels."""
-        av = load_av()
         height, width = (edge - edge % 2 for edge in frame.image.shape[:2])
         if self._stream is None:
             self._stream = self._opened(width, height)
-        form = "gray" if frame.image.ndim == 2 else "bgr24"
-        image = np.ascontiguousarray(frame.image[:height, :width])
-        picture = av.VideoFrame.from_ndarray(image, format=form)
+        picture = _to_encode(frame, (width, height))
         picture.time_base = _TICK
         picture.pts = round(frame.time_ns * _NS / _TICK)
         self._container.mux(self._stream.encode(picture))
@@ -584,6 +574,13 @@ class VideoWriter:
         context.max_b_frames, context.gop_size = 0, _KEY_FRAMES
         stream.options = {"preset": "ultrafast", "tune": "zerolatency", "crf": "18"}
         return stream
+
+
+def _to_encode(frame: Frame, size: tuple[int, int]) -> Any:
+    """Return the image of a frame as PyAV encodes it, cut to a size (width, height)."""
+    width, height = size
+    image = np.ascontiguousarray(frame.image[:height, :width])
+    return load_av().VideoFrame.from_ndarray(image, format="gray" if image.ndim == 2 else "bgr24")
 
 
 def _lacks_index(path: Path) -> bool:

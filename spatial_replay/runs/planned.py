@@ -10,20 +10,17 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
 
-import numpy as np
-
 from spatial_replay.annotate.automaton_state import SpecAutomaton
 from spatial_replay.annotate.specification import logged_specifications
-from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.compile import chosen_spec
 from spatial_replay.compiled import compile_ahead
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
-from spatial_replay.logs.messages import messages_of
 from spatial_replay.logs.output_file import Durability
 from spatial_replay.logs.schemas.BehaviourTree_pb2 import BehaviourTree
 from spatial_replay.logs.topics import BEHAVIOUR_TREE, PLAN_METADATA, protobuf_channel
@@ -36,8 +33,8 @@ from spatial_replay.recording.plan_loop import run_plan
 from spatial_replay.runs.scripted import RunLog, about_run, refuse_unknown_names, run_log
 from spatial_replay.runs.virtual_camera import open_film
 from spatial_replay.sanity import refuse_unsatisfiable
-from spatial_replay.simulation.tabletop import SAMPLES_PER_S, default_specification, make_world
-from spatial_replay.simulation.world import Injection, Start, TreeTick, World
+from spatial_replay.simulation.tabletop import SAMPLES_PER_S, Tabletop, default_specification, make_world
+from spatial_replay.simulation.world import Injection, Start, TreeTick
 from spatial_replay.spec import parse_specification
 from spatial_replay.spec.formula import Atom, Formula, Misalignment, Specification
 from spatial_replay.spec.walks import base_of, iter_expressions, iter_formulas
@@ -46,30 +43,22 @@ from spatial_replay.trace.sample import Sample
 _TREES = protobuf_channel(BEHAVIOUR_TREE, BehaviourTree)
 
 
-@dataclass(frozen=True, slots=True)
-class _Preset:
-    """Resolution and distances for the planning of a skill, in metres."""
-
-    cell_size: float
-    margin: float
-    constraint_margin: float
-    clearance: float
-    room: float
-    lift: float
-
-
-_PRESETS: MappingProxyType[Skill, _Preset] = MappingProxyType(
+_PRESETS: Final[Mapping[Skill, Mapping[str, float]]] = MappingProxyType(
     {
         # a pushed block stops within a centimetre of its target; fingers need room behind it
-        "push": _Preset(
-            cell_size=0.005, margin=0.012, constraint_margin=0.008, clearance=0.0, room=0.04, lift=0.0
-        ),
+        "push": {"cell_size": 0.005, "margin": 0.012, "constraint_margin": 0.008, "room": 0.04},
         # fingers need room beside what they hold, and the hand beside taller things
-        "place": _Preset(
-            cell_size=0.02, margin=0.01, constraint_margin=0.01, clearance=0.02, room=0.09, lift=0.15
-        ),
+        "place": {
+            "cell_size": 0.02,
+            "margin": 0.01,
+            "constraint_margin": 0.01,
+            "clearance": 0.02,
+            "room": 0.09,
+            "lift": 0.15,
+        },
     }
 )
+"""Resolution and distances for the planning of a skill, in metres, by the keys of settings files."""
 
 
 def _yaws_text(yaws: Sequence[float]) -> str:
@@ -81,32 +70,22 @@ _SAME_YAW: Final = math.radians(1.0)
 """Yaws that differ by less count as one."""
 
 
-def settings_for(world: World) -> Settings:
+def settings_for(world: Tabletop) -> Settings:
     """Return the planner settings for a world."""
     bodies, space = world.bodies, world.workspace
-    skill: Skill = world.skill
-    preset = _PRESETS[skill]
-    workspace = Workspace(
-        Grid.over(space.xmin, space.ymin, space.xmax, space.ymax, preset.cell_size),
-        yaws=space.yaws,
-        nearest=space.nearest,
-        farthest=space.farthest,
-        obstacles=tuple(world.obstacles),
-        supports=frozenset(body.name for body in bodies if body.support),
-        clearance=preset.clearance,
-    )
-    return Settings(
-        workspace,
-        skill,
-        movable=tuple(body.name for body in bodies if body.movable),
-        margin=preset.margin,
-        constraint_margin=preset.constraint_margin,
-        room=preset.room,
-        lift=preset.lift,
-    )
+    about = {
+        "skill": world.skill,
+        "area": [space.xmin, space.ymin, space.xmax, space.ymax],
+        "yaws": space.yaws,
+        "nearest": space.nearest,
+        "farthest": space.farthest,
+        "supports": [body.name for body in bodies if body.support],
+        "movable": [body.name for body in bodies if body.movable],
+    }
+    return changed_settings(None, {**about, **_PRESETS[world.skill]})
 
 
-def _settings(world: World, formula: Formula, changes: Mapping[str, Any]) -> Settings:
+def _settings(world: Tabletop, formula: Formula, changes: Mapping[str, Any]) -> Settings:
     preset = settings_for(world)
     if not preset.workspace.yaws:
         yaws = yaws_for(formula, world.sample())
@@ -137,29 +116,22 @@ def yaws_for(formula: Formula, sample: Sample) -> tuple[float, ...]:
     return tuple(sorted(yaws))
 
 
-class WorldExecutor:
-    """The robot of a simulated world as an `Executor`."""
+def execute_in(world: Tabletop, settings: Settings, step: Step) -> Outcome:
+    """Let the robot of a simulated world execute a step, as an `Executor` does.
 
-    def __init__(self, world: World, settings: Settings) -> None:
-        self._world = world
-        self._settings = settings
-
-    def execute(self, step: Step) -> Outcome:
-        """See `Executor`.
-
-        Raises:
-            UsageError: the step moves nothing.
-        """
-        target = step.target
-        if target is None:
-            raise UsageError(f"step {step.number} ({step.kind}) moves nothing")
-        if self._settings.skill == "push":
-            # strokes turn objects, which matters only where orientations are planned
-            yaw = target.yaw if self._settings.workspace.yaws else None
-            done = self._world.push(target.name, target.waypoints[1:] or target.waypoints, yaw)
-        else:
-            done = self._world.place(target.name, target.x, target.y, target.yaw, target.waypoints[1:-1])
-        return Outcome(done.succeeded, done.reason, done.at)
+    Raises:
+        UsageError: the step moves nothing.
+    """
+    target = step.target
+    if target is None:
+        raise UsageError(f"step {step.number} ({step.kind}) moves nothing")
+    if settings.skill == "push":
+        # strokes turn objects, which matters only where orientations are planned
+        yaw = target.yaw if settings.workspace.yaws else None
+        done = world.push(target.name, target.waypoints[1:] or target.waypoints, yaw)
+    else:
+        done = world.place(target.name, target.x, target.y, target.yaw, target.waypoints[1:-1])
+    return Outcome(done.succeeded, done.reason, done.at)
 
 
 class PlanLoop:
@@ -174,7 +146,7 @@ class PlanLoop:
         """Begin before the first sample."""
         self._box, self._log = box, log
         self.planning_s = 0.0
-        self._newest_ns = self._ticks = 0
+        self._newest_ns = 0
 
     @property
     def planner(self) -> Planner:
@@ -208,10 +180,7 @@ class PlanLoop:
         for node in tick.nodes:
             status = BehaviourTree.Status.Value(f"STATUS_{node.status}")
             message.nodes.add(name=node.name, type=node.kind, parent=node.parent, status=status)
-        payload = message.SerializeToString(deterministic=True)
-        times_ns = np.array([self._newest_ns])
-        self._log.write_messages(messages_of(_TREES, times_ns, [payload], self._ticks))
-        self._ticks += 1
+        self._log.write_payload(_TREES, self._newest_ns, message.SerializeToString(deterministic=True))
 
     def conclude(self, outcome: Outcome) -> None:
         """Take the outcome of the last step, and log it."""
@@ -308,11 +277,12 @@ def record_plan(
     opened = make_world(scenario, seed=seed, noise_m=noise_m, injections=injections, starts=starts, gui=gui)
     with closing(opened) as world:
         refuse_unknown_names([kept, *others], world.sample())
-        settings = _settings(world, chosen_spec(kept, name).formula, changes)
+        spec = chosen_spec(kept, name)
+        settings = _settings(world, spec.formula, changes)
         planner = Planner(kept, settings, name=name, rate_hz=SAMPLES_PER_S)
         warm_up_planner()
         # a replay does not know the rate, and has no automaton for bounds in seconds: neither has the log
-        known = _known(kept, planner.automaton) if planner.rate_hz is None else []
+        known = [SpecAutomaton(spec.name, kept, spec, planner.automaton)] if planner.rate_hz is None else []
         with (
             open_film(world, cameras, seed=seed) as film,
             run_log(output, [kept, *others], about, inputs, known, durability) as log,
@@ -328,7 +298,7 @@ def record_plan(
                 return planner.stop_reason
 
             world.attach(observe, lambda tick: loop.log_tick(tick, world.time_ns))
-            end = run_plan(loop, WorldExecutor(world, planner.settings).execute, world.step)
+            end = run_plan(loop, partial(execute_in, world, planner.settings), world.step)
         last, own = end.last, {spec.name for spec in kept.results}
         return PlannedRun(
             samples=log.samples,
@@ -351,15 +321,6 @@ def _refuse_missing(file: Specification, name: str | None) -> None:
     results = [spec.name for spec in file.results]
     if name is not None and name not in results:
         raise UsageError(f"{file.filename} has no result {name!r}; its results are: {', '.join(results)}")
-
-
-def _known(file: Specification, automaton: Automaton) -> list[SpecAutomaton]:
-    """Return the automaton that is planned with, as a log stores it."""
-    return [
-        SpecAutomaton(spec.name, file, spec, automaton)
-        for spec in file.results
-        if spec.name == automaton.name
-    ]
 
 
 def warm_up_planner() -> None:

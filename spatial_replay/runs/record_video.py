@@ -16,13 +16,12 @@ from foxglove_schemas_protobuf.CompressedVideo_pb2 import CompressedVideo
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
-from google.protobuf.timestamp_pb2 import Timestamp
 
 from spatial_replay.annotate.requirements import Requirement, Standing, requirements_of
 from spatial_replay.annotate.scene.scene_template import FRAME
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.logs.messages import Channel, Messages, messages_of
+from spatial_replay.logs.messages import Channel
 from spatial_replay.logs.output_file import Durability
 from spatial_replay.logs.topics import (
     CAMERA_ANNOTATIONS,
@@ -57,17 +56,6 @@ _AROUND: Final = 24
 _THICKNESS, _LETTERS = 3.0, 16.0
 
 Colour = tuple[float, float, float]
-
-
-class CameraChannels:
-    """The channels of one of several cameras, and the name of its frame; a process for one run."""
-
-    def __init__(self, number: int) -> None:
-        """Name them: `/camera/video`, `/camera2/video`."""
-        self.frame = "camera" if number == 1 else f"camera{number}"
-        self.video = protobuf_channel(topic_of_camera(CAMERA_VIDEO, number), CompressedVideo)
-        self.annotations = protobuf_channel(topic_of_camera(CAMERA_ANNOTATIONS, number), ImageAnnotations)
-        self.calibration = protobuf_channel(topic_of_camera(CAMERA_CALIBRATION, number), CameraCalibration)
 
 
 class AskedColours:
@@ -119,7 +107,7 @@ def _members(requirement: Requirement, sample: Sample) -> set[str]:
 def encode_video(time_ns: int, data: bytes, frame: str) -> bytes:
     """Return the message of one frame in H.264."""
     message = CompressedVideo(frame_id=frame, data=data, format="h264")
-    _stamp(message.timestamp, time_ns)
+    message.timestamp.FromNanoseconds(time_ns)
     return message.SerializeToString(deterministic=True)
 
 
@@ -165,7 +153,7 @@ def encode_calibration(time_ns: int, camera: Camera, frame: str) -> bytes:
         R=np.eye(3).ravel().tolist(),
         P=np.concatenate([camera.matrix, np.zeros((3, 1))], axis=1).ravel().tolist(),
     )
-    _stamp(message.timestamp, time_ns)
+    message.timestamp.FromNanoseconds(time_ns)
     return message.SerializeToString(deterministic=True)
 
 
@@ -173,7 +161,7 @@ def encode_camera_pose(time_ns: int, plane: CameraPlane, frame: str) -> bytes:
     """Return where the camera is in the frame of the scene."""
     message = FrameTransforms()
     each = message.transforms.add(parent_frame_id=FRAME, child_frame_id=frame)
-    _stamp(each.timestamp, time_ns)
+    each.timestamp.FromNanoseconds(time_ns)
     x, y, z = (-plane.rotation.T @ plane.pose[3:]).tolist()
     each.translation.x, each.translation.y, each.translation.z = x, y, z
     # the other way round than the pose, which takes the scene to the camera
@@ -201,7 +189,7 @@ def _outline(
     message: ImageAnnotations, time_ns: int, pixels: Floats, colour: Colour, thickness: float
 ) -> None:
     each = message.points.add(type=PointsAnnotation.LINE_LOOP, thickness=thickness)
-    _stamp(each.timestamp, time_ns)
+    each.timestamp.FromNanoseconds(time_ns)
     each.outline_color.r, each.outline_color.g, each.outline_color.b = colour
     each.outline_color.a = 1.0
     for x, y in pixels.tolist():
@@ -213,16 +201,12 @@ def _text(
     message: ImageAnnotations, time_ns: int, text: str, place: Floats, colour: Colour, size: float
 ) -> None:
     each = message.texts.add(text=text, font_size=size)
-    _stamp(each.timestamp, time_ns)
+    each.timestamp.FromNanoseconds(time_ns)
     each.position.x, each.position.y = (place + 0.5).tolist()
     each.text_color.r, each.text_color.g, each.text_color.b = colour
     each.text_color.a = 1.0
     each.background_color.r = each.background_color.g = each.background_color.b = 1.0
     each.background_color.a = 0.8
-
-
-def _stamp(stamp: Timestamp, time_ns: int) -> None:
-    stamp.seconds, stamp.nanos = divmod(time_ns, 10**9)
 
 
 # -------------------------------------------------------------------------------------------------- recording
@@ -352,7 +336,6 @@ def record_seen(
     with run_log(output, files, about, inputs, durability=durability) as log:
         log.add_attachment(f"{CAMERA_PREFIX}{tags.name}", "application/yaml", tags.text.encode())
         pictures = [_Picture(number, *each) for number, each in enumerate(zip(cameras, kept, strict=True), 1)]
-        beside = _Beside(log)
         for seen in chain([begun], (observer.observe(*frames) for frames in coming)):
             samples, last_ns = samples + 1, seen.sample.time_ns
             log.write(seen.sample)
@@ -360,7 +343,7 @@ def record_seen(
             coloured = colours.of(seen.sample, updates)
             for picture, view, own in zip(pictures, seen.views, of_cameras, strict=True):
                 if view is not None:
-                    picture.write(beside, view, seen.sample, coloured, own.camera)
+                    picture.write(log, view, seen.sample, coloured, own.camera)
             alone.count(seen)
             for change in changes.after(updates):
                 show(change)
@@ -408,26 +391,14 @@ class _Alone:
                 )
 
 
-class _Beside:
-    """Messages of several topics into the log of a run, numbered."""
-
-    def __init__(self, log: RunLog) -> None:
-        self._log = log
-        self._written: dict[str, int] = {}
-
-    def write(self, channel: Channel, time_ns: int, payload: bytes) -> None:
-        number = self._written.get(channel.topic, 0)
-        self._written[channel.topic] = number + 1
-        times = np.array([time_ns], np.int64)
-        messages: Messages = messages_of(channel, times, [payload], number)
-        self._log.write_messages(messages)
-
-
 class _Picture:
-    """Messages of one camera in the log: picture, annotations, calibration and pose."""
+    """Messages of one camera in the log: picture, annotations, calibration, pose, as `/camera2/video`."""
 
     def __init__(self, number: int, camera: FrameSource, kept: KeepVideo) -> None:
-        self._channels = CameraChannels(number)
+        self._frame = "camera" if number == 1 else f"camera{number}"
+        self._video = protobuf_channel(topic_of_camera(CAMERA_VIDEO, number), CompressedVideo)
+        self._annotations = protobuf_channel(topic_of_camera(CAMERA_ANNOTATIONS, number), ImageAnnotations)
+        self._calibration = protobuf_channel(topic_of_camera(CAMERA_CALIBRATION, number), CameraCalibration)
         self._kept, self._copied = kept, camera.channel
         if self._copied is not None and self._copied.topic.startswith(OWN_PREFIX):
             self._kept = "none"
@@ -436,7 +407,7 @@ class _Picture:
 
     def write(
         self,
-        beside: _Beside,
+        log: RunLog,
         view: View,
         sample: Sample,
         colours: Mapping[str, Colour],
@@ -444,15 +415,14 @@ class _Picture:
     ) -> None:
         """Write what a frame shows."""
         time_ns = view.frame.time_ns
-        self._write_frame(beside, view.frame)
-        beside.write(self._channels.annotations, time_ns, encode_annotations(view, sample, colours))
-        frame = self._channels.frame
+        self._write_frame(log, view.frame)
+        log.write_payload(self._annotations, time_ns, encode_annotations(view, sample, colours))
         if camera is not None and self._is_due(CAMERA_CALIBRATION, time_ns):
-            beside.write(self._channels.calibration, time_ns, encode_calibration(time_ns, camera, frame))
+            log.write_payload(self._calibration, time_ns, encode_calibration(time_ns, camera, self._frame))
         if isinstance(view.plane, CameraPlane) and self._is_due(CAMERA_FRAMES, time_ns):
-            beside.write(TRANSFORMS, time_ns, encode_camera_pose(time_ns, view.plane, frame))
+            log.write_payload(TRANSFORMS, time_ns, encode_camera_pose(time_ns, view.plane, self._frame))
 
-    def _write_frame(self, beside: _Beside, frame: Frame) -> None:
+    def _write_frame(self, log: RunLog, frame: Frame) -> None:
         channel, data = self._copied, frame.data
         if self._kept == "none":
             return
@@ -462,10 +432,10 @@ class _Picture:
                 self._encoder = H264Encoder(width, height)
             channel, data = None, self._encoder.encode(frame)
         if channel is not None:
-            beside.write(channel, frame.time_ns, data)
+            log.write_payload(channel, frame.time_ns, data)
         elif data:
-            encoded = encode_video(frame.time_ns, data, self._channels.frame)
-            beside.write(self._channels.video, frame.time_ns, encoded)
+            encoded = encode_video(frame.time_ns, data, self._frame)
+            log.write_payload(self._video, frame.time_ns, encoded)
 
     def _is_due(self, what: str, time_ns: int) -> bool:
         """Return whether what does not change is repeated now."""

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from spatial_replay.annotate.automaton_state import SpecAutomaton
 from spatial_replay.errors import SpecificationError, UsageError
 from spatial_replay.logs.mcap.write import LogWriter
-from spatial_replay.logs.messages import Messages, merge
+from spatial_replay.logs.messages import Channel, Messages, merge, messages_of
 from spatial_replay.logs.output_file import Durability, open_output, refuse_inputs
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.recording.log import Recording, refuse_templates
@@ -42,6 +45,7 @@ class RunLog:
         self._beside: list[Messages] = []
         self._first_ns = self._last_ns = 0
         self._samples = 0
+        self._written = Counter[str]()
 
     @property
     def samples(self) -> int:
@@ -77,6 +81,12 @@ class RunLog:
     def write_messages(self, messages: Messages) -> None:
         """Write messages of other channels, at the time of the newest sample."""
         self._beside.append(messages)
+
+    def write_payload(self, channel: Channel, time_ns: int, payload: bytes) -> None:
+        """Write the next message of another channel."""
+        number = self._written[channel.topic]
+        self.write_messages(messages_of(channel, np.array([time_ns], np.int64), [payload], number))
+        self._written[channel.topic] += 1
 
     def add_metadata(self, name: str, data: Mapping[str, str]) -> None:
         """Add a metadata record.

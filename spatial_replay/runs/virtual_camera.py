@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, nullcontext
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from types import MappingProxyType
-from typing import Final, NamedTuple, Self
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -293,44 +293,23 @@ MOST_CAMERAS: Final = 2
 
 
 class Film:
-    """Cameras above a simulated world, as a context manager; a process for one run.
+    """Cameras above a simulated world; a process for one run.
 
     Every object carries a tag on a card on its top, those that things are put on two; further tags lie on the
     table. The pictures have the blur of lens and motion, and noise; what the arm hides is hidden.
     """
 
-    def __init__(
-        self, world: Tabletop, videos: Sequence[Path], *, seed: int = 0, flaws: Flaws | None = None
-    ) -> None:
-        """Open the videos, one or two, and write the tags file beside the first.
+    def __init__(self, world: Tabletop, writers: Sequence[VideoWriter], seed: int) -> None:
+        """Begin before the first sample.
 
         Args:
+            writers: of the videos, one or two.
             seed: of the noise.
-
-        Raises:
-            UsageError: the extra `vision` is not installed, or the name is not that of a video.
-            OutputError: a file cannot be written.
         """
-        self._world, self._seed, self._flaws = world, seed, flaws
-        self._views = _VIEWS[world.name][len(videos) - 1]
-        self._before: tuple[int, dict[str, Pose]] | None = None
+        self._world, self._writers, self._seed = world, writers, seed
+        self._views = _VIEWS[world.name][len(writers) - 1]
+        self._before: dict[str, Pose] | None = None
         self._taken = 0
-        tags = tags_of_film(videos)
-        self._opened = ExitStack()
-        self._writers: list[VideoWriter] = []
-        try:
-            for video in videos:
-                refuse_inputs(video, ())
-                self._writers.append(self._opened.enter_context(VideoWriter(video, SAMPLES_PER_S)))
-            tags.write_text(tags_text(world, len(videos)), encoding="utf-8")
-        except OSError as error:
-            raise OutputError(f"{tags}: {(error.strerror or str(error)).lower()}") from None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._opened.close()
 
     def take(self, sample: Sample) -> None:
         """Add the frames of a sample, while the world is in its state."""
@@ -344,7 +323,7 @@ class Film:
         instants = [self._plates(poses, 0.0)]
         if self._before is not None:
             instants = [self._plates(poses, share) for share in (-_EXPOSURE / 2, 0.0, _EXPOSURE / 2)]
-        self._before = time_ns, poses
+        self._before = poses
         self._taken += 1
         size = (views.size[0] // views.coarse, views.size[1] // views.coarse)
         for number, look in enumerate(views.looks):
@@ -358,7 +337,6 @@ class Film:
                 instants,
                 views.camera,
                 look.pose,
-                flaws=self._flaws,
                 # of one camera as before there were two
                 seed=(self._seed, self._taken, *([number] if number else [])),
                 backdrop=Backdrop(
@@ -377,7 +355,7 @@ class Film:
             pose = poses[body.name]
             moved = np.zeros(3)
             if self._before is not None:
-                moved = share * (pose.position - self._before[1][body.name].position)
+                moved = share * (pose.position - self._before[body.name].position)
             for index, (x, y) in enumerate(_spots(body)):
                 there = pose.rotation @ np.array([x, y, body.shape.height / 2]) + pose.position + moved
                 plates.append(Plate(number + index, there, pose.rotation.T[:2], self._views.tag))
@@ -435,8 +413,9 @@ def _spots(body: Body) -> list[tuple[float, float]]:
     return [(r, 0.0), (-r, 0.0)]
 
 
-def open_film(world: Tabletop, videos: Sequence[Path], *, seed: int) -> AbstractContextManager[Film | None]:
-    """Return a context of the film of a world; of None without a name for it.
+@contextmanager
+def open_film(world: Tabletop, videos: Sequence[Path], *, seed: int) -> Iterator[Film | None]:
+    """Open the videos of a world, one or two, and write the tags file beside the first; None without any.
 
     Raises:
         UsageError: the extra `vision` is not installed, or a name that is not that of a video or comes
@@ -444,7 +423,8 @@ def open_film(world: Tabletop, videos: Sequence[Path], *, seed: int) -> Abstract
         OutputError: a file cannot be written.
     """
     if not videos:
-        return nullcontext()
+        yield None
+        return
     if len(videos) > MOST_CAMERAS:
         raise UsageError(f"{len(videos)} cameras: a run is filmed by one or two; leave out the others")
     for video in videos:
@@ -452,4 +432,13 @@ def open_film(world: Tabletop, videos: Sequence[Path], *, seed: int) -> Abstract
             raise UsageError(f"{video}: a film is a video; name it {video.stem}.mp4")
     if len({video.resolve() for video in videos}) < len(videos):
         raise UsageError(f"{videos[0]} is the film of two cameras; give each a name of its own")
-    return Film(world, videos, seed=seed)
+    tags = tags_of_film(videos)
+    with ExitStack() as opened:
+        try:
+            for video in videos:
+                refuse_inputs(video, ())
+            writers = [opened.enter_context(VideoWriter(video, SAMPLES_PER_S)) for video in videos]
+            tags.write_text(tags_text(world, len(videos)), encoding="utf-8")
+        except OSError as error:
+            raise OutputError(f"{tags}: {(error.strerror or str(error)).lower()}") from None
+        yield Film(world, writers, seed)

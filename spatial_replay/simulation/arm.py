@@ -221,10 +221,6 @@ class Scene:
         ]
         return least_distance(covered, others) if others else math.inf
 
-    def distance(self, covered: Footprint, name: str) -> float:
-        """Return the distance to a body in the plane; below 0 if they overlap."""
-        return least_distance(covered, [self.footprint(name)])
-
 
 def least_distance(covered: Footprint, others: Sequence[Footprint]) -> float:
     """Return the distance, in metres, to the nearest of some footprints; below 0 if it overlaps one."""
@@ -332,7 +328,7 @@ def surface(scene: Scene, name: str, goal: Point) -> float:
     under = [
         scene.height(other)[1]
         for other, body in scene.bodies.items()
-        if body.support and other != name and scene.distance(spot, other) <= 0
+        if body.support and other != name and least_distance(spot, [scene.footprint(other)]) <= 0
     ]
     return max(under, default=0.0)
 

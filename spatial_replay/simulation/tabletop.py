@@ -12,8 +12,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from spatial_replay.errors import UsageError
-from spatial_replay.geometry.footprint import Footprint, TrackedObject
+from spatial_replay.errors import UsageError, importing
+from spatial_replay.geometry.footprint import TrackedObject
 from spatial_replay.simulation.arm import (
     STEPS_PER_TICK,
     TICKS_PER_S,
@@ -114,7 +114,11 @@ _Result = TypeVar("_Result")
 
 
 class Tabletop:
-    """The world of a scenario; `World` documents the methods that all worlds have.
+    """The world of a scenario, simulated step by step; lengths are in metres.
+
+    The robot's base is at (0, 0); x points forward, y to its left, z up; the table is z = 0. Methods that
+    advance time (`step`, `push`, `place`) pass each sample to the attached listener when it is due; the first
+    one, of time 0, when time starts to advance.
 
     Raises:
         UsageError: the simulator is not installed, the noise is below 0, an injection is impossible, or a
@@ -164,26 +168,27 @@ class Tabletop:
 
     @property
     def name(self) -> str:
+        """The scenario's name."""
         return self._scenario.name
 
     @property
     def skill(self) -> Skill:
+        """Motions of the robot."""
         return self._scenario.skill
 
     @property
     def bodies(self) -> tuple[Body, ...]:
+        """The objects, in the order of the samples."""
         return tuple(each.body for each in self._scenario.placements)
 
     @property
     def workspace(self) -> ReachableArea:
+        """Where the robot can place objects."""
         return self._scenario.workspace
 
     @property
-    def obstacles(self) -> tuple[Footprint, ...]:
-        return ()
-
-    @property
     def time_ns(self) -> int:
+        """The simulated time, from 0."""
         return self._ticks * 10**9 // TICKS_PER_S
 
     @property
@@ -196,9 +201,14 @@ class Tabletop:
         listen: Callable[[Sample], str | None],
         listen_to_tree: Callable[[TreeTick], None] = lambda tick: None,
     ) -> None:
+        """Pass samples to `listen` from now on, and ticks of behaviour trees to `listen_to_tree`.
+
+        A reason that `listen` returns stops a motion.
+        """
         self._listen, self._listen_to_tree = listen, listen_to_tree
 
     def reset(self, seed: int) -> None:
+        """Restart at time 0; equal seeds give equal worlds."""
         if seed < 0:
             raise UsageError(f"the seed is {seed}; give 0 or more")
         self.close()
@@ -216,12 +226,14 @@ class Tabletop:
             place = (x, y, each.bottom + tall / 2 + 5e-4)
             engine.add(each.body.name, each.body.shape, each.mass_kg, place, yaw, each.colour)
         bodies = {each.body.name: each.body for each in scenario.placements}
-        self._scene = Scene(engine, Arm(engine), MappingProxyType(bodies), self._report_tick)
+        arm, bodies_by_name = Arm(engine), MappingProxyType(bodies)
+        self._scene = Scene(engine, arm, bodies_by_name, lambda tick: self._listen_to_tree(tick))
         self._scene.arm.drive()
         for _ in range(_SETTLING_STEPS):
             engine.step()
 
     def sample(self) -> Sample:
+        """Return the current sample: all bodies, with detection noise; repeated calls return the same."""
         self._open_engine()
         number = self._ticks // _TICKS_PER_SAMPLE
         errors = _displacements(self._noise_m, self._seed, number, len(self._scene.bodies))
@@ -234,9 +246,15 @@ class Tabletop:
         return Sample(self.time_ns, objects, signals)
 
     def step(self) -> None:
+        """Advance to the time of the next sample; the robot holds still."""
         self.run(self._scene.arm.wait(1 / SAMPLES_PER_S))
 
     def push(self, name: str, path: Sequence[tuple[float, float]], yaw: float | None = None) -> Execution:
+        """Push an object along a path of points (x, y) of its centre, and turn it there to `yaw` if given.
+
+        Raises:
+            UsageError: no such object, or the robot does not push.
+        """
         numbers = [number for point in path for number in point]
         self._refuse_unless("push", name, numbers and [*numbers, 0.0 if yaw is None else yaw])
         return self._move(name, pushing(self._scene, name, path, yaw))
@@ -244,6 +262,11 @@ class Tabletop:
     def place(
         self, name: str, x: float, y: float, yaw: float | None = None, via: Sequence[tuple[float, float]] = ()
     ) -> Execution:
+        """Pick an object up, carry it along points and place its centre at (x, y); None keeps its yaw.
+
+        Raises:
+            UsageError: no such object, or the robot does not pick.
+        """
         self._refuse_unless("place", name, [x, y, 0.0 if yaw is None else yaw])
         return self._move(name, self._scenario.placing(self._scene, name, (x, y), yaw, via))
 
@@ -251,30 +274,28 @@ class Tabletop:
         """Return the motion of the robot without a planner."""
         return self._scenario.script(self._scene)
 
-    def run(self, motion: Generator[None, None, _Result]) -> _Result:
-        """Run a motion to its end, and return its result.
+    def run(
+        self, motion: Generator[None, None, _Result], is_over: Callable[[], object] = lambda: False
+    ) -> _Result | None:
+        """Run a motion to its end, and return its result; None if it is over before.
 
         Raises:
             UsageError: the world is closed.
         """
-        while True:
+        while not is_over():
             try:
                 next(motion)
             except StopIteration as end:
                 result: _Result = end.value
                 return result
             self.tick()
+        return None
 
     def _move(self, name: str, motion: Generator[None, None, Execution]) -> Execution:
         """Run a motion of a body to its end, or until the listener stops it."""
         self._halt = ""
-        while not self._halt:
-            try:
-                next(motion)
-            except StopIteration as end:
-                result: Execution = end.value
-                return result
-            self.tick()
+        if (result := self.run(motion, lambda: self._halt)) is not None:
+            return result
         reason = self._halt
         motion.close()
         if self._scenario.skill == "place":
@@ -291,18 +312,8 @@ class Tabletop:
         if duration_ns is None:
             return self.run(motion)
         end_ns = self.time_ns + duration_ns
-        result: _Result | None = None
-        while self.time_ns < end_ns:
-            try:
-                next(motion)
-            except StopIteration as end:
-                result = end.value
-                break
-            self.tick()
-        for _ in self._scene.arm.rest():
-            if self.time_ns >= end_ns:
-                break
-            self.tick()
+        result = self.run(motion, lambda: self.time_ns >= end_ns)
+        self.run(self._scene.arm.rest(), lambda: self.time_ns >= end_ns)
         return result
 
     def tick(self) -> None:
@@ -320,6 +331,7 @@ class Tabletop:
         self._emit()
 
     def close(self) -> None:
+        """Release the simulator."""
         if self._engine is not None:
             self._engine.close()
             self._engine = None
@@ -329,9 +341,6 @@ class Tabletop:
         if self._ticks % _TICKS_PER_SAMPLE == 0 and self._ticks != self._last_sampled:
             self._last_sampled = self._ticks
             self._halt = self._listen(self.sample()) or ""
-
-    def _report_tick(self, tick: TreeTick) -> None:
-        self._listen_to_tree(tick)
 
     def _inject(self) -> None:
         if not self._injections:
@@ -428,15 +437,7 @@ def scenario_of(name: str) -> Scenario:
     """
     if name not in SCENARIOS:
         raise UsageError(f"there is no scenario {name!r}; there are {', '.join(SCENARIOS)}")
-    try:
+    with importing(f"the world {name} needs py_trees", extra="sim"):
         module = import_module(f"spatial_replay.simulation.scenarios.{name.replace('-', '_')}")
-    except ModuleNotFoundError as error:
-        if error.name is None or error.name.partition(".")[0] != "py_trees":
-            raise
-        raise UsageError(
-            f"the world {name} needs py_trees, which is not installed: pip install 'spatial-replay[sim]'"
-        ) from error
-    scenario = module.SCENARIO
-    if not isinstance(scenario, Scenario):
-        raise TypeError(f"{module.__name__}.SCENARIO is no scenario but {scenario!r}")
+    scenario: Scenario = module.SCENARIO
     return scenario

@@ -1,19 +1,17 @@
-"""Simulated worlds: shapes of bodies, the interface to the rest of the package, and injected failures."""
+"""Simulated worlds: shapes of bodies, what worlds consist of, and injected failures."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, Protocol, TypeAlias, get_args
+from typing import Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.geometry.footprint import Footprint
-from spatial_replay.trace.sample import Sample
 
 # ----------------------------------------------------------------------------------------------------- shapes
 
@@ -172,11 +170,6 @@ class ReachableArea:
     farthest: float = math.inf
     yaws: tuple[float, ...] = ()
 
-    def contains(self, x: float, y: float) -> bool:
-        """Return whether a point is inside or on the border."""
-        inside = self.xmin <= x <= self.xmax and self.ymin <= y <= self.ymax
-        return inside and self.nearest <= math.hypot(x, y) <= self.farthest
-
 
 @dataclass(frozen=True, slots=True)
 class Execution:
@@ -213,77 +206,6 @@ class TreeTick(NamedTuple):
 
     number: int
     nodes: tuple[TreeNode, ...]
-
-
-class World(Protocol):
-    """A world that is simulated step by step; lengths are in metres.
-
-    The robot's base is at (0, 0); x points forward, y to its left, z up; the table is z = 0. Methods that
-    advance time (`step`, `push`, `place`) pass each sample to the attached listener when it is due; the first
-    one, of time 0, when time starts to advance.
-    """
-
-    @property
-    def name(self) -> str:
-        """The scenario's name."""
-
-    @property
-    def skill(self) -> Skill:
-        """Motions of the robot."""
-
-    @property
-    def bodies(self) -> tuple[Body, ...]:
-        """The objects, in the order of the samples."""
-
-    @property
-    def workspace(self) -> ReachableArea:
-        """Where the robot can place objects."""
-
-    @property
-    def obstacles(self) -> tuple[Footprint, ...]:
-        """Fixed obstacles that are not bodies."""
-
-    @property
-    def time_ns(self) -> int:
-        """The simulated time, from 0."""
-
-    def attach(
-        self,
-        listen: Callable[[Sample], str | None],
-        listen_to_tree: Callable[[TreeTick], None] = lambda tick: None,
-    ) -> None:
-        """Pass samples to `listen` from now on, and ticks of behaviour trees to `listen_to_tree`.
-
-        A reason that `listen` returns stops a motion.
-        """
-
-    def reset(self, seed: int) -> None:
-        """Restart at time 0; equal seeds give equal worlds."""
-
-    def sample(self) -> Sample:
-        """Return the current sample: all bodies, with detection noise; repeated calls return the same."""
-
-    def step(self) -> None:
-        """Advance to the time of the next sample; the robot holds still."""
-
-    def push(self, name: str, path: Sequence[tuple[float, float]], yaw: float | None = None) -> Execution:
-        """Push an object along a path of points (x, y) of its centre, and turn it there to `yaw` if given.
-
-        Raises:
-            UsageError: no such object, or the robot does not push.
-        """
-
-    def place(
-        self, name: str, x: float, y: float, yaw: float | None = None, via: Sequence[tuple[float, float]] = ()
-    ) -> Execution:
-        """Pick an object up, carry it along points and place its centre at (x, y); None keeps its yaw.
-
-        Raises:
-            UsageError: no such object, or the robot does not pick.
-        """
-
-    def close(self) -> None:
-        """Release the simulator."""
 
 
 # ------------------------------------------------------------------------------- starts and injected failures
