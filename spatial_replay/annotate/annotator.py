@@ -22,7 +22,7 @@ from spatial_replay.annotate.events import EncodedEvent, EventReporter, encoded_
 from spatial_replay.annotate.requirements import requirements_of
 from spatial_replay.annotate.robustness import encode_robustness
 from spatial_replay.annotate.scene.scene_frames import SceneFrames
-from spatial_replay.annotate.scene.scene_template import encode_frame
+from spatial_replay.annotate.scene.scene_template import SceneBounds, encode_frame
 from spatial_replay.annotate.scene.scene_update import SceneEncoder, SceneState
 from spatial_replay.annotate.specification import ReportedTree, encode_specification
 from spatial_replay.annotate.standing import StandingEncoder
@@ -113,6 +113,9 @@ class Annotator:
     """Encodes the results of an evaluation as messages, sample after sample.
 
     Cutting the samples into blocks changes no message.
+
+    Attributes:
+        extent: of all footprints so far; None before any.
     """
 
     def __init__(
@@ -160,6 +163,7 @@ class Annotator:
         requirements = [each for result in self._results for each in result.requirements]
         named = frozenset(name for each in requirements for name in each.objects)
         self._encoder = SceneEncoder(shown_regions(files), units.get("", ""), named)
+        self.extent: SceneBounds | None = None
         self._latest: tuple[Trace, list[SeriesBlock]] | None = None
         self._scene = scene or SceneState()
         self._show = show
@@ -173,6 +177,11 @@ class Annotator:
         return self._scene
 
     @property
+    def has_samples(self) -> bool:
+        """Whether there was any sample."""
+        return self._latest is not None
+
+    @property
     def _over(self) -> list[str]:
         """Deciding atoms of the results that are decided so far."""
         return [each.reporter.over for each in self._results]
@@ -183,6 +192,7 @@ class Annotator:
         Args:
             blocks: their evaluation, one for each tree.
         """
+        self.extent = SceneBounds.of(trace, self.extent)
         if not len(trace):
             return []
         messages = []
@@ -334,8 +344,6 @@ class Annotator:
         self, channel: Channel, blocks: Sequence[SeriesBlock], encoded: Sequence[Sequence[bytes]]
     ) -> Messages:
         """Order the messages of results by time; among equal times the order of results stays."""
-        if len(blocks) == 1:
-            return self._messages(channel, blocks[0].times_ns, encoded[0])
         times_ns = np.concatenate([np.empty(0, np.int64), *(block.times_ns for block in blocks)])
         order = np.argsort(times_ns, kind="stable")
         payloads = [payload for each in encoded for payload in each]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -85,13 +85,10 @@ class AutomatonRun:
             return []
         values = self._values(block)
         before, after = self._steps(values)
-        keys, groups = _distinct(before, after)
         encoded = []
-        for number in range(len(keys)):
-            members = np.flatnonzero(groups == number)
-            template = self._template(
-                *(tuple(_members(each[members[0]]).tolist()) for each in (before, after))
-            )
+        for members in _alike(before, after):
+            sources, targets = (tuple(_members(each[members[0]]).tolist()) for each in (before, after))
+            template = self._template(sources, targets)
             marks = np.empty((len(members), len(self.propositions) + 3), np.uint8)
             marks[:, :-3] = _TRUTHS[values[:, members]].T
             marks[:, -3:] = self._summary(after[members[0]])
@@ -110,9 +107,11 @@ class AutomatonRun:
 
     def words(self) -> tuple[list[str], Integers]:
         """Return states in words, and which of them is after each of the samples last taken in."""
-        kinds, groups = _distinct(self._after, self._after)
-        firsts = [int(np.argmax(groups == number)) for number in range(len(kinds))]
-        return [self._text(self._after_states(first)) for first in firsts], groups
+        texts, which = list[str](), np.empty(len(self._after), np.int64)
+        for members in _alike(self._after, self._after):
+            which[members] = len(texts)
+            texts.append(self._text(self._after_states(int(members[0]))))
+        return texts, which
 
     @property
     def latest_words(self) -> str:
@@ -212,20 +211,13 @@ def _members(states: NDArray[np.bool_] | Integers) -> Integers:
     return np.atleast_1d(np.flatnonzero(states) if states.ndim else states.astype(np.int64))
 
 
-def _distinct(
-    before: NDArray[np.bool_] | Integers, after: NDArray[np.bool_] | Integers
-) -> tuple[list[bytes], Integers]:
-    """Return the distinct steps, each with a key, and which of them (T,) each sample takes."""
+def _alike(before: NDArray[np.bool_] | Integers, after: NDArray[np.bool_] | Integers) -> Iterator[Integers]:
+    """Return the samples of each distinct step."""
     if before.ndim == 1:
-        steps, groups = np.stack([before, after], axis=1), np.empty(len(before), np.int64)
-        keys = list[bytes]()
-        for places in equal_places(combined([before, after], len(before))):
-            groups[places] = len(keys)
-            keys.append(steps[places[0]].tobytes())
-        return keys, groups
+        return equal_places(combined([before, after], len(before)))
     rows = np.packbits(np.concatenate([before, after], axis=1), axis=1)
-    kinds, groups = np.unique(rows.view(f"V{rows.shape[1]}").ravel(), return_inverse=True)
-    return [kind.tobytes() for kind in kinds], groups.ravel()
+    _, groups = np.unique(rows.view(f"V{rows.shape[1]}").ravel(), return_inverse=True)
+    return equal_places(groups.ravel())
 
 
 _STORED = ".json"

@@ -114,32 +114,6 @@ class MessageHash:
         return total.hexdigest()
 
 
-class ResultHash:
-    """SHA-256 of results: of each one's numbers as little-endian bytes, sample by sample, node by node."""
-
-    def __init__(self, names: Sequence[tuple[str, str | None]]) -> None:
-        self._names = names
-        self._hashes = [hashlib.sha256() for _ in names]
-
-    def add(self, index: int, series: Floats) -> None:
-        """Take in the next numbers, (N, 4, T), of result `index`."""
-        _take_in(self._hashes[index], _floats(series.transpose(2, 0, 1)))
-
-    def hexdigest(self) -> str:
-        total = hashlib.sha256()
-        for (name, object), hashed in zip(self._names, self._hashes, strict=True):
-            total.update(_text(name) + _text(object) + hashed.digest())
-        return total.hexdigest()
-
-
-def specification_sha256(files: Sequence[Specification]) -> str:
-    """Return the SHA-256 of the canonical texts."""
-    total = hashlib.sha256()
-    for file in files:
-        total.update(_text(format_specification(file)))
-    return total.hexdigest()
-
-
 PLAN_SHA256 = "plan_sha256"
 """The entry of a certificate for the settings of a planned run."""
 
@@ -154,16 +128,12 @@ def plan_sha256(plan: Mapping[str, str]) -> str:
 
 def specifications_json(files: Sequence[Specification]) -> str:
     """Return specifications as metadata lists them, in JSON: name, SHA-256 of their text, plug-ins."""
-    texts = [format_specification(file).encode("utf-8", "surrogatepass") for file in files]
-    hashes = [hashlib.sha256(text).hexdigest() for text in texts]
-    listed = zip(files, hashes, strict=True)
-    plugins = [{"plugins": file.plugins} if file.plugins else {} for file in files]
-    return json.dumps(
-        [
-            {"name": file.filename, "sha256": digest, **more}
-            for (file, digest), more in zip(listed, plugins, strict=True)
-        ]
-    )
+    listed = []
+    for file in files:
+        text = format_specification(file).encode("utf-8", "surrogatepass")
+        plugins = {"plugins": file.plugins} if file.plugins else {}
+        listed.append({"name": file.filename, "sha256": hashlib.sha256(text).hexdigest(), **plugins})
+    return json.dumps(listed)
 
 
 class EvaluationHashes:
@@ -171,12 +141,8 @@ class EvaluationHashes:
 
     def __init__(self, names: Sequence[tuple[str, str | None]]) -> None:
         """Start before the first sample; each result has a name and, of a template, an object."""
-        self._samples, self._messages, self._results = SampleHash(), MessageHash(), ResultHash(names)
-
-    def add(self, trace: Trace, own: Messages, results: Sequence[SeriesBlock]) -> None:
-        """Take in the next samples, the log's own messages, and the numbers of each result."""
-        self.add_samples(trace, own)
-        self.add_results(results)
+        self._samples, self._messages = SampleHash(), MessageHash()
+        self._results = [(_text(name) + _text(object), hashlib.sha256()) for name, object in names]
 
     def add_samples(self, trace: Trace, own: Messages) -> None:
         """Take in the next samples and the log's own messages; their results follow, in any pieces."""
@@ -184,9 +150,9 @@ class EvaluationHashes:
         self._messages.add(own)
 
     def add_results(self, results: Sequence[SeriesBlock]) -> None:
-        """Take in the next numbers of each result."""
-        for index, block in enumerate(results):
-            self._results.add(index, block.series)
+        """Take in the next numbers of each result, sample by sample, node by node."""
+        for (_, hashed), block in zip(self._results, results, strict=True):
+            _take_in(hashed, _floats(block.series.transpose(2, 0, 1)))
 
     def certificate(
         self, files: Sequence[Specification], plan: Mapping[str, str] | None = None
@@ -196,11 +162,16 @@ class EvaluationHashes:
         Args:
             plan: the metadata of a planned run.
         """
+        specifications, results = hashlib.sha256(), hashlib.sha256()
+        for file in files:
+            specifications.update(_text(format_specification(file)))
+        for name, hashed in self._results:
+            results.update(name + hashed.digest())
         return {
             "samples_sha256": self._samples.hexdigest(),
             "messages_sha256": self._messages.hexdigest(),
-            "specification_sha256": specification_sha256(files),
-            "results_sha256": self._results.hexdigest(),
+            "specification_sha256": specifications.hexdigest(),
+            "results_sha256": results.hexdigest(),
             **({} if plan is None else {PLAN_SHA256: plan_sha256(plan)}),
             "spatial_replay_version": __version__,
         }

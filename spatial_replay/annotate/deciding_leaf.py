@@ -46,7 +46,14 @@ from spatial_replay.spec.formula import (
     iter_nodes,
 )
 from spatial_replay.spec.relations import RELATION_NAMES
-from spatial_replay.spec.walks import base_of, iter_expressions, looks_back, operand_signs, substitute
+from spatial_replay.spec.walks import (
+    base_of,
+    iter_expressions,
+    leaf_key,
+    looks_back,
+    operand_signs,
+    substitute,
+)
 from spatial_replay.trace.trace import Trace
 
 
@@ -62,20 +69,33 @@ class LeavesBelow(NamedTuple):
     signs: Floats
 
 
-class LeafValue(NamedTuple):
-    """A leaf at a sample.
+class DecidingLeaf(NamedTuple):
+    """A leaf at the sample at which it decides.
 
     Attributes:
         leaf: index among the program's leaves.
-        number: its own number there, its sign not turned.
+        number: its own number there, its sign not turned, without what is uncertain.
         end: which end of its interval that is.
-        time_ns: of the sample; None where only the number is known.
+        time_ns: of the sample.
+        node: its id in the formula's tree; -1 where only its number was compared.
+        bound: the same number with what is uncertain: the end of its interval that decides.
+        missed: the implication above it that failed, if a violation is due to one.
+        response: where it is the condition's, the leaf by which the response came closest, if one did.
     """
 
     leaf: int
     number: float
     end: End
-    time_ns: int | None = None
+    time_ns: int
+    node: int = -1
+    bound: float = math.nan
+    missed: MissedResponse | None = None
+    response: DecidingLeaf | None = None
+
+    @property
+    def shown(self) -> DecidingLeaf:
+        """The leaf to point at: that of a response that was missed, not of the condition that held."""
+        return self if self.response is None else self.response
 
 
 def leaves_below(formula: Formula, leaves: Sequence[Formula]) -> list[LeavesBelow]:
@@ -101,13 +121,14 @@ def leaves_below(formula: Formula, leaves: Sequence[Formula]) -> list[LeavesBelo
 
 
 def find_leaf(
-    below: LeavesBelow, ends: tuple[Floats, Floats], number: float, *, low: bool
-) -> LeafValue | None:
+    below: LeavesBelow, ends: tuple[Floats, Floats], number: float, time_ns: int, *, low: bool
+) -> DecidingLeaf | None:
     """Return the first leaf below a node that has the node's number, in one sample.
 
     Args:
         ends: (A,) low and high end of each of the program's leaves in that sample.
         number: of the node; NaN finds the first that is unknown, an infinite one identifies no leaf.
+        time_ns: of the sample.
         low: whether the number is the low end of the node's interval, or the high one.
     """
     if np.isinf(number):
@@ -120,21 +141,12 @@ def find_leaf(
         return None
     end = End.LOW if (below.signs[hits[0]] > 0.0) == low else End.HIGH
     shown = number if np.isnan(number) else float(own[hits[0]]) + 0.0
-    return LeafValue(int(below.indices[hits[0]]), shown, end)
+    return DecidingLeaf(int(below.indices[hits[0]]), shown, end, time_ns)
 
 
 def _columns(entries: Sequence[tuple[int, int]]) -> LeavesBelow:
     pairs = np.array(entries, np.int64).reshape(-1, 2)
     return LeavesBelow(pairs[:, 0], pairs[:, 1].astype(np.float64))
-
-
-def leaf_key(leaf: Formula) -> tuple[object, ...]:
-    """Return what equal leaves have in common."""
-    if isinstance(leaf, Quantified):
-        return leaf.quantifier, leaf.variables, leaf.group, leaf.body
-    if isinstance(leaf, Atom):
-        return (leaf.expression,)
-    raise TypeError(f"{leaf!r} is not a leaf")
 
 
 _RECENT: Final = 1024
@@ -160,18 +172,18 @@ class NewestSamples:
         self._older += len(trace)
 
     def deciding_atom(
-        self, leaf: Formula, found: LeafValue, now_ns: int, regions: Mapping[str, Outline]
+        self, leaf: Formula, found: DecidingLeaf, now_ns: int, regions: Mapping[str, Outline]
     ) -> tuple[Atom, float] | None:
         """Return the atom of the objects that give a quantifier its number, with the atom's own number.
 
-        None if the sample is not recent or unknown, if earlier samples would be needed, or if no atom has
+        None if the sample is not recent, if earlier samples would be needed, or if no atom has
         that number.
 
         Args:
             leaf: with the object of a template.
             now_ns: the time of the sample from which the number is looked back at.
         """
-        sample = None if found.time_ns is None else self.sample(found.time_ns, now_ns)
+        sample = self.sample(found.time_ns, now_ns)
         if sample is None or look_back([leaf]) != (0, 0):
             return None
         decided = deciding_atom(TraceScene(sample, regions), leaf, found.end)
@@ -197,40 +209,6 @@ class NewestSamples:
 MOST_NUMBERS: Final = 1 << 22
 """Numbers of leaves that are kept of one result, at most: 32 MiB of them."""
 _END_OF: Final = {Verdict.SATISFIED: End.LOW, Verdict.VIOLATED: End.HIGH}
-
-
-class DecidingLeaf(NamedTuple):
-    """A leaf at the sample at which it decides.
-
-    Attributes:
-        node: its id in the formula's tree.
-        leaf: index among the program's leaves.
-        number: its own number there, its sign not turned, without what is uncertain.
-        bound: the same with what is uncertain: the end of its interval that decides.
-        time_ns: of the sample.
-        end: which end of its interval the number is.
-        missed: the implication above it that failed, if a violation is due to one.
-        response: where it is the condition's, the leaf by which the response came closest, if one did.
-    """
-
-    node: int
-    leaf: int
-    number: float
-    time_ns: int
-    end: End
-    missed: MissedResponse | None = None
-    response: DecidingLeaf | None = None
-    bound: float = math.nan
-
-    @property
-    def shown(self) -> DecidingLeaf:
-        """The leaf to point at: that of a response that was missed, not of the condition that held."""
-        return self if self.response is None else self.response
-
-    @property
-    def value(self) -> LeafValue:
-        """The leaf without its node and what was missed."""
-        return LeafValue(self.leaf, self.number, self.end, self.time_ns)
 
 
 class SettledViolation(NamedTuple):
@@ -385,7 +363,7 @@ class LeafHistory:
         if not math.isfinite(number) or (number >= 0.0) != (bound >= 0.0):
             number = bound
         time_ns = int(samples.times_ns[sample])
-        return DecidingLeaf(node, index, number + 0.0, time_ns, path.end, bound=bound + 0.0)
+        return DecidingLeaf(index, number + 0.0, path.end, time_ns, node, bound + 0.0)
 
 
 class Pair(NamedTuple):

@@ -13,10 +13,9 @@ from typing import TYPE_CHECKING, Final
 from spatial_replay.annotate.specification import reported_trees
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.logs.messages import Attachment, Channel, Messages, merge
+from spatial_replay.logs.messages import Attachment, Channel
 from spatial_replay.logs.topics import AUTOMATON, DERIVED, SCENE
 from spatial_replay.monitor.instances import Instance
-from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.stream import EvaluationStream, SeriesBlock
 from spatial_replay.spec.formula import Specification
@@ -82,49 +81,28 @@ class AnnotatedEvaluation:
         ]
         self.streams = [stream for evaluation in self._evaluations for stream in evaluation.streams]
         self.trees = reported_trees(files, instances)
-        titles = [tree.title for tree in self.trees]
-        if arrow and not any(tree.is_called(arrow) for tree in self.trees):
-            hint = nearest_hint(arrow, titles) or f"there are: {', '.join(titles[:_MOST_NAMED])}"
-            raise UsageError(f"there is no result {arrow!r} for the arrow to point at; {hint}")
-        self._extent: SceneBounds | None = None
-        self._has_samples = False
+        self.check_arrow(arrow)
+
+    def check_arrow(self, title: str) -> None:
+        """Check that a result has a title, or that it is "".
+
+        Raises:
+            UsageError: none has.
+        """
+        if title and not any(tree.is_called(title) for tree in self.trees):
+            titles = [tree.title for tree in self.trees]
+            more = ", …" if len(titles) > _MOST_NAMED else ""
+            hint = nearest_hint(title, titles) or f"there are: {', '.join(titles[:_MOST_NAMED])}{more}"
+            raise UsageError(f"there is no result {title!r} for the arrow to point at; {hint}")
 
     def extend(self, trace: Trace) -> list[SeriesBlock]:
         """Evaluate the next samples; return one block for each of `trees`."""
         return [block for evaluation in self._evaluations for block in evaluation.extend(trace)]
 
-    def messages(self, trace: Trace, blocks: Sequence[SeriesBlock]) -> list[Messages]:
-        """Return what to write beside samples, from the blocks that `extend` returned for them."""
-        from spatial_replay.annotate.scene.scene_template import SceneBounds
-
-        self._extent = SceneBounds.of(trace, self._extent)
-        self._has_samples |= len(trace) > 0
-        return self._annotator.messages(trace, blocks)
-
-    def occurrence(self, time_ns: int, what: str, sentence: str) -> Messages:
-        """Return the event of what happens to a run beside its samples."""
-        return merge(self._annotator.occurrence(time_ns, what, sentence))
-
     @property
     def finals(self) -> list[Floats]:
         """For each of `trees` (N, 2), lower and upper end of each node's value if the log ends here."""
         return [stream.final for stream in self.streams]
-
-    def end(self, time_ns: int, results: Sequence[SpecResult] = ()) -> Messages:
-        """Return what to write after everything else of a log.
-
-        Args:
-            time_ns: that of its last sample or message, whichever is later.
-            results: for each of `trees` its result, if there is one: they know what they were tested by.
-        """
-        return merge(self._annotator.end(time_ns, self.finals, results))
-
-    @property
-    def worst_first(self) -> Sequence[int]:
-        """The places of `trees`, the worst first, after `end`."""
-        from spatial_replay.annotate.standing import worst_first
-
-        return worst_first(self._annotator.standing.outcomes)
 
     @property
     def channels(self) -> tuple[Channel, ...]:
@@ -187,10 +165,11 @@ class AnnotatedEvaluation:
         """
         from spatial_replay.annotate.foxglove_layout import layout_attachment
 
-        contents = self.contents(self._extent, topics, axes, images)._replace(planned_for=planned_for)
-        if not self._has_samples:
+        extent, outcomes = self.annotator.extent, self.annotator.standing.outcomes
+        contents = self.contents(extent, topics, axes, images)._replace(planned_for=planned_for)
+        if not self.annotator.has_samples:
             return layout_attachment(contents._replace(has_states=[False] * len(self.trees), topics=topics))
-        return layout_attachment(contents._replace(outcomes=self._annotator.standing.outcomes))
+        return layout_attachment(contents._replace(outcomes=outcomes))
 
     @cached_property
     def automata(self) -> Sequence[SpecAutomaton]:
@@ -199,7 +178,7 @@ class AnnotatedEvaluation:
 
         return automata_of(self._files, self.trees, self._semantics, self._compiled_before(), self._known)
 
-    def annotator(self, scene: SceneState | None = None, arrow: str = "") -> Annotator:
+    def new_annotator(self, scene: SceneState | None = None, arrow: str = "") -> Annotator:
         """Return an annotator that starts before the first sample.
 
         Args:
@@ -222,5 +201,6 @@ class AnnotatedEvaluation:
         )
 
     @cached_property
-    def _annotator(self) -> Annotator:
-        return self.annotator(arrow=self._arrow)
+    def annotator(self) -> Annotator:
+        """The encoder of messages beside samples, which takes in what `extend` returns for these."""
+        return self.new_annotator(arrow=self._arrow)

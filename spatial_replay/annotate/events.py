@@ -16,7 +16,6 @@ from google.protobuf.timestamp_pb2 import Timestamp
 from spatial_replay.annotate.deciding_leaf import (
     DecidingLeaf,
     LeafHistory,
-    LeafValue,
     LeavesBelow,
     NewestSamples,
     SettledViolation,
@@ -388,7 +387,7 @@ class EventReporter:
         self._bindings = instance.bindings
         self._relations = RELATION_NAMES | file.relations
         self._states = NodeStates.begin(len(self._reported))
-        self._carried: dict[tuple[int, int], LeafValue | None] = {}
+        self._carried: dict[tuple[int, int], DecidingLeaf | None] = {}
         self._last_ns: int | None = None
         self.settled: SettledViolation | None = None
         self.violated_ns = LATEST_NS
@@ -447,7 +446,7 @@ class EventReporter:
             for each in dict.fromkeys((*result.vacuous, *result.untested))
         ]
 
-    def _deciding_leaf(self, node: int, period: Period, block: SeriesBlock) -> LeafValue | None:
+    def _deciding_leaf(self, node: int, period: Period, block: SeriesBlock) -> DecidingLeaf | None:
         """Return the leaf that gives a period its worst number, if comparing numbers finds one."""
         if period.place < 0:
             return self._carried.get((node, period.place))
@@ -455,8 +454,8 @@ class EventReporter:
         low, high = low_and_high(len(leaves), wide=period.code in (SATISFIED, VIOLATED))
         ends = leaves[low], leaves[high]
         number = math.nan if period.code == UNKNOWN else period.worst
-        found = find_leaf(self._reported[node].below, ends, number, low=period.code != VIOLATED)
-        return found and found._replace(time_ns=int(block.times_ns[period.place]))
+        below, time_ns = self._reported[node].below, int(block.times_ns[period.place])
+        return find_leaf(below, ends, number, time_ns, low=period.code != VIOLATED)
 
     def _event(self, change: Change, block: SeriesBlock) -> EncodedEvent:
         reported, after, before = self._reported[change.node], change.after, change.before
@@ -542,24 +541,23 @@ class EventReporter:
         )
         return EncodedEvent(time_ns, event.SerializeToString(deterministic=True), log)
 
-    def _remember(self, node: int, found: DecidingLeaf | LeafValue | None, now_ns: int) -> None:
+    def _remember(self, node: int, found: DecidingLeaf | None, now_ns: int) -> None:
         """Keep what decided the root's verdict, if it is one over all continuations."""
         if self._reported[node].node or found is None or not self._settles:
             return
-        missed = found.missed if isinstance(found, DecidingLeaf) else None
-        leaf, _ = self._leaf(found.shown.value if isinstance(found, DecidingLeaf) else found, now_ns)
+        leaf, _ = self._leaf(found.shown, now_ns)
         self.over = self._leaf_text(leaf)
-        if missed and missed.is_condition:
-            self.over = f"missed {missed.response}"
+        if found.missed and found.missed.is_condition:
+            self.over = f"missed {found.missed.response}"
 
     def _violation(self, found: DecidingLeaf | None, time_ns: int) -> SettledViolation:
         """Return the violation of the root with the atom that settled it, as it stood then."""
         if found is None:
             return SettledViolation(time_ns, found)
-        atom, _ = self._leaf(found.shown.value, time_ns)
+        atom, _ = self._leaf(found.shown, time_ns)
         return SettledViolation(time_ns, found, atom, self._samples.sample(found.shown.time_ns, time_ns))
 
-    def _leaf(self, found: LeafValue, now_ns: int) -> tuple[Formula, float]:
+    def _leaf(self, found: DecidingLeaf, now_ns: int) -> tuple[Formula, float]:
         """Return a leaf with its number, in place of a quantifier that of the objects that decide it."""
         leaf = substitute(self._leaves[found.leaf], self._bindings)
         decided = None
@@ -576,15 +574,15 @@ class EventReporter:
             return "", ""
         missed, shown = found.missed, found.shown
         before_ns = since_ns - shown.time_ns
-        words = self._words(shown.value, now_ns, past=before_ns > 0)
+        words = self._words(shown, now_ns, past=before_ns > 0)
         if abs(shown.bound) < abs(shown.number):
-            leaf, _ = self._leaf(shown.value, now_ns)
+            leaf, _ = self._leaf(shown, now_ns)
             words += uncertain_text(amount_text(abs(shown.bound), leaf, self._units))
         ago = f" ({time_text(before_ns)} earlier)" if before_ns else ""
         response = f"`{missed.condition}` held, but `{missed.response}` did not: " if missed else ""
         return words, f"{response}{words}{ago}"
 
-    def _words(self, found: LeafValue | None, now_ns: int, *, past: bool = False) -> str:
+    def _words(self, found: DecidingLeaf | None, now_ns: int, *, past: bool = False) -> str:
         """Return a leaf and its number in words; "" for none."""
         if found is None:
             return ""

@@ -10,17 +10,12 @@ from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 from spatial_replay.annotate.robustness import curved_nodes
+from spatial_replay.annotate.scene.scene_frames import STANDING_WORDS
 from spatial_replay.annotate.scene.scene_template import FRAMES, SceneBounds
 from spatial_replay.annotate.specification import MIXED, ReportedTree, unit_of, unit_words
 from spatial_replay.annotate.standing import FinalStanding, named_parts, part_title, worst_first
 from spatial_replay.logs.messages import Attachment
-from spatial_replay.logs.schemas.Robustness_pb2 import (
-    HOLDS_SO_FAR,
-    PENDING,
-    SATISFIED,
-    UNKNOWN,
-    VIOLATED,
-)
+from spatial_replay.logs.schemas.Robustness_pb2 import HOLDS_SO_FAR, PENDING, SATISFIED, UNKNOWN, VIOLATED
 from spatial_replay.logs.topics import (
     CAMERA_ANNOTATIONS,
     CAMERA_CALIBRATION,
@@ -38,7 +33,7 @@ from spatial_replay.logs.topics import (
     STANDING,
     topic_of_camera,
 )
-from spatial_replay.palette import CURVES, HOLDING, NEGATIVE, NEUTRAL, POSITIVE, hexadecimal, lighter
+from spatial_replay.palette import CURVES, hexadecimal, lighter
 from spatial_replay.spec.formula import Formula
 from spatial_replay.spec.walks import looks_ahead
 from spatial_replay.text import number_text
@@ -61,13 +56,10 @@ _LONGEST_LABEL: Final = 24
 _INDICATOR_PIXELS: Final = 18
 _ZERO: Final = "#8c8c8c"
 
-STANDING_COLOURS: Final[Mapping[int, tuple[str, str]]] = MappingProxyType(
+_STANDING_COLOURS: Final[Mapping[int, tuple[str, str]]] = MappingProxyType(
     {
-        SATISFIED: ("satisfied", hexadecimal(POSITIVE)),
-        HOLDS_SO_FAR: ("holds so far", hexadecimal(HOLDING)),
-        PENDING: ("pending", hexadecimal(NEUTRAL)),
-        VIOLATED: ("violated", hexadecimal(NEGATIVE)),
-        UNKNOWN: ("unknown", hexadecimal(NEUTRAL)),
+        code: (STANDING_WORDS[code][0], hexadecimal(STANDING_WORDS[code][1]))
+        for code in (SATISFIED, HOLDS_SO_FAR, PENDING, VIOLATED, UNKNOWN)
     }
 )
 """Each number of `Standing` in words, and the colour that it has where a panel lets us choose it."""
@@ -119,7 +111,7 @@ def indicators(trees: Sequence[ReportedTree], outcomes: Sequence[FinalStanding] 
     titles = [_light_title(tree, outcome) for tree, outcome in zip_longest(trees, outcomes)]
     rules = [
         {"operator": "=", "rawValue": str(number), "color": colour, "label": words}
-        for number, (words, colour) in STANDING_COLOURS.items()
+        for number, (words, colour) in _STANDING_COLOURS.items()
     ]
     return [
         _titled(
@@ -130,7 +122,7 @@ def indicators(trees: Sequence[ReportedTree], outcomes: Sequence[FinalStanding] 
                 "style": "background",
                 "fontSize": _INDICATOR_PIXELS,
                 "rules": rules,
-                "fallbackColor": STANDING_COLOURS[UNKNOWN][1],
+                "fallbackColor": _STANDING_COLOURS[UNKNOWN][1],
                 "fallbackLabel": "not evaluated",
             },
         )
@@ -138,22 +130,21 @@ def indicators(trees: Sequence[ReportedTree], outcomes: Sequence[FinalStanding] 
     ]
 
 
-def result_curves(trees: Sequence[ReportedTree], units: Mapping[str, str]) -> list[Panel]:
-    """Return the curves of the results, those of each unit in a panel of their own."""
-    curves = [
-        _Curve(tree.title, _standing_path(tree.title, "robustness"), unit_of(tree.formula, units))
-        for tree in trees
+def sample_curves(trees: Sequence[ReportedTree], units: Mapping[str, str]) -> list[Panel]:
+    """Return the curves of the results and of named specs, those of each unit in a panel of their own."""
+    results = [(tree.title, tree.formula) for tree in trees]
+    return [
+        panel
+        for name, title, shown in (
+            ("robustness", "Robustness of results", results),
+            ("parts", "Robustness of named specs", _parts(trees)),
+        )
+        for panel in _plots(
+            name,
+            title,
+            [_Curve(each, _standing_path(each, "robustness"), unit_of(node, units)) for each, node in shown],
+        )
     ]
-    return _plots("robustness", "Robustness of results", curves)
-
-
-def part_curves(trees: Sequence[ReportedTree], units: Mapping[str, str]) -> list[Panel]:
-    """Return the curves of named specs, those of each unit in a panel of their own."""
-    curves = [
-        _Curve(title, _standing_path(title, "robustness"), unit_of(node, units))
-        for title, node in _parts(trees)
-    ]
-    return _plots("parts", "Robustness of named specs", curves)
 
 
 def whole_curves(trees: Sequence[ReportedTree], units: Mapping[str, str]) -> list[Panel]:
@@ -187,7 +178,7 @@ def state_strips(trees: Sequence[ReportedTree]) -> Panel:
     # Foxglove takes its colours from here, Lichtblick from the numbers
     states = [
         {"value": str(number), "label": words, "color": colour}
-        for number, (words, colour) in STANDING_COLOURS.items()
+        for number, (words, colour) in _STANDING_COLOURS.items()
     ]
     paths = [
         {
@@ -361,8 +352,7 @@ def viewer_layout(contents: LayoutContents) -> dict[str, Any]:
     unit at a time, the states of results, and a panel of tabs.
     """
     contents = contents.worst_first()
-    shown = contents.trees, contents.units
-    return _layout(contents, [*result_curves(*shown), *part_curves(*shown)], _details(contents))
+    return _layout(contents, sample_curves(contents.trees, contents.units), _details(contents))
 
 
 def layout_for_live(contents: LayoutContents) -> dict[str, Any]:

@@ -292,12 +292,6 @@ def _needs_all_now(place: _Place, is_always: bool) -> bool:
     return is_always or is_outside or (isinstance(place.formula, Boolean) and _needs_all(place))
 
 
-def iter_subformulas(formula: Formula) -> Iterator[Formula]:
-    """Yield a formula and all below it, including the bodies of open quantifiers."""
-    for node, _ in _with_bindings(formula):
-        yield node
-
-
 def _sign(parent: Formula, operand: int) -> float:
     """Return the sign that an operand has in its parent; 0 where it counts in both."""
     signs = operand_signs(parent, operand)

@@ -84,13 +84,7 @@ def _encoded_once(name: str, object: str | None, names: tuple[str | None, ...], 
     message = Robustness(time_ns=1, specification=name, object=object or "", final=final)
     for identifier, node in enumerate(names):
         message.nodes.add(
-            id=identifier,
-            name=node or "",
-            value=1.0,
-            now=1.0,
-            lower=1.0,
-            upper=1.0,
-            standing=UNKNOWN,
+            id=identifier, name=node or "", value=1.0, now=1.0, lower=1.0, upper=1.0, standing=UNKNOWN
         )
     return WireTemplate.of(message)
 

@@ -10,23 +10,16 @@ from operator import attrgetter
 from pathlib import PurePath
 from typing import TYPE_CHECKING, NamedTuple
 
-from spatial_replay.annotate.requirements import iter_subformulas
 from spatial_replay.errors import SpecificationError
 from spatial_replay.logs.messages import Attachment
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.spec import format_specification, parse_specification
 from spatial_replay.spec.checks import with_numbers
 from spatial_replay.spec.format import format_formula
-from spatial_replay.spec.formula import (
-    Atom,
-    Formula,
-    Specification,
-    iter_nodes,
-    operator_of,
-)
+from spatial_replay.spec.formula import Atom, Formula, Specification, iter_nodes, operator_of
 from spatial_replay.spec.relations import RELATION_NAMES, used_modules
 from spatial_replay.spec.tokens import written_name
-from spatial_replay.spec.walks import Unit, per_second, units_of
+from spatial_replay.spec.walks import Unit, iter_formulas, per_second, units_of
 from spatial_replay.text import names_of, plain_unit
 
 if TYPE_CHECKING:
@@ -194,12 +187,11 @@ def unit_of(formula: Formula, units: Mapping[str, str]) -> str:
     Args:
         units: those that are declared, of signals by their names, of lengths by "".
     """
-    atoms = [node for node in iter_subformulas(formula) if isinstance(node, Atom)]
-    found = {_declared(unit, units) for node in atoms for unit in units_of(node)}
+    found = {_declared(unit, units) for unit in units_of(formula)}
     if len(found) > 1:
         return MIXED
-    if not found and atoms:  # comparisons of modes alone are infinite
-        return DIMENSIONLESS
+    if not found and any(isinstance(node, Atom) for node in iter_formulas(formula)):
+        return DIMENSIONLESS  # comparisons of modes alone are infinite
     return found.pop() if found else units.get(FOOTPRINT_UNITS, FOOTPRINT_UNITS)
 
 

@@ -14,17 +14,11 @@ import numpy as np
 
 from spatial_replay.annotate.automaton_state import AutomatonRun
 from spatial_replay.annotate.robustness import Codes, standing_codes
+from spatial_replay.annotate.scene.scene_frames import STANDING_WORDS
 from spatial_replay.annotate.scene.scene_update import spaced
 from spatial_replay.annotate.specification import ReportedTree, unit_of
 from spatial_replay.geometry.arrays import Floats, Integers, combined, equal_places
-from spatial_replay.logs.schemas.Robustness_pb2 import (
-    HOLDS_SO_FAR,
-    PENDING,
-    SATISFIED,
-    UNKNOWN,
-    VIOLATED,
-    StandingUpdate,
-)
+from spatial_replay.logs.schemas.Robustness_pb2 import SATISFIED, UNKNOWN, VIOLATED, StandingUpdate
 from spatial_replay.logs.wire import WireTemplate, placed, rounded, words_of
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.spec.formula import Formula, iter_nodes
@@ -34,7 +28,7 @@ from spatial_replay.trace.sample import LATEST_NS
 _MOST_TEMPLATES: Final = 1024
 
 _RANKS: Final = np.full(256, 2, np.uint8)
-for _rank, _code in enumerate((VIOLATED, PENDING, UNKNOWN, HOLDS_SO_FAR, SATISFIED)):
+for _rank, _code in enumerate(STANDING_WORDS):
     _RANKS[_code] = _rank
 _RANKS.flags.writeable = False
 """How bad each number of `Standing` is; 0 is the worst."""
@@ -53,6 +47,22 @@ def worst_results(codes: Codes, violated_ns: Integers) -> Integers:
     since_ns = np.where(codes == VIOLATED, violated_ns, LATEST_NS)
     order = np.where(ranks == ranks.min(axis=0), since_ns - 1, LATEST_NS)
     return np.asarray(order.argmin(axis=0), np.int64)
+
+
+class _Entry(NamedTuple):
+    """An entry of `results` in every message: a result, or a named spec within one.
+
+    Attributes:
+        title, unit: as messages have them.
+        tree, node: the result's place, and the id of the node in it.
+        number: which of the node's numbers is shown: its value or, of a condition of each sample, `now`.
+    """
+
+    title: str
+    unit: str
+    tree: int
+    node: int = 0
+    number: int = 0
 
 
 class _Layout(NamedTuple):
@@ -110,10 +120,7 @@ class StandingEncoder:
     """
 
     def __init__(
-        self,
-        trees: Sequence[ReportedTree],
-        runs: Sequence[AutomatonRun | None],
-        units: Mapping[str, str],
+        self, trees: Sequence[ReportedTree], runs: Sequence[AutomatonRun | None], units: Mapping[str, str]
     ) -> None:
         """Start before the first sample.
 
@@ -121,9 +128,16 @@ class StandingEncoder:
             runs: of each tree, the run of its automaton, which takes in the same samples.
             units: those that are declared, see `unit_of`.
         """
-        self._units = units
         self._trees, self._runs = trees, runs
-        self._parts = [named_parts(tree) for tree in trees]
+        self._units = [unit_of(tree.formula, units) for tree in trees]
+        self._entries = [
+            _Entry(tree.title, unit, index)
+            for index, (tree, unit) in enumerate(zip(trees, self._units, strict=True))
+        ]
+        for index, tree in enumerate(trees):
+            for name, (node, formula) in named_parts(tree).items():
+                title, unit = part_title(name, tree), unit_of(formula, units)
+                self._entries.append(_Entry(title, unit, index, node, 0 if looks_ahead(formula) else 1))
         self._last = [np.full((len(list(iter_nodes(tree.formula))), 4, 1), np.nan) for tree in trees]
         self._words = [""] * len(trees)
         self._violated_ns = [LATEST_NS] * len(trees)
@@ -148,9 +162,7 @@ class StandingEncoder:
         series, words, since, least = [], [], [], []
         for index, block in enumerate(blocks):
             at = np.searchsorted(block.times_ns, shown_ns, side="right")
-            is_whole = len(at) == block.series.shape[2] and bool((at == np.arange(1, len(at) + 1)).all())
-            with_last = [] if is_whole else [self._last[index], block.series]
-            series.append(np.concatenate(with_last, axis=2)[:, :, at] if with_last else block.series)
+            series.append(np.concatenate([self._last[index], block.series], axis=2)[:, :, at])
             words.append(self._described(index, block, at))
             since.append(np.append(self._violated_ns[index], self._violated(index, block))[at])
             least.append(np.append(self._least_ns[index], self._became_least(index, block))[at])
@@ -207,13 +219,12 @@ class StandingEncoder:
             ended = last.copy()
             ended[:, 2:, 0] = final
             series.append(ended)
-        each_of = zip(self._trees, series, since_ns, self._least_ns, over, strict=True)
-        for tree, ended, violated_ns, least_ns, said in each_of:
+        each_of = zip(self._units, series, since_ns, self._least_ns, over, strict=True)
+        for unit, ended, violated_ns, least_ns, said in each_of:
             code = int(standing_codes(ended[:1], final=True)[0, 0])
             low, high = ended[0, 2:, 0].tolist()
             by = -high if code == VIOLATED else low if code == SATISFIED else math.nan
             since_s, at_s = ((min(each, time_ns) - first_ns) / 1e9 for each in (violated_ns, least_ns))
-            unit = unit_of(tree.formula, self._units)
             outcomes.append(FinalStanding(code, since_s, by, at_s, unit, said, violated_ns == LATEST_NS))
         self.outcomes = tuple(outcomes)
         words, times_ns = [([each], np.zeros(1, np.int64)) for each in self._words], np.array([time_ns])
@@ -251,7 +262,8 @@ class StandingEncoder:
             kind="stable",
         )
         counts = (of_results == VIOLATED).sum(axis=0)
-        marks, numbers = self._columns(series, codes)
+        marks = [codes[each.tree][each.node, :, None] for each in self._entries]
+        numbers = [_finite(series[each.tree][each.node, each.number, :, None]) for each in self._entries]
         encoded, of_violated = [], dict[int, tuple[Floats, Floats, Floats]]()
         is_listed = np.arange(len(order))[:, None] < counts
         keys = [worst, *(which for _, which in words), *np.where(is_listed, order, -1)]
@@ -271,31 +283,16 @@ class StandingEncoder:
             encoded.append((members, self._template(layout).encode(words_of(own), own_marks)))
         return placed(len(times_ns), encoded)
 
-    def _columns(self, series: Sequence[Floats], codes: Sequence[Codes]) -> tuple[list[Codes], list[Floats]]:
-        """Return the standing (S, 1) and the robustness (S, 1) of each entry of `results`."""
-        marks = [each[0, :, None] for each in codes]
-        numbers = [each[0, 0, :, None] for each in series]
-        for own, numbered, parts in zip(codes, series, self._parts, strict=True):
-            for identifier, node in parts.values():
-                marks.append(own[identifier, :, None])
-                numbers.append(numbered[identifier, 0 if looks_ahead(node) else 1, :, None])
-        return marks, [_finite(each) for each in numbers]
-
     def _made_template(self, layout: _Layout) -> WireTemplate:
         """Return a template with a value in every field that differs between samples."""
         worst, words, violated, final = layout
         message = StandingUpdate(time_ns=1, worst=self._trees[worst].title, final=final)
-        for tree, said in zip(self._trees, words, strict=True):
-            unit = unit_of(tree.formula, self._units)
-            message.results.add(name=tree.title, standing=UNKNOWN, robustness=1.0, unit=unit, automaton=said)
-        for tree, parts in zip(self._trees, self._parts, strict=True):
-            for name, (_, node) in parts.items():
-                unit = unit_of(node, self._units)
-                message.results.add(name=part_title(name, tree), standing=UNKNOWN, robustness=1.0, unit=unit)
+        for number, (title, unit, *_) in enumerate(self._entries):
+            said = words[number] if number < len(words) else ""
+            message.results.add(name=title, standing=UNKNOWN, robustness=1.0, unit=unit, automaton=said)
         for index, over in violated:
-            tree = self._trees[index]
-            unit = unit_of(tree.formula, self._units)
-            message.violated.add(name=tree.title, since=1.0, by=1.0, unit=unit, over=over, at=1.0)
+            name, unit = self._trees[index].title, self._units[index]
+            message.violated.add(name=name, since=1.0, by=1.0, unit=unit, over=over, at=1.0)
         if not violated:
             message.violated.add(name="nothing is violated")
         return WireTemplate.of(message)

@@ -15,7 +15,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from spatial_replay.annotate.deciding_leaf import LeafPairs, Pair, SettledViolation, leaf_key, pair_of
+from spatial_replay.annotate.deciding_leaf import LeafPairs, Pair, SettledViolation, pair_of
 from spatial_replay.annotate.requirements import ClassMembers, Requirement
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.geometry.contact import contacts
@@ -25,15 +25,8 @@ from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.online.codes import low_and_high
 from spatial_replay.monitor.stream import SeriesBlock
-from spatial_replay.spec.formula import (
-    ANY_CLASS,
-    Formula,
-    Outline,
-    Quantified,
-    TrackedName,
-    iter_nodes,
-)
-from spatial_replay.spec.walks import iter_terms, looks_back, substitute
+from spatial_replay.spec.formula import ANY_CLASS, Formula, Outline, Quantified, TrackedName, iter_nodes
+from spatial_replay.spec.walks import iter_terms, leaf_key, looks_back, substitute
 from spatial_replay.trace.sample import LATEST_NS
 from spatial_replay.trace.trace import Trace
 

@@ -8,7 +8,6 @@ import os
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
@@ -137,19 +136,14 @@ def write_summary(table: pa.Table, environment: Mapping[str, str] = os.environ) 
 
 def markdown(table: pa.Table) -> str:
     """Return the totals and the worst rows as Markdown."""
-    rows = totals(table)
-    columns = counts_of(rows)
+    numbers, rows = _cells(totals(table))
     lines = [
         "### spatial-replay\n",
         f"{summary_text(table)}\n",
-        f"| case | spec | requirement | {' | '.join(columns)} | least robustness |",
-        f"|---|---|---|{'--:|' * (len(columns) + 1)}",
+        f"| case | spec | requirement | {' | '.join(numbers)} |",
+        f"|---|---|---|{'--:|' * len(numbers)}",
+        *map(_line, rows),
     ]
-    for place, each in enumerate(rows):
-        names = [each.group["case"], each.group["spec"] or each.group["file"], each.about]
-        numbers = [f"{own[place]:,}" for own in columns.values()]
-        least = "" if each.least is None else f"{each.least:.6g}"
-        lines.append(_line([*names, *numbers, least]))
     failing = [row for row in worst_rows(table, _WORST) if row["failure"] is not None]
     if failing:
         count = len(table) - table.column("failure").null_count
@@ -165,6 +159,17 @@ def markdown(table: pa.Table) -> str:
             verdict = f"{verdict_word(row)}{damage_word(row)}"
             lines.append(_line([*names, verdict, row["failure"], row["reason"]]))
     return "\n".join([*lines, "", ""])
+
+
+def _cells(rows: Sequence[Total]) -> tuple[list[str], list[list[str]]]:
+    """Return a table of totals: the headings of its numbers, and rows of three names and then these."""
+    columns = counts_of(rows)
+    cells = []
+    for place, each in enumerate(rows):
+        names = [each.group["case"], each.group["spec"] or each.group["file"], each.about]
+        counts = [f"{own[place]:,}" for own in columns.values()]
+        cells.append([*names, *counts, "" if each.least is None else f"{each.least:.6g}"])
+    return [*columns, "least robustness"], cells
 
 
 def _line(cells: list[str]) -> str:
@@ -380,22 +385,16 @@ def _panel(title: str, *content: Html) -> Html:
 
 def _totals(by_spec: Sequence[Total]) -> Html:
     names = ("case", "spec", "requirement")
-    columns = counts_of(by_spec)
-    numbers = (*columns, "least robustness")
+    numbers, cells = _cells(by_spec)
     head = [*(element("th", each) for each in names), *(_number("th", each) for each in numbers)]
-    rows = []
-    for place, each in enumerate(by_spec):
-        group = each.group
-        cells = [group["case"], group["spec"] or group["file"], each.about]
-        counts = [f"{own[place]:,}" for own in columns.values()]
-        least = "" if each.least is None else f"{each.least:.6g}"
-        rows.append(
-            element(
-                "tr",
-                *(element("td", text(cell)) for cell in cells),
-                *(_number("td", count) for count in (*counts, least)),
-            )
+    rows = [
+        element(
+            "tr",
+            *(element("td", text(cell)) for cell in own[: len(names)]),
+            *(_number("td", cell) for cell in own[len(names) :]),
         )
+        for own in cells
+    ]
     return element("table", element("thead", element("tr", *head)), element("tbody", *rows))
 
 
@@ -558,14 +557,6 @@ _LONGEST: Final = 80
 _UNSAFE: Final = re.compile(r"[^A-Za-z0-9._-]+")
 
 
-@dataclass(frozen=True, slots=True)
-class _Page:
-    """A page to write about one log of one case."""
-
-    task: Task
-    path: Path
-
-
 def write_pages(
     result: BatchResult, folder: Path, name: str, workers: Workers, *, progress: Progress = no_progress
 ) -> dict[tuple[str, str], Path]:
@@ -594,7 +585,7 @@ def write_pages(
     except OSError as error:
         raise output_error(folder, error) from error
     missing = {
-        path: _Page(_task(failing[key]), path.resolve()) for key, path in pages.items() if not path.exists()
+        path: (_task(failing[key]), path.resolve()) for key, path in pages.items() if not path.exists()
     }
     with progress("reports", len(missing)) as advance:
         for _ in workers.results(_write_page, missing.values()) if missing else ():
@@ -631,12 +622,13 @@ def _file_name(log: str, wanted: list[Wanted]) -> str:
     return f"{_UNSAFE.sub('-', log).strip('-.')[-_LONGEST:]}-{digest}.html"
 
 
-def _write_page(page: _Page) -> None:
-    """Write one page; a log that cannot be read any more has none."""
+def _write_page(page: tuple[Task, Path]) -> None:
+    """Write one page about a log; one that cannot be read any more has none."""
+    task, path = page
     try:
-        files = parsed_specifications(page.task.specs, page.task.conditions)
-        source, options = opened_task(page.task, files)
-        write_report(source, files, page.path, options)
+        files = parsed_specifications(task.specs, task.conditions)
+        source, options = opened_task(task, files)
+        write_report(source, files, path, options)
     except OutputError:
         raise
     except (SpatialReplayError, OSError):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Final, Literal, TypeAlias
@@ -103,11 +103,11 @@ class ResultRow:
         source: the name of the file that was read; faults, remarks and errors name it.
     """
 
-    spec: str
-    object: str | None
-    requirement: str | None
-    title: str | None
-    line: int
+    spec: str = ""
+    object: str | None = None
+    requirement: str | None = None
+    title: str | None = None
+    line: int = 1
     verdict: Verdict | None = None
     unit: str = ""
     robustness: float = float("nan")
@@ -226,57 +226,29 @@ def error_rows(task: Task, message: str, kind: ErrorKind) -> tuple[tuple[ResultR
 
     A specification that cannot be parsed has one row, with an empty name.
     """
-    error, source = _cut(message), log_file(task.log).name
+    failed = ResultRow(error=_cut(message), error_kind=kind, source=log_file(task.log).name)
     rows: list[tuple[ResultRow, ...]] = []
     for text in task.specs:
         try:
             (file,) = parsed_specifications((text,), replace(task.conditions, constants=()))
         except SpatialReplayError:
-            rows.append((ResultRow("", None, None, None, 1, error=error, error_kind=kind, source=source),))
-            continue
-        lines = spec_lines(file)
-        rows.append(
-            tuple(
-                ResultRow(
-                    spec.name,
-                    None,
-                    spec.id,
-                    spec.title,
-                    lines[spec.name],
-                    error=error,
-                    error_kind=kind,
-                    source=source,
-                )
-                for spec in file.results
-            )
-        )
+            rows.append((failed,))
+        else:
+            lines = spec_lines(file)
+            rows.append(tuple(_about(failed, spec, lines) for spec in file.results))
     return tuple(rows)
+
+
+def _about(row: ResultRow, spec: NamedSpec, lines: Mapping[str, int]) -> ResultRow:
+    """Return a row with the name, the requirement and the line of a spec."""
+    return replace(row, spec=spec.name, requirement=spec.id, title=spec.title, line=lines[spec.name])
 
 
 def _rows_of_file(
     replay: Replay, replayed: Replayed, file: Specification, index: int
 ) -> tuple[ResultRow, ...]:
     lines = spec_lines(file)
-    log = _row_of_log(replayed)
-    pairs = zip(replay.trees, replayed.results, strict=True)
-    # a name that another file has, too, is that of the file's own text here
-    results = [replace(result, name=result.spec.name) for tree, result in pairs if tree.file == index]
-    parts = {part.text: part for part in replayed.vacuous}
-    rows = [_row(log, result, replayed.first_ns, lines[result.name]) for result in results]
-    evaluated = {result.name for result in results}
-    idle = [spec for spec in file.results if spec.name not in evaluated and spec.parameter is not None]
-    rows += [_idle_row(log, spec, lines[spec.name], parts[f"{spec.name}({spec.parameter})"]) for spec in idle]
-    return tuple(rows)
-
-
-def _row_of_log(replayed: Replayed) -> ResultRow:
-    """Return a row with what all rows of a log share."""
-    return ResultRow(
-        "",
-        None,
-        None,
-        None,
-        1,
+    log = ResultRow(
         samples=replayed.samples,
         start_ns=replayed.start_ns,
         duration_ns=replayed.end_ns - replayed.start_ns,
@@ -285,6 +257,15 @@ def _row_of_log(replayed: Replayed) -> ResultRow:
         missing=_some([_missing(each) for each in replayed.missing]),
         dropped=replayed.dropped.text or None,
     )
+    pairs = zip(replay.trees, replayed.results, strict=True)
+    # a name that another file has, too, is that of the file's own text here
+    results = [replace(result, name=result.spec.name) for tree, result in pairs if tree.file == index]
+    parts = {part.text: part for part in replayed.vacuous}
+    rows = [_row(_about(log, result.spec, lines), result, replayed.first_ns) for result in results]
+    evaluated = {result.name for result in results}
+    idle = [spec for spec in file.results if spec.name not in evaluated and spec.parameter is not None]
+    rows += [_idle_row(_about(log, spec, lines), parts[f"{spec.name}({spec.parameter})"]) for spec in idle]
+    return tuple(rows)
 
 
 def _missing(name: Diagnostic) -> str:
@@ -293,16 +274,12 @@ def _missing(name: Diagnostic) -> str:
     return f"{name.message}; {nearest}{mark}" if mark else name.message
 
 
-def _row(log: ResultRow, result: SpecResult, first_ns: int, line: int) -> ResultRow:
+def _row(about: ResultRow, result: SpecResult, first_ns: int) -> ResultRow:
     witness = result.worst
     deciding = None if witness is None else witness.deciding
     return replace(
-        log,
-        spec=result.name,
+        about,
         object=result.object,
-        requirement=result.spec.id,
-        title=result.spec.title,
-        line=line,
         verdict=result.verdict,
         unit=result.unit,
         robustness=result.robustness,
@@ -322,16 +299,12 @@ def _row(log: ResultRow, result: SpecResult, first_ns: int, line: int) -> Result
     )
 
 
-def _idle_row(log: ResultRow, spec: NamedSpec, line: int, part: UntestedPart) -> ResultRow:
+def _idle_row(about: ResultRow, part: UntestedPart) -> ResultRow:
     """Return the row of a template that no object of the log fits: nothing violates it."""
     message = _cut(part.message)
     endless = float("inf")
     return replace(
-        log,
-        spec=spec.name,
-        requirement=spec.id,
-        title=spec.title,
-        line=line,
+        about,
         verdict=Verdict.SATISFIED,
         robustness=endless,
         lower=endless,

@@ -14,7 +14,7 @@ from glob import glob, has_magic
 from os import PathLike
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
 
 from spatial_replay import __version__
 from spatial_replay.batch.rows import (
@@ -256,51 +256,30 @@ def _nothing(text: str, folder: Path) -> str:
     return f"{text}: no such file; check the path"
 
 
-class Identities:
-    """The identities of logs: hashes of their bytes, or what a server says of a version.
+def identify(
+    paths: Sequence[str], known: Mapping[str, str], workers: Workers, progress: Progress
+) -> tuple[dict[str, str | None], dict[str, str | None]]:
+    """Return the identity of each log, and the states of their files.
 
-    The path, size, times and inode of a file only decide whether it is hashed again.
+    An identity is a hash of bytes, or what a server says of a version; None if the log cannot be read. The
+    path, size, times and inode of a file, its state, only decide whether it is hashed again.
+
+    Args:
+        known: identities by states.
+        workers: they read the logs that are not known.
+        progress: shows how many have been read.
     """
-
-    def __init__(self, known: Mapping[str, str]) -> None:
-        """Take the identities of an earlier batch by the states of files."""
-        self._known = known
-        self._states: dict[str, str | None] = {}
-
-    def of(self, paths: Sequence[str], workers: Workers, progress: Progress) -> dict[str, str | None]:
-        """Return the identity of each log; None if it cannot be read.
-
-        Args:
-            workers: they read the logs that are not known.
-            progress: shows how many have been read.
-        """
-        states = {path: None if is_address(path) else _state(path) for path in paths}
-        unknown = [path for path, state in states.items() if state is None or state not in self._known]
-        groups = [tuple(unknown[begin : begin + _TOGETHER]) for begin in range(0, len(unknown), _TOGETHER)]
-        # few are read sooner than a process begins
-        at_work = ThisProcess() if len(groups) == 1 else workers
-        found: dict[str, str | None] = {}
-        with progress("logs read", len(unknown)) as advance:
-            for group, identities in at_work.results(identities_of, groups) if groups else ():
-                found |= dict.fromkeys(group) if isinstance(identities, WorkerLost) else identities
-                advance(len(group))
-        self._states = states
-        known = {path: found[path] if path in found else self._known[states[path] or ""] for path in paths}
-        self._known = {
-            state: identity
-            for path, identity in known.items()
-            if identity is not None and (state := states[path]) is not None
-        }
-        return known
-
-    @property
-    def by_state(self) -> Mapping[str, str]:
-        """The identities that were asked for, for the next batch."""
-        return self._known
-
-    def is_unchanged(self, path: str) -> bool:
-        """Return whether a file is still what was identified; at an address, readers see to that."""
-        return is_address(path) or _state(path) == self._states[path]
+    states = {path: None if is_address(path) else _state(path) for path in paths}
+    unknown = [path for path, state in states.items() if state is None or state not in known]
+    groups = [tuple(unknown[begin : begin + _TOGETHER]) for begin in range(0, len(unknown), _TOGETHER)]
+    # few are read sooner than a process begins
+    at_work = ThisProcess() if len(groups) == 1 else workers
+    found: dict[str, str | None] = {}
+    with progress("logs read", len(unknown)) as advance:
+        for group, identities in at_work.results(identities_of, groups) if groups else ():
+            found |= dict.fromkeys(group) if isinstance(identities, WorkerLost) else identities
+            advance(len(group))
+    return {path: found[path] if path in found else known[states[path] or ""] for path in paths}, states
 
 
 def identities_of(paths: tuple[str, ...]) -> dict[str, str | None]:
@@ -502,14 +481,6 @@ class Wanted:
     key: str | None
 
 
-@dataclass(frozen=True, slots=True)
-class StoredTask:
-    """A task, and the key of the rows for each of its specifications."""
-
-    task: Task
-    keys: tuple[str, ...]
-
-
 @dataclass(frozen=True, eq=False)
 class BatchResult:
     """Results of a batch.
@@ -574,20 +545,21 @@ def run_batch(
     folder = ResultsFolder.create(results)
     with folder.locked():
         known, remarks = folder.identities()
-        identities = Identities(known)
         paths = list(dict.fromkeys(log.path for each in cases for log in each.logs))
-        wanted = _wanted(cases, identities.of(paths, workers, progress))
-        folder.write_identities(identities.by_state)
+        identities, states = identify(paths, known, workers, progress)
+        wanted = _wanted(cases, identities)
+        by_state = {states[path] or "": each for path, each in identities.items() if each and states[path]}
+        folder.write_identities(by_state)
         stored, damaged = folder.rows({each.key for each in wanted if each.key is not None})
-        tasks = list(_tasks(wanted, set(stored.column("key").to_pylist())))
+        tasks = _tasks(wanted, set(stored.column("key").to_pylist()))
         unstored: dict[str, Sequence[ResultRow]] = {}
         with folder.new_rows() as new_rows, progress("logs", len(tasks)) as advance:
-            for task, result in workers.results(_evaluated, tasks) if tasks else ():
+            for task, result in workers.results(rows_from_task, tasks) if tasks else ():
                 if isinstance(result, WorkerLost):
-                    result = error_rows(task.task, str(result), "machine")
-                # a log that changed during the run has another key
-                is_same = identities.is_unchanged(task.task.log)
-                for key, rows in zip(task.keys, result, strict=True):
+                    result = error_rows(task, str(result), "machine")
+                # a log that changed during the run has another key; at an address, readers see to that
+                is_same = is_address(task.log) or _state(task.log) == states[task.log]
+                for key, rows in zip(tasks[task], result, strict=True):
                     # errors may pass
                     if is_same and all(row.error is None for row in rows):
                         new_rows.add(key, rows)
@@ -597,12 +569,8 @@ def run_batch(
         table = _table(wanted, [stored, *new_rows.tables], unstored, fail_on)
         folder.write_run(table)
     # a log that cannot be read was tried, and is not known
-    evaluated = {task.task.log for task in tasks} | {each.log.path for each in wanted if each.key is None}
+    evaluated = {task.log for task in tasks} | {each.log.path for each in wanted if each.key is None}
     return BatchResult(table, len(paths), len(evaluated), tuple(wanted), (*remarks, *damaged))
-
-
-def _evaluated(stored: StoredTask) -> tuple[tuple[ResultRow, ...], ...]:
-    return rows_from_task(stored.task)
 
 
 def _wanted(cases: Sequence[PreparedCase], identities: Mapping[str, str | None]) -> list[Wanted]:
@@ -635,17 +603,18 @@ def _key_of(conditions: Conditions) -> list[Any]:
     ]
 
 
-def _tasks(wanted: Sequence[Wanted], stored: set[str]) -> Iterator[StoredTask]:
-    """Yield a task for each log and conditions under which something is missing, with all that is."""
+def _tasks(wanted: Sequence[Wanted], stored: set[str]) -> dict[Task, tuple[str, ...]]:
+    """Return a task for each log and conditions that lack rows, with the keys of these."""
     groups: dict[tuple[str, Conditions], dict[str, SpecFile]] = defaultdict(dict)
     taken = set(stored)
     for each in wanted:
         if each.key is not None and each.key not in taken:
             taken.add(each.key)
             groups[each.log.path, each.case.conditions][each.key] = each.file
-    for (path, conditions), files in groups.items():
-        task = Task(path, tuple(file.text for file in files.values()), conditions)
-        yield StoredTask(task, tuple(files))
+    return {
+        Task(path, tuple(file.text for file in files.values()), conditions): tuple(files)
+        for (path, conditions), files in groups.items()
+    }
 
 
 def _table(
@@ -741,4 +710,8 @@ _JUDGED = ["verdict", "lower", "tested", "untested", "vacuous", "dropped", "faul
 
 def _failure(row: Mapping[str, Any], expectation: Expectation, fail_on: frozenset[str]) -> str | None:
     """Return why a row does not pass, in a few words; None if it does."""
-    return row["error"] if row["verdict"] is None else expectation.failure(SimpleNamespace(**row), fail_on)
+    return (
+        row["error"]
+        if row["verdict"] is None
+        else expectation.failure(cast(ResultRow, SimpleNamespace(**row)), fail_on)
+    )

@@ -10,6 +10,7 @@ import os
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import fields
 from os import PathLike, fspath
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
@@ -161,40 +162,14 @@ _DIGEST_BYTES: Final = 32
 
 
 def columns() -> pa.Schema:
-    """Return the columns of stored rows."""
+    """Return the columns of stored rows: a key, and the fields of `ResultRow`."""
     pa = _pyarrow()
-    text, time, texts = pa.string(), pa.int64(), pa.list_(pa.string())
-    return pa.schema(
-        [
-            pa.field("key", text, nullable=False),
-            ("spec", text),
-            ("object", text),
-            ("requirement", text),
-            ("title", text),
-            ("line", pa.int32()),
-            ("verdict", text),
-            ("unit", text),
-            *((name, pa.float64()) for name in ("robustness", "lower", "upper")),
-            *((name, time) for name in ("first_satisfied_ns", "violated_at_ns", "satisfied_at_ns")),
-            ("atom", text),
-            ("atom_time_ns", time),
-            ("atom_objects", texts),
-            ("reason", text),
-            ("explanation", texts),
-            ("tested", text),
-            ("untested", texts),
-            ("vacuous", texts),
-            ("dropped", text),
-            ("samples", pa.int64()),
-            ("start_ns", time),
-            ("duration_ns", time),
-            *((name, texts) for name in ("faults", "remarks", "missing")),
-            ("seconds", pa.float64()),
-            ("error", text),
-            ("error_kind", text),
-            (SOURCE, text),
-        ]
-    )
+    kinds = {"int": pa.int64(), "float": pa.float64(), "tuple[str, ...]": pa.list_(pa.string())}
+    own = {
+        each.name: kinds.get(str(each.type).removesuffix(" | None"), pa.string())
+        for each in fields(ResultRow)
+    }
+    return pa.schema([pa.field("key", pa.string(), nullable=False), *{**own, "line": pa.int32()}.items()])
 
 
 def run_columns() -> pa.Schema:

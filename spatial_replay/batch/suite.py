@@ -12,7 +12,7 @@ from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
-from typing import Any, Final, Protocol, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypeVar
 
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.read_options import KEYS
@@ -29,6 +29,9 @@ from spatial_replay.mapping.yaml_document import (
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.trace.trace import time_point_from_text
+
+if TYPE_CHECKING:
+    from spatial_replay.batch.rows import ResultRow
 
 LARGEST_SUITE: Final = 8 * 2**20
 """Bytes of a suite file."""
@@ -70,25 +73,6 @@ class Conditions:
 DEFAULT_CONDITIONS: Final = Conditions()
 
 
-class Outcome(Protocol):
-    """The fields of a result that decide whether it passes; see `ResultRow`."""
-
-    @property
-    def verdict(self) -> Verdict | str | None: ...
-    @property
-    def lower(self) -> float: ...
-    @property
-    def tested(self) -> str | None: ...
-    @property
-    def untested(self) -> Sequence[str]: ...
-    @property
-    def vacuous(self) -> Sequence[str]: ...
-    @property
-    def dropped(self) -> str | None: ...
-    @property
-    def faults(self) -> Sequence[str]: ...
-
-
 UNTESTED: Final = "tested by nothing"
 VACUOUS: Final = "vacuous"
 DROPPED: Final = "the recorder dropped"
@@ -122,7 +106,7 @@ class Expectation:
             return f"robustness of at least {self.at_least:.6g}{unknown}"
         return f"{self.verdict}{unknown}"
 
-    def failure(self, outcome: Outcome, fail_on: AbstractSet[str] = frozenset()) -> str | None:
+    def failure(self, outcome: ResultRow, fail_on: AbstractSet[str] = frozenset()) -> str | None:
         """Return why a result with a verdict does not pass, in a few words; None if it does.
 
         Args:
@@ -143,7 +127,7 @@ class Expectation:
         damage = f"{DAMAGED}: {outcome.faults[0]}" if outcome.faults else None
         return "; ".join(filter(None, (failure, damage))) or None
 
-    def _unexpected(self, outcome: Outcome) -> str | None:
+    def _unexpected(self, outcome: ResultRow) -> str | None:
         """Return how a verdict or a robustness differs from what is expected."""
         if outcome.verdict == Verdict.UNKNOWN and self.allow_unknown:
             return None

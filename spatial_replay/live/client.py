@@ -35,10 +35,16 @@ _HEAD: Final = struct.Struct("<IQ")
 _LONGEST_TEXT: Final = 200
 
 
-class ServerInfo(NamedTuple):
-    """The first frame of a server: its name."""
+class Connected(NamedTuple):
+    """A connection stands; channels are advertised next."""
 
-    name: str
+    server: str
+
+
+class Warned(NamedTuple):
+    """The server says something about itself, or sends what breaks the protocol."""
+
+    text: str
 
 
 class Advertised(NamedTuple):
@@ -53,13 +59,6 @@ class Unadvertised(NamedTuple):
     numbers: tuple[int, ...]
 
 
-class StatusMessage(NamedTuple):
-    """A server's message about itself: level 0 is information, 1 a warning, 2 an error."""
-
-    level: int
-    text: str
-
-
 class MessageData(NamedTuple):
     """A message of a subscription."""
 
@@ -68,7 +67,7 @@ class MessageData(NamedTuple):
     payload: bytes
 
 
-Frame: TypeAlias = ServerInfo | Advertised | Unadvertised | StatusMessage | MessageData
+Frame: TypeAlias = Connected | Advertised | Unadvertised | Warned | MessageData
 
 
 def decoded(raw: str | bytes) -> Frame | None:
@@ -105,13 +104,14 @@ def _decoded_text(raw: str) -> Frame | None:
     try:
         match frame:
             case {"op": "serverInfo"}:
-                return ServerInfo(str(frame.get("name", ""))[:_LONGEST_TEXT])
+                return Connected(str(frame.get("name", ""))[:_LONGEST_TEXT])
             case {"op": "advertise", "channels": channels}:
                 return Advertised({_number(each["id"]): _channel(each) for each in channels})
             case {"op": "unadvertise", "channelIds": numbers}:
                 return Unadvertised(tuple(map(_number, numbers)))
             case {"op": "status", "message": text}:
-                return StatusMessage(int(frame.get("level", 0)), str(text)[:_LONGEST_TEXT])
+                # information, such as about a subscription, is no warning
+                return Warned(str(text)[:_LONGEST_TEXT]) if int(frame.get("level", 0)) > 0 else None
             case {"op": _}:
                 return None
         raise ValueError("it has no `op`")
@@ -183,12 +183,6 @@ class Received(NamedTuple):
     arrived_s: float
 
 
-class Connected(NamedTuple):
-    """A connection stands; channels are advertised next."""
-
-    server: str
-
-
 class Offered(NamedTuple):
     """All channels that the server offers now, after a change."""
 
@@ -200,12 +194,6 @@ class Disconnected(NamedTuple):
 
     reason: str
     arrived_s: float
-
-
-class Warned(NamedTuple):
-    """The server says something about itself, or sends what breaks the protocol."""
-
-    text: str
 
 
 Item: TypeAlias = Received | Connected | Offered | Disconnected | Warned
@@ -345,8 +333,8 @@ class Client:
                             received = Received(channel, time_ns, payload, arrived_s)
                             self.record(received)
                             self.inbox.put(received)
-                    case ServerInfo(name):
-                        self.inbox.put(Connected(name))
+                    case Connected():
+                        self.inbox.put(frame)
                     case Advertised(channels):
                         offered |= channels
                         if len(offered) > _MOST_CHANNELS:
@@ -366,7 +354,7 @@ class Client:
                             offered.pop(number, None)
                             subscribed.pop(number, None)
                         self.inbox.put(Offered(channels_now))
-                    case StatusMessage(level, text) if level > 0:
+                    case Warned(text):
                         self.inbox.put(Warned(f"{self.address} says: {text}"))
                     case _:
                         pass

@@ -35,7 +35,7 @@ from spatial_replay.monitor.verdict import Verdict, worst_verdict
 from spatial_replay.monitor.violation import Violation
 from spatial_replay.recording.clips import Trigger
 from spatial_replay.recording.log import (
-    Missed,
+    RecorderLog,
     Recording,
     RunEnd,
     RunEvent,
@@ -338,7 +338,7 @@ class LiveSession:
                 async for update in self._turn(inbox):
                     yield update
                 if self._assembler is None:
-                    self._take_up(inbox, time.monotonic())
+                    self._begin(inbox, time.monotonic())
                 async for update in self._turn(inbox):
                     yield update
             async for update in self._evaluated(self._finish(), time.monotonic()):
@@ -356,11 +356,12 @@ class LiveSession:
     def _is_evaluated(self, topic: str) -> bool:
         if self._mapping is None:
             return topic == OBJECTS
-        if topic in self._planned or topic == self._mapping.sampling.topic:
-            return True
+        return topic in self._planned or self._is_named(topic, self._mapping)
+
+    def _is_named(self, topic: str, mapping: LogMapping) -> bool:
         # which topics have transforms is known once they are offered: their names say it to a client
-        is_frames = self._mapping.fixed_frame is not None and topic.rsplit("/", 1)[-1] in ("tf", "tf_static")
-        return is_frames or any(entry.topic == topic for entry in self._mapping.topics)
+        is_frames = mapping.fixed_frame is not None and topic.rsplit("/", 1)[-1] in ("tf", "tf_static")
+        return is_frames or topic in (mapping.sampling.topic, *(entry.topic for entry in mapping.topics))
 
     def _is_copied(self, topic: str) -> bool:
         return is_kept(topic, self._topics, ()) if self._topics else self._is_evaluated(topic)
@@ -444,7 +445,7 @@ class LiveSession:
             yield update
         now_s = time.monotonic()
         if self._assembler is None and self._is_connected and now_s >= min(self._offered_s, self._settled_s):
-            self._take_up(inbox, now_s)
+            self._begin(inbox, now_s)
         if silent := self._silent_topics(now_s):
             self._silent |= {*silent}
             listed = ", ".join(silent)
@@ -512,8 +513,8 @@ class LiveSession:
         # transforms and optional topics are often offered a little later
         self._settled_s = math.inf if self._missing else time.monotonic() + _SETTLE_S
 
-    def _begin(self) -> None:
-        """Begin to assemble samples from the topics that are offered now."""
+    def _begin(self, inbox: Inbox, now_s: float) -> None:
+        """Begin to assemble samples from the topics that are offered now, with what came before."""
         self._offered_s = self._settled_s = math.inf
         offered = {channel.topic: channel for channel in self._channels}
         if self._mapping is None:
@@ -542,31 +543,19 @@ class LiveSession:
                 for topic in topics
                 if topic.name in self._planned
                 and short_type(topic.type) in TRANSFORM_TYPES
-                and not self._wanted_before(topic.name)
+                and not self._is_named(topic.name, self._mapping)
             ]
             if unheard:
                 self._notes.append(f"transforms on {', '.join(unheard)} are not listened to: map the topic")
-        now_s = time.monotonic()
         self._last_s = dict.fromkeys(self._assembler.topics, now_s)
         self._notes.append(
             f"connected to {self._address}{f' ({self._server})' if self._server else ''}:"
             f" {counted(len(self._planned), 'topic')}"
         )
-
-    def _take_up(self, inbox: Inbox, now_s: float) -> None:
-        """Begin, with what came before."""
-        self._begin()
         self._early, early = Inbox(), self._early
         for item in early.take():
             # it has waited for the beginning, not for evaluation that falls behind
             inbox.put(item._replace(arrived_s=now_s) if isinstance(item, Received) else item)
-
-    def _wanted_before(self, topic: str) -> bool:
-        planned, self._planned = self._planned, {}
-        try:
-            return self._is_evaluated(topic)
-        finally:
-            self._planned = planned
 
     # ------------------------------------------------------------------------------ evaluating
 
@@ -732,12 +721,10 @@ _GATHER_S: Final = 1 / 30
 _MOST_WAITING: Final = 4_096
 
 
-class _ViewerLog:
-    """The log of a run, of which nothing is kept: viewers are sent each message; see `RecorderLog`."""
+class _ViewerLog(RecorderLog):
+    """The log of a run, of which nothing is kept: viewers are sent each message, and miss others unseen."""
 
     gather_s = _GATHER_S
-    is_busy = False
-    backlog = 0
 
     def __init__(self, files: Sequence[Specification], about: Mapping[str, str], server: RunServer) -> None:
         self._server = server
@@ -752,27 +739,15 @@ class _ViewerLog:
         if len(trace):
             self._server.send_time(int(trace.times_ns[-1]))
 
-    def miss(self, time_ns: int, kind: Missed) -> None:
-        """Viewers miss it unseen."""
-
     def report(self, event: RunEvent) -> None:
         """Send what happens to the run beside its samples."""
         self._recording.report(event)
         self._publish()
 
-    def flush(self) -> None:
-        """Nothing waits."""
-
     def end(self, end: RunEnd) -> None:
         """Send the events at the end."""
-        self._recording.end(interrupted=end.interrupted)
+        self._recording.end(end)
         self._publish()
-
-    def break_off(self, end: RunEnd) -> None:
-        """Nothing follows."""
-
-    def close(self) -> None:
-        """Nothing is open."""
 
     def _publish(self) -> None:
         for made in self._sink.messages:

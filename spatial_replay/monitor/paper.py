@@ -29,7 +29,7 @@ from spatial_replay.spec.formula import (
     Truth,
     iter_nodes,
 )
-from spatial_replay.spec.walks import has_rate, is_spatial
+from spatial_replay.spec.walks import has_rate, is_spatial, leaf_key
 
 Numbers: TypeAlias = Floats
 """(2, …): numbers, NaN where they are left out, and whether something unknown matters to them (1, else 0)."""
@@ -138,9 +138,9 @@ class PaperRun:
         for identifier, parent, _ in iter_nodes(formula):
             if parent is not None:
                 self._operands[parent].append(identifier)
-        keys = [_key(leaf) for leaf in leaves]
+        keys = [leaf_key(leaf) for leaf in leaves]
         is_leaf = [isinstance(node, Atom | Quantified) for node in self._nodes]
-        self._leaf = {n: keys.index(_key(node)) for n, node in enumerate(self._nodes) if is_leaf[n]}
+        self._leaf = {n: keys.index(leaf_key(node)) for n, node in enumerate(self._nodes) if is_leaf[n]}
         self._is_plain = [is_spatial(node) for node in self._nodes]
         # which nodes are needed at every sample, and which of all later samples change in more than one place
         self._is_wanted = [False] * len(self._nodes)
@@ -375,13 +375,6 @@ def _with_room(numbers: Numbers, wanted: int, axis: int) -> Numbers:
     new = np.zeros(shape)
     new[0] = np.nan
     return np.concatenate([numbers, new], axis=axis)
-
-
-def _key(leaf: Formula) -> object:
-    """Return what equal leaves have in common."""
-    if isinstance(leaf, Quantified):
-        return leaf.quantifier, leaf.variables, leaf.group, leaf.body
-    return leaf.expression if isinstance(leaf, Atom) else leaf
 
 
 def left_out(

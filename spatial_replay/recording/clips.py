@@ -25,6 +25,7 @@ from spatial_replay.monitor.monitor import Monitor, Update
 from spatial_replay.recording.log import (
     GATHER_S,
     Missed,
+    RecorderLog,
     Recording,
     RunEnd,
     RunEvent,
@@ -79,7 +80,7 @@ class Trigger:
         if self.most_bytes < 2**20:
             raise UsageError(f"most_bytes is {self.most_bytes}; a ring takes 1 MB (1048576) or more")
         for text in self.texts:
-            _refuse_unknown(text)
+            _parsed(text)
 
     @property
     def texts(self) -> list[str]:
@@ -93,11 +94,23 @@ def condition_of(text: str, files: Sequence[Specification]) -> Condition:
     Raises:
         UsageError: it is none, or names no spec.
     """
-    words = text.strip()
-    if words == MANUAL:
+    name, what = _parsed(text)
+    if what == MANUAL:
         return lambda updates, has_changed: None
-    if words == EVENT:
+    if what == EVENT:
         return lambda updates, has_changed: EVENT if has_changed else None
+    if not files:
+        raise UsageError(f"the trigger {text!r} waits for a spec, but there is none; give a specification")
+    if not name:
+        return lambda updates, _: next(
+            (
+                f"{spec.spec.name} {what}"
+                for update in updates
+                for spec in update.specs
+                if str(spec.verdict) == what
+            ),
+            None,
+        )
     names = {
         node.name
         for file in files
@@ -105,74 +118,47 @@ def condition_of(text: str, files: Sequence[Specification]) -> Condition:
         for _, _, node in iter_nodes(spec.formula)
         if node.name is not None
     } | {spec.name for file in files for spec in file.results}
-    if not files:
-        raise UsageError(f"the trigger {text!r} waits for a spec, but there is none; give a specification")
-    if words in _VERDICTS:
-        return lambda updates, _: next(
-            (
-                f"{spec.spec.name} {words}"
-                for update in updates
-                for spec in update.specs
-                if str(spec.verdict) == words
-            ),
-            None,
-        )
-    name, _, verdict = words.rpartition(" ")
-    if verdict in _VERDICTS:
-        name = _known(name.strip(), names, text)
-        return lambda updates, _: f"{name} {verdict}" if _verdict(updates, name) == verdict else None
-    if (found := _BELOW.match(words)) is not None:
-        with suppress(ValueError):
-            number = float(found["number"])
-            name = _known(found["name"], names, text)
-            return lambda updates, _: f"{name} below {number:g}" if _value(updates, name) < number else None
-    raise _not_understood(text)
+    if name not in names:
+        hint = nearest_hint(name, names) or f"the specs are {', '.join(sorted(names))}"
+        raise UsageError(f"the trigger {text!r} names no spec: {name!r}; {hint}")
+    if isinstance(what, float):
+        return lambda updates, _: f"{name} below {what:g}" if _standing(updates, name)[1] < what else None
+    return lambda updates, _: f"{name} {what}" if _standing(updates, name)[0] == what else None
 
 
-def _refuse_unknown(text: str) -> None:
-    """Check what can be checked of a condition before its specifications are there."""
+def _parsed(text: str) -> tuple[str, str | float]:
+    """Return the spec that a condition names, "" for none, and a verdict, `EVENT`, `MANUAL`, or the number
+    that its robustness falls below.
+
+    Raises:
+        UsageError: it is none.
+    """
     name, _, verdict = text.rpartition(" ")
-    if text in (*_VERDICTS, EVENT, MANUAL) or (name and verdict in _VERDICTS):
-        return
-    with suppress(ValueError, TypeError):
-        float(_BELOW.match(text)["number"])  # type: ignore[index]
-        return
-    raise _not_understood(text)
-
-
-def _not_understood(text: str) -> UsageError:
+    if text in (*_VERDICTS, EVENT, MANUAL):
+        return "", text
+    if name and verdict in _VERDICTS:
+        return name.strip(), verdict
+    if (found := _BELOW.match(text)) is not None:
+        with suppress(ValueError):
+            return found["name"], float(found["number"])
     hint = nearest_hint(text, [*_VERDICTS, EVENT, MANUAL])
-    return UsageError(
+    raise UsageError(
         f"the trigger {text!r} is not understood; {f'{hint}; ' if hint else ''}write 'violated',"
         " 'NAME violated', 'NAME satisfied', 'NAME < 0.2', 'event' or 'manual'"
     )
 
 
-def _known(name: str, names: set[str], text: str) -> str:
-    if name not in names:
-        hint = nearest_hint(name, names) or f"the specs are {', '.join(sorted(names))}"
-        raise UsageError(f"the trigger {text!r} names no spec: {name!r}; {hint}")
-    return name
-
-
-def _verdict(updates: Sequence[Update], name: str) -> str:
+def _standing(updates: Sequence[Update], name: str) -> tuple[str, float]:
+    """Return the verdict of a spec and its robustness; "" and NaN while it has none."""
     for update in updates:
         for spec in update.specs:
             if spec.spec.name == name:
-                return str(spec.verdict)
+                number = math.nan if spec.numbers is None else float(spec.numbers[0, 0])
+                return str(spec.verdict), number
         if name in update.places and update.specs[update.places[name][0]].numbers is not None:
-            return str(update.node(name).verdict)
-    return ""
-
-
-def _value(updates: Sequence[Update], name: str) -> float:
-    for update in updates:
-        for spec in update.specs:
-            if spec.spec.name == name and spec.numbers is not None:
-                return float(spec.numbers[0, 0])
-        if name in update.places and update.specs[update.places[name][0]].numbers is not None:
-            return float(update.node(name).value)
-    return math.nan
+            node = update.node(name)
+            return str(node.verdict), float(node.value)
+    return "", math.nan
 
 
 _SLICE_BYTES: Final = 8 * 2**20
@@ -317,21 +303,24 @@ class _Open:
                 "held_before_s": repr(held_s),
             }
             self._writer.add_metadata(TRIGGER, record)
-            self._recording.end(**end._asdict())
+            self._recording.end(end)
             self._writer.close()
         finally:
             self._stream.close()
         return TriggeredClip(self.path, self.reasons[0], self.at_ns, held_s, end.dropped)
 
 
-class ClipLog:
+class ClipLog(RecorderLog):
     """The ring of a recorder with a trigger, and the clips that it leaves; see `RecorderLog`.
 
     A trigger that fires while a clip is open makes it longer.
+
+    Attributes:
+        held_bytes: memory of the ring.
+        written: the clips that are complete.
     """
 
     gather_s = GATHER_S / 4
-    backlog = 0
 
     def __init__(
         self, folder: Path, files: Sequence[Specification], about: Mapping[str, str] | None, trigger: Trigger
@@ -360,7 +349,7 @@ class ClipLog:
             "message": deque(maxlen=_MOST_MISSED),
         }
         self._channels: Mapping[int, Channel] = {}
-        self._bytes = 0
+        self.held_bytes = 0
         self._newest_ns = -1
         self._progress: dict[type, tuple[int, float]] = {}
         self._open: _Open | None = None
@@ -375,11 +364,6 @@ class ClipLog:
         return (self._newest_ns >= 0 and not self._fired.empty()) or (
             self._open is not None and bool(self._open.waiting)
         )
-
-    @property
-    def held_bytes(self) -> int:
-        """Memory of the ring, in bytes."""
-        return self._bytes
 
     def fire(self, reason: str) -> None:
         """Fire by hand, from any thread."""
@@ -440,9 +424,7 @@ class ClipLog:
             is_whole = self._newest_ns >= self._open.until_ns
             self._finish(is_interrupted=end.interrupted or not is_whole)
 
-    def break_off(self, end: RunEnd) -> None:
-        """Finish the clip that is open, as far as that is possible."""
-        self.end(end)
+    break_off = end
 
     def close(self) -> None:
         """Let go of the ring."""
@@ -490,7 +472,7 @@ class ClipLog:
             self._messages.append(item)
         else:
             self._samples.append(item)
-        self._bytes += item.size
+        self.held_bytes += item.size
         self._newest_ns = max(self._newest_ns, item.time_ns)
         kind = type(item)
         newest_ns = max(self._progress[kind][0], item.time_ns) if kind in self._progress else item.time_ns
@@ -540,11 +522,11 @@ class ClipLog:
             ring: deque[_Held] | deque[_HeldSample] = self._messages
             if not self._messages or (self._samples and self._samples[0].time_ns < self._messages[0].time_ns):
                 ring = self._samples
-            is_over = self._bytes > self._trigger.most_bytes
+            is_over = self.held_bytes > self._trigger.most_bytes
             if ring[0].time_ns >= oldest_ns and not is_over:
                 return
             dropped = ring.popleft()
-            self._bytes -= dropped.size
+            self.held_bytes -= dropped.size
             if is_over and dropped.time_ns >= oldest_ns + _LATE_NS and not self._has_overflowed:
                 self._has_overflowed = True
                 held_s = max(0.0, (reached_ns - dropped.time_ns) / 1e9)

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -82,8 +82,23 @@ class RunEvent(NamedTuple):
     sentence: str
 
 
+class RunEnd(NamedTuple):
+    """How a recording ended: whether early, and how many samples and messages beside them found no place."""
+
+    interrupted: bool = False
+    dropped: int = 0
+    messages_dropped: int = 0
+
+
+_WHOLE: Final = RunEnd()
+
+
 class Recording:
-    """Write samples to a sink as they arrive, in blocks of any length."""
+    """Write samples to a sink as they arrive, in blocks of any length.
+
+    Attributes:
+        files: the specifications, as the log stores them.
+    """
 
     def __init__(
         self,
@@ -104,7 +119,7 @@ class Recording:
         """
         refuse_templates(files)
         self._axes = Axes.from_metadata(about or {})
-        self._files = files = logged_specifications(files, self._axes.units)
+        self.files = files = logged_specifications(files, self._axes.units)
         self._sink = sink
         self._evaluation = AnnotatedEvaluation(
             files,
@@ -127,11 +142,6 @@ class Recording:
     def __len__(self) -> int:
         """Return the number of samples so far."""
         return self._samples
-
-    @property
-    def files(self) -> Sequence[Specification]:
-        """The specifications, as the log stores them."""
-        return self._files
 
     @property
     def automata(self) -> Sequence[SpecAutomaton]:
@@ -168,7 +178,7 @@ class Recording:
         """
         stretches = self._evaluation.extend(trace)
         own = self._own(trace, beside)
-        self._sink.write_messages(merge([own, *self._evaluation.messages(trace, stretches)]))
+        self._sink.write_messages(merge([own, *self._evaluation.annotator.messages(trace, stretches)]))
         self._hashes.add_results(stretches)
 
     def add_samples(self, trace: Trace, beside: Messages | None = None) -> None:
@@ -178,7 +188,7 @@ class Recording:
     def evaluate(self, trace: Trace) -> None:
         """Write the messages of the evaluation of samples that were added before."""
         stretches = self._evaluation.extend(trace)
-        self._sink.write_messages(merge(self._evaluation.messages(trace, stretches)))
+        self._sink.write_messages(merge(self._evaluation.annotator.messages(trace, stretches)))
         self._hashes.add_results(stretches)
 
     def report(self, event: RunEvent) -> None:
@@ -186,7 +196,7 @@ class Recording:
 
         A replay, which knows nothing of it, has only what it makes unknown.
         """
-        self._sink.write_messages(self._evaluation.occurrence(*event))
+        self._sink.write_messages(merge(self._evaluation.annotator.occurrence(*event)))
 
     def _own(self, trace: Trace, beside: Messages | None) -> Messages:
         """Return samples and messages beside them as they are written; count and hash them."""
@@ -210,23 +220,21 @@ class Recording:
         if name == PLAN_METADATA:
             self._plan = dict(data)
 
-    def end(self, *, interrupted: bool = False, dropped: int = 0, messages_dropped: int = 0) -> None:
-        """Write what follows the last sample; the certificate is that of a replay of the log.
+    def end(self, end: RunEnd = _WHOLE) -> None:
+        """Write what follows the last sample; the certificate is that of a replay of the log."""
+        # loaded like other encoders, with the first message
+        from spatial_replay.annotate.standing import worst_first
 
-        Args:
-            interrupted: whether the recording ended early.
-            dropped, messages_dropped: how many samples, and messages beside them, found no place.
-        """
-        ending = self._ending(interrupted, dropped, messages_dropped)
+        ending = self._ending(end)
         if self._samples:
-            self._sink.write_messages(self._evaluation.end(self._end_ns))
+            annotator = self._evaluation.annotator
+            self._sink.write_messages(merge(annotator.end(self._end_ns, self._evaluation.finals)))
         layout = self._evaluation.layout(self._topics, self._axes, self._images)
         self._sink.add_attachment(layout.name, layout.media_type, layout.data)
         streams = self._evaluation.streams
         if self._samples and streams:
-            results = [
-                (self._evaluation.trees[place], streams[place]) for place in self._evaluation.worst_first
-            ]
+            places = worst_first(self._evaluation.annotator.standing.outcomes)
+            results = [(self._evaluation.trees[place], streams[place]) for place in places]
             texts = {
                 tree.title: verdict_text(
                     each.verdict,
@@ -237,21 +245,20 @@ class Recording:
             }
             self._sink.add_metadata(VERDICTS, texts)
         self._sink.add_metadata(ENDING, ending)
-        self._sink.add_metadata(CERTIFICATE, self._hashes.certificate(self._files, self._plan))
+        self._sink.add_metadata(CERTIFICATE, self._hashes.certificate(self.files, self._plan))
 
-    def break_off(self, *, dropped: int = 0, messages_dropped: int = 0) -> None:
+    def break_off(self, end: RunEnd) -> None:
         """Write the end of a log whose last samples could not be written: it has no certificate."""
-        ending = self._ending(True, dropped, messages_dropped) | {"failed": "true"}
-        self._sink.add_metadata(ENDING, ending)
+        self._sink.add_metadata(ENDING, self._ending(end._replace(interrupted=True)) | {"failed": "true"})
 
-    def _ending(self, interrupted: bool, dropped: int, messages_dropped: int) -> dict[str, str]:
+    def _ending(self, end: RunEnd) -> dict[str, str]:
         ending = {
             "samples": str(self._samples),
-            "dropped": str(dropped),
-            "interrupted": json.dumps(interrupted),
+            "dropped": str(end.dropped),
+            "interrupted": json.dumps(end.interrupted),
         }
-        if self._messages or messages_dropped:
-            ending |= {"messages": str(self._messages), "messages_dropped": str(messages_dropped)}
+        if self._messages or end.messages_dropped:
+            ending |= {"messages": str(self._messages), "messages_dropped": str(end.messages_dropped)}
         return ending
 
 
@@ -305,31 +312,25 @@ _AT_FIRST, _MOST_AT_ONCE = 16, 1024
 Missed: TypeAlias = Literal["sample", "message"]
 
 
-class RunEnd(NamedTuple):
-    """How a recording ended: whether early, and how many samples and messages found no place."""
+class RecorderLog:
+    """Log of a recorder's thread. Only that thread calls it, except for `miss` and `close`.
 
-    interrupted: bool
-    dropped: int
-    messages_dropped: int
+    Attributes:
+        gather_s: how long to gather samples before the next call of `add`.
+        backlog: how many of the samples given so far wait for their evaluation.
+    """
 
-
-class RecorderLog(Protocol):
-    """Log of a recorder's thread. Only that thread calls it, except for `miss` and `close`."""
-
-    @property
-    def gather_s(self) -> float:
-        """How long to gather samples before the next call of `add`."""
+    gather_s = GATHER_S
+    backlog = 0
 
     @property
     def is_busy(self) -> bool:
         """Whether to call `add` again at once, whatever has come."""
-
-    @property
-    def backlog(self) -> int:
-        """How many of the samples given so far wait for their evaluation."""
+        return False
 
     def add(self, samples: Sequence[Sample], trace: Trace, messages: Messages) -> None:
         """Write the next samples, given in both forms, and messages."""
+        raise NotImplementedError
 
     def miss(self, time_ns: int, kind: Missed) -> None:
         """Take note of what found no place; the threads that write call it."""
@@ -350,14 +351,12 @@ class RecorderLog(Protocol):
         """Let go of files, whatever happened before."""
 
 
-class FileLog:
+class FileLog(RecorderLog):
     """One log in one file, written in place.
 
     Samples are written before they are evaluated, a few at a time: an evaluation can be repeated from the
     log, samples cannot.
     """
-
-    gather_s = GATHER_S
 
     def __init__(
         self,
@@ -369,7 +368,6 @@ class FileLog:
         overwrite: bool = True,
     ) -> None:
         """Begin the file, with everything compiled that writing to it takes."""
-        self.backlog = 0
         self._unevaluated: deque[Trace] = deque()
         self._plans: deque[Mapping[str, str]] = deque()
         self._at_once = _AT_FIRST
@@ -396,9 +394,6 @@ class FileLog:
             self._unevaluated.append(trace)
         if self._unevaluated:
             self._evaluate_some()
-
-    def miss(self, time_ns: int, kind: Missed) -> None:
-        """The end of the log has the counts."""
 
     def report(self, event: RunEvent) -> None:
         """See `RecorderLog`."""
@@ -436,12 +431,12 @@ class FileLog:
         """See `RecorderLog`."""
         while self._unevaluated:
             self._evaluate_some()
-        self._recording.end(**end._asdict())
+        self._recording.end(end)
         self._writer.close()
 
     def break_off(self, end: RunEnd) -> None:
         """See `RecorderLog`."""
-        self._recording.break_off(dropped=end.dropped, messages_dropped=end.messages_dropped)
+        self._recording.break_off(end)
         self._writer.close()
 
     def close(self) -> None:

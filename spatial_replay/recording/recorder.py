@@ -268,6 +268,11 @@ class MessageQueue:
 
     Only the threads that write messages take its lock, so that an interruption of one of them never stops
     the writing thread.
+
+    Attributes:
+        is_closed: whether no more messages are taken.
+        process: the one that the recorder belongs to.
+        failure: why nothing can be written any more, or None.
     """
 
     def __init__(
@@ -290,14 +295,9 @@ class MessageQueue:
         self._declared: Mapping[int, Channel] = MappingProxyType({})
         self._queue: queue.SimpleQueue[_Waiting] = queue.SimpleQueue()
         self._bytes_in = self._bytes_out = 0
-        self._is_closed = False
-        self._process = os.getpid()
-        self._failure: Exception | None = None
-
-    @property
-    def written(self) -> int:
-        """How many messages were taken, on all channels."""
-        return sum(channel.written for channel in self.channels.values())
+        self.is_closed = False
+        self.process = os.getpid()
+        self.failure: SpatialReplayError | None = None
 
     @property
     def dropped(self) -> int:
@@ -332,12 +332,16 @@ class MessageQueue:
             UsageError: the recorder is closed, or another process has it since a fork.
             Exception: what prevents writing.
         """
-        if self._is_closed:
+        if self.is_closed:
             raise UsageError(f"{self._name} is closed; open another recorder")
-        if os.getpid() != self._process:
+        if os.getpid() != self.process:
             raise UsageError(f"{self._name} belongs to another process; open a recorder in this one")
-        if self._failure is not None:
-            raise self._failure
+        self.raise_failure()
+
+    def raise_failure(self) -> None:
+        """Raise what prevents writing, if anything does."""
+        if self.failure is not None:
+            raise self.failure
 
     def put(self, message: _Waiting) -> bool:
         """Queue a message; return False if it was dropped. Call it with the lock held."""
@@ -345,9 +349,8 @@ class MessageQueue:
         while self._is_full(size):
             if not self._blocks:
                 return False
-            if self._failure is not None:
-                # no one makes room any more
-                raise self._failure
+            # no one makes room after that
+            self.raise_failure()
             self._ring()
             time.sleep(_PAUSE_S)
         self._bytes_in += size
@@ -372,15 +375,6 @@ class MessageQueue:
         channel, sequence, log_ns, publish_ns = (np.array(each, np.int64) for each in numbers)
         return Messages(self._declared, channel, sequence, log_ns, publish_ns, payloads)
 
-    def fail(self, error: Exception) -> None:
-        """Raise an error of the writing thread in whichever call comes next."""
-        self._failure = error
-
-    def close(self) -> None:
-        """Take no more messages."""
-        with self.lock:
-            self._is_closed = True
-
     def _is_full(self, size: int) -> bool:
         waiting_bytes = self._bytes_in - self._bytes_out
         return self._queue.qsize() >= self._limit or (
@@ -392,33 +386,20 @@ class MessageChannel:
     """A topic of a recorder for messages of the caller's own; `Recorder.channel` opens it.
 
     Any thread may write, also several on one channel.
+
+    Attributes:
+        topic, encoding: those of its messages.
+        written: how many messages were taken.
+        dropped: how many messages were dropped because the queue was full.
     """
 
     def __init__(self, queue: MessageQueue, number: int, declaration: Channel) -> None:
         self._queue, self._number = queue, number
         self.declaration = declaration
+        self.topic, self.encoding = declaration.topic, declaration.encoding
         self._encode = payload_encoder(declaration)
         self._last_ns = 0
-        self._written = self._dropped = 0
-
-    @property
-    def topic(self) -> str:
-        return self.declaration.topic
-
-    @property
-    def encoding(self) -> str:
-        """The encoding of its messages."""
-        return self.declaration.encoding
-
-    @property
-    def written(self) -> int:
-        """How many messages were taken."""
-        return self._written
-
-    @property
-    def dropped(self) -> int:
-        """How many messages were dropped because the queue was full."""
-        return self._dropped
+        self.written = self.dropped = 0
 
     def __repr__(self) -> str:
         return f"MessageChannel({self.topic!r}, encoding={self.encoding!r}, written={self.written})"
@@ -456,10 +437,10 @@ class MessageChannel:
 
     def _put(self, time_ns: int, publish_ns: int, payload: bytes) -> None:
         self._last_ns = time_ns
-        if self._queue.put(_Waiting(self._number, self._written, time_ns, publish_ns, payload)):
-            self._written += 1
+        if self._queue.put(_Waiting(self._number, self.written, time_ns, publish_ns, payload)):
+            self.written += 1
         else:
-            self._dropped += 1
+            self.dropped += 1
             self._queue.missed(time_ns)
 
     def _checked(self, time_ns: object) -> int:
@@ -550,7 +531,11 @@ _TOGETHER = 1024
 
 
 class SampleWriter:
-    """Samples and messages from a caller's threads, on their way to the one thread that writes them."""
+    """Samples and messages from a caller's threads, on their way to the one thread that writes them.
+
+    Attributes:
+        dropped: how many samples were dropped because the queue was full, or given to `miss`.
+    """
 
     def __init__(
         self, log: RecorderLog, name: str, waiting: int, *, block: bool, most_lost_s: float = math.inf
@@ -565,7 +550,6 @@ class SampleWriter:
             most_lost_s: how much time of samples a kill may cost.
         """
         self._log, self.name = log, name
-        self._process = os.getpid()
         # unlike a queue with a limit of its own, an interruption never leaves this one locked
         self._queue: queue.SimpleQueue[Sample | None] = queue.SimpleQueue()
         self._bell: queue.SimpleQueue[None] = queue.SimpleQueue()
@@ -577,19 +561,12 @@ class SampleWriter:
         self._events: queue.SimpleQueue[RunEvent] = queue.SimpleQueue()
         missed = partial(log.miss, kind="message")
         self._messages = MessageQueue(name, waiting, blocks=block, ring=self._ring, missed=missed)
-        self._dropped = 0
+        self.dropped = 0
         self._last_ns = -1
         self._unsafe_s: float | None = None
-        self._closed = False
         self._drains = False
-        self._failure: SpatialReplayError | None = None
         self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
         self._thread.start()
-
-    @property
-    def dropped(self) -> int:
-        """How many samples were dropped because the queue was full, or given to `miss`."""
-        return self._dropped
 
     @property
     def messages_dropped(self) -> int:
@@ -598,7 +575,7 @@ class SampleWriter:
 
     def reserve(self) -> bool:
         """Return whether the next `write` takes its sample, which it then does at once."""
-        self._is_reserved = self._failure is not None or not self._is_behind()
+        self._is_reserved = self._messages.failure is not None or not self._is_behind()
         return self._is_reserved
 
     def copy(self, channel: Channel, time_ns: int, payload: bytes) -> None:
@@ -624,7 +601,6 @@ class SampleWriter:
         """
         require_sample(sample)
         self._messages.require_open()
-        self._raise_failure()
         if sample.time_ns <= self._last_ns:
             at, last = times_apart(sample.time_ns, self._last_ns)
             raise TraceError(f"a sample at {at} follows one at {last}; give times that increase")
@@ -634,7 +610,7 @@ class SampleWriter:
             if not self._blocks:
                 self.miss(sample)
                 return
-            self._raise_failure()
+            self._messages.raise_failure()
             time.sleep(_PAUSE_S)
         if self._unsafe_s is None:
             self._unsafe_s = time.monotonic()
@@ -644,7 +620,7 @@ class SampleWriter:
 
     def miss(self, sample: Sample) -> None:
         """Count a sample that is left out."""
-        self._dropped += 1
+        self.dropped += 1
         self._log.miss(sample.time_ns, kind="sample")
 
     def report(self, event: RunEvent) -> None:
@@ -666,21 +642,21 @@ class SampleWriter:
             OutputError: something could not be written.
         """
         with uninterrupted():
-            if self._closed or os.getpid() != self._process:
+            if self._messages.is_closed or os.getpid() != self._messages.process:
                 return
-            self._closed = True
-            self._messages.close()
+            with self._messages.lock:
+                self._messages.is_closed = True
             self._queue.put(None)
             self._ring()
             self._thread.join()
             self._finish(interrupted=interrupted)
-        self._raise_failure()
+        self._messages.raise_failure()
 
     def _finish(self, *, interrupted: bool) -> None:
         """Write the end of the log; after a failure, as far as that is possible, and say that it failed."""
-        end = RunEnd(interrupted, self._dropped, self._messages.dropped)
+        end = RunEnd(interrupted, self.dropped, self._messages.dropped)
         try:
-            if self._failure is not None:
+            if self._messages.failure is not None:
                 with suppress(Exception):
                     self._log.break_off(end)
             else:
@@ -690,10 +666,7 @@ class SampleWriter:
 
     def _work(self) -> None:
         """Encode and write waiting samples, until `close`."""
-        try:
-            self._write_waiting()
-        except Exception as error:
-            self._fail(error)
+        self._try(self._write_waiting)
 
     def _write_waiting(self) -> None:
         flushed = taken = time.monotonic()
@@ -708,7 +681,7 @@ class SampleWriter:
             # decisions come before the samples that follow them
             while self._drains and len(messages := self._messages.take()):
                 self._record([], messages)
-            if self._failure is None and time.monotonic() - flushed >= FLUSH_S:
+            if self._messages.failure is None and time.monotonic() - flushed >= FLUSH_S:
                 self._try(self._log.flush)
                 flushed = time.monotonic()
                 self._unsafe_s = taken if self._queue.qsize() else None
@@ -717,13 +690,13 @@ class SampleWriter:
 
     def _report_events(self) -> None:
         with suppress(queue.Empty):
-            while self._failure is None:
+            while self._messages.failure is None:
                 event = self._events.get_nowait()
                 self._try(partial(self._log.report, event))
 
     def _record(self, samples: Sequence[Sample], messages: Messages) -> None:
         """Encode and write samples and messages; after a failure, drop them."""
-        if self._failure is not None or not (samples or len(messages) or self._log.is_busy):
+        if self._messages.failure is not None or not (samples or len(messages) or self._log.is_busy):
             return
         try:
             trace = Trace.from_samples(samples)
@@ -749,8 +722,7 @@ class SampleWriter:
             failure = OutputError(f"{self.name} ends here: {what}")
             failure.__cause__ = error
             error = failure
-        self._failure = error
-        self._messages.fail(error)
+        self._messages.failure = error
 
     def _ring(self) -> None:
         """Wake the writing thread before its gathering time is over."""
@@ -763,19 +735,13 @@ class SampleWriter:
             with suppress(queue.Empty):
                 self._bell.get(timeout=self._log.gather_s)
         samples: list[Sample] = []
-        try:
+        with suppress(queue.Empty):
             while len(samples) < _TOGETHER:
                 sample = self._queue.get_nowait()
                 if sample is None:
                     return samples, True
                 samples.append(sample)
-        except queue.Empty:
-            pass
         return samples, False
-
-    def _raise_failure(self) -> None:
-        if self._failure is not None:
-            raise self._failure
 
 
 @named_arguments
@@ -909,13 +875,10 @@ class Recorder(SampleWriter):
         if self._box is not None:
             is_first = not self._box.planner.has_observed
             self._box.observe(sample)
-            if is_first:
-                self._add_plan(self._box.planner)
-
-    def _add_plan(self, planner: Planner) -> None:
-        """Write the settings, which may depend on the first sample."""
-        if isinstance(self._log, FileLog):
-            self._log.add_plan(planner, self._files.index(planner.specification))
+            # settings may depend on the first sample
+            if is_first and isinstance(self._log, FileLog):
+                planner = self._box.planner
+                self._log.add_plan(planner, self._files.index(planner.specification))
 
     def next_step(self) -> Step:
         """Return the planner's next step, and record it with everything that it depends on.
@@ -1138,7 +1101,7 @@ def _record(
 
 def _end(writer: LogWriter, recording: Recording, *, interrupted: bool) -> None:
     with uninterrupted():
-        recording.end(interrupted=interrupted)
+        recording.end(RunEnd(interrupted))
         writer.close()
 
 

@@ -209,16 +209,6 @@ class Replay:
             UsageError: no sample in the window.
             SpecificationError: names that the log never has, if names are strict.
         """
-        self._pass(write, layer=layer, advance=advance)
-        replayed = self._replayed()
-        if write is not None:
-            write(self._evaluation.end(self._end_ns, replayed.results))
-        return replayed
-
-    def _pass(
-        self, write: Callable[[Messages], None] | None, *, layer: bool, advance: Callable[[int], None]
-    ) -> None:
-        """Evaluate all samples; see `run`."""
         needs_messages = write is not None or self._hashes is not None
         # the next block is evaluated while messages of this one are made, if a core is free for that
         for block, trace, stretches in read_ahead(self._evaluated(messages=needs_messages)):
@@ -234,9 +224,14 @@ class Replay:
                 self._images |= image_topics(own.channels.values())
             self._add(inside, own, stretches)
             if write is not None:
-                derived = self._evaluation.messages(inside, stretches)
+                derived = self._evaluation.annotator.messages(inside, stretches)
                 write(merge([*derived, *([] if layer else [own])]))
             advance(len(inside))
+        replayed = self._replayed()
+        if write is not None:
+            annotator, finals = self._evaluation.annotator, self._evaluation.finals
+            write(merge(annotator.end(self._end_ns, finals, replayed.results)))
+        return replayed
 
     @property
     def automata(self) -> Sequence[SpecAutomaton]:
@@ -272,7 +267,8 @@ class Replay:
         if len(messages):
             self._end_ns = max(self._end_ns, int(messages.log_time_ns[-1]))
         if self._hashes is not None:
-            self._hashes.add(trace, messages, stretches)
+            self._hashes.add_samples(trace, messages)
+            self._hashes.add_results(stretches)
         for index, stretch in enumerate(stretches):
             if self._keep_series or self._keep_leaves:
                 kept = self._kept[index]
@@ -301,11 +297,7 @@ class Replay:
             start_ns=self._times[0],
             end_ns=self._times[-1],
             faults=counted_from(self._faults, first_ns),
-            remarks=(
-                *counted_from(self._remarks, first_ns),
-                *dropped.remarks,
-                *self._empty_ends(first_ns),
-            ),
+            remarks=(*counted_from(self._remarks, first_ns), *dropped.remarks, *self._empty_ends(first_ns)),
             missing=missing,
             dropped=dropped,
             unreadable=self._unreadable,

@@ -18,12 +18,12 @@ from typing import Final
 
 import numpy as np
 
-from spatial_replay.annotate.annotator import Annotator, shown_regions
+from spatial_replay.annotate.annotator import shown_regions
 from spatial_replay.annotate.evaluation import AnnotatedEvaluation
 from spatial_replay.annotate.foxglove_layout import layout_attachment
 from spatial_replay.annotate.robustness import encode_curves
 from spatial_replay.annotate.scene.scene_template import SceneBounds
-from spatial_replay.annotate.scene.scene_update import SceneState, scene_start
+from spatial_replay.annotate.scene.scene_update import scene_start
 from spatial_replay.annotate.specification import logged_specifications
 from spatial_replay.errors import SpecificationError, UsageError
 from spatial_replay.geometry.arrays import Integers, select
@@ -40,17 +40,18 @@ from spatial_replay.replay.selection import (
     LogNames,
     ReplayOptions,
     Selection,
+    between,
     first_sample_ns,
     look_before,
 )
-from spatial_replay.replay.specification_files import SpecificationFiles
+from spatial_replay.replay.specification_files import SpecificationFiles, constant_value
 from spatial_replay.spec import parse_specification
 from spatial_replay.spec.checks import with_numbers
 from spatial_replay.spec.diagnostics import Diagnostic, nearest_hint
 from spatial_replay.spec.format import format_duration, format_specification
 from spatial_replay.spec.formula import Constant, Specification, iter_nodes
 from spatial_replay.text import counted_from
-from spatial_replay.trace.trace import Trace, window_of
+from spatial_replay.trace.trace import Trace
 
 _FEW: Final = 2_000
 _FEW_BYTES: Final = 1 << 26
@@ -86,8 +87,7 @@ class OwnMessages:
     def add(self, block: Block) -> None:
         """Add the next block of the log."""
         window = self._selection.window
-        begin, end = window_of(block.messages.log_time_ns, window.start_ns, window.end_ns)
-        messages = select(block.messages, np.arange(begin, end))
+        messages = between(block.messages, window.start_ns, window.end_ns)
         self._span(messages.log_time_ns)
         self._span(self._selection.inside(block.trace).times_ns)
         self._count(messages)
@@ -488,10 +488,6 @@ class Evaluated:
         order = worst_first(self.replayed.results)
         return layout_attachment(contents._replace(order=order), live=True)
 
-    def annotator(self, scene: SceneState | None = None, arrow: str = "") -> Annotator:
-        """Return the annotator of these samples, before the first; see `AnnotatedEvaluation`."""
-        return self.evaluation.annotator(scene, arrow)
-
     def part(self, begin: int, end: int) -> tuple[Trace, list[SeriesBlock]]:
         """Return samples `begin` to before `end` of those in the window, with their evaluation."""
         trace = self.loaded.inside.slice(begin, end)
@@ -511,11 +507,6 @@ def constant_text(constant: Constant) -> str:
     if constant.duration_ns is not None:
         return format_duration(constant.duration_ns)
     return repr(constant.value).removesuffix(".0")
-
-
-def constant_value(constant: Constant) -> float | str:
-    """Return a constant as `LoadedLog.edit` takes it: a number or, as a text, a duration."""
-    return constant.value if constant.duration_ns is None else constant_text(constant)
 
 
 def constant_values(constants: Mapping[str, Constant]) -> dict[str, float | str]:
@@ -587,7 +578,7 @@ class Playback:
         self.arrow = ""
         self._regions = shown_regions(evaluated.edited.files)
         self._start = scene_start(evaluated.loaded.inside, self._regions)
-        self._annotator = evaluated.annotator(self._start)
+        self._annotator = evaluated.evaluation.new_annotator(self._start)
         self._own = MessageCursor(own, self.start_ns)
         self._next = 0
         self._has_ended = False
@@ -616,7 +607,7 @@ class Playback:
         if regions != self._regions:
             self._start, self._regions = scene_start(self.evaluated.loaded.inside, regions), regions
         scene = replace(self._annotator.scene, written_ns=None, last={}, place=self._start.place)
-        self._annotator = self.evaluated.annotator(scene, self.arrow)
+        self._annotator = self.evaluated.evaluation.new_annotator(scene, self.arrow)
         self._has_ended = False
         events = _last(merge(self._annotator.pass_over(*self.evaluated.part(0, shown))))
         derived = self._annotator.messages(*self.evaluated.part(shown, self._next))

@@ -6,7 +6,6 @@ import json
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cache
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final
 
@@ -95,8 +94,6 @@ def _check_patterns(source: Source, patterns: Sequence[str]) -> None:
 
 
 def _topics(source: Source) -> list[str]:
-    from spatial_replay.logs.mcap.read import McapSource
-
     if isinstance(source, McapSource):
         with source.open_walk() as walk:
             return sorted({channel.topic for channel in walk.channels.values()})
@@ -299,13 +296,12 @@ class Selection:
             first: the number of the block's first sample in the window.
         """
         messages = block.messages
-        begin, end = window_of(messages.log_time_ns, self.window.start_ns, self.window.end_ns)
-        chosen = messages if end - begin == len(messages) else select(messages, np.arange(begin, end))
+        chosen = between(messages, self.window.start_ns, self.window.end_ns)
         if any(channel.topic == OBJECTS for channel in messages.channels.values()):
             # in the source, messages of one time come in the order of its numbers of channels
             return merge([chosen])
         trace = self.inside(block.trace)
-        return merge([chosen, messages_of(_objects_channel(), trace.times_ns, encode_objects(trace), first)])
+        return merge([chosen, messages_of(_OBJECTS, trace.times_ns, encode_objects(trace), first)])
 
     def instances(self, file: Specification) -> list[Instance]:
         """Return what is to be evaluated of a specification; for templates, the source is read for objects.
@@ -365,9 +361,7 @@ class Selection:
         return [remark for remark in remarks if remark.severity == "error"]
 
 
-@cache
-def _objects_channel() -> Channel:
-    return protobuf_channel(OBJECTS, ObjectStates)
+_OBJECTS: Final = protobuf_channel(OBJECTS, ObjectStates)
 
 
 def _check_windows(files: Sequence[Specification], max_gap_ns: int) -> None:
@@ -405,7 +399,7 @@ class _ClippedSource(SourceOf):
             yield Block(Trace.from_samples(()), self.latched)
         for block in self.source.iter_blocks(first, last):
             # an external log is read from before the window, for what is valid in it
-            yield replace(block, messages=_between(block.messages, first, last))
+            yield replace(block, messages=between(block.messages, first, last))
 
     def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
         """See `Source.metadata`."""
@@ -459,10 +453,11 @@ def _messages_before(source: Source, end_ns: int) -> Iterator[Messages]:
             if not any(map(source.is_wanted, topics)):
                 return
     for block in read_blocks(source, None, end_ns):
-        yield _between(block.messages, 0, end_ns)
+        yield between(block.messages, 0, end_ns)
 
 
-def _between(messages: Messages, start_ns: int, end_ns: int) -> Messages:
+def between(messages: Messages, start_ns: int, end_ns: int) -> Messages:
+    """Return messages from one time to before another."""
     begin, end = window_of(messages.log_time_ns, start_ns, end_ns)
     return messages if end - begin == len(messages) else select(messages, np.arange(begin, end))
 

@@ -5,10 +5,9 @@ from __future__ import annotations
 import stat
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import zip_longest
 from pathlib import Path
 from threading import Lock
-from typing import Final, NamedTuple
+from typing import Final, TypeAlias
 
 from spatial_replay.errors import MissingFileError, SpatialReplayError, UsageError, importing
 from spatial_replay.logs.output_file import replacing
@@ -19,7 +18,7 @@ from spatial_replay.spec.load import load_specification, load_specifications
 
 _MARK: Final = b"\xef\xbb\xbf"
 _SETTLE_S: Final = 0.04
-"""How long size and time of a file that is written in place have to stay before it counts as saved."""
+"""How long size and time of a file have to stay before it counts as saved."""
 _ERROR_SETTLE_S: Final = 0.1
 """How long a file with errors, or one that is gone, is left to an editor that may be writing it."""
 _PATIENCE_S: Final = 1.0
@@ -29,19 +28,8 @@ _STEP_MS: Final = 10
 """The longest wait for a change, and how long to wait for more after one."""
 
 
-class _State(NamedTuple):
-    """Fields that differ after a save."""
-
-    file: int
-    size: int
-    modified_ns: int
-    changed_ns: int
-
-    def replaces(self, before: _State | None) -> bool:
-        """Say whether another file got this name after it was written, as many editors save."""
-        is_other = before is None or before.file != self.file
-        # a new name changes the entry of a file, and not its content
-        return is_other and self.changed_ns > self.modified_ns
+_State: TypeAlias = tuple[int, int, int, int]
+"""Inode, size and times of a file; one of them differs after a save."""
 
 
 class SpecificationFiles:
@@ -101,9 +89,8 @@ class SpecificationFiles:
     def iter_saves(self) -> Iterator[list[Specification] | SpatialReplayError | None]:
         """Yield the files whenever one is saved with another text, or why they cannot be read.
 
-        Between saves it yields None, about ten times a second. A file may be replaced by another of its name,
-        as many editors do: that counts at once. One that is written in place counts as saved when its size
-        and time have stayed for 0.04 s, and with errors, or while it is gone, for 0.1 s more.
+        Between saves it yields None, about ten times a second. A file counts as saved when its size and time
+        have stayed for 0.04 s, and with errors, or while it is gone, for 0.1 s more.
 
         Raises:
             UsageError: the library that watches files is not installed.
@@ -136,53 +123,41 @@ class SpecificationFiles:
             MissingFileError, SpecificationError, UsageError, OutputError: see `write_constants`.
         """
         with self._turn:
-            return self._write(values)
-
-    def _write(self, values: Sequence[Mapping[str, float | str]]) -> dict[str, float | str]:
-        files = load_specifications(self.paths, profile=self._profile, constants=self._constants)
-        plain = load_specifications(self.paths, profile=self._profile)
-        changed: dict[str, float | str] = {}
-        for index, (path, own, with_given, written) in enumerate(
-            zip(self.paths, values or [{}] * len(self.paths), files, plain, strict=True)
-        ):
-            given = {
-                name: value
-                for name, value in plain_values(with_given).items()
-                if with_given.constants[name] != written.constants[name]
-            }
-            new = {**given, **own}
-            names = write_constants(path, new, profile=self._profile)
-            changed |= {name: new[name] for name in names}
-            after = load_specification(path, profile=self._profile) if names else written
-            self._written |= {(index, name): after.constants[name] for name in names}
-        self._constants = {}
-        return changed
+            files = load_specifications(self.paths, profile=self._profile, constants=self._constants)
+            plain = load_specifications(self.paths, profile=self._profile)
+            changed: dict[str, float | str] = {}
+            for index, (path, own, with_given, written) in enumerate(
+                zip(self.paths, values or [{}] * len(self.paths), files, plain, strict=True)
+            ):
+                given = {
+                    name: value
+                    for name, value in plain_values(with_given).items()
+                    if with_given.constants[name] != written.constants[name]
+                }
+                new = {**given, **own}
+                names = write_constants(path, new, profile=self._profile)
+                changed |= {name: new[name] for name in names}
+                after = load_specification(path, profile=self._profile) if names else written
+                self._written |= {(index, name): after.constants[name] for name in names}
+            self._constants = {}
+            return changed
 
     def _saved(self) -> list[Specification] | SpatialReplayError | None:
         """Return the files as saved; None if their text is the one before, or they change all the time."""
         before, give_up = self._sources, time.monotonic() + _PATIENCE_S
-        state, failure = self._state(), None
-        is_settled = all(
-            now == then or (now is not None and now.replaces(then))
-            for now, then in zip_longest(state, self._read)
-        )
         while time.monotonic() < give_up:
-            if not is_settled:
-                time.sleep(_SETTLE_S)
-                is_settled, state = self._state() == state, self._state()
+            state = self._state()
+            time.sleep(_SETTLE_S)
+            if self._state() != state:
                 continue
             try:
                 files = self.load()
             except SpatialReplayError as error:
-                if failure is not None:
-                    return error
-                state = self._read
                 time.sleep(_ERROR_SETTLE_S)
-                is_settled = self._state() == state
-                failure = error if is_settled else None
+                if self._state() == self._read:
+                    return error
                 continue
-            is_settled, state = self._state() == self._read, self._read
-            if is_settled:
+            if self._state() == self._read:
                 return files if self._sources != before else None
         # what was read may be half a file: the next turn reads it again
         self._read, self._sources = [], before
@@ -197,7 +172,7 @@ class SpecificationFiles:
             except (OSError, ValueError):
                 states.append(None)
             else:
-                states.append(_State(found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns))
+                states.append((found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns))
         return states
 
 
@@ -247,8 +222,9 @@ def write_constants(
 
 def plain_values(file: Specification) -> dict[str, float | str]:
     """Return the constants of a specification that follow from no others, as they are given."""
-    return {
-        name: each.value if each.duration_ns is None else format_duration(each.duration_ns)
-        for name, each in file.constants.items()
-        if not each.is_computed
-    }
+    return {name: constant_value(each) for name, each in file.constants.items() if not each.is_computed}
+
+
+def constant_value(constant: Constant) -> float | str:
+    """Return a constant as it is given: a number or, as a text, a duration."""
+    return constant.value if constant.duration_ns is None else format_duration(constant.duration_ns)

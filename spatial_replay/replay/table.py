@@ -6,7 +6,7 @@ import csv
 import io
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import chain, count
 from pathlib import Path
@@ -81,20 +81,13 @@ def export_table(
     titles, automata = _titles(source)
     faults: list[str] = []
     rows, first_ns = 0, 0
-    with replacing(output, inputs) as stream:
-        write = writer(stream, [TIME, SECONDS, *titles.values()], list(automata.values()))
-        try:
-            for table in _iter_tables(source, titles, automata, QUANTITIES.index(quantity), faults):
-                write(table)
-                first_ns = first_ns if rows else int(table.times_ns[0])
-                rows += len(table.times_ns)
-                advance(len(table.times_ns))
-            write(None)
-        except BaseException:
-            # a writer that is left open would go on writing when it is collected, to a closed file
-            with suppress(Exception):
-                write(None)
-            raise
+    columns = [TIME, SECONDS, *titles.values()], list(automata.values())
+    with replacing(output, inputs) as stream, writer(stream, *columns) as write:
+        for table in _iter_tables(source, titles, automata, QUANTITIES.index(quantity), faults):
+            write(table)
+            first_ns = first_ns if rows else int(table.times_ns[0])
+            rows += len(table.times_ns)
+            advance(len(table.times_ns))
     return rows, len(titles), counted_from(faults, first_ns)
 
 
@@ -156,7 +149,7 @@ def _titles(source: Source) -> tuple[Mapping[_Node, str], Mapping[_Result, str]]
         titles[result, identifier] = _free(title, numbered, taken)
     automata = {
         result: _free(f"{_shown(result)}/automaton", f"{_shown(result)}#automaton", taken)
-        for result in _results_with_automaton(source)
+        for result in dict.fromkeys(result for _, result, _ in _iter_states(source))
     }
     return titles, automata
 
@@ -211,11 +204,6 @@ def _payloads(source: Source, topic: str) -> Iterator[bytes]:
             yield from payloads
 
 
-def _results_with_automaton(source: Source) -> list[_Result]:
-    """Return the results whose automaton has states in the log, in the order in which they appear."""
-    return list(dict.fromkeys(result for _, result, _ in _iter_states(source)))
-
-
 def _iter_states(source: Source) -> Iterator[tuple[int, _Result, str]]:
     """Yield time, result and states of each message about an automaton."""
     for payload in _payloads(source, AUTOMATON):
@@ -255,28 +243,30 @@ def _iter_tables(
         yield TableRows(times_ns, (times_ns - first_ns) / 1e9, numbers, cells)
 
 
-Write: TypeAlias = Callable[[TableRows | None], None]
-"""Writes the next rows; None after the last."""
-
-
-def _csv_writer(stream: Any, titles: Sequence[str], automata: Sequence[str]) -> Write:
+@contextmanager
+def _csv_writer(
+    stream: Any, titles: Sequence[str], automata: Sequence[str]
+) -> Iterator[Callable[[TableRows], None]]:
     text = io.TextIOWrapper(stream, encoding="utf-8", newline="", write_through=True)
     rows = csv.writer(text)
     rows.writerow([*titles, *automata])
 
-    def write(table: TableRows | None) -> None:
-        if table is None:
-            text.detach()
-            return
+    def write(table: TableRows) -> None:
         columns = [table.times_ns.tolist(), table.seconds.tolist(), table.numbers.tolist()]
         for index, (time_ns, seconds, numbers) in enumerate(zip(*columns, strict=True)):
             cells = ("" if math.isnan(number) else number for number in numbers)
             rows.writerow([time_ns, seconds, *cells, *(states[index] for states in table.states)])
 
-    return write
+    try:
+        yield write
+    finally:
+        text.detach()
 
 
-def _parquet_writer(stream: Any, titles: Sequence[str], automata: Sequence[str]) -> Write:
+@contextmanager
+def _parquet_writer(
+    stream: Any, titles: Sequence[str], automata: Sequence[str]
+) -> Iterator[Callable[[TableRows], None]]:
     with importing("Parquet, unlike .csv, needs pyarrow", extra="parquet"):
         import pyarrow as pa
         from pyarrow import parquet
@@ -290,13 +280,7 @@ def _parquet_writer(stream: Any, titles: Sequence[str], automata: Sequence[str])
     )
     writer = parquet.ParquetWriter(stream, schema)
 
-    def write(table: TableRows | None) -> None:
-        if table is None:
-            try:
-                writer.close()
-            finally:
-                writer.is_open = False
-            return
+    def write(table: TableRows) -> None:
         columns = [
             pa.array(table.times_ns),
             pa.array(table.seconds),
@@ -305,10 +289,14 @@ def _parquet_writer(stream: Any, titles: Sequence[str], automata: Sequence[str])
         ]
         writer.write_table(pa.table(columns, schema=schema))
 
-    return write
+    try:
+        yield write
+    finally:
+        # one that is left open would go on writing when it is collected, to a closed file
+        try:
+            writer.close()
+        finally:
+            writer.is_open = False
 
 
-_WRITERS: dict[str, Callable[[Any, Sequence[str], Sequence[str]], Write]] = {
-    ".csv": _csv_writer,
-    ".parquet": _parquet_writer,
-}
+_WRITERS = {".csv": _csv_writer, ".parquet": _parquet_writer}

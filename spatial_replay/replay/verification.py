@@ -165,7 +165,6 @@ class FirstDifferences:
     def __init__(self, log: LogFile) -> None:
         self._reader = McapLog(log)
         self._recorded: dict[str, Iterator[Message]] = {}
-        self._counts: dict[str, int] = {}
         self._found: dict[str, Sentence] = {}
 
     def add(self, messages: Messages) -> None:

@@ -17,7 +17,7 @@ from spatial_replay.logs.mcap.write import LogWriter
 from spatial_replay.logs.messages import Channel, Messages, merge, messages_of
 from spatial_replay.logs.output_file import Durability, open_output, refuse_inputs
 from spatial_replay.monitor.verdict import Verdict
-from spatial_replay.recording.log import Recording, refuse_templates
+from spatial_replay.recording.log import Recording, RunEnd, refuse_templates
 from spatial_replay.recording.recorder import leaving, terminable, uninterrupted
 from spatial_replay.runs.virtual_camera import Film, open_film
 from spatial_replay.simulation.tabletop import Tabletop, default_specification, make_world
@@ -117,7 +117,7 @@ class RunLog:
     def end(self, *, interrupted: bool = False) -> None:
         """Write what follows the last sample, and close the log."""
         self._write_waiting()
-        self._recording.end(interrupted=interrupted)
+        self._recording.end(RunEnd(interrupted))
         self._writer.close()
 
     def _write_waiting(self) -> None:

@@ -37,7 +37,6 @@ from spatial_replay.logs.topics import (
     is_image_type,
 )
 from spatial_replay.replay.loaded_log import EditedFiles, Evaluated, LoadedLog, Playback, constant_values
-from spatial_replay.text import nearest_hint
 
 if TYPE_CHECKING:
     from spatial_replay.serve.server import LiveServer
@@ -268,6 +267,8 @@ class Session:
     one counts.
 
     Attributes:
+        edited: the specifications with the constants as viewers set them.
+        arrow: the value of `ARROW`.
         failure: why the last change that could not be evaluated could not, or None.
     """
 
@@ -283,14 +284,14 @@ class Session:
         self._log = loaded
         self._pace = Pace(clock)
         self._transport = Transport(start_ns, end_ns)
-        self._edited = loaded.edit({})
+        self.edited = loaded.edit({})
         self._pending = PendingRequests()
         self._awaited: Future[Evaluated] | None = None
         self._requested = Condition()
         self._is_over = False
         self._loops = False
         self._is_behind = False
-        self._arrow = ""
+        self.arrow = ""
         self.failure: SpatialReplayError | None = None
 
     @property
@@ -306,12 +307,7 @@ class Session:
     @property
     def values(self) -> Values:
         """The constants as viewers set them."""
-        return constant_values(self._edited.constants)
-
-    @property
-    def edited(self) -> EditedFiles:
-        """The specifications with these values."""
-        return self._edited
+        return constant_values(self.edited.constants)
 
     @property
     def state(self) -> PlaybackState:
@@ -327,11 +323,6 @@ class Session:
         is_playing = state.status is Status.PLAYING
         return dict(zip(PLAYBACK, (seconds, is_playing, state.speed, self._loops), strict=True))
 
-    @property
-    def arrow(self) -> str:
-        """The value of `ARROW`."""
-        return self._arrow
-
     # ------------------------------------------------------------------------ called for viewers
 
     def control(self, *, is_playing: bool, speed: float, seek_ns: int | None = None) -> PlaybackState:
@@ -341,10 +332,12 @@ class Session:
         """
         with self._requested:
             now = self._pace.now()
-            if seek_ns is None and is_playing and self._transport.state(now).status is Status.ENDED:
+            status = self._transport.state(now).status
+            if seek_ns is None and is_playing and status is Status.ENDED:
                 seek_ns = self._transport.start_ns
             # what was played since the last turn is still to be sent
-            self._is_behind = seek_ns is None and not is_playing and (self._is_behind or self._plays(now))
+            is_behind = self._is_behind or status is Status.PLAYING
+            self._is_behind = seek_ns is None and not is_playing and is_behind
             self._transport.set_speed(speed, now)
             if seek_ns is not None:
                 self._transport.move_to(seek_ns, now)
@@ -354,9 +347,6 @@ class Session:
             self._requested.notify()
             # the player says that it jumped, right before it sends what is there
             return self._transport.state(now)
-
-    def _plays(self, now: float) -> bool:
-        return self._transport.state(now).status is Status.PLAYING
 
     def steer(self, values: Mapping[str, float | str | bool]) -> PlaybackState:
         """Play, pause, seek, change the speed or begin again at the end, as some of `PLAYBACK` say.
@@ -394,7 +384,7 @@ class Session:
         if not isinstance(arrow, str):
             raise UsageError(f'{ARROW} cannot be {arrow!r}: give the title of a result, or "" for the first')
         with self._requested:
-            self._pending.arrow = self._arrow = arrow
+            self._pending.arrow = self.arrow = arrow
             self._requested.notify()
 
     def set_constants(self, values: Values) -> None:
@@ -405,8 +395,8 @@ class Session:
             SpecificationError: the specification is invalid with these values.
         """
         with self._requested:
-            edited = self._edited
-            self._pending.edited = self._edited = edited.loaded.edit({**edited.given, **values})
+            edited = self.edited
+            self._pending.edited = self.edited = edited.loaded.edit({**edited.given, **values})
             self._requested.notify()
 
     def replace_log(self, loaded: LoadedLog) -> None:
@@ -415,7 +405,7 @@ class Session:
         Constants that viewers changed keep their values, unless the text changed them, too.
         """
         with self._requested:
-            before = self._edited
+            before = self.edited
             written = before.loaded.constants
             kept = {
                 name: value
@@ -428,7 +418,7 @@ class Session:
                 edited = loaded.edit(kept)
             except SpatialReplayError:
                 edited = loaded.edit({})
-            self._pending.edited = self._edited = edited
+            self._pending.edited = self.edited = edited
             self._requested.notify()
 
     def resend(self, topic: str) -> None:
@@ -503,8 +493,8 @@ class Session:
         with self._requested:
             self.failure = failure
             if self._pending.edited is None:
-                self._edited = edited
-            return constant_values(self._edited.constants)
+                self.edited = edited
+            return constant_values(self.edited.constants)
 
     def pause(self) -> PlaybackState:
         """Stay at the present time, unless a seek is pending."""
@@ -642,9 +632,6 @@ class Note(NamedTuple):
     text: str
 
 
-_MOST_NAMED: Final = 10
-"""The most results that a note lists."""
-
 CONSTANTS = "constants"
 LOG = "log"
 SPECIFICATION = "specification"
@@ -677,7 +664,7 @@ class Player:
     def run(self) -> None:
         """Do what is requested until the session is stopped."""
         try:
-            while not (requests := self._next_requests()).stop:
+            while not (requests := self._session.next_requests(PERIOD_S, is_due=self._shows_again)).stop:
                 try:
                     self._do(requests)
                     self._play_on()
@@ -686,9 +673,6 @@ class Player:
                     self._viewers.send_state(self._session.pause())
         finally:
             self._session.end()
-
-    def _next_requests(self) -> PendingRequests:
-        return self._session.next_requests(PERIOD_S, is_due=self._shows_again)
 
     def _do(self, requests: PendingRequests) -> None:
         shows_again, self._shows_again = self._shows_again, False
@@ -720,12 +704,10 @@ class Player:
 
     def _point_at(self, arrow: str) -> bool:
         """Choose the result that the arrow is about; say whether there is such a one."""
-        trees = self._playback.evaluated.evaluation.trees
-        if arrow and not any(tree.is_called(arrow) for tree in trees):
-            titles = [tree.title for tree in trees]
-            named = ", ".join(titles[:_MOST_NAMED]) + (", …" if len(titles) > _MOST_NAMED else "")
-            hint = nearest_hint(arrow, titles) or f"the results are: {named}"
-            self._viewers.send_note(Note(ARROW, f"there is no result {arrow!r}; {hint}"))
+        try:
+            self._playback.evaluated.evaluation.check_arrow(arrow)
+        except UsageError as error:
+            self._viewers.send_note(Note(ARROW, str(error)))
             self._session.point_at(self._playback.arrow)
             self._viewers.send_playback()
             return False

@@ -171,6 +171,13 @@ def iter_formulas(formula: Formula) -> Iterator[Formula]:
                 stack.append(current.body)
 
 
+def leaf_key(leaf: Formula) -> tuple[object, ...]:
+    """Return what equal leaves have in common, wherever they stand in the text."""
+    if isinstance(leaf, Quantified):
+        return leaf.quantifier, leaf.variables, leaf.group, leaf.body
+    return (leaf.expression,) if isinstance(leaf, Atom) else (leaf,)
+
+
 def is_spatial(formula: Formula) -> bool:
     """Return whether a formula is about one sample: no operator in it looks ahead or back."""
     return not any(isinstance(each, Temporal) for each in iter_formulas(formula))

@@ -8,7 +8,7 @@ from replay.runs import SPECIFICATION, run
 from spatial_replay import TraceError, parse_specification
 from spatial_replay.logs import MemorySink
 from spatial_replay.logs.topics import ENDING
-from spatial_replay.recording.log import Recording
+from spatial_replay.recording.log import Recording, RunEnd
 
 
 def test_metadata_comes_before_the_samples() -> None:
@@ -38,7 +38,7 @@ def test_the_end_counts_the_samples() -> None:
     sink = MemorySink()
     recording = Recording(sink)
     recording.add(run())
-    recording.end(interrupted=True, dropped=3)
+    recording.end(RunEnd(interrupted=True, dropped=3))
     assert sink.metadata[-2] == (ENDING, {"samples": "12", "dropped": "3", "interrupted": "true"})
 
 

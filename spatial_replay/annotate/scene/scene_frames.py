@@ -29,13 +29,7 @@ from spatial_replay.annotate.scene.scene_template import (
 from spatial_replay.annotate.violations import EvaluatedResult, Violations
 from spatial_replay.geometry.arrays import Floats, Integers, combined, equal_places
 from spatial_replay.geometry.footprint import FootprintBatch
-from spatial_replay.logs.schemas.Robustness_pb2 import (
-    HOLDS_SO_FAR,
-    PENDING,
-    SATISFIED,
-    UNKNOWN,
-    VIOLATED,
-)
+from spatial_replay.logs.schemas.Robustness_pb2 import HOLDS_SO_FAR, PENDING, SATISFIED, UNKNOWN, VIOLATED
 from spatial_replay.palette import HOLDING, MAP, NEGATIVE, NEUTRAL, POSITIVE
 from spatial_replay.text import Instant
 
@@ -80,7 +74,7 @@ _MOST_LABELS: Final = 20
 
 _MOST_TITLES: Final = 6
 _BANNER_WIDTH: Final = 30
-_STANDING_WORDS: Final = MappingProxyType(
+STANDING_WORDS: Final = MappingProxyType(
     {
         VIOLATED: ("violated", NEGATIVE),
         PENDING: ("pending", NEUTRAL),
@@ -123,7 +117,7 @@ def _banner(
     results: Sequence[EvaluatedResult], codes: NDArray[np.uint8], place: tuple[float, float]
 ) -> Banner | None:
     worst, others, colour = "", list[str](), None
-    for code, (words, hue) in _STANDING_WORDS.items():
+    for code, (words, hue) in STANDING_WORDS.items():
         of_code = [result for result, each in zip(results, codes.tolist(), strict=True) if each == code]
         if code == VIOLATED:  # the one that was so first comes first
             of_code.sort(key=lambda each: each.violated_ns)

@@ -130,12 +130,8 @@ def extents(footprints: FootprintBatch) -> Floats:
     if not len(footprints):
         return np.empty(0)
     start = footprints.vertex_start[footprints.part_start]
-    if footprints.radius.any():
-        radius = np.repeat(footprints.radius, np.diff(footprints.vertex_start))[:, None]
-        sides = boxes(footprints.vertices + radius, start)[1] - boxes(footprints.vertices - radius, start)[0]
-    else:
-        low, high = boxes(footprints.vertices, start)
-        sides = high - low
+    radius = np.repeat(footprints.radius, np.diff(footprints.vertex_start))[:, None]
+    sides = boxes(footprints.vertices + radius, start)[1] - boxes(footprints.vertices - radius, start)[0]
     return np.asarray(np.maximum(sides[:, 0], sides[:, 1]))
 
 

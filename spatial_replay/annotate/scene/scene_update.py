@@ -9,6 +9,7 @@ from bisect import bisect_left
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from operator import itemgetter
 from types import MappingProxyType
 from typing import Final, Literal, NamedTuple
 
@@ -36,7 +37,6 @@ from spatial_replay.annotate.scene.scene_template import (
     CauseText,
     Dashes,
     DrawnObject,
-    EncodedRegions,
     Region,
     SceneLayout,
     SceneTemplate,
@@ -72,12 +72,7 @@ class SceneNumbers:
     """The numbers of S messages that show R objects in all."""
 
     def __init__(
-        self,
-        times_ns: Integers,
-        regions: Floats,
-        objects: Floats,
-        content: SceneContent,
-        scale: float,
+        self, times_ns: Integers, regions: Floats, objects: Floats, content: SceneContent, scale: float
     ) -> None:
         """Take over what the messages show.
 
@@ -191,7 +186,6 @@ class SceneMessages(NamedTuple):
     frames: SceneFrames | None
 
 
-@dataclass(frozen=True, eq=False)
 class SceneEncoder:
     """Draws traces over the regions of a specification.
 
@@ -202,21 +196,19 @@ class SceneEncoder:
     first (see `violations`).
 
     Attributes:
-        regions: by name.
         unit: that of lengths, "" where nothing declares it.
         named: the objects that specifications name.
     """
 
-    regions: Mapping[str, Outline]
-    unit: str = ""
-    named: frozenset[str] = frozenset()
-    _drawn: tuple[Region, ...] = field(init=False, repr=False)
-    _encoded: EncodedRegions = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        drawn = tuple(_region(name, self.regions[name]) for name in sorted(self.regions))
-        object.__setattr__(self, "_drawn", drawn)
-        object.__setattr__(self, "_encoded", encode_regions(drawn))
+    def __init__(
+        self, regions: Mapping[str, Outline], unit: str = "", named: frozenset[str] = frozenset()
+    ) -> None:
+        self.unit, self.named = unit, named
+        self._drawn = tuple(
+            Region(name, outline, tuple(outlines_of(footprint_from_outline(outline))))
+            for name, outline in sorted(regions.items(), key=itemgetter(0))
+        )
+        self._encoded = encode_regions(self._drawn)
 
     def encode(
         self, trace: Trace, results: Sequence[EvaluatedResult] = (), state: SceneState | None = None
@@ -318,15 +310,16 @@ class SceneEncoder:
         if not is_shown.any():
             return state, scales, len(rows)
         first = int(is_shown.argmax())
-        scale = state.scale or _scale_of(trace, rows[first])
+        shown = trace.footprints.select(rows[first][rows[first] >= 0])
+        # the median size of the objects
+        scale = state.scale or float(np.median(extents(shown))) or _UNSCALED
         scales[first:] = scale
-        place, line = self._place(trace, rows[first])
+        place, line = self._place(shown)
         return replace(state, scale=scale, place=place, line=line), scales, first
 
-    def _place(self, trace: Trace, rows: Integers) -> tuple[tuple[float, float], float]:
+    def _place(self, shown: FootprintBatch) -> tuple[tuple[float, float], float]:
         """Return the place above the objects of one sample and the regions, and a line's height."""
-        shown = trace.footprints.select(rows[rows >= 0]).vertices
-        points = np.concatenate([shown, *(ring for region in self._drawn for ring in region.rings)])
+        points = np.concatenate([shown.vertices, *(ring for region in self._drawn for ring in region.rings)])
         points = points[np.isfinite(points).all(axis=1)]
         if not len(points):
             return _NOWHERE, 0.0
@@ -374,10 +367,6 @@ def _shades_of(
     return of_objects, of_regions
 
 
-def _region(name: str, outline: Outline) -> Region:
-    return Region(name, outline, tuple(outlines_of(footprint_from_outline(outline))))
-
-
 def spaced(times_ns: Integers, written_ns: int | None) -> Integers:
     """Return the indices of the samples to write: each at least `PERIOD_NS` after the one before.
 
@@ -395,11 +384,6 @@ def spaced(times_ns: Integers, written_ns: int | None) -> Integers:
         chosen.append(at)
         at = bisect_left(times_ns, int(times_ns[at]) + PERIOD_NS, at + 1)
     return np.array(chosen, np.int64)
-
-
-def _scale_of(trace: Trace, rows: Integers) -> float:
-    """Return the median size of the objects in one sample, whose rows are given."""
-    return float(np.median(extents(trace.footprints.select(rows[rows >= 0])))) or _UNSCALED
 
 
 def _rows_of(names: Sequence[str], trace: Trace, rows: Integers) -> Integers:

@@ -27,7 +27,7 @@ from spatial_replay.spec.formula import (
     expand,
     operands_of,
 )
-from spatial_replay.spec.walks import looks_ahead
+from spatial_replay.spec.walks import leaf_key, looks_ahead
 
 Row = tuple[int, ...]
 """A row of a table, its columns as `codes` lists them."""
@@ -129,11 +129,7 @@ class SignalTable:
         return self._rows.setdefault((code, a, b, unit, low, high), len(self._rows))
 
     def _leaf_number(self, formula: Atom | Quantified) -> int:
-        key: tuple[object, ...]
-        if isinstance(formula, Atom):
-            key = (formula.expression,)
-        else:
-            key = (formula.quantifier, formula.variables, formula.group, formula.body)
+        key = leaf_key(formula)
         if key not in self._leaf_numbers:
             self._leaf_numbers[key] = len(self.leaves)
             self.leaves.append(formula)

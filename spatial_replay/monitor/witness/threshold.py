@@ -46,6 +46,7 @@ from spatial_replay.spec.formula import (
 from spatial_replay.spec.walks import (
     iter_expressions,
     iter_formulas,
+    leaf_key,
     map_leaves,
     map_terms,
     operand_signs,
@@ -455,10 +456,10 @@ class _Search:
     def _shifted(self, added: Sequence[Formula], number: float) -> Floats:
         """Return columns of turned atoms, shifted from those of the original ones."""
         indices = {
-            _leaf_key(rewritten(leaf, lambda atom: self._turned_atom(atom, number))): index
+            leaf_key(rewritten(leaf, lambda atom: self._turned_atom(atom, number))): index
             for index, leaf in self._moving.items()
         }
-        found = [indices[_leaf_key(leaf)] for leaf in added]
+        found = [indices[leaf_key(leaf)] for leaf in added]
         shifts = [self._slopes[index] * (number - self._dial.value) for index in found]
         shifted: Floats = self._leaves[:, found] + np.array(shifts).reshape(1, -1, 1)
         return shifted
@@ -488,10 +489,6 @@ def _bare(formula: Formula) -> tuple[Atom, int] | None:
         else:
             return None
     return formula, sign
-
-
-def _leaf_key(leaf: Formula) -> object:
-    return leaf.expression if isinstance(leaf, Atom) else leaf
 
 
 def _radii_in(expression: Expression) -> list[float]:

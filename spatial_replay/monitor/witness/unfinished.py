@@ -32,6 +32,7 @@ from spatial_replay.spec.formula import (
     operands_of,
     operator_of,
 )
+from spatial_replay.spec.walks import leaf_key
 
 _Ends = tuple[Floats, Floats]
 _Samples: TypeAlias = NDArray[np.bool_]
@@ -92,7 +93,7 @@ def evaluate_untested(
 
 def _columns(order: Sequence[Atom | Quantified], leaves: Floats) -> dict[tuple[object, ...], _Ends]:
     low, high = low_and_high(len(leaves), wide=True)
-    return {_key(leaf): (leaves[low, index], leaves[high, index]) for index, leaf in enumerate(order)}
+    return {leaf_key(leaf): (leaves[low, index], leaves[high, index]) for index, leaf in enumerate(order)}
 
 
 def is_cut(formula: Temporal, times_ns: Integers) -> _Samples:
@@ -128,13 +129,6 @@ def is_closed(bound: Bound | None, times_ns: Integers) -> _Samples:
     # integers of any size: a time and a duration may add up to more than 64 bits
     span_ns = int(times_ns[-1]) - bound.upper
     return np.arange(count) < bisect_left(times_ns, span_ns + 1)
-
-
-def _key(leaf: Formula) -> tuple[object, ...]:
-    """Return what equal leaves have in common."""
-    if isinstance(leaf, Quantified):
-        return leaf.quantifier, leaf.variables, leaf.group, leaf.body
-    return (leaf.expression,) if isinstance(leaf, Atom) else (leaf,)
 
 
 class _Evaluator:
@@ -183,7 +177,7 @@ class _Evaluator:
                 return _combined(formula.operator, operands)
             case Temporal():
                 return self._temporal(formula, operands)
-        return self._leaves[_key(formula)]
+        return self._leaves[leaf_key(formula)]
 
     def _temporal(self, formula: Temporal, operands: Sequence[_Ends]) -> _Ends:
         low, high = self._finished(formula, operands)
