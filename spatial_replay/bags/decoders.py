@@ -601,17 +601,15 @@ def decoder_of(topic: Topic, distribution: str | None = None) -> Decoder:
 
 def why_unreadable(topic: Topic, distribution: str | None = None) -> str | None:
     """Return why the messages of a topic cannot be decoded, or None."""
+    start = f"topic {topic.name!r}: "
     try:
-        if topic.encoding not in ("ros1", "cdr"):
+        if topic.encoding in ("ros1", "cdr"):
+            # making a decoder takes longer than checking its definition
+            ros_definitions(topic.type, topic.encoding, topic.schema, distribution)
+        else:
             decoder_of(topic)
-            return None
     except LogError as error:
-        return str(error)
-    try:
-        # making a decoder takes longer than checking its definition
-        ros_definitions(topic.type, topic.encoding, topic.schema, distribution)
-    except LogError as error:
-        return f"topic {topic.name!r}: {error}"
+        return start + str(error).removeprefix(start)
     return None
 
 
@@ -652,8 +650,7 @@ def _message_class(type_name: str, schema: Schema | None) -> type[Message]:
         return GetMessageClass(pool.FindMessageTypeByName(type_name))
     # descriptors that contradict themselves or each other end in TypeError, and names without one in KeyError
     except (DecodeError, TypeError, ValueError, KeyError, UnicodeError, RecursionError) as error:
-        reason = f"{error!s:.200}" or type(error).__name__
-        raise LogError(f"the definition of {type_name!r:.100} cannot be used: {reason}") from None
+        raise LogError(f"the definition of {type_name!r:.100} cannot be used: {_reason(error)}") from None
 
 
 def _with_well_known(described: FileDescriptorSet) -> FileDescriptorSet:

@@ -8,32 +8,25 @@ columns of a chunk at a time rather than one object for each message.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from copy import copy
 from functools import cached_property
 
 import numpy as np
 
 from spatial_replay.bags.decoders import Topic, topic_of, topics_by_name
 from spatial_replay.bags.reader import Columns, MessageColumns, MessageReader, in_order, places_in
+from spatial_replay.geometry.arrays import select
 from spatial_replay.logs.mcap.index import (
     ChunkPlace,
-    DamageError,
     Directory,
     iter_attachments,
     iter_metadata,
     read_directory,
 )
-from spatial_replay.logs.mcap.read import (
-    ChunkWalk,
-    directory_remarks,
-    iter_records,
-    most_waiting,
-    split_records,
-)
-from spatial_replay.logs.messages import Attachment, Channel
+from spatial_replay.logs.mcap.read import ChunkWalk, directory_remarks, most_waiting
+from spatial_replay.logs.messages import Attachment, Channel, Messages
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.logs.remote import LogFile, open_file
-from spatial_replay.text import Instant, Sentence
-from spatial_replay.trace.sample import LATEST_NS
 
 
 class McapLog(MessageReader):
@@ -48,15 +41,18 @@ class McapLog(MessageReader):
         self._is_remarked = False
 
     @cached_property
-    def _contents(self) -> tuple[Directory, dict[int, Channel]]:
+    def _walk(self) -> ChunkWalk:
         with open_file(self._file) as stream:
             directory = read_directory(stream, self._faults, self.name)
-            return directory, ChunkWalk(stream, directory, FaultList(), self.name).channels
+            return ChunkWalk(stream, directory, self._faults, self.name)
+
+    @property
+    def _directory(self) -> Directory:
+        return self._walk.directory
 
     @cached_property
     def _topics(self) -> tuple[Topic, ...]:
-        directory, channels = self._contents
-        statistics = directory.statistics
+        statistics = self._directory.statistics
         counts = statistics.channel_message_counts if statistics else None
         if statistics and not counts and statistics.message_count:
             # the format leaves counts of channels out at will
@@ -68,24 +64,24 @@ class McapLog(MessageReader):
             )
         return topics_by_name(
             topic_of(channel, None if counts is None else counts.get(number, 0))
-            for number, channel in sorted(channels.items())
+            for number, channel in sorted(self._walk.channels.items())
         )
 
     @property
     def profile(self) -> str:
-        header = self._contents[0].header
+        header = self._directory.header
         return header.profile if header else ""
 
     def take_remarks(self) -> tuple[str, ...]:
         is_first, self._is_remarked = not self._is_remarked, True
-        return directory_remarks(self.name, self._contents[0], self.metadata()) if is_first else ()
+        return directory_remarks(self.name, self._directory, self.metadata()) if is_first else ()
 
     @cached_property
     def _topic_of(self) -> Mapping[int, str]:
-        return {number: channel.topic for number, channel in self._contents[1].items()}
+        return {number: channel.topic for number, channel in self._walk.channels.items()}
 
     def _channel(self, number: int) -> Channel:
-        return self._contents[1][number]
+        return self._walk.channels[number]
 
     @property
     def channel_topics(self) -> frozenset[str]:
@@ -95,10 +91,10 @@ class McapLog(MessageReader):
     @property
     def start_ns(self) -> int | None:
         """Log time of the first message."""
-        return min((place.start_ns for place in self._contents[0].chunks), default=None)
+        return min((place.start_ns for place in self._directory.chunks), default=None)
 
     def _read(self, topics: Collection[str], first: int, last: int, *, as_recorded: bool) -> Columns:
-        directory, wanted = self._contents[0], self._wanted(topics)
+        directory, wanted = self._directory, self._wanted(topics)
         places = [
             (rank, place)
             for rank, place in enumerate(directory.chunks)
@@ -110,10 +106,17 @@ class McapLog(MessageReader):
             places.sort(key=lambda ranked: ranked[1].start_ns)
         self._walked, self._walked_all = 0, len(places) == len(directory.chunks)
         with open_file(self._file) as stream:
-            found = iter_records(stream, [place for _, place in places])
+            walk = copy(self._walk)
+            walk.stream = stream
+            statistics = directory.statistics
+            # where the log counts no channels, all messages are compared with its total
+            is_total = statistics is not None and not statistics.channel_message_counts
+            found = walk.iter_messages(
+                [place for _, place in places], lambda topic: is_total or topic in topics
+            )
             contents = (
-                self._messages(rank, place, content, wanted, first, last)
-                for (rank, _), (place, content) in zip(places, found, strict=True)
+                self._columns(rank, place, messages, wanted, first, last)
+                for (rank, _), (place, messages) in zip(places, found, strict=True)
             )
             if as_recorded:
                 yield from contents
@@ -123,7 +126,7 @@ class McapLog(MessageReader):
 
     def _counted(self, columns: Columns, topics: Collection[str], name: str | None = None) -> Columns:
         yield from super()._counted(columns, topics, name)
-        statistics = self._contents[0].statistics
+        statistics = self._directory.statistics
         # without counts of channels, the total is all there is to compare
         if statistics and not statistics.channel_message_counts and self._walked_all:
             total = statistics.message_count
@@ -134,53 +137,31 @@ class McapLog(MessageReader):
 
     def attachments(self) -> tuple[Attachment, ...]:
         with open_file(self._file) as stream:
-            return tuple(iter_attachments(stream, self._contents[0], FaultList(), self.name))
+            return tuple(iter_attachments(stream, self._directory, FaultList(), self.name))
 
     def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
         with open_file(self._file) as stream:
-            return tuple(iter_metadata(stream, self._contents[0], FaultList(), self.name))
+            return tuple(iter_metadata(stream, self._directory, FaultList(), self.name))
 
-    def _messages(
-        self,
-        rank: int,
-        place: ChunkPlace,
-        content: bytes | DamageError,
-        wanted: dict[int, str],
-        first: int,
-        last: int,
+    def _columns(
+        self, rank: int, place: ChunkPlace, messages: Messages, wanted: dict[int, str], first: int, last: int
     ) -> MessageColumns:
-        """Read the messages in a place; what is lost of them goes to the faults."""
-        span = Sentence("messages between ", Instant(place.start_ns, 0), " and ", Instant(place.end_ns, 0))
-        if isinstance(content, DamageError):
-            self._fault(place, Sentence(f"{content}; the ", span, " are lost"))
-            return MessageColumns()
-        split = split_records(content)
-        channel, times = split.heads["channel"], split.heads["log_time"]
-        if split.breaks_off:
-            self._fault(
-                place, Sentence("a record breaks off; of the ", span, f", {len(channel)} could be read")
-            )
-        self._walked += len(channel)
-        beyond = times > LATEST_NS
-        if beyond.any():
-            self._fault(place, Sentence(f"{beyond.sum()} of the ", span, " have a time beyond 2**63 - 1 ns"))
-        if len(unknown := set(np.unique(channel).tolist()) - self._contents[1].keys()):
-            self._fault(
-                place,
-                Sentence("some of the ", span, f" are of a channel {min(unknown)} that is not declared"),
-            )
-        is_chosen = np.isin(channel, list(wanted)) & (times >= first) & (times < last)
+        """Return the wanted messages in a place; those of channels that the index lacks go to the faults."""
+        self._walked += len(messages)
+        unknown = np.setdiff1d(messages.channel, self._numbers)
+        if len(unknown):
+            what = f"at byte {place.offset}: some messages are of a channel {unknown[0]} that is not declared"
+            self._faults.add(f"{self.name}: {what} in the index")
+        times = messages.log_time_ns
+        is_chosen = np.isin(messages.channel, list(wanted)) & (times >= first) & (times < last)
         rows = np.flatnonzero(is_chosen)
-        heads = split.heads[rows]
+        chosen = select(messages, rows)
         return MessageColumns(
-            [wanted[number] for number in heads["channel"].tolist()],
-            heads["log_time"].astype(np.int64),
-            heads["publish_time"].astype(np.int64),
-            heads["sequence"].astype(np.int64),
-            [content[split.payloads[row]] for row in rows.tolist()],
+            [wanted[number] for number in chosen.channel.tolist()],
+            chosen.log_time_ns,
+            chosen.publish_time_ns,
+            chosen.sequence,
+            chosen.payloads,
             places_in(rank, rows),
-            np.searchsorted(self._numbers, heads["channel"].astype(np.int64)),
+            np.searchsorted(self._numbers, chosen.channel),
         )
-
-    def _fault(self, place: ChunkPlace, what: str) -> None:
-        self._faults.add(Sentence(f"{self.name}: at byte {place.offset}: ", what))

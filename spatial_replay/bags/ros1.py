@@ -264,16 +264,6 @@ class _Record:
         return self.data + self.length
 
 
-def read_bag_directory(stream: BinaryIO, faults: FaultList, name: str) -> BagDirectory:
-    """Read the directory of a ROS 1 bag; what is wrong with the file goes to `faults`."""
-    size = stream.seek(0, os.SEEK_END)
-    try:
-        return _from_index(stream, size)
-    except DamageError as damage:
-        faults.add(f"{name}: {damage}; the bag was read without its index")
-        return _Scan(stream, size, faults, name).directory()
-
-
 def read_chunk(stream: BinaryIO, offset: int) -> bytes:
     """Read the content of the chunk at an offset, decompressed.
 
@@ -461,7 +451,12 @@ class Ros1Bag(MessageReader):
     @cached_property
     def _directory(self) -> BagDirectory:
         with self._path.open("rb") as stream:
-            return read_bag_directory(stream, self._faults, self.name)
+            size = stream.seek(0, os.SEEK_END)
+            try:
+                return _from_index(stream, size)
+            except DamageError as damage:
+                self._faults.add(f"{self.name}: {damage}; the bag was read without its index")
+                return _Scan(stream, size, self._faults, self.name).directory()
 
     @cached_property
     def _topics(self) -> tuple[Topic, ...]:

@@ -375,7 +375,10 @@ class SqliteBag(MessageReader):
             f" WHERE topic_id IN ({', '.join('?' * len(wanted))}) AND timestamp BETWEEN ? AND ?"
             f" ORDER BY {'rowid' if as_recorded else 'timestamp, rowid'}"
         )
-        key = _by_id if as_recorded else _by_time
+
+        def key(row: Row | RowHead) -> tuple[int, int]:
+            return (row[0], 0) if as_recorded else (row[2], row[0])
+
         after = (-1, -1)
         with _opened(self._whole) as database:
             try:
@@ -525,14 +528,6 @@ def _batches(cursor: Iterable[Row]) -> Iterator[list[Row]]:
         raise
     if rows:
         yield rows
-
-
-def _by_id(row: Row | RowHead) -> tuple[int, int]:
-    return row[0], 0
-
-
-def _by_time(row: Row | RowHead) -> tuple[int, int]:
-    return row[2], row[0]
 
 
 def _intact_rows(database: sqlite3.Connection) -> tuple[list[RowHead], set[_Span]]:

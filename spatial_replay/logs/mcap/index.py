@@ -169,11 +169,15 @@ def _is_own(header: records.Header | None) -> bool:
 
 def has_summary(stream: BinaryIO) -> bool:
     """Return whether a file ends with a footer that points to a summary; without one, it is scanned."""
-    size = stream.seek(0, os.SEEK_END)
+    tail = _tail(stream, stream.seek(0, os.SEEK_END))
+    return any(tail[RECORD_HEAD.size : RECORD_HEAD.size + 8])
+
+
+def _tail(stream: BinaryIO, size: int) -> bytes:
+    """Return the footer of a file and what follows; nothing without one."""
     stream.seek(max(0, size - _FOOTER_BYTES - len(MAGIC)))
-    tail = stream.read(_FOOTER_BYTES + len(MAGIC))
-    footer = RECORD_HEAD.pack(Opcode.FOOTER, 20)
-    return tail.endswith(MAGIC) and tail.startswith(footer) and any(tail[len(footer) : len(footer) + 8])
+    tail = stream.read()
+    return tail if tail.endswith(MAGIC) and tail.startswith(RECORD_HEAD.pack(Opcode.FOOTER, 20)) else b""
 
 
 class _NoSummaryError(Exception):
@@ -188,20 +192,16 @@ def _from_summary(stream: BinaryIO, size: int) -> Directory:
         DamageError: the end of the file is missing or damaged.
     """
     directory = Directory(header=_header(stream))
-    tail_bytes = _FOOTER_BYTES + len(MAGIC)
-    if size < tail_bytes + len(MAGIC):
-        raise DamageError("the file ends without a footer; its writer was interrupted")
-    stream.seek(size - tail_bytes)
-    tail = stream.read(tail_bytes)
-    if not tail.endswith(MAGIC) or RECORD_HEAD.unpack_from(tail) != (Opcode.FOOTER, 20):
+    tail = _tail(stream, size)
+    if not tail:
         raise DamageError("the file ends without a footer; its writer was interrupted")
     footer = decoded(records.Footer.read, tail[RECORD_HEAD.size :])
     if footer.summary_start == 0:
         raise _NoSummaryError
-    if not len(MAGIC) <= footer.summary_start <= size - tail_bytes:
+    if not len(MAGIC) <= footer.summary_start <= size - len(tail):
         raise DamageError("the footer points outside the file")
     stream.seek(footer.summary_start)
-    section = stream.read(size - tail_bytes - footer.summary_start)
+    section = stream.read(size - len(tail) - footer.summary_start)
     has_checksum = footer.summary_crc or _is_own(directory.header)
     if has_checksum and crc32(section + tail[: _FOOTER_BYTES - 4]) != footer.summary_crc:
         raise DamageError("the summary's checksum does not fit")

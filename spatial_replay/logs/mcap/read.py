@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -93,18 +93,12 @@ def too_many_waiting(name: str, most: int) -> LogError:
     )
 
 
-def read_records(stream: BinaryIO, place: ChunkPlace) -> bytes:
-    """Read the records in a place, decompressed.
+def _content(place: ChunkPlace, record: bytes) -> bytes:
+    """Return the records in what was read of a place, decompressed.
 
     Raises:
         DamageError: the chunk is cut off, does not decompress, or has another checksum than it says.
     """
-    stream.seek(place.offset)
-    return _content(place, stream.read(place.length))
-
-
-def _content(place: ChunkPlace, record: bytes) -> bytes:
-    """Return the records in what was read of a place; see `read_records`."""
     if len(record) < place.length:
         raise DamageError("the chunk breaks off")
     if not place.compressed:
@@ -145,7 +139,7 @@ def _decompressed(compression: bytes, data: memoryview, size: int) -> bytes:
 def iter_records(
     stream: BinaryIO, places: Sequence[ChunkPlace]
 ) -> Iterator[tuple[ChunkPlace, bytes | DamageError]]:
-    """Yield places with their records, or with the damage that `read_records` raises, in this order.
+    """Yield places with their records, decompressed, or with what is wrong with them, in this order.
 
     While the caller processes one, other threads read the next ones, so it must not use the stream.
     """
@@ -290,10 +284,10 @@ class ChunkWalk:
 
     def _find_channels(self) -> None:
         """Declare all channels of a log without a summary: chunks need not come in the order of time."""
-        for place in sorted(self.places, key=lambda each: each.offset):
+        for _, found in iter_records(self.stream, sorted(self.places, key=lambda each: each.offset)):
             # the chunk is read again for its messages, and its damage reported then
-            with suppress(DamageError):
-                self._take_in(split_records(read_records(self.stream, place)).declarations)
+            if not isinstance(found, DamageError):
+                self._take_in(split_records(found).declarations)
 
     def _take_in(self, declarations: Iterable[tuple[int, bytes]]) -> str:
         """Store declarations that are new; return what is wrong with one, or ""."""

@@ -228,7 +228,6 @@ class LogWriter:
         stream: BinaryIO,
         *,
         profile: str = "",
-        library: str = LIBRARY,
         chunk_ns: int = CHUNK_NS,
         clock: Callable[[], float] | None = None,
     ) -> None:
@@ -254,7 +253,7 @@ class LogWriter:
         self._packing_bytes = 0
         self._closed = False
         self._write(MAGIC)
-        self._write_record(records.Header(profile, library))
+        self._write_record(records.Header(profile, LIBRARY))
 
     def __enter__(self) -> Self:
         return self
