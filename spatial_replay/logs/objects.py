@@ -27,7 +27,7 @@ from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.logs.wire import Bytes, LayoutError, WireTemplate, Words, payloads_of, rows_of
 from spatial_replay.text import Instant, Sentence
 from spatial_replay.trace.observations import Observations, trace_from_observations
-from spatial_replay.trace.trace import ABSENT, Trace, require_few
+from spatial_replay.trace.trace import ABSENT, Trace, class_order, require_few
 
 UNKNOWN, ZERO = -2, -1
 """Slots of numbers that a message does not hold, after its last slot: they read as NaN and 0."""
@@ -301,13 +301,12 @@ def _padded(words: Words) -> Floats:
 
 def _observations(groups: Sequence[_Group], times_ns: Integers) -> Observations:
     names = {name: code for code, name in enumerate(dict.fromkeys(n for g in groups for n in g.layout.names))}
-    ordered = sorted({c for g in groups for c in g.layout.classes}, key=lambda c: (c is not None, c or ""))
+    ordered = class_order(name for group in groups for name in group.layout.classes)
     classes = {name: code for code, name in enumerate(ordered)}
 
     def column(field: str) -> Floats:
         picked = [np.take(g.numbers, getattr(g.layout, field), axis=1).reshape(-1) for g in groups]
-        # most blocks have one layout, and need no copy
-        return picked[0] if len(picked) == 1 else np.concatenate([np.empty(0), *picked])
+        return np.concatenate([np.empty(0), *picked])
 
     def repeated(values: Iterable[tuple[_Group, Sequence[int] | Integers]]) -> Integers:
         tiled = (np.tile(np.asarray(v, np.int64), len(g.samples)) for g, v in values)
@@ -322,7 +321,7 @@ def _observations(groups: Sequence[_Group], times_ns: Integers) -> Observations:
         name=repeated((g, [names[n] for n in g.layout.names]) for g in groups),
         names=list(names),
         class_code=repeated((g, [classes[c] for c in g.layout.classes]) for g in groups),
-        classes=tuple(ordered),
+        classes=ordered,
         yaw=column("yaw"),
         uncertainty=column("uncertainty"),
         shapes=FootprintBatch(

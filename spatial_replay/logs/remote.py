@@ -118,11 +118,6 @@ def plan_reads(stream: BinaryIO, ranges: Iterable[Range]) -> None:
         stream.plan(ranges)
 
 
-def is_planned(stream: BinaryIO) -> bool:
-    """Return whether a stream reads announced ranges ahead, and joined: that of a remote file."""
-    return isinstance(stream, RangeStream)
-
-
 def joined_ranges(ranges: Sequence[Range]) -> list[Range]:
     """Return ranges in order, joined over the smallest gaps as long as these add up to little."""
     ordered = sorted(each for each in ranges if each[1] > each[0])

@@ -30,9 +30,6 @@ _NARROW = FieldDescriptor.TYPE_ENUM
 # there is a slot.
 _SENTINELS = ((0x40404040 << 32, 1), (0xBFBFBFBF << 32 | 0xFFFFFFFF, 2))
 
-_TOGETHER = 256
-"""Messages that are compared at once."""
-
 
 class LayoutError(ValueError):
     """A message that cannot serve as a template."""
@@ -108,13 +105,7 @@ class WireTemplate:
 
     def matches(self, rows: Bytes) -> NDArray[np.bool_]:
         """Return (n,) which of n encoded messages (n, L) have this layout."""
-        same = np.ones(len(rows), np.bool_)
-        for begin in range(0, len(rows), _TOGETHER):
-            # so few that all passes over them stay within the processor's cache
-            differing = (rows[begin : begin + _TOGETHER] ^ self.payload) & self.fixed
-            if differing.any():
-                same[begin : begin + _TOGETHER] = ~differing.any(axis=1)
-        return same
+        return np.asarray(~((rows ^ self.payload) & self.fixed).any(axis=1))
 
     def words(self, rows: Bytes) -> Words:
         """Return (n, W) the words of n messages (n, L) of this layout."""

@@ -93,11 +93,10 @@ class _Assembling:
         self._readers = {
             topic.name: TopicReader(
                 topic,
+                plan.mapping,
                 decoder,
                 names,
                 classes,
-                mapping_name=plan.mapping.name,
-                needs_frame=plan.mapping.fixed_frame is not None,
                 decodes_early=self._is_live,
                 report=self._add_fault,
             )
@@ -247,30 +246,19 @@ class _Assembling:
             LogError: time jumps back, and jumps do not split the log.
         """
         moving = [each for each in stamped if each.reader.advances_time]
-        if not moving:
-            return len(arrived)
-        places, times_ns = moving[0].places, moving[0].times_ns
-        if len(moving) > 1:
-            places = np.concatenate([each.places for each in moving])
-            times_ns = np.concatenate([each.times_ns for each in moving])
-            order = np.argsort(places, kind="stable")
-            places, times_ns = places[order], times_ns[order]
-        if not len(times_ns):
-            return len(arrived)
-        if self._begin_ns is None:
+        none = np.empty(0, np.int64)
+        places = np.concatenate([none, *(each.places for each in moving)])
+        order = np.argsort(places, kind="stable")
+        times_ns = np.concatenate([none, *(each.times_ns for each in moving)])[order]
+        if self._begin_ns is None and len(times_ns):
             self._begin_ns = int(times_ns[0])
-        newest_ns = max(self._newest_ns, int(times_ns.max()))
-        if int(times_ns.min()) >= newest_ns - self._plan.late_ns:
-            self._newest_ns = newest_ns
-            return len(arrived)
-        newest = np.maximum.accumulate(np.concatenate([[self._newest_ns], times_ns]))
+        newest = np.maximum.accumulate(np.append(self._newest_ns, times_ns))
         late = np.flatnonzero(times_ns < newest[:-1] - self._plan.late_ns)
-        if not len(late):
-            self._newest_ns = int(newest[-1])
-            return len(arrived)
-        at = int(late[0])
+        at = int(late[0]) if len(late) else -1
         self._newest_ns = int(newest[at])
-        place = int(places[at])
+        if at < 0:
+            return len(arrived)
+        place = int(places[order[at]])
         where = Sentence(
             f"time jumps back by {(int(newest[at]) - int(times_ns[at])) / 1e9:.3f} s, from ",
             Instant(int(newest[at]), self._begin_ns or 0),
@@ -301,7 +289,7 @@ class _Assembling:
             times_ns = np.maximum(stamped.times_ns, self._settled_ns + 1)
             self._latest_ns = max(self._latest_ns, int(times_ns.max(initial=-1)))
             sequences, recorded = arrived.sequence[stamped.places], arrived.place[stamped.places]
-            reader.pending.add(times_ns, sequences, log_times_ns, recorded, stamped.contents)
+            reader.pending.add((times_ns, sequences, log_times_ns, recorded), stamped.contents)
 
     def _settle(self, upto_ns: int) -> Trace:
         """Return the samples up to a time; messages before it that come later count from then on.
@@ -316,7 +304,7 @@ class _Assembling:
         with np.errstate(all="ignore"):
             times_ns = self._sample_times.upto(self._tracker.advance(upto_ns), upto_ns)
             times_ns = times_ns[(times_ns >= start_ns) & (times_ns < end_ns)]
-            self._remarks.note_samples(times_ns)
+            self._remarks.samples.add(times_ns)
             trace = self._tracker.trace(times_ns, max(self._newest_ns, self._latest_ns))
             self._tracker.forget(upto_ns)
         self._settled_ns = upto_ns

@@ -82,7 +82,6 @@ class Namer:
         self._is_wanted: dict[int, bool] = {}
         self._code_by_value: dict[Any, int] = {}
         self._get: Callable[[Any, int | str, Any], Any] | None = None
-        self._is_by_index = False
         self.is_by_place = False
         """Whether nothing but their places in a list distinguished some objects."""
         self._has_ids = False
@@ -118,13 +117,7 @@ class Namer:
             message = messages[0] if messages else None
             self._name(objects[0], indices[0], message)
             self._prepare(objects[0], indices[0], message, style)
-        known = self._code_by_value
-        if self._is_by_index:
-            for index, each in zip(indices, objects, strict=True):
-                if index not in known:
-                    known[index] = self._codes[self._name(each, index, None)]
-            return [known[index] for index in indices]
-        get = self._get
+        known, get = self._code_by_value, self._get
         of_objects = repeat(None, len(objects)) if messages is None else messages
         rows = zip(objects, indices, of_objects, strict=True)
         if get is None:
@@ -154,7 +147,7 @@ class Namer:
         fields = [part for part in self._template.parts if not isinstance(part, str)]
         given = {INDEX, TOPIC}.difference(field_names(example))
         if all(alternatives[0].text in given for alternatives in fields):
-            self._is_by_index = True
+            self._get = lambda _, index, message: index
         elif len(fields) == 1 and len(fields[0]) == 1:
             (path,) = fields[0]
             value = walk(path, message if path.from_message else example, index)

@@ -203,6 +203,8 @@ def _height_intervals(solids: Solids, count: int) -> tuple[Floats, Floats]:
         points = solids.points[solids.point_start[piece] : solids.point_start[piece + 1]]
         heights = points @ solids.rotation[piece, 2] + solids.position[piece, 2]
         lowest[piece], highest[piece] = heights.min(initial=np.inf), heights.max(initial=-np.inf)
+    if len(lowest) == count:
+        return lowest, highest
     bottom, top = np.full(count, np.inf), np.full(count, -np.inf)
     # NaN prevails: one solid without a height leaves the object without
     np.minimum.at(bottom, solids.owner, lowest)

@@ -300,20 +300,13 @@ def _contradictions(document: Document) -> list[tuple[Place, str]]:
         for one, other in (*outlines, ("orientation", "yaw")):
             if one in entry and other in entry:
                 faults.append((("topics", topic, other), f"there is {one!r} already; give one of the two"))
-    for place, text in _durations(value):
+    tables = [((), value, "max_age"), ((), value, "max_gap"), (("sample",), value.get("sample"), "every")]
+    tables += [(("topics", topic), entry, "max_age") for topic, entry in topics.items()]
+    for place, table, key in tables:
+        text = table.get(key) if isinstance(table, dict) else None
         if isinstance(text, str) and _NO_TIME.fullmatch(text):
-            faults.append((place, f"{text!r} is not a time; give a duration above 0"))
+            faults.append(((*place, key), f"{text!r} is not a time; give a duration above 0"))
     return faults
-
-
-def _durations(value: Any) -> list[tuple[Place, Any]]:
-    tables: list[tuple[Place, Any, str]] = [
-        ((), value, "max_age"),
-        ((), value, "max_gap"),
-        (("sample",), value.get("sample"), "every"),
-    ]
-    tables += [(("topics", topic), entry, "max_age") for topic, entry in value["topics"].items()]
-    return [((*place, key), table.get(key)) for place, table, key in tables if isinstance(table, dict)]
 
 
 def _topic_mapping(topic: str, entry: Table[str, Any], shapes: Table[str, Any]) -> TopicMapping:

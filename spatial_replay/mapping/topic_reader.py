@@ -588,7 +588,6 @@ class TopicReader:
 
     Args:
         names, classes: codes that all topics share.
-        needs_frame: whether there is a fixed frame, so that frames matter.
         decodes_early: whether messages whose objects have frames are decoded when they arrive.
         report: receives each message that is lost.
     """
@@ -596,15 +595,15 @@ class TopicReader:
     def __init__(
         self,
         planned: PlannedTopic,
+        mapping: LogMapping,
         decoder: Callable[[str], Decoder],
         names: Codes,
         classes: Codes,
         *,
-        mapping_name: str,
-        needs_frame: bool,
-        decodes_early: bool = False,
+        decodes_early: bool,
         report: ReportFault,
     ) -> None:
+        needs_frame = mapping.fixed_frame is not None
         self.planned = planned
         self.name = planned.name
         self.pending = PendingMessages(has_own_clock=planned.clock == "header")
@@ -622,7 +621,7 @@ class TopicReader:
             self.extractor = Extractor(
                 planned.layout, planned.mapping, names, classes, needs_frame=needs_frame
             )
-        self._mapping_name = mapping_name
+        self._mapping_name = mapping.name
         self._report = report
         reads = self.is_mapped or self.decodes_on_arrival
         self._decode: Decoder = decoder(planned.name) if reads else _skip
@@ -905,21 +904,14 @@ class PendingMessages:
         """The time of the first message that waits."""
         return min((int(each[0].min()) for each in self._columns if len(each[0])), default=None)
 
-    def add(
-        self,
-        times_ns: Integers,
-        sequences: Integers,
-        log_times_ns: Integers,
-        recorded: Integers,
-        contents: list[Any],
-    ) -> None:
+    def add(self, columns: tuple[Integers, Integers, Integers, Integers], contents: list[Any]) -> None:
         """Add messages in the order of arrival.
 
         Args:
-            recorded: numbers that increase in the order of recording.
+            columns: times, sequences, log times, and numbers that increase in the order of recording.
             contents: payloads, or decoded messages.
         """
-        self._columns.append((times_ns, sequences, log_times_ns, recorded))
+        self._columns.append(columns)
         self._contents += contents
 
     def take(self, upto_ns: int) -> tuple[Integers, Integers, list[Any]]:

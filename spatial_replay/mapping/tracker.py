@@ -8,7 +8,7 @@ The tracker holds the last state of every object and signal, so that a log can b
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -25,7 +25,7 @@ from spatial_replay.mapping.topic_reader import ReadingPlan, ReportFault, TopicR
 from spatial_replay.mapping.transforms import FrameTree, Transforms
 from spatial_replay.text import Instant, Sentence, counted
 from spatial_replay.trace.observations import Observations, check_observations
-from spatial_replay.trace.trace import ABSENT, Pauses, Trace, renumbered
+from spatial_replay.trace.trace import ABSENT, Pauses, Trace, class_order, renumbered
 from spatial_replay.trace.units import Axes
 
 LEFT = -1
@@ -220,38 +220,9 @@ def rows_from_detections(
         heights = poses.position[:, 2, None] + detections.height
         shapes = replace(shapes, bottom=heights[:, 0], top=heights[:, 1])
     uncertainty = detections.uncertainty if covariance is None else _radius(covariance)
+    uncertainty = uncertainty * axes.scale
     shapes, yaw = axes.convert_shapes(shapes), axes.convert_yaw(poses.yaw)
-    return _checked(detections, shapes, yaw, uncertainty * axes.scale, unknown, concave, report)
-
-
-def _moved(solids: Solids, transforms: Transforms) -> Solids:
-    rotation = transforms.rotation[solids.owner]
-    position = np.einsum("nij,nj->ni", rotation, solids.position) + transforms.translation[solids.owner]
-    return replace(solids, position=position, rotation=rotation @ solids.rotation)
-
-
-def _radius(covariance: Floats) -> Floats:
-    """Return the longest half axes (R,) of the ellipses of covariances (R, 3, 3), detections from above.
-
-    NaN for a negative variance, by which some programs mark an unknown covariance.
-    """
-    a, b, d = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
-    # the larger eigenvalue of [[a, b], [b, d]]
-    largest = (a + d) / 2 + np.hypot((a - d) / 2, b)
-    return np.asarray(np.where((a < 0) | (d < 0), np.nan, np.sqrt(np.maximum(largest, 0.0))))
-
-
-def _checked(
-    detections: Detections,
-    shapes: FootprintBatch,
-    yaw: Floats,
-    uncertainty: Floats,
-    unknown: Booleans,
-    concave: Concave,
-    report: Callable[[int, str], None],
-) -> ObservationRows:
-    """Check the observations, each as a sample of its own, so that an invalid one does not affect others."""
-    count = len(detections.name)
+    # each is checked as a sample of its own, so that an invalid one does not affect others
     each = np.arange(count, dtype=np.int64)
     readable, checked, faults = check_observations(
         Observations(
@@ -274,10 +245,26 @@ def _checked(
     rows = ObservationRows(checked, yaw, uncertainty, detections.class_code, readable)
     if not faults and not unknown.any():
         return rows
-    lost = unknown.copy()
-    lost[list(faults)] = True
+    unknown[list(faults)] = True
     both = concatenated([rows, ObservationRows.blank(detections.class_code)])
-    return replace(select(both, np.where(lost, count + each, each)), is_valid=readable & ~lost)
+    return replace(select(both, np.where(unknown, count + each, each)), is_valid=readable & ~unknown)
+
+
+def _moved(solids: Solids, transforms: Transforms) -> Solids:
+    rotation = transforms.rotation[solids.owner]
+    position = np.einsum("nij,nj->ni", rotation, solids.position) + transforms.translation[solids.owner]
+    return replace(solids, position=position, rotation=rotation @ solids.rotation)
+
+
+def _radius(covariance: Floats) -> Floats:
+    """Return the longest half axes (R,) of the ellipses of covariances (R, 3, 3), detections from above.
+
+    NaN for a negative variance, by which some programs mark an unknown covariance.
+    """
+    a, b, d = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    # the larger eigenvalue of [[a, b], [b, d]]
+    largest = (a + d) / 2 + np.hypot((a - d) / 2, b)
+    return np.asarray(np.where((a < 0) | (d < 0), np.nan, np.sqrt(np.maximum(largest, 0.0))))
 
 
 _OLD_ADVANCES, _OLD_ROWS = 32, 256
@@ -342,15 +329,16 @@ class Tracker:
                 elif columns.signals.size:
                     self._count_replaced(name, times_ns, np.flatnonzero(times_ns[1:] == times_ns[:-1]))
                 for index, values in enumerate(columns.signals.T if len(times_ns) else ()):
-                    self._take_signal((name, index), times_ns, values)
+                    before_ns, before = self._signals.get((name, index), (times_ns[:0], values[:0]))
+                    series = np.concatenate([before_ns, times_ns]), np.concatenate([before, values])
+                    self._signals[name, index] = series
             if reader.is_mapped and not (reader.planned.is_lasting or reader.planned.is_latched):
-                before = self._reported.get(name, times_ns[:0])
-                self._reported[name] = np.concatenate([before[-1:], times_ns])
+                latest_ns = self._reported.get(name, times_ns[:0])[-1:]
+                self._reported[name] = np.concatenate([latest_ns, times_ns])
                 start_ns, end_ns = self.window_ns
-                is_inside = (times_ns >= start_ns) & (times_ns < end_ns)
-                self.remarks.note_messages(
-                    name, times_ns[is_inside], is_sampled=name == self.plan.sampled_topic
-                )
+                if name != self.plan.sampled_topic:
+                    # the pauses of that one are those of samples
+                    self.remarks.messages[name].add(times_ns[(times_ns >= start_ns) & (times_ns < end_ns)])
             if reader.extractor is not None:
                 self.remarks.note_frames(reader.extractor.noted_frames)
             if self.plan.sampled_topic in (None, name):
@@ -383,9 +371,8 @@ class Tracker:
             stored = concatenated([stored, blank])
         # codes follow the log; a trace must not depend on the order of its messages
         by_code = self.classes.by_code
-        ordered = sorted(range(len(by_code)), key=lambda i: (by_code[i] is not None, by_code[i] or ""))
-        rank = np.zeros(len(by_code), np.int64)
-        rank[ordered] = np.arange(len(by_code))
+        classes_of = class_order(by_code)
+        rank = np.array([classes_of.index(name) for name in by_code], np.int64)
         used, numbered = renumbered(numbered)
         stored = select(stored, used)
         return Trace(
@@ -396,7 +383,7 @@ class Tracker:
             yaw=stored.yaw,
             uncertainty=stored.uncertainty,
             class_code=rank[stored.class_code] if len(rank) else stored.class_code,
-            classes=tuple(by_code[i] for i in ordered),
+            classes=classes_of,
             signals=self._signal_columns(times_ns, newest_ns),
         )
 
@@ -447,7 +434,9 @@ class Tracker:
         self._count_replaced(reader.name, times_ns, _replaced(detections, times_ns, is_complete=is_complete))
 
         def report(index: int, what: str) -> None:
-            self._report_object(reader.name, log_times_ns[detections.message[index]], detections, index, what)
+            name = self.names.by_code[int(detections.name[index])]
+            log_ns = int(log_times_ns[detections.message[index]])
+            self.report(reader.name, log_ns, f"object {name!r}{what}")
 
         transforms = self._transforms(reader, detections, times_ns, log_times_ns)
         rows = rows_from_detections(detections, transforms, self.plan.mapping.axes, self.concave, report)
@@ -491,12 +480,6 @@ class Tracker:
         # faults were reported when it arrived
         rows = rows_from_detections(repeated, moved, mapping.axes, self.concave, lambda index, what: None)
         return self._add(rows)[np.searchsorted(changed, np.arange(len(times_ns)), "right") - 1]
-
-    def _report_object(
-        self, topic: str, log_time_ns: int, detections: Detections, index: int, what: str
-    ) -> None:
-        name = self.names.by_code[int(detections.name[index])]
-        self.report(topic, int(log_time_ns), f"object {name!r}{what}")
 
     def _count_missing(self, topic: str, frame: str, times_ns: Integers) -> None:
         if len(times_ns):
@@ -562,7 +545,10 @@ class Tracker:
                 )
                 result.put(chosen, between)
                 missing = clock_ns[chosen[~between.known]]
-                self._count_missing(reader.name, frame, missing[self._is_relevant(reader, missing)])
+                # those that may be valid in the window
+                start_ns, end_ns = self.window_ns
+                is_near = (missing < end_ns) & (missing >= start_ns - reader.planned.max_age_ns)
+                self._count_missing(reader.name, frame, missing[is_near])
         return result
 
     def _follows(self, reader: TopicReader, detections: Detections) -> Integers:
@@ -572,15 +558,6 @@ class Tracker:
         if reader.planned.is_static:
             return np.arange(len(detections.name))
         return np.flatnonzero(False if detections.is_locked is None else detections.is_locked)
-
-    def _is_relevant(self, reader: TopicReader, times_ns: Integers) -> Booleans:
-        """Return whether observations at some times may be valid in the window."""
-        start_ns, end_ns = self.window_ns
-        return (times_ns < end_ns) & (times_ns >= start_ns - reader.planned.max_age_ns)
-
-    def _take_signal(self, key: tuple[str, int], times_ns: Integers, values: Floats) -> None:
-        before = self._signals.get(key, (np.empty(0, np.int64), np.empty(0)))
-        self._signals[key] = np.concatenate([before[0], times_ns]), np.concatenate([before[1], values])
 
     def _in_gap(self, topic: str, times_ns: Integers, newest_ns: int) -> Booleans:
         """Return at which times a topic pauses for longer than `max_gap`."""
@@ -648,6 +625,7 @@ class Remarks:
             longer than `max_gap`, and name.
         replaced: messages that have the time of a later one, by topic.
         skipped: objects without solids, by topic.
+        samples, messages: the intervals between samples, and between messages by topic.
     """
 
     def __init__(self, name: str, mapping: LogMapping) -> None:
@@ -657,16 +635,8 @@ class Remarks:
         self.missing, self.stale, self.replaced = _Counts(), _Counts(), _Counts()
         self.skipped: Counter[str] = Counter()
         self._frames: set[str] = set()
-        self._samples = Pauses()
-        self._messages: dict[str, Pauses] = {}
-
-    def note_samples(self, times_ns: Integers) -> None:
-        self._samples.add(times_ns)
-
-    def note_messages(self, topic: str, times_ns: Integers, *, is_sampled: bool) -> None:
-        """Note when messages of a topic came; the pauses of the one that is sampled are those of samples."""
-        if not is_sampled:
-            self._messages.setdefault(topic, Pauses()).add(times_ns)
+        self.samples = Pauses()
+        self.messages: dict[str, Pauses] = defaultdict(Pauses)
 
     def count_stale(
         self, topic: str, name: str, times_ns: Integers, stale: Booleans, in_gap: Booleans
@@ -679,8 +649,8 @@ class Remarks:
 
     def add_pauses(self) -> None:
         """Remark pauses of topics, but for those in which there are no samples either."""
-        pauses = self._samples.found()
-        for topic, messages in sorted(self._messages.items()):
+        pauses = self.samples.found()
+        for topic, messages in sorted(self.messages.items()):
             own = messages.found()
             is_common = all(
                 any(at < start + length and start < at + long for at, long in pauses) for start, length in own

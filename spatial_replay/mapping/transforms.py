@@ -360,12 +360,10 @@ class FrameTree:
         if target == source or not count:
             return Transforms.identity(count)
         ask = _Question(np.arange(count), times_ns, log_ns, by_stamp, min(longest_ns, HISTORY_NS), holds)
-        parts = [part for run in self._by_run(ask) for part in self._by_parents(run)]
-        if len(parts) == 1:
-            return self._in_one_tree(target, source, parts[0])
         result = Transforms.unknown(count)
-        for part in parts:
-            result.put(part.places, self._in_one_tree(target, source, part))
+        for run in self._by_run(ask):
+            for part in self._by_parents(run):
+                result.put(part.places, self._in_one_tree(target, source, part))
         return result
 
     def _by_run(self, ask: _Question) -> list[_Question]:

@@ -44,7 +44,7 @@ from spatial_replay.logs.source import IterTraces, Source, TrackSource, axes_of,
 from spatial_replay.logs.topics import MAGIC
 from spatial_replay.text import counted_from, printable
 from spatial_replay.trace.trace import Trace
-from spatial_replay.trace.units import Axes
+from spatial_replay.trace.units import OUR_AXES, Axes
 
 _BAG_FILE = re.compile(r"^metadata\.yaml$|\.(db3|mcap)(\.zstd)?$")
 
@@ -267,15 +267,11 @@ class Format(NamedTuple):
     options: frozenset[str] = frozenset()
 
 
-def _tracks(iter_traces: IterTraces) -> Callable[[LogFile, str, ReadOptions], Source]:
-    return lambda path, kind, options: _track_source(path, kind, options, iter_traces, y_down=False)
-
-
 def _track_source(
-    path: LogFile, kind: str, options: ReadOptions, iter_traces: IterTraces, *, y_down: bool, unit: str = ""
+    path: LogFile, kind: str, options: ReadOptions, iter_traces: IterTraces, usual: Axes = OUR_AXES
 ) -> Source:
-    """Return the source of a file; `y_down` and `unit` say what is usual in its format."""
-    axes = Axes("down" if (y_down if options.y_down is None else options.y_down) else "up", unit=unit)
+    """Return the source of a file, with the axes that are usual in its format unless options say others."""
+    axes = usual if options.y_down is None else replace(usual, y="down" if options.y_down else "up")
     return TrackSource(
         Path(path), kind, options.concave, iter_traces, MappingProxyType(options.given()), axes
     )
@@ -284,13 +280,13 @@ def _track_source(
 def _open_annotations(path: LogFile, kind: str, options: ReadOptions) -> Source:
     rate = FRAMES_A_SECOND if options.rate is None else options.rate
     reader = partial(iter_annotations, rate=rate, lost=options.lost)
-    return _track_source(path, kind, options, reader, y_down=True)
+    return _track_source(path, kind, options, reader, Axes("down"))
 
 
 def _open_scenario(path: LogFile, kind: str, options: ReadOptions) -> Source:
     from spatial_replay.logs.formats.commonroad import iter_scenario
 
-    return _track_source(path, kind, options, iter_scenario, y_down=False, unit="m")
+    return _track_source(path, kind, options, iter_scenario, Axes(unit="m"))
 
 
 def _open_messages(path: LogFile, kind: str, options: ReadOptions) -> Source:
@@ -336,15 +332,14 @@ def _open_mcap(path: LogFile, kind: str, options: ReadOptions) -> Source:
 
 
 _MESSAGES = frozenset({"mapping", "on_time_jump", "max_lateness", "max_gap"})
+_TRACKS = frozenset({"y_down", "max_gap"})
 
 FORMATS: dict[str, Format] = {
     "MCAP": Format(lambda head: head.startswith(MAGIC), _open_mcap, _MESSAGES),
     "ROS 1 bag": Format(lambda head: head.startswith(b"#ROSBAG V2.0\n"), _open_messages, _MESSAGES),
     "ROS 2 bag": Format(lambda head: head.startswith(b"SQLite format 3\x00"), _open_messages, _MESSAGES),
-    "track JSONL": Format(_is_jsonl, _tracks(iter_jsonl), frozenset({"y_down", "max_gap"})),
-    "track CSV": Format(_is_csv, _tracks(iter_csv), frozenset({"y_down", "max_gap"})),
-    "drone annotations": Format(
-        is_annotations, _open_annotations, frozenset({"rate", "lost", "y_down", "max_gap"})
-    ),
+    "track JSONL": Format(_is_jsonl, partial(_track_source, iter_traces=iter_jsonl), _TRACKS),
+    "track CSV": Format(_is_csv, partial(_track_source, iter_traces=iter_csv), _TRACKS),
+    "drone annotations": Format(is_annotations, _open_annotations, _TRACKS | {"rate", "lost"}),
     "CommonRoad scenario": Format(_is_scenario, _open_scenario, frozenset({"max_gap"})),
 }

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from bisect import bisect_left
-from collections import OrderedDict
 from collections.abc import Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
@@ -37,27 +36,24 @@ class MeasurementCache:
     """
 
     def __init__(self) -> None:
-        self._arrays: OrderedDict[Hashable, Floats] = OrderedDict()
-        self._bytes = 0
+        self._arrays: dict[Hashable, Floats] = {}
         self._lock = Lock()
 
     def get(self, key: Hashable) -> Floats | None:
         """Return the array stored under a key, or None."""
         with self._lock:
-            array = self._arrays.get(key)
+            array = self._arrays.pop(key, None)
             if array is not None:
-                self._arrays.move_to_end(key)
+                self._arrays[key] = array
             return array
 
     def put(self, key: Hashable, array: Floats) -> None:
         """Store an array, which must not be written to afterwards."""
         with self._lock:
-            replaced = self._arrays.pop(key, None)
-            self._bytes += array.nbytes - (0 if replaced is None else replaced.nbytes)
+            self._arrays.pop(key, None)
             self._arrays[key] = array
-            while self._bytes > _BYTES and len(self._arrays) > 1:
-                _, dropped = self._arrays.popitem(last=False)
-                self._bytes -= dropped.nbytes
+            while len(self._arrays) > 1 and sum(each.nbytes for each in self._arrays.values()) > _BYTES:
+                del self._arrays[next(iter(self._arrays))]
 
 
 _DURATION = re.compile(
@@ -289,7 +285,7 @@ class Trace(Displayed):
         for row, (index, name, _) in enumerate(blank, len(observed)):
             rows[index, number[name]] = -2 - row
         named = [*(tracked.class_name for tracked in observed), *(class_name for *_, class_name in blank)]
-        classes = _class_order(named)
+        classes = class_order(named)
         columns = {name: [sample.signals.get(name, np.nan) for sample in listed] for name in signals}
         known = FootprintBatch.from_footprints(
             [each.footprint for each in observed], [each.height for each in observed]
@@ -372,7 +368,7 @@ class Trace(Displayed):
             signals={name: values for name, values in self.signals.items() if not np.isnan(values).all()},
         ).take(np.arange(len(self), dtype=np.int64))
         codes, inverse = np.unique(whole.class_code, return_inverse=True)
-        classes = _class_order(self.classes[code] for code in codes.tolist())
+        classes = class_order(self.classes[code] for code in codes.tolist())
         order = np.array([classes.index(self.classes[code]) for code in codes.tolist()], np.int64)
         return replace(whole, class_code=order[inverse] if len(codes) else whole.class_code, classes=classes)
 
@@ -385,7 +381,7 @@ class Trace(Displayed):
         """
         names = tuple(sorted({name for trace in traces for name in trace.names}))
         number = {name: index for index, name in enumerate(names)}
-        classes = _class_order(name for trace in traces for name in trace.classes)
+        classes = class_order(name for trace in traces for name in trace.classes)
         code = {name: index for index, name in enumerate(classes)}
         signals = sorted({name for trace in traces for name in trace.signals})
         rows = np.full((sum(map(len, traces)), len(names)), ABSENT, np.int64)
@@ -503,7 +499,8 @@ def renumbered(rows: Integers) -> tuple[Integers, Integers]:
     return used, result
 
 
-def _class_order(classes: Iterable[str | None]) -> tuple[str | None, ...]:
+def class_order(classes: Iterable[str | None]) -> tuple[str | None, ...]:
+    """Return class names in the order of a trace: None first."""
     return tuple(sorted(set(classes), key=lambda name: (name is not None, name or "")))
 
 

@@ -63,10 +63,9 @@ class Axes:
     def metadata(self) -> dict[str, str]:
         """Return the entries for the metadata of a log; none where the source has our axes and no units."""
         unit = {"unit": self.unit} if self.unit else {}
-        axes = {AXES_KEY: json.dumps({"scale": self.scale, **unit, "y": self.y})} if self != OUR_AXES else {}
-        return axes | (
-            {SIGNAL_UNITS_KEY: json.dumps(dict(sorted(self.signals.items())))} if self.signals else {}
-        )
+        axes = {"scale": self.scale, **unit, "y": self.y} if self != OUR_AXES else {}
+        about = {AXES_KEY: axes, SIGNAL_UNITS_KEY: dict(sorted(self.signals.items()))}
+        return {key: json.dumps(value) for key, value in about.items() if value}
 
     @property
     def units(self) -> dict[str, str]:
@@ -90,8 +89,6 @@ class Axes:
             vertices = vertices[mirror]
             # 0 - y rather than -y: zero stays zero
             vertices = np.column_stack([vertices[:, 0], 0.0 - vertices[:, 1]])
-        if self.scale == 1.0:
-            return replace(shapes, vertices=vertices)
         return replace(
             shapes,
             vertices=vertices * self.scale,

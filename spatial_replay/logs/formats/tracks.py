@@ -28,7 +28,7 @@ from spatial_replay.logs.read_options import FaultList, Lost, frame_times
 from spatial_replay.text import Instant, Sentence, is_encodable, text_number, times_apart
 from spatial_replay.trace.observations import Observations, trace_from_observations
 from spatial_replay.trace.sample import LATEST_NS
-from spatial_replay.trace.trace import Trace, require_few
+from spatial_replay.trace.trace import Trace, class_order, require_few
 
 GZIP_MAGIC = b"\x1f\x8b"
 LONGEST_LINE = 16 * 2**20
@@ -113,8 +113,8 @@ class ReportedSample(NamedTuple):
 def _reported(samples: Sequence[ReportedSample]) -> Observations:
     reports = [report for sample in samples for report in sample.reports]
     names = {name: index for index, name in enumerate(dict.fromkeys(r.name for r in reports))}
-    ordered = sorted({r.class_name for r in reports}, key=lambda c: (c is not None, c or ""))
-    classes = {name: index for index, name in enumerate(ordered)}
+    classes = class_order(r.class_name for r in reports)
+    code = {name: index for index, name in enumerate(classes)}
     signals = sorted({name for sample in samples for name in sample.signals})
     require_few(names, signals)
     return Observations(
@@ -122,8 +122,8 @@ def _reported(samples: Sequence[ReportedSample]) -> Observations:
         sample=np.repeat(np.arange(len(samples)), [len(sample.reports) for sample in samples]),
         name=np.array([names[r.name] for r in reports], np.int64),
         names=list(names),
-        class_code=np.array([classes[r.class_name] for r in reports], np.int64),
-        classes=tuple(ordered),
+        class_code=np.array([code[r.class_name] for r in reports], np.int64),
+        classes=classes,
         yaw=np.array([r.yaw for r in reports], np.float64),
         uncertainty=np.array([r.uncertainty for r in reports], np.float64),
         shapes=_shapes(reports),
@@ -483,14 +483,19 @@ def iter_annotations(
     frames, starts = np.unique(boxes["frame"], return_index=True)
     sound = ~np.isin(frames, np.fromiter(broken, np.int64))
     frames, starts, ends = frames[sound], starts[sound], np.append(starts[1:], len(boxes))[sound]
-    classes = tuple(label or None for label in labels)
+    classes, period = tuple(label or None for label in labels), frame_times(rate)
     after = 0
     while after < len(frames):
         first = after
         filled = int(np.searchsorted(ends, starts[first] + _BLOCK_BOXES, side="right"))
         after = min(first + BLOCK_SAMPLES, max(filled, first + 1))
-        block = slice(first, after)
-        observations = _observations(boxes, classes, frames[block], starts[block], ends[block], rate, lost)
+        counts = ends[first:after] - starts[first:after]
+        rows = boxes[flat_index(starts[first:after], counts)]
+        sample = np.repeat(np.arange(after - first, dtype=np.int64), counts)
+        if lost == "drop":
+            rows, sample = rows[~rows["lost"]], sample[~rows["lost"]]
+        times_ns = np.array([round(frame * period) for frame in frames[first:after].tolist()], np.int64)
+        observations = _observations(times_ns, sample, rows, classes)
         trace, left_out = trace_from_observations(observations, concave=concave)
         for index, what in sorted(left_out.items()):
             faults.add(f"{path.name}: frame {frames[first + index]}: {what}")
@@ -555,25 +560,13 @@ def _last_frame(rate: float) -> int:
 
 
 def _observations(
-    boxes: _Boxes,
-    classes: tuple[str | None, ...],
-    frames: Integers,
-    starts: Integers,
-    ends: Integers,
-    rate: float,
-    lost: Lost,
+    times_ns: Integers, sample: Integers, boxes: _Boxes, classes: tuple[str | None, ...]
 ) -> Observations:
-    """Return the boxes of some frames, those from `starts` up to `ends`."""
-    counts = ends - starts
-    sample = np.repeat(np.arange(len(frames), dtype=np.int64), counts)
-    boxes = boxes[flat_index(starts, counts)]
-    if lost == "drop":
-        sample, boxes = sample[~boxes["lost"]], boxes[~boxes["lost"]]
+    """Return boxes, each in a sample, as observations."""
     numbers, name = np.unique(boxes["id"], return_inverse=True)
     count, corners = len(boxes), boxes["corners"]
-    period = frame_times(rate)
     return Observations(
-        times_ns=np.array([round(frame * period) for frame in frames.tolist()], np.int64),
+        times_ns=times_ns,
         sample=sample,
         name=name,
         names=[str(number) for number in numbers.tolist()],
