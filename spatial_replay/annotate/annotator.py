@@ -211,7 +211,9 @@ class Annotator:
             )
             messages.append(self._messages(_SPECIFICATION, trace.times_ns[:1], [specification]))
         messages.append(self._robustness(blocks))
-        messages.append(self._automaton_states(blocks))
+        running = [(run, block) for run, block in zip(self._runs, blocks, strict=True) if run is not None]
+        states = [run.encode(block) for run, block in running]
+        messages.append(self._in_order(_AUTOMATON, [block for _, block in running], states))
         changes = self._changes(trace, blocks)
         if self._trees:
             standing = self.standing.encode(trace.times_ns, blocks, self._over)
@@ -322,12 +324,6 @@ class Annotator:
             seconds = round((event.time_ns - first_ns) / 1e9, 3)
             self._newest.appendleft(RecentEvent(at=seconds, event=event.log.message))
         return RecentEvents(events=self._newest).SerializeToString(deterministic=True)
-
-    def _automaton_states(self, blocks: Sequence[SeriesBlock]) -> Messages:
-        """Return one message per sample and result that has an automaton."""
-        running = [(run, block) for run, block in zip(self._runs, blocks, strict=True) if run is not None]
-        encoded = [run.encode(block) for run, block in running]
-        return self._in_order(_AUTOMATON, [block for _, block in running], encoded)
 
     def _scene_messages(
         self, trace: Trace, blocks: Sequence[SeriesBlock], *, is_final: bool = False

@@ -28,7 +28,7 @@ from spatial_replay.annotate.specification import logged_specifications
 from spatial_replay.errors import SpecificationError, UsageError
 from spatial_replay.geometry.arrays import Integers, select
 from spatial_replay.logs.messages import Attachment, Block, Channel, Messages, join, merge
-from spatial_replay.logs.source import MemorySource, Source, axes_of, read_blocks
+from spatial_replay.logs.source import MemorySource, Source, axes_of, read_ahead, read_blocks
 from spatial_replay.logs.topics import RECENT_EVENTS
 from spatial_replay.monitor.result import SpecResult, worst_first
 from spatial_replay.monitor.stream import SeriesBlock
@@ -266,7 +266,7 @@ class LoadedLog:
         self.own = OwnMessages(selection)
         traces: list[Trace] = []
         remarks: list[str] = []
-        for block, trace in selection.iter_blocks():
+        for block, trace in read_ahead(selection.read_blocks()):
             traces.append(trace)
             remarks += block.remarks
             self.own.add(block)

@@ -241,10 +241,6 @@ class Selection:
     def window(self) -> Window:
         return self.options.window
 
-    def iter_blocks(self) -> Iterator[tuple[Block, Trace]]:
-        """Read what `read_blocks` does, each block while the previous one is processed."""
-        return read_ahead(self.read_blocks())
-
     def read_blocks(self, *, messages: bool = True) -> Generator[tuple[Block, Trace], None, None]:
         """Read each block, with its samples in the window, and before it if a specification looks back.
 
@@ -265,12 +261,12 @@ class Selection:
             yield block, trace
 
     def iter_traces(self) -> Iterator[Trace]:
-        """Read the samples of `iter_blocks`."""
+        """Read the samples of `read_blocks`."""
         for _, trace in read_ahead(self.read_blocks(messages=False)):
             yield trace
 
     def trace(self, advance: Callable[[int], None] = lambda samples: None) -> Trace:
-        """Read the samples of `iter_blocks` as one trace.
+        """Read the samples of `read_blocks` as one trace.
 
         Args:
             advance: called with the number of samples of each block.
