@@ -87,11 +87,6 @@ def starts_from_counts(counts: Sequence[int] | Integers) -> Integers:
     return start
 
 
-def counts_from_starts(start: Integers) -> Integers:
-    """Return the lengths (n,) of rows that begin and end at the given places (n + 1,)."""
-    return np.asarray(start[1:] - start[:-1])
-
-
 def flat_index(first: Integers, counts: Integers) -> Integers:
     """Return the flat indices of the elements of rows starting at `first` (n,) with lengths `counts` (n,)."""
     if len(counts) and (counts == counts[0]).all():

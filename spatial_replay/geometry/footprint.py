@@ -20,7 +20,6 @@ from spatial_replay.errors import GeometryError
 from spatial_replay.geometry.arrays import (
     Floats,
     Integers,
-    counts_from_starts,
     flat_index,
     read_only_floats,
     read_only_integers,
@@ -437,8 +436,8 @@ class FootprintBatch:
         if len(batches) == 1:
             return batches[0]
         none = np.empty(0, np.int64)
-        part_counts = np.concatenate([none, *(counts_from_starts(batch.part_start) for batch in batches)])
-        vertex_counts = np.concatenate([none, *(counts_from_starts(batch.vertex_start) for batch in batches)])
+        part_counts = np.concatenate([none, *(np.diff(batch.part_start) for batch in batches)])
+        vertex_counts = np.concatenate([none, *(np.diff(batch.vertex_start) for batch in batches)])
         return cls.trusted(
             part_start=starts_from_counts(part_counts),
             vertex_start=starts_from_counts(vertex_counts),
@@ -464,17 +463,6 @@ class FootprintBatch:
             radius=self.radius[parts],
             bottom=self.bottom[rows],
             top=self.top[rows],
-        )
-
-    def with_outlines(self, vertex_start: Integers, vertices: Floats) -> FootprintBatch:
-        """Return the same parts with other vertices, of as many parts: new arrays."""
-        return FootprintBatch.trusted(
-            part_start=self.part_start,
-            vertex_start=vertex_start,
-            vertices=vertices,
-            radius=self.radius,
-            bottom=self.bottom,
-            top=self.top,
         )
 
     def footprint(self, row: int) -> Footprint:

@@ -19,7 +19,6 @@ from spatial_replay.geometry.arrays import (
     Booleans,
     Floats,
     Integers,
-    counts_from_starts,
     flat_index,
     select,
     starts_from_counts,
@@ -70,7 +69,7 @@ class Solids:
         """Return the solids of one object, `count` times."""
         own = np.flatnonzero(self.owner == owner)
         pieces = np.tile(own, count)
-        sizes = counts_from_starts(self.point_start)[pieces]
+        sizes = np.diff(self.point_start)[pieces]
         return Solids(
             owner=np.repeat(np.arange(count, dtype=np.int64), len(own)),
             kind=self.kind[pieces],
@@ -98,7 +97,7 @@ def footprints_from_solids(solids: Solids, count: int) -> FootprintBatch:
     rings = [_ring(solids, piece) for piece in hulls.tolist()]
     vertex_counts = _VERTICES[kind]
     vertex_counts[tilted] = 6
-    vertex_counts[polygons] = counts_from_starts(solids.point_start)[polygons]
+    vertex_counts[polygons] = np.diff(solids.point_start)[polygons]
     vertex_counts[hulls] = [len(ring) for ring in rings]
     start = starts_from_counts(vertex_counts)
     vertices = np.empty((int(start[-1]), 2))
@@ -168,7 +167,7 @@ def _hexagons(solids: Solids, pieces: Integers) -> Floats:
 
 
 def _fill_polygons(vertices: Floats, start: Integers, solids: Solids, pieces: Integers) -> None:
-    counts = counts_from_starts(solids.point_start)[pieces]
+    counts = np.diff(solids.point_start)[pieces]
     points = solids.points[flat_index(solids.point_start[:-1][pieces], counts)]
     rotation, position = solids.rotation[pieces, :2, :], solids.position[pieces, :2]
     if (rotation != np.eye(3)[:2]).any() or position.any():

@@ -20,7 +20,7 @@ from spatial_replay.errors import LogError, OutputError, UsageError, importing
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.perception.frame import Frame
 from spatial_replay.perception.opencv import Calibration, Camera, TagDetector, calibrate, tag_cells
-from spatial_replay.perception.tags_file import ReferenceTag
+from spatial_replay.perception.tags_file import MountedTag
 from spatial_replay.text import counted
 
 # ------------------------------------------------------------------------------------------------ calibration
@@ -55,7 +55,7 @@ class Calibrated(NamedTuple):
 
 
 def calibrate_camera(
-    name: str, frames: Iterable[Frame], family: str, references: Sequence[ReferenceTag]
+    name: str, frames: Iterable[Frame], family: str, references: Sequence[MountedTag]
 ) -> Calibrated:
     """Calibrate a camera from frames in which tags are seen from several sides.
 
@@ -203,11 +203,11 @@ class TagSheet:
         """How many tags a page holds."""
         return self._columns * self._rows
 
-    def references(self) -> tuple[ReferenceTag, ...]:
+    def references(self) -> tuple[MountedTag, ...]:
         """Return the tags of the first page at their places, in metres from its lower left corner, y up."""
         _, height = PAPERS[self.paper]
         return tuple(
-            ReferenceTag(number, self.size, x / 1e3, (height - y) / 1e3)
+            MountedTag(number, self.size, x / 1e3, (height - y) / 1e3)
             for number, (x, y) in zip(self.ids[: self.per_page], self._centres(), strict=False)
         )
 

@@ -513,21 +513,6 @@ class Observation:
         """The view of the first camera that has one."""
         return next(view for view in self.views if view is not None)
 
-    @property
-    def frame(self) -> Frame:
-        """The frame of that camera."""
-        return self.first.frame
-
-    @property
-    def detections(self) -> tuple[Detection, ...]:
-        """All its tags, those that no one mapped, too."""
-        return self.first.detections
-
-    @property
-    def plane(self) -> Plane | None:
-        """Its plane; None as long as reference tags are missing."""
-        return self.first.plane
-
 
 class TagObserver:
     """Turns the frames of cameras, which stand still, into samples; a process for one run.

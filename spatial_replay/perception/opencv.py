@@ -7,7 +7,6 @@ converts these.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -43,33 +42,8 @@ def pose_looking_at(eye: Floats, target: Floats, up: Floats) -> Floats:
         )
     forward, right = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
     rotation = np.stack([right, np.cross(forward, right), forward])
-    return np.concatenate([rotation_vector(rotation), -rotation @ eye])
-
-
-def rotation_vector(rotation: Floats) -> Floats:
-    """Return the rotation vector (3,) of a rotation matrix (3, 3)."""
-    # through the quaternion, whose largest component is never small
-    xx, yy, zz = np.diag(rotation)
-    four = np.array([1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz])
-    index = int(four.argmax())
-    part = math.sqrt(max(four[index], 0.0)) / 2
-    antisymmetric = np.array(
-        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
-    )
-    symmetric = rotation + rotation.T
-    if index == 0:
-        w, vector = part, antisymmetric / (4 * part)
-    else:
-        axis = index - 1
-        w = antisymmetric[axis] / (4 * part)
-        vector = symmetric[axis] / (4 * part)
-        vector[axis] = part
-    if w < 0:
-        w, vector = -w, -vector
-    sine = float(np.linalg.norm(vector))
-    angle = 2 * math.atan2(sine, w)
-    turn: Floats = vector * (angle / sine if sine > 1e-12 else 2.0)
-    return turn
+    turn, _ = _load().Rodrigues(rotation)
+    return np.concatenate([np.asarray(turn, np.float64).ravel(), -rotation @ eye])
 
 
 def rotations(vectors: Floats) -> Floats:

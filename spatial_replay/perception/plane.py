@@ -17,7 +17,7 @@ import numpy as np
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.perception.opencv import Camera, fit_homography, fit_pose, projection, rotations
-from spatial_replay.perception.tags_file import ReferenceTag, TagsFile
+from spatial_replay.perception.tags_file import MountedTag, TagsFile
 
 LEAST_CORNER_ERROR: Final = 0.1
 """Standard deviation of a corner in pixels that is assumed at least, however well reference tags fit."""
@@ -292,7 +292,7 @@ def _pixels_per_unit(seen: Floats, known: Floats) -> float:
 
 
 def _refuse_misfit(
-    tags: TagsFile, references: Sequence[ReferenceTag], off: Floats, seen: Floats, known: Floats
+    tags: TagsFile, references: Sequence[MountedTag], off: Floats, seen: Floats, known: Floats
 ) -> None:
     """Check that no tag is off (K,) by more pixels than noise and `error` explain."""
     limit = _WORST_RESIDUAL + 2 * tags.reference_error * _pixels_per_unit(seen, known)

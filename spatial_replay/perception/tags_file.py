@@ -31,13 +31,13 @@ _ANGLE: Final = re.compile(r"([-+]?[0-9]*\.?[0-9]+)\s*deg")
 
 @dataclass(frozen=True, slots=True)
 class MountedTag:
-    """A tag on an object, in the object's own frame.
+    """A tag on an object, in the object's own frame, or one whose place in the plane is known.
 
     Attributes:
         id: its number.
         size: edge of its black square, in footprint units.
         x, y: where its centre is.
-        yaw: radians, counter-clockwise from the object's x axis to the tag's, which points to its right.
+        yaw: radians, counter-clockwise from the frame's x axis to the tag's, which points to its right.
         z: height of the tag above the reference tags, for objects that stay where they stand.
     """
 
@@ -47,6 +47,15 @@ class MountedTag:
     y: float = 0.0
     yaw: float = 0.0
     z: float = 0.0
+
+    @property
+    def corners(self) -> Floats:
+        """(4, 2), in the order of a detection."""
+        half = self.size / 2
+        turn = np.array([[math.cos(self.yaw), math.sin(self.yaw)], [-math.sin(self.yaw), math.cos(self.yaw)]])
+        square = np.array([(-half, -half), (half, -half), (half, half), (-half, half)])
+        corners: Floats = square @ turn + np.array([self.x, self.y])
+        return corners
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,26 +76,6 @@ class TaggedObject:
     height: tuple[float, float] | None = None
     is_lifted: bool = False
     fastest: float = 1.0
-
-
-@dataclass(frozen=True, slots=True)
-class ReferenceTag:
-    """A tag whose place in the plane is known; attributes as of `MountedTag`, in the plane's frame."""
-
-    id: int
-    size: float
-    x: float
-    y: float
-    yaw: float = 0.0
-
-    @property
-    def corners(self) -> Floats:
-        """(4, 2), in the order of a detection."""
-        half = self.size / 2
-        turn = np.array([[math.cos(self.yaw), math.sin(self.yaw)], [-math.sin(self.yaw), math.cos(self.yaw)]])
-        square = np.array([(-half, -half), (half, -half), (half, half), (-half, half)])
-        corners: Floats = square @ turn + np.array([self.x, self.y])
-        return corners
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,7 +103,7 @@ class TagsFile:
     family: str
     objects: tuple[TaggedObject, ...]
     is_image: bool = False
-    references: tuple[ReferenceTag, ...] = ()
+    references: tuple[MountedTag, ...] = ()
     camera: Camera | None = None
     pose: Floats | None = None
     cameras: Mapping[str, tuple[Camera, Floats | None]] = field(default_factory=lambda: MappingProxyType({}))
@@ -234,10 +223,8 @@ def _object(
     tags = []
     for each in mounted:
         tag = each if isinstance(each, dict) else {"id": each}
-        x, y = (_length(number) for number in tag.get("at", (0.0, 0.0)))
-        edge = _length(tag.get("size", 0.0 if size is None else size))
         z = _length(tag.get("z", top)) - level
-        tags.append(MountedTag(tag["id"], edge, x, y, _angle(tag.get("yaw", 0.0)), z))
+        tags.append(_tag(tag["id"], tag, 0.0 if size is None else size, z))
     return TaggedObject(
         name,
         _footprint(entry),
@@ -258,14 +245,15 @@ def _footprint(entry: Mapping[str, Any]) -> Footprint:
     return Footprint.polygon([[_length(each) for each in corner] for corner in entry["polygon"]])
 
 
-def _references(plane: Mapping[str, Any], size: Any) -> list[ReferenceTag]:
-    tags = []
+def _references(plane: Mapping[str, Any], size: Any) -> Iterator[MountedTag]:
     for number, entry in plane.get("tags", {}).items():
         tag = entry if isinstance(entry, dict) else {"at": entry}
-        x, y = (_length(each) for each in tag["at"])
-        edge = _length(tag.get("size", plane.get("size", size)))
-        tags.append(ReferenceTag(int(number), edge, x, y, _angle(tag.get("yaw", 0.0))))
-    return tags
+        yield _tag(int(number), tag, plane.get("size", size))
+
+
+def _tag(number: int, entry: Mapping[str, Any], size: Any, z: float = 0.0) -> MountedTag:
+    x, y = (_length(each) for each in entry.get("at", (0.0, 0.0)))
+    return MountedTag(number, _length(entry.get("size", size)), x, y, _angle(entry.get("yaw", 0.0)), z)
 
 
 def _camera(value: Mapping[str, Any]) -> Camera:

@@ -11,11 +11,12 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from copy import copy
 from itertools import pairwise, product, takewhile
-from typing import Any, Final, NamedTuple, TypeAlias
+from typing import Any, Final, NamedTuple, TypeAlias, TypeVar
 
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.guards import MAX_CUBES, Transition
 from spatial_replay.errors import NoAutomatonError, UsageError
+from spatial_replay.geometry.arrays import Floats
 from spatial_replay.geometry.footprint import TrackedObject, centre_of, moved_object, radius_of
 from spatial_replay.monitor.atoms.live import SampleLeaves
 from spatial_replay.monitor.atoms.measurements import leaf_values
@@ -32,6 +33,8 @@ from spatial_replay.trace.trace import Trace
 
 Pose: TypeAlias = tuple[float, float, float]
 """x, y and turn of an object."""
+
+_Value = TypeVar("_Value", float, Floats)
 
 MOST_ALTERNATIVES: Final = 32
 """The most conjunctions that a formula is written as; further ones are not tried."""
@@ -86,7 +89,7 @@ def values_in(
     return leaves[0][:, 0].tolist(), leaves[min(1, len(leaves) - 1)][:, 0].tolist()
 
 
-def surplus(lower: float, upper: float, demand: Demand) -> float:
+def surplus(lower: _Value, upper: _Value, demand: Demand) -> _Value:
     """Return by how much a demand is met, less its margin; an unknown one is not met."""
     return (lower if demand.wanted else -upper) - demand.least
 

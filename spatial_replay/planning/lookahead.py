@@ -142,9 +142,13 @@ class Arranger:
 
     @cached_property
     def _unmet(self) -> tuple[Demand, ...]:
-        values = values_in(self._sample, [each.formula for each in self._demands], self._regions)
-        columns = zip(self._demands, *values, strict=True)
-        return tuple(each for each, low, high in columns if surplus(low, high, each) < 0.0)
+        met = zip(self._demands, self._surplus_in(self._sample), strict=True)
+        return tuple(each for each, value in met if value < 0.0)
+
+    def _surplus_in(self, sample: Sample) -> list[float]:
+        """Return by how much a sample meets each demand."""
+        values = values_in(sample, [each.formula for each in self._demands], self._regions)
+        return list(map(surplus, *values, self._demands))
 
     def why_hopeless(self) -> str:
         """Return why no arrangement at all meets the demands, if one object's cells show that; else ""."""
@@ -292,10 +296,7 @@ class Arranger:
         formulas = [*(each.formula for each in about), *distances]
         free = replace(workspace, supports=workspace.supports | set(others))
         maps = proposition_maps(formulas, self._regions, self._sample, name, free)
-        met = {
-            each: (low if each.wanted else -high) - each.least
-            for each, low, high in zip(about, maps.lower, maps.upper, strict=False)
-        }
+        met = dict(zip(about, map(surplus, maps.lower, maps.upper, about), strict=True))
         measured = zip(others, maps.lower[len(about) :], strict=True)
         apart = {other: low - workspace.clearance for other, low in measured}
         reached = np.broadcast_to(workspace.within_reach(maps.grid), maps.clearance.shape)
@@ -371,10 +372,7 @@ class Arranger:
             objects = {first: moved_object(one, 0.0, 0.0, turn), second: two}
             sample = Sample(self._sample.time_ns, objects, self._sample.signals)
             maps = proposition_maps(formulas, self._regions, sample, second, workspace)
-            own = [
-                (low if each.wanted else -high) - each.least
-                for each, low, high in zip(demands, maps.lower, maps.upper, strict=True)
-            ]
+            own = list(map(surplus, maps.lower, maps.upper, demands))
             if apart:
                 own.append(maps.clearance - self._settings.workspace.clearance - _STRICTLY)
             met[number, measured] = np.minimum.reduce(own)
@@ -531,9 +529,7 @@ class Arranger:
 
     def meets(self, sample: Sample) -> bool:
         """Return whether a sample meets all demands."""
-        values = values_in(sample, [each.formula for each in self._demands], self._regions)
-        columns = zip(self._demands, *values, strict=True)
-        return all(surplus(low, high, each) >= 0.0 for each, low, high in columns)
+        return all(value >= 0.0 for value in self._surplus_in(sample))
 
 
 def _listed(names: Sequence[str]) -> str:

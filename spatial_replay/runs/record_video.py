@@ -58,31 +58,27 @@ _THICKNESS, _LETTERS = 3.0, 16.0
 Colour = tuple[float, float, float]
 
 
-class AskedColours:
-    """The colours of what specifications ask of each object, from sample to sample."""
+def asked_colours(
+    requirements: Sequence[Sequence[Requirement]], sample: Sample, updates: Sequence[Update]
+) -> Mapping[str, Colour]:
+    """Return the colour of each object: of the worst requirement that it takes part in, grey without one.
 
-    def __init__(self, files: Sequence[Specification]) -> None:
-        """Find the requirements of each result."""
-        self._requirements = [[requirements_of(spec.formula) for spec in file.results] for file in files]
-
-    def of(self, sample: Sample, updates: Sequence[Update]) -> Mapping[str, Colour]:
-        """Return the colour of each object: of the worst requirement that it takes part in, grey without one.
-
-        Args:
-            updates: of each file, after the sample.
-        """
-        worst: dict[str, int] = {}
-        at = np.zeros(1, np.int64)
-        for of_file, update in zip(self._requirements, updates, strict=True):
-            for requirements, spec in zip(of_file, update.specs, strict=True):
-                if spec.numbers is None:
-                    continue
-                series = spec.numbers[:, :, None]
-                for each in requirements:
-                    standing = _RANKS[Standing(int(each.standing(series, at)[0]))]
-                    for name in _members(each, sample):
-                        worst[name] = max(worst.get(name, 0), standing)
-        return {name: _COLOURS[worst.get(name, 0)] for name in sample.objects}
+    Args:
+        requirements: of each result.
+        updates: of all files, after the sample.
+    """
+    worst: dict[str, int] = {}
+    at = np.zeros(1, np.int64)
+    specs = [spec for update in updates for spec in update.specs]
+    for of_spec, spec in zip(requirements, specs, strict=True):
+        if spec.numbers is None:
+            continue
+        series = spec.numbers[:, :, None]
+        for each in of_spec:
+            standing = _RANKS[Standing(int(each.standing(series, at)[0]))]
+            for name in _members(each, sample):
+                worst[name] = max(worst.get(name, 0), standing)
+    return {name: _COLOURS[worst.get(name, 0)] for name in sample.objects}
 
 
 _RANKS: Final = {
@@ -318,7 +314,8 @@ def record_seen(
     # reference tags that do not fit raise here, before the output is touched
     begun = observer.observe(*first)
     monitors = [Monitor(file, units={"": tags.unit}) for file in files]
-    changes, colours = VerdictChanges(files), AskedColours(files)
+    changes = VerdictChanges(files)
+    requirements = [requirements_of(spec.formula) for file in files for spec in file.results]
     options = {
         "tags": tags.name,
         "hold_ns": observer.hold_ns,
@@ -340,7 +337,7 @@ def record_seen(
             samples, last_ns = samples + 1, seen.sample.time_ns
             log.write(seen.sample)
             updates: list[Update] = [monitor.update(seen.sample) for monitor in monitors]
-            coloured = colours.of(seen.sample, updates)
+            coloured = asked_colours(requirements, seen.sample, updates)
             for picture, view, own in zip(pictures, seen.views, of_cameras, strict=True):
                 if view is not None:
                     picture.write(log, view, seen.sample, coloured, own.camera)

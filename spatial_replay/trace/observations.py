@@ -13,7 +13,6 @@ from spatial_replay.geometry.arrays import (
     Floats,
     Integers,
     count_in_rows,
-    counts_from_starts,
     flat_index,
     starts_from_counts,
 )
@@ -159,10 +158,10 @@ def _finite(observed: Observations) -> Booleans:
 def _wrong_numbers(observed: Observations, readable: Booleans) -> dict[int, str]:
     shapes = observed.shapes
     with np.errstate(invalid="ignore"):
-        empty_parts = count_in_rows(counts_from_starts(shapes.vertex_start) == 0, shapes.part_start)
+        empty_parts = count_in_rows(np.diff(shapes.vertex_start) == 0, shapes.part_start)
         negative_parts = count_in_rows(shapes.radius < 0, shapes.part_start)
         checks = (
-            (counts_from_starts(shapes.part_start) == 0, "has no footprint; give it a polygon or parts"),
+            (np.diff(shapes.part_start) == 0, "has no footprint; give it a polygon or parts"),
             (empty_parts > 0, "has a part without vertices; give each part at least one"),
             (negative_parts > 0, "has a part with a negative radius; give a radius of at least 0"),
             (observed.uncertainty < 0, "has a negative uncertainty; give a radius of at least 0"),
@@ -181,14 +180,14 @@ def _normalised(
 ) -> tuple[FootprintBatch, dict[int, str]]:
     """Return normalised polygons and the samples' faults; cut up those that are not convex."""
     shapes = observed.shapes
-    part_counts = counts_from_starts(shapes.part_start)
+    part_counts = np.diff(shapes.part_start)
     vertex_start, vertices, fault = normalise_polygons(shapes.vertex_start, shapes.vertices)
-    shapes = shapes.with_outlines(vertex_start, vertices)
+    shapes = replace(shapes, vertex_start=vertex_start, vertices=vertices)
     if not fault.any():
         return shapes, {}
     owner = np.repeat(np.arange(len(readable)), part_counts)
     # few are concave, so the slow decomposition runs one by one
-    odd = np.flatnonzero((fault != SOUND) & readable[owner] & (counts_from_starts(vertex_start) > 0))
+    odd = np.flatnonzero((fault != SOUND) & readable[owner] & (np.diff(vertex_start) > 0))
     pieces: dict[int, Footprint] = {}
     faults: dict[int, str] = {}
     for part in odd.tolist():

@@ -232,10 +232,10 @@ def test_raw_images_as_sensors_give_them_show_the_same_tags(encoding: str, folde
     tags = load_tags(folder / "tags.yaml")
     (shown,) = observe_frames(open_frames(bag), tags)
     (truth,) = observe_frames([frame], tags)
-    assert {each.id for each in shown.detections} == {each.id for each in truth.detections}
+    assert {each.id for each in shown.first.detections} == {each.id for each in truth.first.detections}
     off = [
         np.abs(ours.corners - other.corners).max()
-        for ours, other in zip(shown.detections, truth.detections, strict=True)
+        for ours, other in zip(shown.first.detections, truth.first.detections, strict=True)
     ]
     assert max(off) < 0.35
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from spatial_replay.cores import over_cores
-from spatial_replay.geometry.arrays import Booleans, Flags, Floats, read_only_floats
+from spatial_replay.geometry.arrays import Booleans, Flags, Floats
 from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.geometry.measure import (
     MeasureRequest,
@@ -222,7 +222,7 @@ class MovedLeaves:
         for place, where in self._unknown:
             values[place, where] = np.nan
         batch = self._scene.batch
-        batch = batch.with_outlines(batch.vertex_start, read_only_floats(vertices))
+        batch = replace(batch, vertices=vertices)
         closest = np.array([_ends_of(self._scene, each, batch) for each in self._code.closest])
         return self._code.run(values, self._spreads, closest)
 

@@ -92,7 +92,7 @@ class TraceScene:
         if not self._has_centres:
             return vertices
         count = len(self._whole.vertices)
-        moved = self._whole.with_outlines(self._whole.vertex_start, vertices[:count])
+        moved = replace(self._whole, vertices=vertices[:count])
         centres = centres_of(moved).vertices
         return np.concatenate((vertices[:count], centres, vertices[count + len(centres) :]))
 
