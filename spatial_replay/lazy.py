@@ -2,29 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import ast
+from collections.abc import Callable, Iterable, Iterator
+from functools import cache
 from html import escape
 from importlib import import_module
 from typing import Any
 
 
-def loaded_when_used(
-    package: dict[str, Any], names_by_module: Mapping[str, Sequence[str]]
-) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+def loaded_when_used(package: dict[str, Any]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """Return the `__getattr__` and `__dir__` of a package (PEP 562).
+
+    A name of its `__all__` is loaded as the package's source imports it for type checkers.
 
     Args:
         package: its `globals()`, where loaded names are stored.
-        names_by_module: the names that each module defines; modules are relative to the package,
-            one that begins with a dot to the package above.
     """
     home = package["__name__"]
-    modules = {name: f".{module}" for module, names in names_by_module.items() for name in names}
+
+    @cache
+    def modules() -> dict[str, str]:
+        tree = ast.parse(package["__loader__"].get_source(home))
+        imports = (node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom))
+        return {each.name: node.module or "" for node in imports for each in node.names}
 
     def load(name: str) -> Any:
-        if name not in modules:
+        if name not in package["__all__"]:
             raise AttributeError(f"module {home!r} has no attribute {name!r}")
-        package[name] = getattr(import_module(modules[name], home), name)
+        package[name] = getattr(import_module(modules()[name]), name)
         return package[name]
 
     def names() -> list[str]:

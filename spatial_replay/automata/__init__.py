@@ -28,12 +28,4 @@ __all__ = [
     "words_text",
 ]
 
-__getattr__, __dir__ = loaded_when_used(
-    globals(),
-    {
-        "automaton": ("TransitionTable",),
-        "compile": ("Compiler", "automaton_from", "chosen_spec", "stored_text"),
-        "text": ("dot_text", "hoa_text", "svg_text", "words_text"),
-        "guards": ("Transition",),
-    },
-)
+__getattr__, __dir__ = loaded_when_used(globals())

@@ -16,7 +16,4 @@ if TYPE_CHECKING:
 
 __all__ = ["Decoder", "Message", "MessageReader", "Topic", "open_messages"]
 
-__getattr__, __dir__ = loaded_when_used(
-    globals(),
-    {"decoders": ("Decoder", "Topic"), "open": ("open_messages",), "reader": ("Message", "MessageReader")},
-)
+__getattr__, __dir__ = loaded_when_used(globals())

@@ -17,6 +17,4 @@ if TYPE_CHECKING:
 
 __all__ = ["LiveSession", "LiveUpdate", "SessionStatus", "monitor", "open_recorders"]
 
-__getattr__, __dir__ = loaded_when_used(
-    globals(), {"session": ("LiveSession", "LiveUpdate", "SessionStatus", "monitor", "open_recorders")}
-)
+__getattr__, __dir__ = loaded_when_used(globals())

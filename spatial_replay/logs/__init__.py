@@ -32,13 +32,4 @@ __all__ = [
     "summarise_mcap",
 ]
 
-__getattr__, __dir__ = loaded_when_used(
-    globals(),
-    {
-        "mcap.read": ("McapSource", "summarise_mcap"),
-        "mcap.write": ("LogWriter",),
-        "messages": ("Attachment", "Block", "Channel", "MemorySink", "Messages", "Schema"),
-        "objects": ("decode_objects", "encode_objects"),
-        "source": ("MemorySource", "Source"),
-    },
-)
+__getattr__, __dir__ = loaded_when_used(globals())

@@ -28,13 +28,4 @@ __all__ = [
     "suggest_topics",
 ]
 
-__getattr__, __dir__ = loaded_when_used(
-    globals(),
-    {
-        "assemble": ("Assembler", "LiveAssembler"),
-        "mapped_source": ("MappedSource",),
-        "mapping_file": ("LogMapping", "load_mapping", "parse_mapping"),
-        "suggest": ("suggest_mapping", "suggest_topics"),
-        "topic_reader": ("ReadingPlan",),
-    },
-)
+__getattr__, __dir__ = loaded_when_used(globals())

@@ -28,12 +28,4 @@ __all__ = [
     "parse_tags",
 ]
 
-__getattr__, __dir__ = loaded_when_used(
-    globals(),
-    {
-        "frame": ("Frame",),
-        "image_sources": ("CameraFrames", "open_frames"),
-        "observer": ("Observation", "TagObserver", "observe_cameras", "observe_frames"),
-        "tags_file": ("TagsFile", "load_tags", "parse_tags"),
-    },
-)
+__getattr__, __dir__ = loaded_when_used(globals())

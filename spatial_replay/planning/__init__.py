@@ -57,21 +57,4 @@ __all__ = [
     "redo_decisions",
 ]
 
-__getattr__, __dir__ = loaded_when_used(
-    globals(),
-    {
-        "decisions": ("Candidate", "Executor", "Outcome", "Reason", "Step", "Target"),
-        "maps": ("GradientMap", "MapLayers", "map_layers"),
-        "planner": ("Planner",),
-        ".geometry.footprint": ("moved_object",),
-        "read": (
-            "LoggedStep",
-            "Replanned",
-            "read_decisions",
-            "read_steps",
-            "recompute_decisions",
-            "redo_decisions",
-        ),
-        "settings": ("Grid", "Settings", "Workspace", "changed_settings", "load_settings", "parse_settings"),
-    },
-)
+__getattr__, __dir__ = loaded_when_used(globals())

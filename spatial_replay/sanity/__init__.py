@@ -11,6 +11,4 @@ if TYPE_CHECKING:
 
 __all__ = ["doctor", "refuse_decided", "refuse_unsatisfiable"]
 
-__getattr__, __dir__ = loaded_when_used(
-    globals(), {"examine": ("doctor", "refuse_decided", "refuse_unsatisfiable")}
-)
+__getattr__, __dir__ = loaded_when_used(globals())

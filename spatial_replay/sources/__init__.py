@@ -15,7 +15,4 @@ if TYPE_CHECKING:
 
 __all__ = ["messages_in", "open_source", "overview_of", "read_trace", "survey"]
 
-__getattr__, __dir__ = loaded_when_used(
-    globals(),
-    {"open_log": ("open_source", "read_trace"), "overview": ("messages_in", "overview_of", "survey")},
-)
+__getattr__, __dir__ = loaded_when_used(globals())

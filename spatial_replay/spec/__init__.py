@@ -25,11 +25,4 @@ __all__ = [
     "signal_names",
 ]
 
-__getattr__, __dir__ = loaded_when_used(
-    globals(),
-    {
-        "checks": ("check_names", "instantiate", "object_names", "signal_names"),
-        "format": ("format_formula", "format_specification"),
-        "load": ("load_specification", "parse_specification"),
-    },
-)
+__getattr__, __dir__ = loaded_when_used(globals())

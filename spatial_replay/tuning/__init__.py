@@ -28,10 +28,4 @@ __all__ = [
     "tune_runs",
 ]
 
-__getattr__, __dir__ = loaded_when_used(
-    globals(),
-    {
-        "margins": ("LabelledRun", "load_runs"),
-        "tuned": ("Conflict", "RunMargin", "Surface", "TunedConstant", "Tuning", "tune_runs"),
-    },
-)
+__getattr__, __dir__ = loaded_when_used(globals())
