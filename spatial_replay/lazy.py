@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from functools import cache
 from html import escape
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 
@@ -22,7 +23,7 @@ def loaded_when_used(package: dict[str, Any]) -> tuple[Callable[[str], Any], Cal
 
     @cache
     def modules() -> dict[str, str]:
-        tree = ast.parse(package["__loader__"].get_source(home))
+        tree = ast.parse(Path(package["__file__"]).read_text(encoding="utf-8"))
         imports = (node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom))
         return {each.name: node.module or "" for node in imports for each in node.names}
 

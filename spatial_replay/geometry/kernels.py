@@ -46,24 +46,18 @@ class Rows(NamedTuple):
 
 
 @inlined
-def _fill_edge(vertices: Floats, edges: Floats, i: int, following: int) -> None:
-    dx = vertices[following, 0] - vertices[i, 0]
-    dy = vertices[following, 1] - vertices[i, 1]
-    length = math.sqrt(dx * dx + dy * dy)
-    edges[i, 0] = dy / length
-    edges[i, 1] = -dx / length
-    edges[i, 2] = length
-
-
-@inlined
 def _fill_edges(vertices: Floats, edges: Floats, start: int, stop: int) -> None:
     """Compute outward normal and length of each edge of the part with the vertices `start` up to `stop`."""
-    if stop - start == BOX:
-        for i in range(BOX):
-            _fill_edge(vertices, edges, start + i, start + (i + 1) % BOX)
-    elif stop - start >= 2:
-        for i in range(start, stop):
-            _fill_edge(vertices, edges, i, i + 1 if i + 1 < stop else start)
+    if stop - start < 2:
+        return
+    for i in range(start, stop):
+        following = i + 1 if i + 1 < stop else start
+        dx = vertices[following, 0] - vertices[i, 0]
+        dy = vertices[following, 1] - vertices[i, 1]
+        length = math.sqrt(dx * dx + dy * dy)
+        edges[i, 0] = dy / length
+        edges[i, 1] = -dx / length
+        edges[i, 2] = length
 
 
 @inlined
@@ -85,13 +79,6 @@ def fill_row(rows: Rows, row: int) -> None:
             )
             squared = max(squared, dx * dx + dy * dy)
         rows.edges[start, 3] = math.sqrt(squared)
-
-
-@inlined
-def _is_box(rows: Rows, row: int) -> bool:
-    """Return whether a row, of rows that have one part each, has the corners of a box."""
-    p = rows.part_start[row]
-    return bool(rows.vertex_start[p + 1] - rows.vertex_start[p] == BOX)
 
 
 @inlined
@@ -367,19 +354,15 @@ def measure_rows(
     # edges only of rows that distances need: a log has many more that are projected or unused
     is_filled = np.zeros(len(part_start), dtype=np.bool_)
     rows = Rows(part_start, vertex_start, vertices, edges, radius, bottom, top)
-    is_one_each = len(radius) == len(bottom)
     for block in range(begin, end, BLOCK):
         block_end = min(block + BLOCK, end)
         for k in range(len(quantity)):
             if SIGNED_DISTANCE <= quantity[k] <= PROTRUSION:
                 for side in range(2):
                     operand = first[k] if side == 0 else second[k]
-                    # how far the few corners of a box stick out does not depend on its edges
-                    leaves_boxes = is_one_each and quantity[k] == PROTRUSION and side == 0
                     of_first = member_start[operand]
                     for m in range(of_first + block * width[operand], of_first + block_end * width[operand]):
-                        if not (leaves_boxes and members[m] >= 0 and _is_box(rows, members[m])):
-                            _fill_if_not(rows, members[m], is_filled)
+                        _fill_if_not(rows, members[m], is_filled)
         for t in range(block, block_end):
             for k in range(values.shape[0]):
                 a, b = first[k], second[k]
