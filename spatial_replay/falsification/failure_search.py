@@ -83,10 +83,6 @@ class SearchedRun:
         """Whether a specification is violated."""
         return self.verdict is Verdict.VIOLATED
 
-    def numbered(self, number: int) -> SearchedRun:
-        """Return this run under another number."""
-        return replace(self, number=number)
-
     @property
     def document(self) -> dict[str, Any]:
         """It as JSON."""
@@ -199,10 +195,7 @@ class Falsification(Printed):
     @property
     def verdict(self) -> Verdict:
         """The worst verdict of all runs."""
-        verdicts = {run.verdict for run in self.runs}
-        return next(
-            each for each in (Verdict.VIOLATED, Verdict.UNKNOWN, Verdict.SATISFIED) if each in verdicts
-        )
+        return worst_verdict(run.verdict for run in self.runs)
 
     @cached_property
     def coverage(self) -> tuple[Coverage, ...]:
@@ -561,9 +554,8 @@ class RunFile:
         except OSError as error:
             raise output_error(path, error) from error
 
-    def get(self, case: Case) -> SearchedRun | None:
-        """Return the run of a case, if it is known."""
-        return self._known.get(key_of(case))
+    def __getitem__(self, case: Case) -> SearchedRun:
+        return self._known[key_of(case)]
 
     def __contains__(self, case: Case) -> bool:
         return key_of(case) in self._known
@@ -647,12 +639,12 @@ class _Queue(Generic[_Result]):
         self, rounds: Rounds[_Result], known: RunFile, advance: Callable[[int], None], logs: Path | None
     ) -> None:
         self._rounds, self._known, self._advance, self._logs = rounds, known, advance, logs
+        self._round: Sequence[Case] | None = None
+        self._first = 1
         self._waiting: deque[_Task] = deque()
-        self._round: Sequence[Case] = ()
+        self._unwritten: deque[_Task] = deque()
         self._arrived: dict[int, SearchedRun] = {}
-        # numbers of the first case of the round, and of the next one whose run is to be written
-        self._first = self._next = 1
-        self._begin(None)
+        self._begin()
 
     def __iter__(self) -> Iterator[_Task]:
         return self
@@ -665,44 +657,30 @@ class _Queue(Generic[_Result]):
     def take(self, task: _Task, run: SearchedRun) -> None:
         """Take the run of a task; runs are written in the order of the tasks, whichever ends first."""
         self._arrived[task.number] = run
-        self._write()
-        if all(case in self._known for case in self._round):
-            self._begin([self._of(case) for case in self._round])
+        while self._unwritten and self._unwritten[0].number in self._arrived:
+            self._known.add(self._arrived.pop(self._unwritten.popleft().number))
+            self._advance(1)
+        self._begin()
 
-    def _begin(self, runs: Sequence[SearchedRun] | None) -> None:
-        """Begin the next round of which something is not known."""
-        while True:
-            self._first = self._next = self._first + len(self._round)
+    def _begin(self) -> None:
+        """Begin the next round, and more of them until something is not known."""
+        while not self._unwritten:
             try:
-                self._round = next(self._rounds) if runs is None else self._rounds.send(runs)
+                if self._round is None:
+                    cases = next(self._rounds)
+                else:
+                    self._first += len(self._round)
+                    cases = self._rounds.send([self._known[case] for case in self._round])
             except StopIteration as end:
-                self._round, self.result = (), end.value
+                self.result = end.value
                 return
-            missing = 0
-            for number, case in enumerate(self._round, start=self._first):
+            self._round = cases
+            for number, case in enumerate(cases, start=self._first):
                 if case not in self._known:
-                    missing += 1
                     log = None if self._logs is None else self._logs / f"run-{number:04d}.mcap"
                     self._waiting.append(_Task(number, case, log))
-            self._advance(len(self._round) - missing)
-            if missing:
-                return
-            runs = [self._of(case) for case in self._round]
-
-    def _write(self) -> None:
-        while self._next < self._first + len(self._round):
-            case = self._round[self._next - self._first]
-            if case not in self._known:
-                if self._next not in self._arrived:
-                    return
-                self._known.add(self._arrived.pop(self._next))
-                self._advance(1)
-            self._next += 1
-
-    def _of(self, case: Case) -> SearchedRun:
-        run = self._known.get(case)
-        assert run is not None
-        return run
+            self._unwritten.extend(self._waiting)
+            self._advance(len(cases) - len(self._waiting))
 
 
 def _simulate(simulation: Simulation, task: _Task) -> SearchedRun:
@@ -948,8 +926,8 @@ class _Search:
         )
         known = {key_of(run.case): run for run in runs}
         with self._progress("smaller runs", None) as advance:
-            smaller = self._simulated(self._shrink(failing, known), "smaller", advance)
-        failures = tuple(self._failure(run, least) for run, least in zip(failing, smaller.runs, strict=True))
+            smaller, simulations = self._simulated(self._shrink(failing, known), "smaller", advance)
+        failures = tuple(self._failure(run, least) for run, least in zip(failing, smaller, strict=True))
         with self._progress("clips", len(failures)) as advance:
             for _, done in self._workers.results(partial(_finish, self._simulation), failures):
                 if isinstance(done, WorkerLost):
@@ -961,7 +939,7 @@ class _Search:
             tuple(runs),
             failures,
             len(self._impossible),
-            smaller.simulations,
+            simulations,
             self._is_exhausted,
         )
         self._files.write("failures.json", json.dumps(result.document, indent=1).encode() + b"\n")
@@ -976,7 +954,7 @@ class _Search:
     def _descend(self, budget: int, seed: int) -> Rounds[list[SearchedRun]]:
         """Let an optimiser choose the cases, with the least robustness as cost."""
         (first,) = yield [self._space.at_rest()]
-        runs = [first.numbered(1)]
+        runs = [replace(first, number=1)]
         self._space = space = self._space.ending_at(first.seconds)
         late = next(
             (each for each in space.parameters if each.unit == "s" and each.low >= first.seconds), None
@@ -1009,7 +987,7 @@ class _Search:
             asked = [*new.values()][: budget - len(runs)]
             barren = 0 if asked else barren + 1
             for run in (yield asked) if asked else ():
-                runs.append(run.numbered(len(runs) + 1))
+                runs.append(replace(run, number=len(runs) + 1))
                 costs[key_of(run.case)] = _cost(run)
             if len(asked) < len(new):
                 break
@@ -1026,8 +1004,10 @@ class _Search:
         self._is_exhausted = barren == _BARREN
         return runs
 
-    def _shrink(self, failing: Sequence[SearchedRun], known: Mapping[str, SearchedRun]) -> Rounds[_Smaller]:
-        """Make failures smaller, side by side: each asks for one run in a round."""
+    def _shrink(
+        self, failing: Sequence[SearchedRun], known: Mapping[str, SearchedRun]
+    ) -> Rounds[tuple[list[SearchedRun], int]]:
+        """Make failures smaller, each by one run in a round; return them, and how many runs that took."""
         tried: dict[str, SearchedRun] = {}
         least = list(failing)
         trials = [self._smaller(run) for run in failing]
@@ -1041,12 +1021,12 @@ class _Search:
                 key = key_of(case)
                 run = known[key] if key in known else tried[key]
                 if run.is_violated:
-                    least[place] = run.numbered(failing[place].number)
+                    least[place] = replace(run, number=failing[place].number)
                 try:
                     asked[place] = trials[place].send(run)
                 except StopIteration:
                     del asked[place]
-        return _Smaller(tuple(least), len(tried))
+        return least, len(tried)
 
     def _smaller(self, failure: SearchedRun) -> Generator[Case, SearchedRun, None]:
         """Yield cases with less of what is varied, until no group can be brought to rest by itself."""
@@ -1076,14 +1056,6 @@ class _Search:
             self._folder / "clips" / name,
             self._simulation.command(smaller.case),
         )
-
-
-@dataclass(frozen=True, slots=True)
-class _Smaller:
-    """Failures made smaller, in the order in which they were given, and how many runs that took."""
-
-    runs: tuple[SearchedRun, ...]
-    simulations: int
 
 
 def _finish(simulation: Simulation, failure: Failure) -> None:

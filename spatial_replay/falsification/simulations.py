@@ -258,8 +258,13 @@ def scenario_simulation(
         UsageError: there is no such scenario, no simulator, or what cannot be varied.
         SpecificationError: names that the world does not have.
     """
-    runs = ScenarioRuns.of(scenario, files, options, is_planned=is_planned)
-    return runs, runs.parameters([vary] if isinstance(vary, str) else vary or ["start"])
+    chosen = tuple(files) or (default_specification(scenario),)
+    with closing(make_world(scenario)) as world:
+        refuse_unknown_names(chosen, world.sample())
+    refuse_templates(chosen)
+    runs = ScenarioRuns(scenario, chosen, tuple(options), is_planned)
+    texts = [vary] if isinstance(vary, str) else vary or ["start"]
+    return runs, tuple(parameter for text in texts for parameter in runs.parameters(text))
 
 
 def own_simulation(
@@ -345,43 +350,13 @@ class ScenarioRuns:
 
     name: str
     files: tuple[Specification, ...]
-    spec_options: tuple[str, ...] = ()
-    is_planned: bool = False
+    spec_options: tuple[str, ...]
+    is_planned: bool
 
     @property
     def identity(self) -> Mapping[str, bool]:
         """See `Simulation`."""
         return {"planned": self.is_planned}
-
-    @classmethod
-    def of(
-        cls,
-        scenario: str,
-        files: Sequence[Specification],
-        options: Sequence[str] = (),
-        *,
-        is_planned: bool = False,
-    ) -> ScenarioRuns:
-        """Take a scenario, and specifications that fit it: without any, its own.
-
-        Raises:
-            UsageError: there is no such scenario, or no simulator.
-            SpecificationError: names that the world does not have.
-        """
-        chosen = tuple(files) or (default_specification(scenario),)
-        with closing(make_world(scenario)) as world:
-            refuse_unknown_names(chosen, world.sample())
-        refuse_templates(chosen)
-        return cls(scenario, chosen, tuple(options), is_planned)
-
-    def parameters(self, texts: Iterable[str]) -> tuple[Parameter, ...]:
-        """Return what is varied, as it is written on the command line.
-
-        Raises:
-            UsageError: what cannot be varied in this world, or is given twice.
-        """
-        found = [parameter for text in texts for parameter in self._parameters(text)]
-        return tuple(found)
 
     def is_possible(self, case: Case) -> bool:
         """See `Simulation`."""
@@ -438,7 +413,12 @@ class ScenarioRuns:
 
         return SimulatedCase(trace, write, unit="m")
 
-    def _parameters(self, text: str) -> list[Parameter]:
+    def parameters(self, text: str) -> list[Parameter]:
+        """Return what is varied, as it is written on the command line.
+
+        Raises:
+            UsageError: what cannot be varied in this world.
+        """
         name = text.partition("=")[0].strip()
         kind, at, when = text.partition("@")
         if at and kind in _KINDS:
