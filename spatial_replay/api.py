@@ -102,12 +102,15 @@ def replay_log(
         raise UsageError(
             "keep applies to an annotated log with the log's own messages; give output, not layer"
         )
+    if keep is None and output is None:
+        # of the messages, those that samples are made of
+        keep = (MAPPED,)
     constants, how = _evaluation(options)
     source = _source(log, options)
     return run_replay(
         source,
         _files(specifications, source, constants),
-        replace(how, keep=_kept(keep, output), arrow=arrow),
+        replace(how, keep=None if keep is None else tuple(keep), arrow=arrow),
         keep_series=True,
         keep_leaves=True,
         output=None if output is None else Path(output),
@@ -480,31 +483,20 @@ def _files(
     specifications: Specifications | None, source: Source, constants: Mapping[str, float | str] | None
 ) -> list[Specification]:
     """Return the specifications to evaluate, in the order in which they are given."""
-    named = _listed(specifications)
-    paths = [local_copy(each) for each in named if not isinstance(each, Specification)]
-    if constants and named and not paths:
-        raise UsageError("constants are for files; give parse_specification(text, constants=…) its own")
-    loaded = iter(load_files(paths, source, constants=constants) if paths or not named else [])
-    if not named:
-        return list(loaded)
-    return [each if isinstance(each, Specification) else next(loaded) for each in _distinct(named)]
-
-
-def _distinct(named: Sequence[Specification | PathName]) -> list[Specification | Path]:
-    """Return specifications and paths, each path once."""
     chosen: list[Specification | Path] = []
-    for each in named:
+    for each in _listed(specifications):
         one = each if isinstance(each, Specification) else local_copy(each)
+        # each path counts once
         if isinstance(one, Specification) or one not in chosen:
             chosen.append(one)
-    return chosen
-
-
-def _kept(keep: Sequence[str] | None, output: PathName | None) -> tuple[str, ...] | None:
-    """Return which messages a replay reads: without an output, only those that samples are made of."""
-    if keep is not None:
-        return tuple(keep)
-    return (MAPPED,) if output is None else None
+    paths = [each for each in chosen if isinstance(each, Path)]
+    if constants and chosen and not paths:
+        raise UsageError("constants are for files; give parse_specification(text, constants=…) its own")
+    loaded = load_files(paths, source, constants=constants) if paths or not chosen else []
+    if not chosen:
+        return loaded
+    files = iter(loaded)
+    return [each if isinstance(each, Specification) else next(files) for each in chosen]
 
 
 def _inputs(log: Log, specifications: Specifications | None, reading: Reading) -> list[Path]:

@@ -31,6 +31,7 @@ from spatial_replay.cli.terminal import Coloured, progress, show, show_diagnosti
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import local_files, sendable
 from spatial_replay.text import counted, json_number, with_unit
+from spatial_replay.trace.trace import time_point_from_text
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -348,7 +349,8 @@ def _suite(logs: tuple[str, ...], given: ConditionArguments, semantics: Semantic
             )
         for option, text in (("--from", given.start), ("--to", given.end)):
             if text is not None:
-                _check_time(option, text)
+                with naming_option(option):
+                    time_point_from_text(text)
         specs = dict.fromkeys(map(sendable, given.specs))
         return Suite.of_logs(logs, tuple(specs), conditions)
     if len(logs) > 1:
@@ -358,13 +360,6 @@ def _suite(logs: tuple[str, ...], given: ConditionArguments, semantics: Semantic
             f"{suites[0]} says how its logs are evaluated; change it there, or give logs and options"
         )
     return load_suite(suites[0])
-
-
-def _check_time(option: str, text: str) -> None:
-    from spatial_replay.trace.trace import time_point_from_text
-
-    with naming_option(option):
-        time_point_from_text(text)
 
 
 def _inputs(suite: Suite) -> list[Path]:

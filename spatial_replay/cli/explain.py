@@ -92,12 +92,12 @@ def explain(request: EvaluationArguments, result: str, at: str | None, as_json: 
     if not as_json and object_name is None:
         fitting = [each for each in replayed.results if verdict_of(each, node, goes_on=goes_on) is not None]
         # where none fits, the nearest name is looked for among all
-        shown: Sequence[SpecResult] = worst_of(fitting)[0] if fitting else replayed.results
+        shown, others = worst_of(fitting) if fitting else (replayed.results, ())
         if len(fitting) > MANY:
             verdicts_of_all = [verdict_of(each, node, goes_on=goes_on) for each in fitting]
             counts = f"{len(fitting):,} results: {counts_text(map(str, verdicts_of_all))}"
-            shown, others = worst_of(fitting)
         replayed = replace(replayed, results=tuple(shown))
+    verdicts_of_others = [str(verdict_of(each, node, goes_on=goes_on)) for each in others]
     results = explain_results(replayed, node=node, object=object_name, goes_on=goes_on)
     idle = replayed.vacuous if node is None and object_name is None else ()
     if as_json:
@@ -107,13 +107,10 @@ def explain(request: EvaluationArguments, result: str, at: str | None, as_json: 
         if idle:
             texts.append([each.message for each in idle])
         if others:
-            texts.append(
-                [others_text(others, [str(verdict_of(each, node, goes_on=goes_on)) for each in others])]
-            )
+            texts.append([others_text(others, verdicts_of_others)])
         for number, lines in enumerate(texts):
             show(*([""] if number else []), *map(_coloured, lines))
-    verdicts = [each.verdict for each in results]
-    verdicts += [v for each in others if (v := verdict_of(each, node, goes_on=goes_on)) is not None]
+    verdicts = [*(each.verdict for each in results), *verdicts_of_others]
     return exit_code_from_verdicts(verdicts, bool(replayed.faults))
 
 

@@ -188,6 +188,8 @@ def monitor(
         click.get_current_context().with_resource(by_signal.listening())
     # imported here so that --help stays fast
     from spatial_replay.live import LiveSession, open_recorders
+    from spatial_replay.live.session import layout_of_run
+    from spatial_replay.logs.output_file import refuse_inputs
     from spatial_replay.mapping import load_mapping
 
     if not specs:
@@ -209,11 +211,11 @@ def monitor(
     show_diagnostics(warning for file in files for warning in file.warnings)
     mapping = None if mapping_file is None else load_mapping(mapping_file)
     if layout:
-        show_file(_layout(files, mapping))
+        show_file(layout_of_run(files, mapping))
         return ExitCode.SATISFIED
     trigger = None if clips is None else _trigger(triggers, before_s, after_s, ring)
     if output is not None:
-        _refuse_inputs(output, specs, mapping_file)
+        refuse_inputs(output, [*specs, *([mapping_file] if mapping_file is not None else [])])
     with ExitStack() as opened:
         recorders = opened.enter_context(
             open_recorders(files, mapping, output, trigger, clips, overwrite=overwrite)
@@ -302,18 +304,6 @@ def _trigger(when: tuple[str, ...], before_s: float, after_s: float, ring: int) 
         raise UsageError(f"--ring is {ring} bytes; a ring takes 1MB or more")
     with naming_option("--trigger"):
         return Trigger(when or "violated", before_s, after_s, ring)
-
-
-def _refuse_inputs(output: Path, specs: Sequence[Path], mapping_file: Path | None) -> None:
-    from spatial_replay.logs.output_file import refuse_inputs
-
-    refuse_inputs(output, [*specs, *([mapping_file] if mapping_file is not None else [])])
-
-
-def _layout(files: Sequence[Specification], mapping: LogMapping | None) -> str:
-    from spatial_replay.live.session import layout_of_run
-
-    return layout_of_run(files, mapping)
 
 
 @contextmanager

@@ -112,12 +112,9 @@ def replay(
     if (series or signal) and json_file is None:
         option = "--series" if series else "--to-end"
         raise UsageError(f"{option} adds to the JSON object; add --json FILE or --json -")
-    if layer and output is None:
-        raise UsageError("--layer applies to the annotated log; add -o FILE")
-    if keep and output is None:
-        raise UsageError("--topics applies to the annotated log; add -o FILE")
-    if arrow and output is None:
-        raise UsageError("--arrow applies to the scene of the annotated log; add -o FILE")
+    for option, value in {"--layer": layer, "--topics": keep, "--arrow": arrow}.items():
+        if value and output is None:
+            raise UsageError(f"{option} applies to the annotated log; add -o FILE")
     if keep and layer:
         raise UsageError("--layer copies no messages; remove --topics or --layer")
     window_ns = None if width is None else _width_ns(width)

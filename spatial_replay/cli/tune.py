@@ -28,8 +28,8 @@ from spatial_replay.text import counted
 
 if TYPE_CHECKING:
     from spatial_replay.logs.read_options import Reading
-    from spatial_replay.tuning import TunedConstant, Tuning
     from spatial_replay.tuning.margins import Value
+    from spatial_replay.tuning.tuned import TunedConstant, Tuning
 
 
 _PICTURES = (".png", ".svg", ".html")
@@ -139,7 +139,8 @@ def tune(
     from spatial_replay.logs.output_file import refuse_inputs
     from spatial_replay.replay.specification_files import plain_values, write_constants
     from spatial_replay.sources.open_log import read_trace
-    from spatial_replay.tuning import load_runs, tune_runs
+    from spatial_replay.tuning.margins import load_runs
+    from spatial_replay.tuning.tuned import tune_runs
 
     if not good:
         raise UsageError("there is no good run to satisfy; give at least one: --good LOG")
@@ -160,7 +161,9 @@ def tune(
     if write and tuning.is_found:
         changed = write_constants(local_copy(spec), plain_values(tuning.specification), profile=profile)
     if output is not None:
-        _write_picture(tuning, output)
+        from spatial_replay.notebook.study_view import write_surface
+
+        write_surface(tuning, output)
     if as_json:
         show_json(tuning.document)
     else:
@@ -214,12 +217,6 @@ def _row(constant: TunedConstant) -> tuple[str, str, str, str]:
     return constant.name, text(constant.value), f"({text(constant.written)} as written)", span
 
 
-def _write_picture(tuning: Tuning, output: Path) -> None:
-    from spatial_replay.notebook.study_view import write_surface
-
-    write_surface(tuning, output)
-
-
 @click.command(cls=ManyLogs)
 @click.argument("good", metavar="GOOD...", nargs=-1, required=True, type=LogPath())
 @click.option(
@@ -257,7 +254,7 @@ def learn(
     from spatial_replay.logs.output_file import refuse_inputs, replacing
     from spatial_replay.sources.open_log import read_trace
     from spatial_replay.spec.relations import DEFAULT_PROFILE
-    from spatial_replay.tuning import load_runs
+    from spatial_replay.tuning.margins import load_runs
 
     inputs = input_files(*good, *bad, reading=reading)
     if output is not None:

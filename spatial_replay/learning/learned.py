@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
@@ -118,22 +118,11 @@ def _plainness(fit: FittedLimits, pattern: int, direction: int, quantity: int) -
     return worth * (0.7 if pattern == EVENTUALLY else 1.0)
 
 
-@dataclass
-class _Groups:
-    """Objects joined by the distances that are written: one of two that are joined already says little."""
-
-    group: dict[Party, Party] = field(default_factory=dict)
-
-    def join(self, a: Party, b: Party) -> bool:
-        """Join two, and return whether they were apart."""
-        one, other = self._of(a), self._of(b)
-        self.group[one] = other
-        return one != other
-
-    def _of(self, party: Party) -> Party:
-        while (above := self.group.setdefault(party, party)) != party:
-            party = above
-        return party
+def _join(groups: list[set[Party]], pair: tuple[Party, ...]) -> bool:
+    """Join the groups of two objects, and return whether they were apart."""
+    own = [each for each in groups if not each.isdisjoint(pair)]
+    groups[:] = [*(each for each in groups if each not in own), set(pair).union(*own)]
+    return not any(each.issuperset(pair) for each in own)
 
 
 def _characteristic(fit: FittedLimits, most: int) -> list[Line]:
@@ -148,14 +137,14 @@ def _characteristic(fit: FittedLimits, most: int) -> list[Line]:
 def _goals(fit: FittedLimits) -> list[Line]:
     """Return how good runs end: a distance for each object, and relations that began otherwise."""
     scored: list[tuple[float, int, Line]] = []
-    joined, placed = _Groups(), Counter[Party]()
+    joined, placed = list[set[Party]](), Counter[Party]()
     pairs = set()
     of_class: set[int] = set()
     centre = _centre(fit)
     for _, index in sorted(_distances(fit), key=lambda each: (-each[0], each[1])):
         quantity = fit.quantities[index]
         if index not in of_class and (
-            _places(fit, quantity, placed, centre) if fit.landmarks else joined.join(*quantity.parties)
+            _places(fit, quantity, placed, centre) if fit.landmarks else _join(joined, quantity.parties)
         ):
             of_class.update(fit.members[index])
             fact = near = fit.fact(FINALLY, 1, index)

@@ -58,13 +58,6 @@ def plot(value: Any, *args: Any, **options: Any) -> Any:
     return _after_loading_view(plot, value)(value, *args, **options)
 
 
-def svg(value: Any) -> str | None:
-    """Return an automaton as SVG; None if it is large, or if Graphviz cannot draw it here."""
-    view = import_module("spatial_replay.notebook.automaton_view")
-    drawing: str | None = view.automaton_svg(value)
-    return drawing
-
-
 def _after_loading_view(function: Any, value: object) -> Any:
     kind = type(value)
     generic = function.registry[object]

@@ -365,12 +365,12 @@ class Search:
                     f"greater values of {constant.name} are looser in one place and tighter in another, so "
                     "none is the tightest; give bad runs, too"
                 )
-        loosest = self._at([_PARTS] * len(self._steps), _PARTS)
+        loosest = self._at(_PARTS)
         failing = tuple(run for run in self._good if not self._margins.holds(run, loosest))
         if failing:
             return Found(loosest, is_held=False, conflict=failing, alone=failing)
-        together = self._least(self._good, _PARTS, lambda part: self._at([part] * len(self._steps), _PARTS))
-        point = self._at([together] * len(self._steps), _PARTS)
+        together = self._least(self._good, _PARTS, self._at)
+        point = self._at(together)
         for axis, steps in enumerate(self._steps):
 
             def along(looseness: int, axis: int = axis, point: Point = point) -> Point:
@@ -441,9 +441,7 @@ class Search:
 
     def _widest_by_boxes(self) -> Found:
         """Decide exactly over the runs that decide, and add those that turn out to, until none is missing."""
-        alone = self._alone(
-            self._at([_PARTS] * len(self._steps), _PARTS), self._loosened([0] * len(self._steps))
-        )
+        alone = self._alone(self._at(_PARTS), self._at(0))
         if alone:
             return Found(self._margins.start, is_held=False, conflict=alone, alone=alone)
         exact = ExactSearch(self._margins, self._loosened)
@@ -613,11 +611,9 @@ class Search:
         """Return the number on an axis of a value that is so many steps looser than the tightest."""
         return self._steps[axis] - looseness if self._margins.directions[axis] == -1 else looseness
 
-    def _at(self, parts: Sequence[int], whole: int) -> Point:
-        """Return the point whose looseness is this part of the whole, on each axis."""
-        return tuple(
-            self._numbered(axis, part * self._steps[axis] // whole) for axis, part in enumerate(parts)
-        )
+    def _at(self, part: int) -> Point:
+        """Return the point whose looseness is this part of all steps, on each axis."""
+        return self._loosened([part * steps // _PARTS for steps in self._steps])
 
     def _with(self, point: Point, axis: int, number: int) -> Point:
         return (*point[:axis], number, *point[axis + 1 :])
