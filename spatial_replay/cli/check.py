@@ -173,6 +173,9 @@ def check(
       spatial-replay check blocks.spatial --dfa blocks.svg
       spatial-replay check blocks.spatial --format github
     """
+    # imported here so that --help stays fast
+    from spatial_replay.sanity import doctor as examine
+
     if of is not None and dfa is None:
         raise UsageError("--result chooses an automaton; add --dfa FILE")
     if hz is not None and dfa is None:
@@ -192,7 +195,8 @@ def check(
     if dfa is not None:
         _check_automaton_options(parsed, of, dfa, inputs)
     compared = _compare_with_log(parsed, log, reading, strict_names) if log is not None else _Compared()
-    diagnostics = [*parsed.warnings, *compared.diagnostics, *_examined(parsed)]
+    found = examine(parsed, examples=False).findings
+    diagnostics = [*parsed.warnings, *compared.diagnostics, *(each.diagnostic for each in found)]
     show_diagnostics(diagnostics)
     show_findings(form, shown, diagnostics)
     if any(each.severity == "error" for each in diagnostics):
@@ -220,14 +224,6 @@ class _Compared:
     windows: Sequence[str] = ()
     ranges: Sequence[ThresholdRange] = ()
     summary: str = ""
-
-
-def _examined(specification: Specification) -> list[Diagnostic]:
-    """Return what `doctor` finds."""
-    # only needed once the text is parsed: automata load the numerical libraries
-    from spatial_replay.sanity import doctor
-
-    return [each.diagnostic for each in doctor(specification, examples=False).findings]
 
 
 def _refuse_log_options(reading: Reading, strict_names: bool) -> None:
@@ -336,17 +332,12 @@ def _lines(specification: Specification, compared: _Compared) -> Iterator[str]:
         if number:
             yield ""
         yield _heading(spec)
-        yield from (f"  {line}" for line in _tree_lines(spec.formula))
+        branches = list(iter_branches(spec.formula))
+        width = len(str(len(branches) - 1))
+        for identifier, stem, node in branches:
+            yield f"  {identifier:>{width}}  {stem}{label_of(node)}"
     if compared.summary:
         yield from ("", *compared.windows, *map(str, compared.ranges), compared.summary)
-
-
-def _tree_lines(formula: Formula) -> Iterator[str]:
-    """Yield a line for each node: its id, the branches down to it, its name and operator."""
-    branches = list(iter_branches(formula))
-    width = len(str(len(branches) - 1))
-    for identifier, stem, node in branches:
-        yield f"{identifier:>{width}}  {stem}{label_of(node)}"
 
 
 def _document(

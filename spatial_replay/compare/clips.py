@@ -214,12 +214,12 @@ class ClipSearch:
         needs_samples = any(
             result.object is not None or look_back([result.formula]) != (0, 0) for result in results
         )
-        trace = None
-        if needs_samples:
-            trace = Selection(source, files, options).trace()
-        self._parts = [
-            _Part(each, trace, _regions(files, each.result)) for each in kept if len(each.result.times_ns)
-        ]
+        trace = Selection(source, files, options).trace() if needs_samples else None
+        self._parts = []
+        for each in kept:
+            if len(each.result.times_ns):
+                file = file_of(files, each.result)
+                self._parts.append(_Part(each, trace, {} if file is None else file.regions))
         self._times_ns = _joined_times([result.times_ns for result in results])
         first_ns = min(part.span_ns[0] for part in self._parts) - around_ns
         last_ns = max(part.span_ns[1] for part in self._parts) + around_ns
@@ -271,12 +271,6 @@ def _joined_times(times_ns: Sequence[Integers]) -> Integers:
     if all(np.array_equal(each, first) for each in times_ns):
         return first
     return np.unique(np.concatenate(times_ns))
-
-
-def _regions(files: Sequence[Specification], result: SpecResult) -> Mapping[str, Outline]:
-    """Return the regions of the file that a result comes from."""
-    file = file_of(files, result)
-    return {} if file is None else file.regions
 
 
 def _appearances(trace: Trace, name: str) -> Booleans:

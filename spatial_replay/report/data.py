@@ -36,7 +36,6 @@ from spatial_replay.report.panels import (
     named_nodes,
     requirement_values,
     scene_value,
-    series_of,
     shown_nodes,
     start_of,
     tree_value,
@@ -325,7 +324,8 @@ def _result_value(
     relations = RELATION_NAMES | each.file.relations
     samples = np.flatnonzero(np.isin(each.result.times_ns, kept))
     here = each.result.times_ns[samples]
-    series = series_of(each.result.series, each.result.formula, samples)
+    # (nodes, 4, samples), of the shown nodes
+    series = each.result.series[list(shown_nodes(each.result.formula))][:, :, samples]
     value: dict[str, Any] = {
         "title": each.result.title,
         "name": each.result.name,

@@ -166,27 +166,17 @@ def named_nodes(formula: Formula) -> tuple[int, ...]:
     )
 
 
-def series_of(series: Floats, formula: Formula, samples: Integers) -> Floats:
-    """Return the numbers (nodes, 4, samples) of the shown nodes at some samples."""
-    return np.asarray(series[list(shown_nodes(formula))][:, :, samples])
-
-
 def _head(node: Formula, relations: frozenset[str]) -> str:
     """Return a node's text with dots for its operands."""
     if isinstance(node, Boolean):
         return operator_of(node)
     text = format_formula(node, relations=relations)
-    for operand in _operand_texts(node, relations):
+    for operand in (format_formula(each, relations=relations) for each in operands_of(node)):
         for written in (f"({operand})", operand):
             if written in text:
                 text = text.replace(written, _PLACE, 1)
                 break
     return text
-
-
-def _operand_texts(node: Formula, relations: frozenset[str]) -> Iterator[str]:
-    for operand in operands_of(node):
-        yield format_formula(operand, relations=relations)
 
 
 def _cut(text: str) -> str:
@@ -674,15 +664,15 @@ def _maps_of(plan: ReportedDecisions, decision: PlanDecision) -> Iterator[_Drawn
         (owner, plan.maps[number]) for number, owner in sorted(owners.items()) if number in plan.maps
     ]
     if not owners:
-        found = [(None, grid) for _, grid in sorted(plan.maps.items()) if _is_of_time(grid, decision)]
+        found = [
+            (None, grid)
+            for _, grid in sorted(plan.maps.items())
+            if grid.timestamp.ToNanoseconds() == decision.time_ns
+        ]
     for owner, grid in found:
         drawn = _drawn(grid, owner, _is_chosen(owner, decision, len(found)))
         if drawn is not None:
             yield drawn
-
-
-def _is_of_time(grid: Grid, decision: PlanDecision) -> bool:
-    return grid.timestamp.ToNanoseconds() == decision.time_ns
 
 
 def _is_chosen(owner: _Owner | None, decision: PlanDecision, maps: int) -> bool:

@@ -6,7 +6,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from decimal import Decimal
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple, TypeAlias
@@ -172,10 +172,6 @@ class VariedConstant:
     def is_whole(self) -> bool:
         """Whether both ends are whole numbers, so that it may count samples."""
         return self.written.duration_ns is None and all(each % 1 == 0 for each in (self.low, self.high))
-
-    def in_whole_numbers(self) -> VariedConstant:
-        """Return the constant with a grid of whole numbers."""
-        return replace(self, step=Decimal(1))
 
     @cached_property
     def steps(self) -> int:
@@ -511,6 +507,7 @@ class Margins:
         directions: for each, whether a greater value is looser (1), tighter (-1), or neither for sure (None).
         axes: for each result of the specification, by name, the constants that it depends on.
         evaluations: how many times a result was evaluated on a run.
+        specification: returns that with the values of a point, or None if it is invalid with them.
     """
 
     def __init__(
@@ -536,7 +533,7 @@ class Margins:
         self.runs, self._parse, self._each = tuple(runs), parse, each
         self.varied = tuple(self._fitting(constant) for constant in varied)
         self.evaluations = 0
-        self._parsed: OrderedDict[Point, Specification | None] = OrderedDict()
+        self.specification = lru_cache(_REMEMBERED)(self._parsed_at)
         self._compiled: OrderedDict[tuple[str, Point], _Result] = OrderedDict()
         self._robustness: dict[tuple[int, str, Point], Robustness] = {}
         self._base = parse({})
@@ -551,19 +548,13 @@ class Margins:
             self._prepared.append(self._prepare(run))
             advance(1)
 
-    def specification(self, point: Point) -> Specification | None:
-        """Return the specification with the values of a point, or None if it is invalid with them."""
-        if point not in self._parsed:
-            values = {one.name: one.value(number) for one, number in zip(self.varied, point, strict=True)}
-            try:
-                self._parsed[point] = self._parse(values)
-            except SpecificationError:
-                # such as a window whose ends are reversed, between two constants
-                self._parsed[point] = None
-            if len(self._parsed) > _REMEMBERED:
-                self._parsed.popitem(last=False)
-        self._parsed.move_to_end(point)
-        return self._parsed[point]
+    def _parsed_at(self, point: Point) -> Specification | None:
+        values = {one.name: one.value(number) for one, number in zip(self.varied, point, strict=True)}
+        try:
+            return self._parse(values)
+        except SpecificationError:
+            # such as a window whose ends are reversed, between two constants
+            return None
 
     def robustness(self, run: int, point: Point, results: Iterable[str] | None = None) -> Robustness | None:
         """Return that of a run, of all results or some of them; None where the specification is invalid."""
@@ -620,7 +611,7 @@ class Margins:
         try:
             self._parse({constant.name: float(constant.low + constant.step)})
         except SpecificationError:
-            return constant.in_whole_numbers()
+            return replace(constant, step=Decimal(1))
         return constant
 
     def _tried(self, constant: VariedConstant) -> dict[int, Specification]:

@@ -502,7 +502,8 @@ class Search:
 
         The lines go along an axis with a direction, on which the best number is narrowed down.
         """
-        axis = self._line_axis
+        directed = [axis for axis, each in enumerate(self._margins.directions) if each is not None]
+        axis = max(directed, key=lambda axis: self._steps[axis], default=None)
         others = [each for each in range(len(self._steps)) if each != axis]
         best: tuple[float, Point] = (-np.inf, start)
 
@@ -522,12 +523,6 @@ class Search:
         else:
             evolve(look, sizes, [start[other] for other in others], self._seed)
         return self._climbed(runs, best[1])
-
-    @property
-    def _line_axis(self) -> int | None:
-        """The axis with a direction that has the most numbers, or None."""
-        axes = [axis for axis, each in enumerate(self._margins.directions) if each is not None]
-        return max(axes, key=lambda axis: self._steps[axis], default=None)
 
     def _best_on_line(self, runs: Sequence[int], point: Point, axis: int | None) -> tuple[float, Point]:
         """Return the best point that is found along an axis, with its margin.
