@@ -105,29 +105,6 @@ class JsonCommand(click.Command):
         return super().parse_args(ctx, [each for before, each in pairs if (before, each) != ("--json", "-")])
 
 
-class _OutputFile(click.Path):
-    """A path to write to; "-" is refused."""
-
-    def convert(
-        self, value: str | os.PathLike[str], param: click.Parameter | None, ctx: click.Context | None
-    ) -> str | bytes | os.PathLike[str]:
-        if value == "-":
-            self.fail("'-' is not a file; only --json - writes to standard output", param, ctx)
-        return super().convert(value, param, ctx)
-
-
-class LogOutput(_OutputFile):
-    """A path to write a log to; the name of a file of another kind is refused."""
-
-    def convert(
-        self, value: str | os.PathLike[str], param: click.Parameter | None, ctx: click.Context | None
-    ) -> str | bytes | os.PathLike[str]:
-        from spatial_replay.logs.output_file import refuse_ending
-
-        refuse_ending(Path(value))
-        return super().convert(value, param, ctx)
-
-
 class LogPath(click.Path):
     """A path or an address of a log."""
 
@@ -140,14 +117,32 @@ class LogPath(click.Path):
         return log_file(value) if is_address(value) else super().convert(value, param, ctx)
 
 
+def _output_file(context: click.Context, parameter: click.Parameter, path: Path | None) -> Path | None:
+    if path == Path("-"):
+        raise click.BadParameter("'-' is not a file; only --json - writes to standard output")
+    return path
+
+
+def _log_file(context: click.Context, parameter: click.Parameter, path: Path | None) -> Path | None:
+    """Return a path to write a log to; the name of a file of another kind is refused."""
+    from spatial_replay.logs.output_file import refuse_ending
+
+    if path is not None:
+        refuse_ending(path)
+    return _output_file(context, parameter, path)
+
+
+_output_option = partial(click.option, "-o", "--output", type=click.Path(path_type=Path))
+
+
 def output_option(text: str, *, required: bool = False) -> Callable[[_Command], _Command]:
     """Return the option `-o FILE`, with its help."""
-    return click.option("-o", "--output", type=_OutputFile(path_type=Path), required=required, help=text)
+    return _output_option(callback=_output_file, required=required, help=text)
 
 
 def log_output_option(text: str, *, required: bool = True) -> Callable[[_Command], _Command]:
     """Return the option `-o FILE` of a command that writes a log, with its help."""
-    return click.option("-o", "--output", type=LogOutput(path_type=Path), required=required, help=text)
+    return _output_option(callback=_log_file, required=required, help=text)
 
 
 overwrite_option = click.option("--overwrite", is_flag=True, help="Replace a log that exists already.")

@@ -12,7 +12,6 @@ import click
 
 from spatial_replay.cli.application import ExitCode, exit_code_from_verdicts, most_severe
 from spatial_replay.cli.options import (
-    LogOutput,
     LogPath,
     add_options,
     constants_option,
@@ -132,12 +131,7 @@ def _redo(
     type=LogPath(),
     help="Decide again on the samples of a planned run, with the changes of the options below.",
 )
-@click.option(
-    "-o",
-    "--output",
-    type=LogOutput(path_type=Path),
-    help="Copy of the log to write, with old and redone decisions (MCAP).",
-)
+@log_output_option("Copy of the log to write, with old and redone decisions (MCAP).", required=False)
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of text.")
 @click.option("--spec", metavar="SPEC", type=LogPath(), help="Specification to plan for instead.")
 @click.option("--result", "of", metavar="NAME", help="Result to plan for, if SPEC has several.")

@@ -519,19 +519,19 @@ def learn_runs(
     _check(runs)
     good = [run for run in runs if run.is_good]
     bad = [run for run in runs if not run.is_good]
-    scope = scope_of([run.trace for run in good], profile)
-    if not scope.quantities:
+    quantities, not_compared = scope_of([run.trace for run in good], profile)
+    if not quantities:
         raise UsageError(_nothing_in_common(good))
-    left_out = (*_missing(good), *scope.left_out)
+    left_out = (*_missing(good), *not_compared)
     observed: dict[int, Observed] = {}
     for run in runs:
-        observed[id(run)] = Observed.of(run.trace, scope.quantities)
+        observed[id(run)] = Observed.of(run.trace, quantities)
         advance(1)
     writer = _Writer(profile, {name for run in runs for name in run.trace.names})
 
     def learn(some: Sequence[LabelledRun]) -> _Written | None:
         groups = ([observed[id(run)] for run in some if run.is_good is kind] for kind in (True, False))
-        found = chosen_lines(FittedLimits.to(scope.quantities, *groups), lines)
+        found = chosen_lines(FittedLimits.to(quantities, *groups), lines)
         return writer.written(found, some)
 
     written = learn(runs)

@@ -86,16 +86,8 @@ class Quantity:
         return self.relation in _EITHER_WAY
 
 
-@dataclass(frozen=True, slots=True)
-class Comparable:
-    """The quantities of some runs, and what was left out of them, in sentences."""
-
-    quantities: tuple[Quantity, ...]
-    left_out: tuple[str, ...]
-
-
-def scope_of(traces: Sequence[Trace], profile: str) -> Comparable:
-    """Return what can be measured in all of some runs.
+def scope_of(traces: Sequence[Trace], profile: str) -> tuple[list[Quantity], list[str]]:
+    """Return what can be measured in all of some runs, and what was left out, in sentences.
 
     Objects are compared by their names; those of a class also all at once, as in `forall a, b in class
     "block"`, if every run has two of them, or has them under other names.
@@ -133,7 +125,7 @@ def scope_of(traces: Sequence[Trace], profile: str) -> Comparable:
     for name in signals[:MOST_SIGNALS]:
         atom = Atom(format_relation("signal", (), (name, ">=", 0.0)), "signal", Signal(name))
         found.append(Quantity("signal", (), name, atom, atom))
-    return Comparable(tuple(found), tuple(left_out))
+    return found, left_out
 
 
 def members_of(trace: Trace) -> dict[str, set[str]]:
@@ -285,27 +277,15 @@ class Observed:
             span = np.where(known, nominal, -np.inf).max(axis=1) - np.where(known, nominal, np.inf).min(
                 axis=1
             )
-            found.append(
-                (
-                    values.min(axis=3),
-                    values.max(axis=3),
-                    values[..., 0],
-                    values[..., -1],
-                    values[:, 0][..., some],
-                    np.maximum(span, 0.0),
-                )
-            )
-        least, greatest, first, last, sampled, travel = zip(*found, strict=True)
-        return cls(
-            trace,
-            np.concatenate(least, axis=2),
-            np.concatenate(greatest, axis=2),
-            np.concatenate(first, axis=2),
-            np.concatenate(last, axis=2),
-            np.concatenate(sampled, axis=1),
-            np.concatenate(travel),
-            {name: _shift(trace, column) for column, name in enumerate(trace.names)},
+            ends = values.min(axis=3), values.max(axis=3), values[..., 0], values[..., -1]
+            found.append((*ends, values[:, 0][..., some], np.maximum(span, 0.0)))
+        # the axis of the quantities in each
+        axes = (2, 2, 2, 2, 1, 0)
+        least, greatest, first, last, sampled, travel = (
+            np.concatenate(each, axis) for each, axis in zip(zip(*found, strict=True), axes, strict=True)
         )
+        shifts = {name: _shift(trace, column) for column, name in enumerate(trace.names)}
+        return cls(trace, least, greatest, first, last, sampled, travel, shifts)
 
     def first_time(self, quantity: Quantity, direction: int, limit: float, *, surely: bool) -> int:
         """Return the first sample in which a quantity, or its negative, is at least a limit; T if none.
