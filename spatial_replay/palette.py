@@ -5,6 +5,7 @@ Blue and vermillion, and their mixtures with grey, are distinguishable with ever
 
 from __future__ import annotations
 
+from types import MappingProxyType
 from typing import Final
 
 POSITIVE: Final = (0.0, 0.447, 0.698)
@@ -40,3 +41,13 @@ def lighter(colour: str) -> str:
     shares = (int(colour[begin : begin + 2], 16) / 255.0 for begin in (1, 3, 5))
     red, green, blue = (share + _LIGHTER * (1.0 - share) for share in shares)
     return hexadecimal((red, green, blue))
+
+
+SIGNS: Final = MappingProxyType(
+    {
+        "positive": hexadecimal(POSITIVE),
+        "negative": hexadecimal(NEGATIVE),
+        "neutral": hexadecimal(NEUTRAL),
+    }
+)
+"""Colours of signs on pages."""

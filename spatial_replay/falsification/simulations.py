@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Final, NamedTuple, Protocol, TypeAlias, get_args
+from typing import Final, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 
@@ -214,32 +214,6 @@ class SimulatedCase(NamedTuple):
     unit: str = ""
 
 
-class Simulation(Protocol):
-    """Gives the run of each case; equal cases have equal runs.
-
-    Attributes:
-        name: what is simulated.
-        files: what has to hold.
-        identity: what else its runs depend on, for the folder of a search.
-    """
-
-    @property
-    def name(self) -> str: ...
-    @property
-    def files(self) -> tuple[Specification, ...]: ...
-    @property
-    def identity(self) -> Mapping[str, bool]: ...
-
-    def is_possible(self, case: Case) -> bool:
-        """Return whether there is such a run: False where objects would lie in each other."""
-
-    def run(self, case: Case) -> SimulatedCase:
-        """Simulate a case."""
-
-    def command(self, case: Case) -> str | None:
-        """Return the command that repeats the run of a case; None if there is none."""
-
-
 def scenario_simulation(
     scenario: str,
     files: Sequence[Specification],
@@ -304,7 +278,14 @@ def own_simulation(
 
 @dataclass(frozen=True, slots=True)
 class OwnSimulation:
-    """A simulation of the caller's: a function from the values of a case to samples."""
+    """A simulation of the caller's: a function from the values of a case to samples.
+
+    Equal cases have equal runs.
+
+    Attributes:
+        name: what is simulated.
+        files: what has to hold.
+    """
 
     simulate: Callable[[Mapping[str, float]], Iterable[Sample]]
     files: tuple[Specification, ...]
@@ -312,15 +293,15 @@ class OwnSimulation:
 
     @property
     def identity(self) -> Mapping[str, bool]:
-        """See `Simulation`."""
+        """What else its runs depend on, for the folder of a search."""
         return {}
 
     def is_possible(self, case: Case) -> bool:
-        """See `Simulation`."""
+        """Return whether there is such a run: False where objects would lie in each other."""
         return True
 
     def run(self, case: Case) -> SimulatedCase:
-        """See `Simulation`.
+        """Simulate a case.
 
         Raises:
             UsageError: the function returns anything but samples.
@@ -336,7 +317,7 @@ class OwnSimulation:
         )
 
     def command(self, case: Case) -> None:
-        """See `Simulation`."""
+        """Return the command that repeats the run of a case; None if there is none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -355,11 +336,11 @@ class ScenarioRuns:
 
     @property
     def identity(self) -> Mapping[str, bool]:
-        """See `Simulation`."""
+        """See `OwnSimulation`."""
         return {"planned": self.is_planned}
 
     def is_possible(self, case: Case) -> bool:
-        """See `Simulation`."""
+        """See `OwnSimulation`."""
         starts = {start.name: start for start in _conditions(case).starts}
         scenario = scenario_of(self.name)
         outlines = {each: _outline(each, starts, scenario.scatter_m) for each in scenario.placements}
@@ -370,7 +351,7 @@ class ScenarioRuns:
         )
 
     def run(self, case: Case) -> SimulatedCase:
-        """See `Simulation`."""
+        """See `OwnSimulation`."""
         given = _conditions(case)
         if self.is_planned:
             return self._plan(given)
@@ -381,7 +362,7 @@ class ScenarioRuns:
         )
 
     def command(self, case: Case) -> str:
-        """See `Simulation`."""
+        """See `OwnSimulation`."""
         given = _conditions(case)
         options = ["--seed", str(given.seed)]
         if given.noise_m:
@@ -483,6 +464,9 @@ class ScenarioRuns:
                     ends = round(centre - wide, digits), round(centre + wide, digits)
                     found.append(Parameter(f"{group}.{axis}", *ends, digits, None, group, unit))
         return found
+
+
+Simulation: TypeAlias = OwnSimulation | ScenarioRuns
 
 
 class _Conditions(NamedTuple):

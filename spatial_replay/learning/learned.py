@@ -30,9 +30,8 @@ from spatial_replay.spec.formula import NamedSpec, Specification
 from spatial_replay.spec.relations import DEFAULT_PROFILE, PROFILES
 from spatial_replay.spec.tokens import quoted
 from spatial_replay.text import counted, json_number, number_text, printable
-from spatial_replay.trace.units import require_same_units
 from spatial_replay.tuning.margins import LabelledRun
-from spatial_replay.tuning.tuned import MOST_RUNS, MOST_SAMPLES
+from spatial_replay.tuning.tuned import require_comparable
 
 # -------------------------------------------------------------------------------------------------- selection
 
@@ -561,19 +560,11 @@ def _check(runs: Sequence[LabelledRun]) -> None:
     if len(good) < 2:
         have = "there is no good run" if not good else f"{good[0].name} is the only good run"
         raise UsageError(f"{have}; what may vary shows in several: give at least two, better five")
-    if len(runs) > MOST_RUNS:
-        raise UsageError(f"{len(runs)} runs are more than {MOST_RUNS}; learn from some of them")
-    samples = sum(len(run.trace) for run in runs)
-    if samples > MOST_SAMPLES:
-        raise UsageError(
-            f"the runs have {samples} samples, more than {MOST_SAMPLES}; learn from some of them"
-        )
+    require_comparable(runs, "learn from")
     for run in runs:
         if len(run.trace) < _FEWEST_SAMPLES:
             have = counted(len(run.trace), "sample")
             raise UsageError(f"{run.name} is too short to learn from: it has {have}; leave it out")
-        if run is not runs[0]:
-            require_same_units(runs[0].trace, run.trace, (runs[0].name, run.name))
     for one in good:
         for other in runs:
             if other is one or (len(one.trace), one.trace.names) != (len(other.trace), other.trace.names):

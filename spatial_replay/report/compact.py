@@ -10,7 +10,6 @@ import json
 import re
 import zlib
 from collections.abc import Mapping
-from types import MappingProxyType
 from typing import Any, Final, Literal, TypeAlias
 
 import numpy as np
@@ -21,9 +20,6 @@ Kind: TypeAlias = Literal["f8", "f4", "i4", "u2", "u1"]
 Reference: TypeAlias = Mapping[str, Any]
 """Where an array lies in the page: its kind, the offset of its first byte, how many numbers it has."""
 
-_TYPES: Final[Mapping[Kind, str]] = MappingProxyType(
-    {"f8": "<f8", "f4": "<f4", "i4": "<i4", "u2": "<u2", "u1": "u1"}
-)
 _ALIGNMENT: Final = 8
 _LEVEL: Final = 6
 
@@ -37,7 +33,7 @@ class Packing:
 
     def add(self, array: NDArray[Any], kind: Kind) -> Reference:
         """Take in an array, flattened by rows, and return where the page finds it."""
-        data = np.ascontiguousarray(array, _TYPES[kind]).tobytes()
+        data = np.ascontiguousarray(array, f"<{kind}").tobytes()
         reference = {"kind": kind, "offset": self._size, "length": int(np.size(array))}
         self._pieces += [data, bytes(-len(data) % _ALIGNMENT)]
         self._size += len(data) + len(self._pieces[-1])

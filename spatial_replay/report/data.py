@@ -19,7 +19,7 @@ from spatial_replay.monitor.sentences import divisor_of, open_text
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.monitor.witness.atom import DecidingAtom
 from spatial_replay.monitor.witness.witness import Witness, WitnessStep
-from spatial_replay.palette import CURVES, NEGATIVE, NEUTRAL, POSITIVE, hexadecimal
+from spatial_replay.palette import CURVES, SIGNS
 from spatial_replay.replay.engine import Replayed
 from spatial_replay.report.compact import Packing, sentence_parts, singles
 from spatial_replay.report.panels import (
@@ -269,9 +269,7 @@ def page_data(report: RunReport) -> PageData:
         "is_thinned": len(kept) < len(times_ns),
         "times": packing.add((kept - first_ns) / 1e9, "f8"),
         "palette": {
-            "positive": hexadecimal(POSITIVE),
-            "negative": hexadecimal(NEGATIVE),
-            "neutral": hexadecimal(NEUTRAL),
+            **SIGNS,
             # without those of the signs
             "curves": CURVES[2:],
         },

@@ -20,7 +20,7 @@ from spatial_replay.monitor.causes import settled_time
 from spatial_replay.monitor.result import SpecResult, worst_first
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.notebook.figures import Html, element
-from spatial_replay.palette import NEGATIVE, NEUTRAL, POSITIVE, hexadecimal
+from spatial_replay.palette import SIGNS
 from spatial_replay.report.compact import json_text, sentence_parts
 from spatial_replay.report.data import MANY, ReportedResult, RunReport, page_data
 from spatial_replay.report.panels import final_text
@@ -250,13 +250,6 @@ def chip(verdict: str, *, is_tested: bool = True) -> Html:
     return element("span", verdict, **{"class": f"chip is-{verdict if is_tested else 'vacuous'}"})
 
 
-_BOTH: Final = MappingProxyType(
-    {
-        "positive": hexadecimal(POSITIVE),
-        "negative": hexadecimal(NEGATIVE),
-        "neutral": hexadecimal(NEUTRAL),
-    }
-)
 LIGHT: Final[Mapping[str, str]] = MappingProxyType(
     {
         "paper": "#f6f6f3",
@@ -294,7 +287,7 @@ DARK: Final[Mapping[str, str]] = MappingProxyType(
 
 def theme() -> str:
     """Return the colours as a style sheet: the system's theme, unless the reader chose the other one."""
-    light = _rule({"color-scheme": "light", **_variables(_BOTH), **_variables(LIGHT)})
+    light = _rule({"color-scheme": "light", **_variables(SIGNS), **_variables(LIGHT)})
     dark = _rule({"color-scheme": "dark", **_variables(DARK)})
     return (
         f':root{light}:root[data-theme="dark"]{dark}'

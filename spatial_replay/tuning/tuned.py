@@ -952,16 +952,29 @@ def _check(specification: Specification, runs: Sequence[LabelledRun]) -> None:
         raise UsageError(f"relations given in Python cannot be tuned ({names}); write them as def")
     if not any(run.is_good for run in runs):
         raise UsageError("there is no good run to satisfy; give at least one that did what it should")
-    if len(runs) > MOST_RUNS:
-        raise UsageError(f"{len(runs)} runs are more than {MOST_RUNS}; tune on some of them")
-    samples = sum(len(run.trace) for run in runs)
-    if samples > MOST_SAMPLES:
-        raise UsageError(f"the runs have {samples} samples, more than {MOST_SAMPLES}; tune on some of them")
+    require_comparable(runs, "tune on")
     for run in runs[1:]:
-        require_same_units(runs[0].trace, run.trace, (runs[0].name, run.name))
         if with_numbers(specification, run.trace.units) != with_numbers(specification, runs[0].trace.units):
             what = f"{run.name} and {runs[0].name} name the numbers of a signal differently"
             raise UsageError(f"{what}; read both by one mapping")
+
+
+def require_comparable(runs: Sequence[LabelledRun], remedy: str) -> None:
+    """Check that runs can be held in memory together, and are in the same units.
+
+    Args:
+        remedy: what is to be done with some of them: "tune on".
+
+    Raises:
+        UsageError: too many runs or samples, or other units.
+    """
+    if len(runs) > MOST_RUNS:
+        raise UsageError(f"{len(runs)} runs are more than {MOST_RUNS}; {remedy} some of them")
+    samples = sum(len(run.trace) for run in runs)
+    if samples > MOST_SAMPLES:
+        raise UsageError(f"the runs have {samples} samples, more than {MOST_SAMPLES}; {remedy} some of them")
+    for run in runs[1:]:
+        require_same_units(runs[0].trace, run.trace, (runs[0].name, run.name))
 
 
 def _with_values(
