@@ -44,7 +44,7 @@ def cache_folder() -> Path | None:
                     raise OSError(errno.ENOSPC, "no space left")
         except OSError:
             # code that was compiled when an image was built, and is read-only now, or on a full disk
-            shipped = shipped or (folder if _holds_code(folder) else None)
+            shipped = shipped or (folder if any(folder.rglob("*.nbi")) else None)
             continue
         if is_new:
             _remove_stale(parent, keep=name)
@@ -126,10 +126,6 @@ def _cache_parents() -> Iterator[Path]:
     # a user without a home folder
     with suppress(RuntimeError):
         yield Path.home() / ".cache" / "spatial-replay"
-
-
-def _holds_code(folder: Path) -> bool:
-    return any(folder.rglob("*.nbi"))
 
 
 def _remove_stale(parent: Path, keep: str) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from spatial_replay.compare.runs import file_of
 from spatial_replay.errors import UsageError
-from spatial_replay.geometry.arrays import Booleans, Floats, Integers
+from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.logs.remote import RemoteFile
 from spatial_replay.logs.source import Source
 from spatial_replay.monitor.atoms.delays import look_back
@@ -122,7 +122,8 @@ class _Part:
         # an instance lasts from the first to the last appearance of its object
         self._seen_ns: Integers | None = None
         if result.object is not None and trace is not None:
-            self._seen_ns = trace.times_ns[_appearances(trace, result.object)]
+            column = trace.names.index(result.object)
+            self._seen_ns = trace.times_ns[trace.rows[:, column] != ABSENT]
         self._decision = self._decided(result, self._leaves)
         times_ns = [self._decision.path.decided_ns, self._decision.settled.decided_ns]
         times_ns += [] if self._decision.certain_ns is None else [self._decision.certain_ns]
@@ -271,10 +272,6 @@ def _joined_times(times_ns: Sequence[Integers]) -> Integers:
     if all(np.array_equal(each, first) for each in times_ns):
         return first
     return np.unique(np.concatenate(times_ns))
-
-
-def _appearances(trace: Trace, name: str) -> Booleans:
-    return np.asarray(trace.rows[:, trace.names.index(name)] != ABSENT)
 
 
 @dataclass(frozen=True, eq=False)

@@ -828,9 +828,7 @@ class LogDiff(Displayed):
             "only_a": list(self.only_a),
             "only_b": list(self.only_b),
             "specifications": [each.document for each in self.specs],
-            "decision": None
-            if self.decision is None
-            else {**self.decision._asdict(), "maps": list(self.decision.maps)},
+            "decision": self.decision and self.decision._asdict(),
         }
 
     def __repr__(self) -> str:

@@ -153,14 +153,8 @@ def _draw_colours(surface: Surface, ax: Axes) -> None:
         alpha=0.6,
         shading="nearest",
     )
-    figure = ax.get_figure(root=True)
-    if figure is not None:
-        figure.colorbar(
-            mesh,
-            ax=ax,
-            label="least margin of all runs (robustness)",
-            extend="min" if least.min() < -most else "neither",
-        )
+    extend = "min" if least.min() < -most else "neither"
+    ax.figure.colorbar(mesh, ax=ax, label="least margin of all runs (robustness)", extend=extend)
     for (_, is_good), margins in list(zip(surface.runs, surface.margins, strict=True))[:_MOST_LINES]:
         if min(margins.shape) > 1 and margins.min() < 0.0 <= margins.max():
             ax.contour(
