@@ -293,7 +293,7 @@ class OwnSimulation:
 
     @property
     def identity(self) -> Mapping[str, bool]:
-        """What else its runs depend on, for the folder of a search."""
+        """The other inputs of its runs, for the folder of a search."""
         return {}
 
     def is_possible(self, case: Case) -> bool:
