@@ -167,11 +167,6 @@ def quoted(name: str) -> str:
     return '"' + name.replace('"', '\\"') + '"'
 
 
-@pytest.fixture(scope="module")
-def context(browser: Browser) -> BrowserContext:
-    return browser.new_context()
-
-
 @pytest.fixture
 def open_page(context: BrowserContext, pages: Mapping[str, Path]) -> Iterator[Open]:
     """Opens a page and waits until it is there; any complaint or request of it fails the test in the end."""

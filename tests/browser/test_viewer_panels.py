@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, BrowserContext, Page, expect
 
 import spatial_replay as sr
 from browser.viewer_page import differences, write_viewer_page
@@ -43,7 +43,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, Path]:
 
 
 @pytest.fixture
-def open_panel(browser: Browser, logs: Mapping[str, Path]) -> Iterator[Open]:
+def open_panel(context: BrowserContext, logs: Mapping[str, Path]) -> Iterator[Open]:
     """Opens a panel over a log; a test fails if something is written to the console."""
     opened: list[Page] = []
     problems: list[str] = []
@@ -55,7 +55,8 @@ def open_panel(browser: Browser, logs: Mapping[str, Path]) -> Iterator[Open]:
         state: Mapping[str, Any] | None = None,
         logs: Mapping[str, Path] = logs,
     ) -> Page:
-        page = browser.new_page(viewport={"width": 700, "height": 800})
+        page = context.new_page()
+        page.set_viewport_size({"width": 700, "height": 800})
         opened.append(page)
         page.on("console", lambda message: problems.append(message.text))
         page.on("pageerror", lambda error: problems.append(str(error)))

@@ -6,6 +6,7 @@ import json
 import math
 import re
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,8 @@ from falsification.crossings import APART, VARIED, crossing
 from pages import shown
 from spatial_replay.falsification.failure_search import Falsification
 
-pytest.importorskip("cma", reason="the search needs cma")
+# to import it takes seconds
+pytestmark = pytest.mark.skipif(find_spec("cma") is None, reason="the search needs cma")
 
 
 def search(folder: Path, **options: object) -> Falsification:
