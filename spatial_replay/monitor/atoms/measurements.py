@@ -222,7 +222,7 @@ class MovedLeaves:
         for place, where in self._unknown:
             values[place, where] = np.nan
         batch = self._scene.batch
-        batch = replace(batch, vertices=vertices)
+        batch = replace(batch, vertices=vertices[: len(batch.vertices)])
         closest = np.array([_ends_of(self._scene, each, batch) for each in self._code.closest])
         return self._code.run(values, self._spreads, closest)
 
