@@ -427,15 +427,12 @@ class Arranger:
             if (stencil := stencils.get((name, other))) is not None:
                 left = np.minimum(left, 1.0 - _lost(cells, stencil) / max(int(cells.sum()), 1))
         ranked = [(domain & (left >= _ENOUGH), score), (domain & (left > 0.0), left), (domain, score)]
-        chosen: dict[Cell, None] = {}
-        for among, values in ranked:
-            if among.any():
-                chosen[_best(among, values, score)] = None
-        rows, columns = np.indices(domain.shape)[1:]
+        chosen = [_best(among, values, score) for among, values in ranked if among.any()]
+        rows, columns = np.indices(domain.shape, np.float64)[1:]
         among = domain & (left > 0.0)
-        for direction in (rows, -rows, columns, -columns) if among.any() else ():
-            chosen[_best(among, direction.astype(np.float64), left)] = None
-        yield from chosen
+        if among.any():
+            chosen += [_best(among, each, left) for each in (rows, -rows, columns, -columns)]
+        yield from dict.fromkeys(chosen)
 
     def _score(self, name: str) -> Floats:
         """Return how good each cell of an object is, the other ones aside."""
@@ -613,12 +610,8 @@ class Lookahead:
     def __init__(self, expected: Expectations, sample: Sample) -> None:
         """Begin with what is known about a run, and its newest sample."""
         self._expected, self._first = expected, PredictedState(sample)
-        self._automaton, self._formulas, self._regions = (
-            expected.automaton,
-            expected.formulas,
-            expected.regions,
-        )
-        self._settings = expected.settings
+        self._automaton, self._formulas = expected.automaton, expected.formulas
+        self._regions, self._settings = expected.regions, expected.settings
         self.movables = expected.movables(self._first)
         """The movable objects of the newest sample."""
         self._pruned: set[Edge] = set()

@@ -146,7 +146,6 @@ class PlanLoop:
         """Begin before the first sample."""
         self._box, self._log = box, log
         self.planning_s = 0.0
-        self._newest_ns = 0
 
     @property
     def planner(self) -> Planner:
@@ -161,7 +160,6 @@ class PlanLoop:
             OutputError: the log cannot be written.
         """
         self._log.write(sample)
-        self._newest_ns = sample.time_ns
         began = time.perf_counter()
         self._box.observe(sample)
         self.planning_s += time.perf_counter() - began
@@ -180,7 +178,7 @@ class PlanLoop:
         for node in tick.nodes:
             status = BehaviourTree.Status.Value(f"STATUS_{node.status}")
             message.nodes.add(name=node.name, type=node.kind, parent=node.parent, status=status)
-        self._log.write_payload(_TREES, self._newest_ns, message.SerializeToString(deterministic=True))
+        self._log.write_payload(_TREES, self._log.newest_ns, message.SerializeToString(deterministic=True))
 
     def conclude(self, outcome: Outcome) -> None:
         """Take the outcome of the last step, and log it."""

@@ -36,6 +36,10 @@ class RunLog:
     """A log being written: samples as they arrive, and messages about decisions in between.
 
     Equal samples, specifications and messages give equal bytes. Use `run_log` to make one.
+
+    Attributes:
+        samples: the number of samples so far.
+        newest_ns: the time of the newest one.
     """
 
     def __init__(self, writer: LogWriter, recording: Recording) -> None:
@@ -43,19 +47,13 @@ class RunLog:
         self._recording = recording
         self._waiting: list[Sample] = []
         self._beside: list[Messages] = []
-        self._first_ns = self._last_ns = 0
-        self._samples = 0
+        self._first_ns = self.newest_ns = self.samples = 0
         self._written = Counter[str]()
-
-    @property
-    def samples(self) -> int:
-        """The number of samples so far."""
-        return self._samples
 
     @property
     def seconds(self) -> float:
         """The time from the first sample to the last."""
-        return (self._last_ns - self._first_ns) / 1e9
+        return (self.newest_ns - self._first_ns) / 1e9
 
     @property
     def verdicts(self) -> Mapping[str, Verdict]:
@@ -69,10 +67,10 @@ class RunLog:
             TraceError: it is not after the one before.
             OutputError: the log cannot be written.
         """
-        if not self._samples:
+        if not self.samples:
             self._first_ns = sample.time_ns
-        self._last_ns = sample.time_ns
-        self._samples += 1
+        self.newest_ns = sample.time_ns
+        self.samples += 1
         if len(self._waiting) >= _STRETCH:
             # flushed only when the next sample arrives: messages about the newest sample have its time
             self.flush()

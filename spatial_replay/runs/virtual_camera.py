@@ -70,26 +70,14 @@ class Backdrop(NamedTuple):
     depth: Floats
 
 
-@dataclass(frozen=True, slots=True)
-class Flaws:
-    """Degradation of an image.
-
-    Attributes:
-        noise: standard deviation of a pixel's brightness, of 255.
-        blur: standard deviation of the lens's blur, in pixels.
-    """
-
-    noise: float = 2.0
-    blur: float = 0.6
-
-
 def render(
     family: str,
     instants: Sequence[Sequence[Plate]],
     camera: Camera,
     pose: Floats,
     *,
-    flaws: Flaws | None = None,
+    noise: float = 2.0,
+    blur_px: float = 0.6,
     seed: Sequence[int] = (0,),
     backdrop: Backdrop | None = None,
 ) -> Image:
@@ -98,10 +86,11 @@ def render(
     Args:
         instants: the plates at some instants of the exposure; what moves between them is blurred.
         pose: (6,), rotation vector and translation from the scene's frame to the camera's.
+        noise: standard deviation of a pixel's brightness, of 255.
+        blur_px: standard deviation of the lens's blur, in pixels.
         seed: of the noise.
         backdrop: what else is seen; a plate is hidden by what is nearer.
     """
-    flaws = flaws or Flaws()
     width, height = camera.size
     base = np.full((height, width), 120, np.uint8) if backdrop is None else backdrop.image
     depth = None if backdrop is None else backdrop.depth
@@ -118,14 +107,12 @@ def render(
             moving = [plate for plate, is_moved in zip(plates, moves, strict=True) if is_moved]
             total += _exposed(family, moving, camera, pose, image, depth)
         image = ((total + len(instants) // 2) // len(instants)).astype(np.uint8)
-    if flaws.blur:
-        image = blur(image, flaws.blur)
-    if flaws.noise:
-        # of the brightness: the same in all colours
-        drawn = np.random.default_rng(list(seed)).standard_normal(image.shape[:2], np.float32)
-        noise = np.rint(drawn * flaws.noise).astype(np.int16)
-        image = np.clip(image + (noise if image.ndim == 2 else noise[..., None]), 0, 255).astype(np.uint8)
-    return np.ascontiguousarray(image)
+    image = blur(image, blur_px)
+    # of the brightness: the same in all colours
+    drawn = np.random.default_rng(list(seed)).standard_normal(image.shape[:2], np.float32)
+    brighter = np.rint(drawn * noise).astype(np.int16)
+    image = np.clip(image + (brighter if image.ndim == 2 else brighter[..., None]), 0, 255)
+    return np.ascontiguousarray(image.astype(np.uint8))
 
 
 def _exposed(

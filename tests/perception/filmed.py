@@ -11,7 +11,7 @@ import numpy as np
 from spatial_replay.perception import Frame, TagsFile, parse_tags
 from spatial_replay.perception.opencv import Camera, pose_looking_at
 from spatial_replay.perception.video import VideoWriter
-from spatial_replay.runs.virtual_camera import Flaws, Plate, render
+from spatial_replay.runs.virtual_camera import Plate, render
 
 PERIOD_NS = 40_000_000
 CAMERA = "camera: {size: [480, 360], focal: [640, 640]}"
@@ -52,12 +52,12 @@ def picture(
     scene: Sequence[Plate],
     *,
     seed: int = 0,
-    flaws: Flaws | None = None,
     lens: Camera = LENS,
     pose: np.ndarray = FROM_THE_SIDE,
+    **flaws: float,
 ) -> np.ndarray:
     """Return what a camera sees, the one from the side unless another is given."""
-    return render("36h11", [scene], lens, pose, seed=(seed,), flaws=flaws)
+    return render("36h11", [scene], lens, pose, seed=(seed,), **flaws)
 
 
 def film(poses_at: Callable[[int], Poses], count: int, text: str = TABLE) -> Iterator[Frame]:

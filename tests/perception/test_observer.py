@@ -28,7 +28,7 @@ from spatial_replay.perception.opencv import (
     pose_looking_at,
     rotations,
 )
-from spatial_replay.runs.virtual_camera import Flaws, Plate, render
+from spatial_replay.runs.virtual_camera import Plate, render
 
 pytest.importorskip("cv2")
 
@@ -86,7 +86,7 @@ def test_the_truth_is_within_the_stated_uncertainty(text: str) -> None:
             for number, yaw in enumerate(drawn.uniform(-3, 3, 2))
         }
         scene = plates(tags, poses, top)
-        image = picture(scene, seed=seed, flaws=Flaws(noise=3.0, blur=0.7))
+        image = picture(scene, seed=seed, noise=3.0, blur_px=0.7)
         sample = observer.observe(Frame(seed, image)).sample
         assert set(sample.objects) == {"red", "blue"}
         for number, name in enumerate(("red", "blue")):
