@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from reprlib import repr as shortened
 from types import MappingProxyType
-from typing import Final, Literal, NamedTuple, cast
+from typing import Final, Literal, NamedTuple
 
 from spatial_replay.compiled import compile_ahead
 from spatial_replay.errors import SpecificationError, TraceError, UsageError
@@ -68,8 +68,7 @@ class SpecUpdate:
         if self.numbers is None:
             return ()
         columns = zip(range(len(self.names)), self.names, *self.numbers.T.tolist(), strict=True)
-        # bypasses the constructor, which would take longer than the rest of a sample
-        return tuple([tuple.__new__(NodeUpdate, column) for column in columns])
+        return tuple(map(NodeUpdate._make, columns))
 
     def node(self, identifier: int) -> NodeUpdate:
         """Return the node with an id, once the monitor has started."""
@@ -116,26 +115,11 @@ class Update:
     satisfied: tuple[Settled, ...] = ()
     remarks: tuple[Diagnostic, ...] = ()
 
-    @property
+    @cached_property
     def specs(self) -> tuple[SpecUpdate, ...]:
         """One for each result spec, in the order of the text."""
-        own = self.__dict__
-        # nearly all that is read of an update comes this way: the lock of a cached property, and constructors
-        # of frozen values, would take as long as the kernel
-        if "_specs" not in own:
-            made: list[SpecUpdate] = []
-            for (spec, names, unit), numbers in zip(self.monitored.specs, self.numbers, strict=True):
-                update = object.__new__(SpecUpdate)
-                fields = update.__dict__
-                fields["spec"], fields["numbers"], fields["names"], fields["unit"] = (
-                    spec,
-                    numbers,
-                    names,
-                    unit,
-                )
-                made.append(update)
-            own["_specs"] = tuple(made)
-        return cast("tuple[SpecUpdate, ...]", own["_specs"])
+        of_specs = zip(self.monitored.specs, self.numbers, strict=True)
+        return tuple([SpecUpdate(spec, numbers, names, unit) for (spec, names, unit), numbers in of_specs])
 
     @property
     def places(self) -> Mapping[str, tuple[int, int]]:
@@ -277,12 +261,7 @@ class Monitor:
         if self._violations is not None:
             self._violations.extend(sample, numbers)
             settled, satisfied = self._violations.settled, self._violations.satisfied
-        # bypasses the constructor of a frozen value, which would take as long as the kernel
-        update = object.__new__(Update)
-        own = update.__dict__
-        own["time_ns"], own["numbers"], own["monitored"] = time_ns, numbers, self._monitored
-        own["settled"], own["satisfied"], own["remarks"] = settled, satisfied, remarks
-        return update
+        return Update(time_ns, numbers, self._monitored, settled, satisfied, remarks)
 
 
 class _AwaitedNames:

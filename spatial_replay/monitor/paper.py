@@ -29,7 +29,7 @@ from spatial_replay.spec.formula import (
     Truth,
     iter_nodes,
 )
-from spatial_replay.spec.walks import has_rate, is_spatial, leaf_key
+from spatial_replay.spec.walks import has_rate, is_spatial, leaf_key, nodes_with_operands
 
 Numbers: TypeAlias = Floats
 """(2, …): numbers, NaN where they are left out, and whether something unknown matters to them (1, else 0)."""
@@ -133,11 +133,8 @@ class PaperRun:
             max_pairs: the most pairs of samples to compare.
         """
         self._max_pairs = max_pairs
-        self._nodes = [node for _, _, node in iter_nodes(formula)]
-        self._operands: list[list[int]] = [[] for _ in self._nodes]
-        for identifier, parent, _ in iter_nodes(formula):
-            if parent is not None:
-                self._operands[parent].append(identifier)
+        tree = nodes_with_operands(formula)
+        self._nodes, self._operands = [node for node, _ in tree], [operands for _, operands in tree]
         keys = [leaf_key(leaf) for leaf in leaves]
         is_leaf = [isinstance(node, Atom | Quantified) for node in self._nodes]
         self._leaf = {n: keys.index(leaf_key(node)) for n, node in enumerate(self._nodes) if is_leaf[n]}
@@ -145,7 +142,7 @@ class PaperRun:
         # which nodes are needed at every sample, and which of all later samples change in more than one place
         self._is_wanted = [False] * len(self._nodes)
         self._nested: list[int] = []
-        for n, (node, operands) in enumerate(zip(self._nodes, self._operands, strict=True)):
+        for n, (node, operands) in enumerate(tree):
             if self._is_plain[n]:
                 is_nested = False
             elif isinstance(node, Temporal):

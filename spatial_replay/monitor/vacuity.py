@@ -20,13 +20,13 @@ from spatial_replay.monitor.witness.unfinished import (
     evaluate_untested,
     evaluate_with_whole_windows,
     is_cut,
+    windows_of,
 )
 from spatial_replay.spec.format import format_formula, format_term
 from spatial_replay.spec.formula import (
     FUTURE_OPERATORS,
     Atom,
     Boolean,
-    Bound,
     Earlier,
     Equality,
     Formula,
@@ -190,26 +190,6 @@ def _below(formula: Temporal, place: int, scope: _Samples, times_ns: Integers) -
     np.add.at(edges, end[there], -1)
     covered: _Samples = np.cumsum(edges[:-1]) > 0
     return covered
-
-
-def windows_of(formula: Temporal, times_ns: Integers) -> tuple[Integers, Integers]:
-    """Return the first sample (T,) in an operator's window at each sample, and the one after the last."""
-    count = len(times_ns)
-    here = np.arange(count, dtype=np.int64)
-    is_ahead = formula.operator in FUTURE_OPERATORS
-    bound = formula.bound or Bound(0, None, "samples")
-    if formula.operator in _NEXT:
-        bound = Bound(1, 1, "samples")
-    # as distances from the first sample, and no further than the last: sums stay below 64 bits
-    places = here if bound.unit == "samples" else times_ns - times_ns[0]
-    furthest = int(places[-1]) + 1
-    near = min(bound.lower, furthest)
-    far = furthest if bound.upper is None else min(bound.upper, furthest)
-    low, high = (places + near, places + far) if is_ahead else (places - far, places - near)
-    if bound.unit == "samples":
-        return np.clip(low, 0, count), np.clip(high + 1, 0, count)
-    begin = np.searchsorted(places, low, side="left").astype(np.int64)
-    return begin, np.searchsorted(places, high, side="right").astype(np.int64)
 
 
 # --------------------------------------------------------------------------------------------- reasons

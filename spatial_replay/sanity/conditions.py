@@ -57,6 +57,7 @@ from spatial_replay.spec.walks import (
     iter_expressions,
     iter_formulas,
     measured_terms,
+    named_members,
     standing,
     terms_of,
 )
@@ -93,14 +94,9 @@ Tree: TypeAlias = Linear | LeastOrGreatest
 def tree_of(expression: Expression, regions: Mapping[str, Outline]) -> Tree | None:
     """Return an expression as sums below minima and maxima; None for one with too many sums."""
     try:
-        tree = _built(expression, regions)
-    except (_TooManyError, OverflowError):
+        return _built(expression, regions)
+    except OverflowError:
         return None
-    return tree
-
-
-class _TooManyError(Exception):
-    """An expression of more than `MAX_INEQUALITIES` sums."""
 
 
 def _built(expression: Expression, regions: Mapping[str, Outline]) -> Tree:
@@ -162,7 +158,7 @@ def _times(tree: Tree, factor: Fraction) -> Tree:
 
 def _chosen(kind: Literal["min", "max"], options: tuple[Tree, ...]) -> Tree:
     if sum(map(_size, options)) > MAX_INEQUALITIES:
-        raise _TooManyError
+        raise OverflowError("too many sums")
     return options[0] if len(options) == 1 else LeastOrGreatest(kind, options)
 
 
@@ -268,8 +264,7 @@ def members(term: Term) -> tuple[Term, ...]:
         return (term,)
     if any(isinstance(each, Variable) for each in group.excluded):
         return (term,)
-    left_out = {each.name for each in group.excluded}
-    names = [TrackedName(name) for name in group.members if name not in left_out]
+    names = [TrackedName(name) for name in named_members(group)]
     if not names:
         return (term,)
     if isinstance(term, Earlier):

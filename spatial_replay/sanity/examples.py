@@ -167,57 +167,42 @@ class Setting:
         return self._boxes[key]
 
 
-class Placements:
-    """Placements in which facts have some values, sample by sample; the roomiest first.
+Core: TypeAlias = frozenset[tuple[int, int]]
+"""Facts, by sample and place, that exclude each other."""
 
-    Attributes:
-        core: where there is none with the least room: facts, by sample and place, that exclude each other.
-            None before that is known, or if it takes too long.
+
+def placements(
+    setting: Setting, facts: Sequence[Sequence[tuple[Fact, bool]]], period_ns: int
+) -> Iterator[tuple[tuple[Sample, ...] | None, Core | None]]:
+    """Yield placements in which facts have some values, the roomiest first, or what excludes each other.
+
+    Neither is known where that takes too long.
+
+    Args:
+        facts: of each sample, with their values.
+
+    Raises:
+        CannotPlaceError: a fact is about something that is not placed.
     """
-
-    core: frozenset[tuple[int, int]] | None = None
-
-    def __init__(
-        self, setting: Setting, facts: Sequence[Sequence[tuple[Fact, bool]]], period_ns: int
-    ) -> None:
-        """Begin.
-
-        Args:
-            facts: of each sample, with their values.
-        """
-        self._setting, self._facts, self._period_ns = setting, facts, period_ns
-
-    def __iter__(self) -> Iterator[tuple[Sample, ...]]:
-        """Yield placements.
-
-        Raises:
-            CannotPlaceError: a fact is about something that is not placed.
-        """
-        setting, facts = self._setting, self._facts
-        unit = _unit(setting, facts)
-        turns = [_turns(setting, each) for each in facts]
-        places = [(index, place) for index, sample in enumerate(facts) for place in range(len(sample))]
-        for margin, spread in ((0.2, 2.0), (0.04, 4.0), (0.04, 20.0), (0.005, 50.0)):
-            attempt = _Attempt(setting, unit, margin * unit, spread)
-            required: list[Inequality] = list(attempt.sizes())
-            choices: list[Ways] = []
-            for label, (index, place) in enumerate(places):
-                fact, value = facts[index][place]
-                ways = [
-                    [each._replace(label=label) for each in way] for way in attempt.ways(fact, value, index)
-                ]
-                if len(ways) == 1:
-                    required += ways[0]
-                elif ways:
-                    choices.append(ways)
-            found = attempt.solve(required, choices, len(facts))
-            self.core = None
-            if not isinstance(found, frozenset):
-                yield tuple(
-                    attempt.sample(found, index, turns[index], self._period_ns) for index in range(len(facts))
-                )
-            elif attempt.is_finished:
-                self.core = frozenset(places[label] for label in found)
+    unit = _unit(setting, facts)
+    turns = [_turns(setting, each) for each in facts]
+    places = [(index, place) for index, sample in enumerate(facts) for place in range(len(sample))]
+    for margin, spread in ((0.2, 2.0), (0.04, 4.0), (0.04, 20.0), (0.005, 50.0)):
+        attempt = _Attempt(setting, unit, margin * unit, spread)
+        required: list[Inequality] = list(attempt.sizes())
+        choices: list[Ways] = []
+        for label, (index, place) in enumerate(places):
+            fact, value = facts[index][place]
+            ways = [[each._replace(label=label) for each in way] for way in attempt.ways(fact, value, index)]
+            if len(ways) == 1:
+                required += ways[0]
+            elif ways:
+                choices.append(ways)
+        found = attempt.solve(required, choices, len(facts))
+        if not isinstance(found, frozenset):
+            yield tuple(attempt.sample(found, at, turn, period_ns) for at, turn in enumerate(turns)), None
+        else:
+            yield None, frozenset(places[label] for label in found) if attempt.is_finished else None
 
 
 def _unit(setting: Setting, facts: Sequence[Sequence[tuple[Fact, bool]]]) -> float:
@@ -541,23 +526,18 @@ def shortest_example(
             " and ".join(dict.fromkeys(fact.texts[0 if value else 1] for fact, value in each)) or "any sample"
             for each in facts
         )
-        placing = _Placing(specification, spec, facts, verdict)
         try:
-            found = placing.placed(is_exact=is_exact)
+            found, note, core = _placed(specification, spec, facts, verdict, is_exact=is_exact)
         except CannotPlaceError as reason:
-            found, first = None, first or Example(verdict, sentences, note=str(reason))
+            found, note, core = None, str(reason), None
         if found is not None:
             return Example(verdict, sentences, *found)
-        first = first or Example(verdict, sentences, note="no placement of boxes was found")
-        if placing.core is None:
+        first = first or Example(verdict, sentences, note=note)
+        if core is None:
             break
         numbers = [sorted(cube) for cube in word]
         blamed = tuple(
-            {
-                numbers[index][place]: word[index][numbers[index][place]]
-                for at, place in placing.core
-                if at == index
-            }
+            {numbers[index][place]: word[index][numbers[index][place]] for at, place in core if at == index}
             for index in range(len(word))
         )
         avoided.append(tuple(filter(None, blamed)) if sum(map(bool, blamed)) == 1 else blamed)
@@ -568,52 +548,42 @@ def shortest_example(
     return first if is_exact else None
 
 
-class _Placing:
-    """One word that is placed.
+def _placed(
+    specification: Specification,
+    spec: NamedSpec,
+    facts: Sequence[Sequence[tuple[Fact, bool]]],
+    verdict: str,
+    *,
+    is_exact: bool,
+) -> tuple[tuple[tuple[Sample, ...], float] | None, str, Core | None]:
+    """Return samples that evaluate to the verdict, and their robustness.
 
-    Attributes:
-        core: facts, by sample and place, that cannot be placed together; None if that is not known.
+    Returns:
+        None for those if none are found; then why, and facts that cannot be placed together, if known.
+
+    Raises:
+        CannotPlaceError: there is something that is not placed.
     """
-
-    core: frozenset[tuple[int, int]] | None = None
-
-    def __init__(
-        self,
-        specification: Specification,
-        spec: NamedSpec,
-        facts: Sequence[Sequence[tuple[Fact, bool]]],
-        verdict: str,
-    ) -> None:
-        self._specification, self._spec, self._facts, self._verdict = specification, spec, facts, verdict
-
-    def placed(self, *, is_exact: bool) -> tuple[tuple[Sample, ...], float] | None:
-        """Return samples that evaluate to the verdict, and their robustness; None if none are found.
-
-        Raises:
-            CannotPlaceError: there is something that is not placed, or cannot be evaluated.
-        """
-        if self._spec.parameter is not None:
-            raise CannotPlaceError("a template is about the objects of a log")
-        if len(self._facts) > MAX_SAMPLES:
-            raise CannotPlaceError(f"it takes {len(self._facts)} samples")
-        setting, reason = _setting(self._specification, self._spec), None
-        for period_ns in (_SECOND_NS,) if is_exact else (_SECOND_NS, _TENTH_NS):
-            placements = Placements(setting, self._facts, period_ns)
-            for samples in placements:
-                try:
-                    found, robustness = _evaluated(
-                        self._specification, self._spec, Trace.from_samples(samples)
-                    )
-                except SpatialReplayError as error:
-                    reason = error
-                    continue
-                if found == self._verdict:
-                    return samples, robustness
-                reason = None
-            self.core = placements.core
-        if reason is not None:
-            raise CannotPlaceError(f"it cannot be evaluated: {reason}")
-        return None
+    if spec.parameter is not None:
+        raise CannotPlaceError("a template is about the objects of a log")
+    if len(facts) > MAX_SAMPLES:
+        raise CannotPlaceError(f"it takes {len(facts)} samples")
+    setting, note = _setting(specification, spec), ""
+    core: Core | None = None
+    for period_ns in (_SECOND_NS,) if is_exact else (_SECOND_NS, _TENTH_NS):
+        for samples, excluded in placements(setting, facts, period_ns):
+            core = excluded
+            if samples is None:
+                continue
+            try:
+                found, robustness = _evaluated(specification, spec, Trace.from_samples(samples))
+            except SpatialReplayError as error:
+                note = f"it cannot be evaluated: {error}"
+                continue
+            if found == verdict:
+                return (samples, robustness), "", None
+            note = ""
+    return None, note or "no placement of boxes was found", core
 
 
 def _evaluated(specification: Specification, spec: NamedSpec, trace: Trace) -> tuple[str, float]:

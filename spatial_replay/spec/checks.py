@@ -39,6 +39,7 @@ from spatial_replay.spec.walks import (
     base_of,
     iter_formulas,
     logged_signals,
+    named_members,
     rewritten,
     substitute,
     terms_of,
@@ -200,8 +201,7 @@ def object_names(specification: Specification) -> tuple[str, ...]:
             if isinstance(base, TrackedName):
                 found[base.name] = None
             elif isinstance(base, Group):
-                left_out = {excluded.name for excluded in base.excluded if isinstance(excluded, TrackedName)}
-                found.update((name, None) for name in base.members or () if name not in left_out)
+                found.update(dict.fromkeys(named_members(base)))
     return tuple(found)
 
 
@@ -264,40 +264,35 @@ def check_names(
     known_classes = tuple(classes)
     source = SourceText.of(specification.source, specification.filename)
     places, defined = _places(specification, source)
-    missing = [("object", name, objects) for name in object_names(specification) if name not in objects]
-    missing += [("signal", name, numeric) for name in signal_names(specification) if name not in numeric]
-    found = [
-        source.diagnostic(
-            "error",
-            places.get(name, Span(0, 0)),
-            f"the {where} never has the {kind} {name!r}" + (during and f" {during}"),
-            _class_hint(name, kind, known_classes)
-            or " ".join(filter(None, (nearest_hint(name, candidates), _listing(kind, candidates)))),
-        )
-        for kind, name, candidates in missing
-    ]
+    found: list[Diagnostic] = []
+
+    def report(
+        kind: str, name: str, candidates: tuple[str, ...], span: Span, hint: str = "", during: str = ""
+    ) -> None:
+        hint = hint or " ".join(filter(None, (nearest_hint(name, candidates), _listing(kind, candidates))))
+        message = f"the {where} never has the {kind} {name!r}" + (during and f" {during}")
+        found.append(source.diagnostic("error", span, message, hint))
+
+    for kind, names, candidates in (
+        ("object", object_names(specification), objects),
+        ("signal", signal_names(specification), numeric),
+    ):
+        for name in names:
+            if name not in candidates:
+                hint = _class_hint(name, kind, known_classes)
+                report(kind, name, candidates, places.get(name, Span(0, 0)), hint, during)
+    taken = {each.casefold() for each in known_classes}
     for spec in specification.results:
         chosen = each.get(spec.parameter or "", "all")
         kind, _, name = chosen.partition(":")
-        if chosen not in ("all", *objects) and kind != "class":
-            hint = " ".join(filter(None, (nearest_hint(chosen, objects), _listing("object", objects))))
-            found.append(
-                source.diagnostic("error", spec.span, f"the {where} never has the object {chosen!r}", hint)
-            )
-        if kind == "class" and name.casefold() not in {known.casefold() for known in known_classes}:
-            hint = " ".join(
-                filter(None, (nearest_hint(name, known_classes), _listing("class", known_classes)))
-            )
-            found.append(
-                source.diagnostic("error", spec.span, f"the {where} never has the class {name!r}", hint)
-            )
-    taken = {each.casefold() for each in known_classes}
+        if kind == "class" and name.casefold() not in taken:
+            report("class", name, known_classes, spec.span)
+        elif kind != "class" and chosen not in ("all", *objects):
+            report("object", chosen, objects, spec.span)
     for name in _group_classes(specification):
         # a log may lack a class; one that is nearly spelt like another is taken for a mistake
-        if name.casefold() not in taken and (hint := nearest_hint(name, known_classes)):
-            hint += f" {_listing('class', known_classes)}"
-            message = f"the {where} never has the class {name!r}"
-            found.append(source.diagnostic("error", places.get(name, Span(0, 0)), message, hint))
+        if name.casefold() not in taken and nearest_hint(name, known_classes):
+            report("class", name, known_classes, places.get(name, Span(0, 0)))
     for name, span in defined.items():
         if name in objects:
             message = f"the {where} has an object {name!r}, which this definition hides"

@@ -102,6 +102,7 @@ from spatial_replay.spec.walks import (
     iter_expressions,
     iter_formulas,
     looks_back,
+    named_members,
     other_names,
     rate_of,
     scaled,
@@ -376,8 +377,7 @@ class QuantifierBuilder:
             message = "which members are left out is known only once the variable has a value"
             hint = "quantify over a class or all, or define the group without that member"
             self.resolver.fault(written.group.span, scope, message, hint)
-        excluded = {each.name for each in group.excluded}
-        members = [TrackedName(name) for name in group.members or () if name not in excluded]
+        members = [TrackedName(name) for name in named_members(group)]
         choices = list(islice(permutations(members, len(written.variables)), MAX_SIZE))
         if not choices:
             self._body_of_any(written, scope)

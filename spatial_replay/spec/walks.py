@@ -44,6 +44,7 @@ from spatial_replay.spec.formula import (
     TrackedName,
     Truth,
     Variable,
+    iter_nodes,
     operands_of,
     operator_of,
 )
@@ -176,6 +177,22 @@ def leaf_key(leaf: Formula) -> tuple[object, ...]:
     if isinstance(leaf, Quantified):
         return leaf.quantifier, leaf.variables, leaf.group, leaf.body
     return (leaf.expression,) if isinstance(leaf, Atom) else (leaf,)
+
+
+def nodes_with_operands(formula: Formula) -> list[tuple[Formula, list[int]]]:
+    """Return every node of a tree, by id, with the ids of its operands."""
+    nodes: list[tuple[Formula, list[int]]] = []
+    for identifier, parent, node in iter_nodes(formula):
+        nodes.append((node, []))
+        if parent is not None:
+            nodes[parent][1].append(identifier)
+    return nodes
+
+
+def named_members(group: Group) -> tuple[str, ...]:
+    """Return the members of a named group, without those left out; none of an open one."""
+    left_out = {each.name for each in group.excluded}
+    return tuple(name for name in group.members or () if name not in left_out)
 
 
 def is_spatial(formula: Formula) -> bool:

@@ -11,9 +11,9 @@ sample assigns objects to placeholders. Tracks that appear under new names need 
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache, partial
 from itertools import chain, zip_longest
 from math import nan
 from struct import Struct
@@ -60,7 +60,7 @@ from spatial_replay.spec.formula import (
     TrackedName,
 )
 from spatial_replay.spec.relations import computed_signal
-from spatial_replay.spec.walks import base_of, is_centre, iter_terms, measured_terms, standing
+from spatial_replay.spec.walks import base_of, is_centre, iter_terms, measured_terms, named_members, standing
 from spatial_replay.text import TEXTS
 from spatial_replay.trace.sample import Sample
 
@@ -530,8 +530,7 @@ class PlanRows:
         if base.members is None:
             wanted = self._class_wanted(base)
             return [Row(self._place(sample, name, is_point), wanted) for name in self.candidates(base)]
-        left_out = left_out_of(base)
-        return [Row(self._place(sample, name, is_point)) for name in base.members if name not in left_out]
+        return [Row(self._place(sample, name, is_point)) for name in named_members(base)]
 
     def required(self, term: Term) -> list[int]:
         """Return the rows, its sample's among them, without which a term is unknown."""
@@ -581,20 +580,18 @@ class LeafPlan:
         count = len(frame.delays) + len(self._signals) + (len(self._places) if self._has_classes else 0)
         self._pack = Struct(f"={count}d").pack
 
-    @property
-    def nbytes(self) -> int:
-        """The memory of its arrays."""
-        return self.packed.whole.nbytes + self.packed.real.nbytes
-
     def numbers(
-        self, samples: Sequence[Sample | None], stands_for: Mapping[str, str], codes: ClassCodes
+        self,
+        samples: Sequence[Sample | None],
+        stands_for: Mapping[str, str],
+        code_of: Callable[[str | None], int],
     ) -> bytes:
         """Flatten samples for `measure_sample`, as the bytes of doubles.
 
         Args:
             samples: the one at each of the frame's delays; None before the first.
             stands_for: the objects that go by another name among the plan's members.
-            codes: those of classes.
+            code_of: returns that of a class.
         """
         newest: Any = samples[0]
         numbers = [0.0]
@@ -614,12 +611,12 @@ class LeafPlan:
             if tracked is not None:
                 packed += (centre_object(tracked) if is_point else tracked).packed
                 if self._has_classes:
-                    numbers.append(codes[tracked.class_name])
+                    numbers.append(code_of(tracked.class_name))
                 continue
             unknown: Any = _NOTHING if samples[place] is None else cast(Sample, samples[place]).unknown
             packed.append(_HIDDEN if name in unknown else _NOT_THERE)
             if self._has_classes:
-                numbers.append(codes[unknown[name]] if name in unknown else 0.0)
+                numbers.append(code_of(unknown[name]) if name in unknown else 0.0)
         packed[0] = self._pack(*numbers)
         return b"".join(packed)
 
@@ -637,24 +634,6 @@ def _signal(signal: Signal, sample: Sample, previous: Sample | None) -> float:
 
 _NOTHING_THERE: Callable[[str], None] = MappingProxyType[str, None]({}).get
 _NOT_THERE, _HIDDEN = (Struct("=5d").pack(parts, nan, nan, nan, 0.0) for parts in (0.0, -1.0))
-
-
-class ClassCodes(dict[str | None, int]):
-    """The codes of classes as objects name them, 0 of any other; those asked for lately are kept."""
-
-    def __init__(self, classes: Mapping[str, int]) -> None:
-        super().__init__()
-        self._classes = classes
-
-    def __missing__(self, name: str | None) -> int:
-        if len(self) >= MOST_CLASSES:
-            self.clear()
-        self[name] = code = self._classes.get((name or "").casefold(), 0)
-        return code
-
-
-MOST_CLASSES = 1024
-"""Classes that are kept."""
 
 
 def _arrays(frame: PlanContext, rows: PlanRows, code: LeafCode, outputs: Sequence[int]) -> PlanArrays:
@@ -732,9 +711,10 @@ def _enlargement(term: Term) -> float:
     return _enlargement(term.term) + term.radius if isinstance(term, Enlarged) else 0.0
 
 
-MOST_PLANS = 256
-MOST_BYTES = 1 << 22
-"""Limits on stored plans, by number and memory; the least recently used go first, never the newest."""
+MOST_PLANS = 64
+"""Stored plans; the least recently used go first."""
+_MOST_CLASSES = 1024
+"""Classes whose codes are kept: objects name them in any case."""
 
 _NO_OBJECT = ""
 """A name that no object has."""
@@ -783,10 +763,9 @@ class SampleLeaves:
         while any(name.startswith(self._prefix) for name in self._own_names):
             self._prefix += "?"
         self._own_members: frozenset[Member] = frozenset()  # grows, but no further than the specification
-        self._codes = ClassCodes(self._frame.classes)
+        self._code_of = lru_cache(_MOST_CLASSES)(partial(_class_code, self._frame.classes))
+        self._plan = lru_cache(MOST_PLANS)(partial(_plan, self._frame, self._prefix))
         self._only_plan = None if open_classes else LeafPlan(self._frame, frozenset(), {})
-        self._plans: OrderedDict[tuple[frozenset[Member], _Counts], LeafPlan] = OrderedDict()
-        self._bytes = 0
 
     def look_at(self, sample: Sample) -> list[Sample | None]:
         """Add the next sample; return it and those that it looks back at."""
@@ -804,17 +783,17 @@ class SampleLeaves:
         plan, stands_for = self._only_plan, _NOTHING
         if plan is None:
             plan, stands_for = self._fitting_plan(samples)
-        return leaves_of_sample(plan.packed, plan.numbers(samples, stands_for, self._codes))
+        return leaves_of_sample(plan.packed, plan.numbers(samples, stands_for, self._code_of))
 
     def _fitting_plan(self, samples: Sequence[Sample | None]) -> tuple[LeafPlan, Mapping[str, str]]:
         """Return a plan for the members of open groups in some samples, and their names in it."""
         unnamed = self._unnamed_members(samples)
         counts = {classes: _room(len(names)) for classes, names in unnamed.items()}
         try:
-            plan = self._plan_for(counts)
+            plan = self._plan(self._own_members, tuple(sorted(counts.items())))
         except UsageError:  # the rounded-up counts exceed the limit of bindings; the exact ones may not
             counts = {classes: len(names) for classes, names in unnamed.items()}
-            plan = self._plan_for(counts)
+            plan = self._plan(self._own_members, tuple(sorted(counts.items())))
         stands_for: dict[str, str] = {}
         for classes, names in unnamed.items():
             stands_for.update(zip_longest(plan.placeholders[classes], names, fillvalue=_NO_OBJECT))
@@ -824,11 +803,11 @@ class SampleLeaves:
         """Return the members of open groups that the specification does not name, by their classes."""
         found: dict[str, _Classes] = {}
         own: list[Member] = []
-        codes, takes_any, own_names = self._codes, self._takes_any, self._own_names
+        code_of, takes_any, own_names = self._code_of, self._takes_any, self._own_names
         for sample in filter(None, samples):
             objects: Any = sample.objects
-            coded = [codes[each.class_name] for each in objects.values()]
-            coded += [codes[class_name] for class_name in sample.unknown.values()]
+            coded = [code_of(each.class_name) for each in objects.values()]
+            coded += map(code_of, sample.unknown.values())
             for name, code in zip(chain(objects, sample.unknown), coded, strict=True):
                 if not (code or takes_any):
                     continue
@@ -845,30 +824,22 @@ class SampleLeaves:
             kinds.setdefault(kind, []).append(name)
         return kinds
 
-    def _plan_for(self, counts: Mapping[_Classes, int]) -> LeafPlan:
-        """Return the plan for the given number of unnamed members of each kind."""
-        key = self._own_members, tuple(sorted(counts.items()))
-        if key in self._plans:
-            self._plans.move_to_end(key)
-            return self._plans[key]
-        # names that the specification does not use
-        placeholders = {
-            classes: [f"{self._prefix}{classes} {number}" for number in range(count)]
-            for classes, count in counts.items()
-        }
-        unnamed = {
-            Member(name, code)
-            for classes, names in placeholders.items()
-            for name in names
-            for code in classes
-        }
-        plan = LeafPlan(self._frame, self._own_members | unnamed, placeholders)
-        self._plans[key] = plan
-        self._bytes += plan.nbytes
-        while len(self._plans) > 1 and (len(self._plans) > MOST_PLANS or self._bytes > MOST_BYTES):
-            _, dropped = self._plans.popitem(last=False)
-            self._bytes -= dropped.nbytes
-        return plan
+
+def _plan(frame: PlanContext, prefix: str, own_members: frozenset[Member], counts: _Counts) -> LeafPlan:
+    """Return the plan for the given number of unnamed members of each kind."""
+    # names that the specification does not use
+    placeholders = {
+        classes: [f"{prefix}{classes} {number}" for number in range(count)] for classes, count in counts
+    }
+    unnamed = {
+        Member(name, code) for classes, names in placeholders.items() for name in names for code in classes
+    }
+    return LeafPlan(frame, own_members | unnamed, placeholders)
+
+
+def _class_code(classes: Mapping[str, int], name: str | None) -> int:
+    """Return the code of a class as an object names it; 0 of one that no group asks for."""
+    return classes.get((name or "").casefold(), 0)
 
 
 def _room(count: int) -> int:

@@ -29,6 +29,7 @@ from spatial_replay.spec.formula import (
     Variable,
 )
 from spatial_replay.spec.relations import computed_signal
+from spatial_replay.spec.walks import named_members
 from spatial_replay.trace.trace import ABSENT, Trace
 
 Bindings = Mapping[str, TrackedName]
@@ -214,8 +215,7 @@ class TraceScene:
         return np.full(len(self.trace), ABSENT, np.int64)
 
     def _named_rows(self, group: Group) -> Integers:
-        left_out = left_out_of(group)
-        columns = [self._rows_of(name) for name in group.members or () if name not in left_out]
+        columns = [self._rows_of(name) for name in named_members(group)]
         if not columns:
             return np.empty((len(self.trace), 0), np.int64)
         return np.stack(columns, axis=1)

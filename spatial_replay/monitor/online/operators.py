@@ -67,7 +67,7 @@ class SignalTable:
     def __init__(self, leaves: Sequence[Atom | Quantified] = ()) -> None:
         """Begin with leaves that are numbered already."""
         self.leaves: list[Atom | Quantified] = []
-        self._leaf_numbers: dict[tuple[object, ...], int] = {}
+        self._leaf_numbers: dict[object, int] = {}
         self._rows: dict[Row, int] = {}
         # an expansion holds an operand more than once; without this, nested ones would take 2**depth steps
         self._added: dict[int, tuple[Formula, int]] = {}
@@ -196,13 +196,13 @@ _RUNNING = (codes.UNTIL, codes.RELEASE)
 _RECURRENT_PAST = (codes.PAST_SINCE, codes.PAST_TRIGGER)
 
 
-def part_of(signals: SignalTable, node: Temporal) -> WindowedPart:
+def part_of(signals: SignalTable, node: Temporal) -> PartRows:
     """Return the part of a node that looks ahead.
 
     Raises:
         UsageError: more than `MAX_VARIABLES` unbounded future operators.
     """
-    part = WindowedPart(signals, node)
+    part = PartRows(signals, node)
     if part.variables > MAX_VARIABLES:
         raise UsageError(
             f"a formula nests {part.variables} unbounded temporal operators under one {node.operator}; "
@@ -212,19 +212,26 @@ def part_of(signals: SignalTable, node: Temporal) -> WindowedPart:
 
 
 class PartRows:
-    """The rows of one part, operands first; equal subformulas share one.
+    """The rows of a node that looks ahead, in negation normal form: operands first, equal ones once.
 
     Attributes:
         variables: how many operators take a value from the next sample on.
         tables: 1, and one for each past operator that carries a table of its own.
     """
 
-    def __init__(self) -> None:
-        """Begin without rows."""
+    def __init__(self, signals: SignalTable, root: Temporal) -> None:
+        """Build the part of a node; `signals` receives the subformulas that do not look ahead."""
         self.variables = 0
         self.tables = 1
         self._rows: dict[Row, int] = {}
-        self._is_past = False
+        self._signals = signals
+        self._is_past = root.operator not in FUTURE_OPERATORS
+        self._added: dict[tuple[int, bool], tuple[Formula, int]] = {}
+        is_bounded = root.bound is not None or root.operator in ("X", "WX")
+        if is_bounded and not self._is_past:
+            self._ending(root, True)
+        else:
+            self._add(root, True)
 
     def rows(self) -> tuple[Row, ...]:
         """Return rows with the numbers of their variable and table, and whether they depend on either."""
@@ -278,22 +285,6 @@ class PartRows:
             self.variables += variable
             self.tables += code in _RECURRENT_PAST
         return self._rows[key]
-
-
-class WindowedPart(PartRows):
-    """The rows of a node that looks ahead, in negation normal form."""
-
-    def __init__(self, signals: SignalTable, root: Temporal) -> None:
-        """Build the part of a node that looks ahead; `signals` receives the subformulas that do not."""
-        super().__init__()
-        self._signals = signals
-        self._is_past = root.operator not in FUTURE_OPERATORS
-        self._added: dict[tuple[int, bool], tuple[Formula, int]] = {}
-        is_bounded = root.bound is not None or root.operator in ("X", "WX")
-        if is_bounded and not self._is_past:
-            self._ending(root, True)
-        else:
-            self._add(root, True)
 
     def _add(self, formula: Formula, positive: bool) -> int:
         """Return the row of a formula, or of its negation, in negation normal form.

@@ -28,9 +28,9 @@ from spatial_replay.geometry.arrays import Integers
 from spatial_replay.monitor.online import codes
 from spatial_replay.monitor.online.operators import (
     NOTHING,
+    PartRows,
     Row,
     SignalTable,
-    WindowedPart,
     array_of_rows,
     operand_rows,
     part_of,
@@ -42,9 +42,8 @@ from spatial_replay.spec.formula import (
     Formula,
     Quantified,
     Temporal,
-    iter_nodes,
 )
-from spatial_replay.spec.walks import looks_ahead
+from spatial_replay.spec.walks import looks_ahead, nodes_with_operands
 
 NEVER = codes.SAMPLES, NOTHING
 """The end of a root that has none."""
@@ -223,7 +222,7 @@ def compile_formula(formula: Formula) -> Program:
     signals, parts = SignalTable(), _Parts()
     reports: list[Row] = []
     operand_ids: list[int] = []
-    for node, operands in _nodes_with_operands(formula):
+    for node, operands in nodes_with_operands(formula):
         ends = (len(operand_ids), len(operand_ids) + len(operands))
         operand_ids.extend(operands)
         if not looks_ahead(node):
@@ -294,9 +293,7 @@ class _Parts:
             self.rows.append((*_with_times(nodes), self._own_row(nodes, part, signals, has_now=has_now)))
         return self._built[key]
 
-    def _own_row(
-        self, nodes: tuple[Row, ...], part: WindowedPart, signals: SignalTable, *, has_now: bool
-    ) -> Row:
+    def _own_row(self, nodes: tuple[Row, ...], part: PartRows, signals: SignalTable, *, has_now: bool) -> Row:
         end = NEVER if part.is_flat else root_end(nodes, signals)
         row = (
             0,
@@ -336,16 +333,6 @@ def _looked_up(row: Row, signals: SignalTable) -> Row:
     if code != codes.LITERAL or not is_negated:
         return row
     return (code, signals.row(codes.NOT, signal), 0, *rest)
-
-
-def _nodes_with_operands(formula: Formula) -> list[tuple[Formula, list[int]]]:
-    """Return every node of a tree, by id, with the ids of its operands."""
-    nodes: list[tuple[Formula, list[int]]] = []
-    for identifier, parent, node in iter_nodes(formula):
-        nodes.append((node, []))
-        if parent is not None:
-            nodes[parent][1].append(identifier)
-    return nodes
 
 
 def _now_rule(node: Temporal) -> int:

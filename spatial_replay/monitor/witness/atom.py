@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import permutations, product
 from typing import Any
 
 import numpy as np
 
+from spatial_replay.geometry.arrays import Floats
 from spatial_replay.geometry.contact import Contact, contact, enlarged, protrusion_contact
 from spatial_replay.geometry.footprint import Footprint
 from spatial_replay.geometry.measure import candidate_pairs
@@ -54,6 +55,7 @@ from spatial_replay.spec.walks import (
     iter_expressions,
     logged_signals,
     measured_terms,
+    named_members,
     standing,
     substitute,
     terms_of,
@@ -129,9 +131,8 @@ def _members(base: Term) -> Sequence[str]:
     match base:
         case TrackedName():
             return [base.name]
-        case Group() if base.members is not None:
-            left_out = {each.name for each in base.excluded}
-            return [name for name in base.members if name not in left_out]
+        case Group():
+            return named_members(base)
     return ()
 
 
@@ -322,16 +323,19 @@ def _measured(scene: TraceScene, part: Expression) -> Measured:
         case Misalignment():
             single: Measurement = part
         case SignedDistance():
-            single = _least(scene, _pairs(scene, part))
+            pairs = product(_singles(scene, part.first), _singles(scene, part.second))
+            single = _attaining(np.argmin, scene, (SignedDistance(*pair) for pair in pairs))
         case Protrusion():
             inners = [
-                _least(scene, (Protrusion(inner, outer) for outer in _singles(scene, part.outer)))
+                _attaining(
+                    np.argmin, scene, (Protrusion(inner, outer) for outer in _singles(scene, part.outer))
+                )
                 for inner in _singles(scene, part.inner)
             ]
-            single = _greatest(scene, inners)
+            single = _attaining(np.argmax, scene, inners)
         case Projection() | CentroidProjection():
             projections = [replace(part, term=term) for term in _singles(scene, part.term)]
-            single = (_least if part.side == "min" else _greatest)(scene, projections)
+            single = _attaining(np.argmin if part.side == "min" else np.argmax, scene, projections)
         case _:
             raise TypeError(f"{part!r} is no measurement")
     (value,), (spread,) = (column[:, 0].tolist() for column in measured(scene, [single]))
@@ -340,19 +344,10 @@ def _measured(scene: TraceScene, part: Expression) -> Measured:
     return Measured(quantity, names, value, spread, _contact(scene, single))
 
 
-def _pairs(scene: TraceScene, part: SignedDistance) -> Iterator[SignedDistance]:
-    for first, second in product(_singles(scene, part.first), _singles(scene, part.second)):
-        yield SignedDistance(first, second)
-
-
-def _least(scene: TraceScene, candidates: Iterable[Any]) -> Any:
+def _attaining(pick: Callable[[Floats], Any], scene: TraceScene, candidates: Iterable[Any]) -> Any:
+    """Return the measurement of some that has the least or greatest number (`np.argmin`, `np.argmax`)."""
     listed = list(candidates)
-    return listed[int(np.argmin(measured(scene, listed)[0][:, 0]))]
-
-
-def _greatest(scene: TraceScene, candidates: Iterable[Any]) -> Any:
-    listed = list(candidates)
-    return listed[int(np.argmax(measured(scene, listed)[0][:, 0]))]
+    return listed[int(pick(measured(scene, listed)[0][:, 0]))]
 
 
 def _singles(scene: TraceScene, term: Term) -> list[Term]:
@@ -365,8 +360,7 @@ def _singles(scene: TraceScene, term: Term) -> list[Term]:
         names, members, _ = scene.members(group)
         present = [name for name, is_member in zip(names, members[0].tolist(), strict=True) if is_member]
     else:
-        left_out = {each.name for each in base.excluded}
-        present = [name for name in base.members if name not in left_out]
+        present = [*named_members(base)]
     return [_of_member(term, name) for name in present] or [term]
 
 

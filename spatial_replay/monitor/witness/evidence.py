@@ -17,7 +17,7 @@ from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.online.codes import joined_channels
 from spatial_replay.spec.formula import Atom, Earlier, Formula, Group, Outline, Quantified, Term, TrackedName
-from spatial_replay.spec.walks import base_of, iter_formulas, logged_signals, substitute
+from spatial_replay.spec.walks import base_of, iter_formulas, logged_signals, named_members, substitute
 from spatial_replay.trace.trace import Trace, window_of
 
 
@@ -85,11 +85,8 @@ class Evidence:
 
     def columns(self, formulas: Sequence[Formula]) -> Floats:
         """Compute K formulas without temporal operators in each sample, (C, K, T) (see `leaf_values`)."""
-        parts: list[Floats] = []
-        for scene in self._scenes():
-            times_ns = scene.trace.times_ns[scene.skip :]
-            begin, end = window_of(times_ns, self.instance.start_ns, self.instance.end_ns)
-            parts.append(self._columns(scene, formulas)[:, :, begin:end])
+        scenes = self._scenes()
+        parts = [self._columns(scene, formulas)[:, :, self._inside(scene)] for scene in scenes]
         return joined_channels(parts, axis=2)
 
     def _columns(self, scene: TraceScene, formulas: Sequence[Formula]) -> Floats:
@@ -105,10 +102,8 @@ class Evidence:
 
     def times_ns(self) -> Integers:
         """Return the times of the samples, (T,)."""
-        parts = [scene.trace.times_ns[scene.skip :] for scene in self._scenes()]
-        times_ns = np.concatenate(parts)
-        begin, end = window_of(times_ns, self.instance.start_ns, self.instance.end_ns)
-        return times_ns[begin:end]
+        scenes = self._scenes()
+        return np.concatenate([each.trace.times_ns[each.skip :][self._inside(each)] for each in scenes])
 
     def gaps(self, formula: Formula, time_ns: int = -1) -> tuple[Gap, ...]:
         """Return when each object and signal that a formula names is missing, for those that ever are.
@@ -120,9 +115,8 @@ class Evidence:
         parts: list[NDArray[np.bool_]] = []
         for scene in self._scenes():
             trace = scene.trace.slice(scene.skip, len(scene.trace))
-            inside = slice(*window_of(trace.times_ns, self.instance.start_ns, self.instance.end_ns))
             columns = [trace.filling, *(is_missing(trace, each) for each in kinds)]
-            parts.append(np.stack(columns)[:, inside])
+            parts.append(np.stack(columns)[:, self._inside(scene)])
         times_ns = self.times_ns()
         filling, *columns = np.concatenate(parts, axis=1)
         own = ~filling
@@ -134,11 +128,15 @@ class Evidence:
         """Return (G, T), in which samples each open group has a member, or may have had one."""
         parts: list[NDArray[np.bool_]] = []
         for scene in self._scenes() if groups else ():
-            times_ns = scene.trace.times_ns[scene.skip :]
-            inside = slice(*window_of(times_ns, self.instance.start_ns, self.instance.end_ns))
+            inside = self._inside(scene)
             found = [scene.members(group) for group in groups]
             parts.append(np.stack([(members.any(axis=1) | before)[inside] for _, members, before in found]))
         return np.concatenate(parts, axis=1) if parts else np.empty((0, 0), np.bool_)
+
+    def _inside(self, scene: TraceScene) -> slice:
+        """Return which samples of a scene the instance is evaluated over."""
+        times_ns = scene.trace.times_ns[scene.skip :]
+        return slice(*window_of(times_ns, self.instance.start_ns, self.instance.end_ns))
 
     def _scenes(self) -> Iterator[TraceScene]:
         """Iterate over the samples in blocks, each with the earlier ones that it may look back at."""
@@ -181,8 +179,7 @@ def named_parts(formula: Formula) -> list[NamedPart]:
 def _object_names(base: Term) -> tuple[str, ...]:
     """Return the objects that a term names, itself or as the members of a group."""
     if isinstance(base, Group):
-        left_out = {each.name for each in base.excluded}
-        return tuple(name for name in base.members or () if name not in left_out)
+        return named_members(base)
     return (base.name,) if isinstance(base, TrackedName) else ()
 
 

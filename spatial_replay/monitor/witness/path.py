@@ -6,7 +6,6 @@ negated. The path to it follows one end of the interval (see `End`).
 
 from __future__ import annotations
 
-from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
@@ -18,7 +17,7 @@ import numpy as np
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.offline import OfflineNodes
 from spatial_replay.monitor.verdict import Verdict
-from spatial_replay.monitor.witness.unfinished import UnfinishedNodes, is_closed
+from spatial_replay.monitor.witness.unfinished import UnfinishedNodes, is_closed, windows_of
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import (
     Boolean,
@@ -30,6 +29,7 @@ from spatial_replay.spec.formula import (
     operands_of,
     operator_of,
 )
+from spatial_replay.spec.walks import nodes_with_operands
 from spatial_replay.text import shortened_formula
 
 _Number = TypeVar("_Number")
@@ -192,13 +192,8 @@ class _Walk:
         self._done = done
         self._times = times_ns
         self._goes_on = goes_on
-        self._nodes: list[Formula] = []
-        self._operands: list[list[int]] = []
-        for identifier, parent, node in iter_nodes(formula):
-            self._nodes.append(node)
-            self._operands.append([])
-            if parent is not None:
-                self._operands[parent].append(identifier)
+        tree = nodes_with_operands(formula)
+        self._nodes, self._operands = [each for each, _ in tree], [operands for _, operands in tree]
 
     def follow(self, node: int, sample: int, end: End) -> DecidingPath:
         """Return the path from a node at a sample."""
@@ -269,27 +264,8 @@ class _Walk:
 
     def _window(self, formula: Temporal, sample: int) -> range:
         """Return the samples that an operator looks at."""
-        last = len(self._times) - 1
-        is_ahead = formula.operator in ("X", "WX", "F", "G", "U", "R", "W")
-        if formula.operator in ("X", "WX", "Y"):
-            at = sample + 1 if is_ahead else sample - 1
-            return range(at, at + 1) if 0 <= at <= last else range(0)
-        if formula.bound is None:
-            return range(sample, last + 1) if is_ahead else range(sample + 1)
-        low, high = formula.bound.lower, formula.bound.upper
-        if formula.bound.unit == "samples":
-            far = last if high is None else high
-            if is_ahead:
-                return range(sample + low, min(sample + far, last) + 1)
-            return range(max(sample - far, 0), sample - low + 1)
-        # integers of any size: a time and a duration may add up to more than 64 bits
-        now = int(self._times[sample])
-        if is_ahead:
-            end = last + 1 if high is None else bisect_right(self._times, now + high)
-            return range(bisect_left(self._times, now + low), end)
-        return range(
-            0 if high is None else bisect_left(self._times, now - high), bisect_right(self._times, now - low)
-        )
+        begin, end = windows_of(formula, self._times)
+        return range(int(begin[sample]), int(end[sample]))
 
     def _extreme(self, operand: SignedOperand, window: range, end: End, *, is_minimum: bool) -> PathNode:
         low, high = self._ends(operand, slice(window.start, window.stop))

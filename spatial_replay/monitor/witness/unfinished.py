@@ -91,7 +91,7 @@ def evaluate_untested(
     return _Evaluator(_columns(order, leaves), times_ns, _is_never_open, within).ends(formula)
 
 
-def _columns(order: Sequence[Atom | Quantified], leaves: Floats) -> dict[tuple[object, ...], _Ends]:
+def _columns(order: Sequence[Atom | Quantified], leaves: Floats) -> dict[object, _Ends]:
     low, high = low_and_high(len(leaves), wide=True)
     return {leaf_key(leaf): (leaves[low, index], leaves[high, index]) for index, leaf in enumerate(order)}
 
@@ -131,12 +131,32 @@ def is_closed(bound: Bound | None, times_ns: Integers) -> _Samples:
     return np.arange(count) < bisect_left(times_ns, span_ns + 1)
 
 
+def windows_of(formula: Temporal, times_ns: Integers) -> tuple[Integers, Integers]:
+    """Return the first sample (T,) in an operator's window at each sample, and the one after the last."""
+    count = len(times_ns)
+    here = np.arange(count, dtype=np.int64)
+    is_ahead = formula.operator in FUTURE_OPERATORS
+    bound = formula.bound or Bound(0, None, "samples")
+    if formula.operator in ("X", "WX", "Y"):
+        bound = Bound(1, 1, "samples")
+    # as distances from the first sample, and no further than the last: sums stay below 64 bits
+    places = here if bound.unit == "samples" else times_ns - times_ns[0]
+    furthest = int(places[-1]) + 1
+    near = min(bound.lower, furthest)
+    far = furthest if bound.upper is None else min(bound.upper, furthest)
+    low, high = (places + near, places + far) if is_ahead else (places - far, places - near)
+    if bound.unit == "samples":
+        return np.clip(low, 0, count), np.clip(high + 1, 0, count)
+    begin = np.searchsorted(places, low, side="left").astype(np.int64)
+    return begin, np.searchsorted(places, high, side="right").astype(np.int64)
+
+
 class _Evaluator:
     """The ends of formulas at each sample, each computed once."""
 
     def __init__(
         self,
-        leaves: dict[tuple[object, ...], _Ends],
+        leaves: dict[object, _Ends],
         times_ns: Integers,
         is_open: Callable[[Temporal, Integers], _Samples],
         antecedents: _Evaluator | None = None,
