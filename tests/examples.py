@@ -12,4 +12,4 @@ ALL = 100
 
 def examples(count: int, **others: Any) -> settings:
     """Settings for so many examples in a thorough run, and for the same share of those of another profile."""
-    return settings(max_examples=max(count * settings().max_examples // ALL, 2), **others)
+    return settings(max_examples=max(count * settings().max_examples // ALL, 5), **others)

@@ -29,7 +29,8 @@ from spatial_replay.spec.formula import Atom, Formula, NamedSpec, Quantified, Sp
 _NOW = 1
 """The place of `now` among the numbers of a node."""
 
-_MOST_TEMPLATES = 4096
+_MOST_TEMPLATES = 512
+"""Steps, each with up to `MAX_STATES` states, of which the messages and words are held."""
 
 # what the values of propositions are in messages: false, true and, last so that -1 finds it, unknown
 _TRUTHS = np.array(

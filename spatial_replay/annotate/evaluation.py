@@ -92,7 +92,7 @@ class AnnotatedEvaluation:
         if title and not any(tree.is_called(title) for tree in self.trees):
             titles = [tree.title for tree in self.trees]
             more = ", …" if len(titles) > _MOST_NAMED else ""
-            hint = nearest_hint(title, titles) or f"there are: {', '.join(titles[:_MOST_NAMED])}{more}"
+            hint = nearest_hint(title, titles) or f"the results are: {', '.join(titles[:_MOST_NAMED])}{more}"
             raise UsageError(f"there is no result {title!r} for the arrow to point at; {hint}")
 
     def extend(self, trace: Trace) -> list[SeriesBlock]:

@@ -142,7 +142,9 @@ def decode_robustness(payloads: Sequence[bytes]) -> list[RobustnessSeries]:
             np.array([each.time_ns for each in own], np.uint64).astype(np.int64),
             np.array(
                 [[(node.value, node.now, node.lower, node.upper) for node in each.nodes] for each in own]
-            ).transpose(1, 2, 0),
+            )
+            .reshape(len(own), -1, 4)
+            .transpose(1, 2, 0),
         )
         for (name, object, ids, names), own in rows.items()
     ]

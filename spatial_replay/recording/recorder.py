@@ -642,9 +642,11 @@ class SampleWriter:
             OutputError: something could not be written.
         """
         with uninterrupted():
-            if self._messages.is_closed or os.getpid() != self._messages.process:
+            if os.getpid() != self._messages.process:
                 return
             with self._messages.lock:
+                if self._messages.is_closed:
+                    return
                 self._messages.is_closed = True
             self._queue.put(None)
             self._ring()

@@ -508,7 +508,7 @@ class RunServer(PublishingServer, protocol.ServerListener):
             fire: what the service `trigger` calls with a reason; None for no service.
         """
         self._fire = fire
-        self._latest: dict[int, tuple[foxglove.Channel, list[bytes]]] = {}
+        self._latest: dict[int, tuple[foxglove.Channel, int, list[bytes]]] = {}
         self._time_ns = 0
         super().__init__("spatial-replay: live", channels, host, port, origins)
 
@@ -522,21 +522,26 @@ class RunServer(PublishingServer, protocol.ServerListener):
             own = np.flatnonzero(messages.channel == number)
             if len(own) and channel in self._channels and _is_state(channel):
                 time_ns = int(messages.log_time_ns[own[-1]])
-                self._time_ns = max(self._time_ns, time_ns)
                 newest = own[messages.log_time_ns[own] == time_ns].tolist()
                 sent = self._channels[channel]
-                self._latest[sent.id()] = sent, [messages.payloads[place] for place in newest]
+                self._latest[sent.id()] = sent, time_ns, [messages.payloads[place] for place in newest]
+
+    def send_time(self, time_ns: int) -> None:
+        """Send the time of the newest sample."""
+        self._time_ns = time_ns
+        super().send_time(time_ns)
 
     def on_subscribe(self, client: protocol.Client, channel: protocol.ChannelView) -> None:
-        """Send the last messages of a channel again, at the time of the newest message of the run."""
+        """Send the last messages of a channel again, at the time of the newest sample if there is one."""
         latest = None
         # newer ones may come while these are sent
         while latest is not self._latest.get(channel.id):
             latest = self._latest[channel.id]
-            sent, payloads = latest
+            sent, time_ns, payloads = latest
+            present_ns = self._time_ns or time_ns
             for payload in payloads:
-                sent.log(payload, log_time=self._time_ns)
-            self.send_time(self._time_ns)
+                sent.log(payload, log_time=present_ns)
+            super().send_time(present_ns)
 
     def _options(self) -> dict[str, Any]:
         services = [] if self._fire is None else [_trigger_service(self._fire)]
