@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import heapq
 from abc import ABC, abstractmethod
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -255,9 +255,8 @@ class _Recorded:
 
     def __init__(self, disorder_ns: int) -> None:
         self._disorder_ns = disorder_ns
-        self._times_ns = np.zeros(0, np.int64)
-        # one longer: how far it had come before each
-        self._furthest = np.array([-1], np.int64)
+        self._latest: deque[tuple[Integers, Integers]] = deque()
+        self._before = self._furthest = -1
 
     def first_jump(self, times_ns: Integers, places: Integers) -> int | None:
         """Return the first message recorded before one that is earlier by more than the disorder, or None.
@@ -266,12 +265,15 @@ class _Recorded:
             times_ns, places: (M,) of messages in the order of time, at least one, after those of the call
                 before.
         """
-        furthest = np.maximum.accumulate(np.append(self._furthest[-1], places))[1:]
-        self._times_ns = np.concatenate([self._times_ns, times_ns])
-        self._furthest = np.concatenate([self._furthest, furthest])
-        earlier = np.searchsorted(self._times_ns, times_ns - self._disorder_ns)
-        jumps = np.flatnonzero(places < self._furthest[earlier])
-        self._times_ns, self._furthest = self._times_ns[earlier[-1] :], self._furthest[earlier[-1] :]
+        furthest = np.maximum.accumulate(np.append(self._furthest, places))[1:]
+        self._latest.append((times_ns, furthest))
+        self._furthest, jumps = int(furthest[-1]), np.zeros(0, np.int64)
+        if (places < furthest).any():
+            times, reached = map(np.concatenate, zip(*self._latest, strict=True))
+            earlier = np.searchsorted(times, times_ns - self._disorder_ns)
+            jumps = np.flatnonzero(places < np.append(self._before, reached)[earlier])
+        while self._latest[0][0][-1] < times_ns[-1] - self._disorder_ns:
+            self._before = int(self._latest.popleft()[1][-1])
         return int(jumps[0]) if len(jumps) else None
 
 
@@ -424,15 +426,13 @@ class MessageReader(ABC):
 
     def take_remarks(self) -> tuple[str, ...]:
         """Return what is wrong since the last call without a loss on the topics that were read."""
-        self._gather_parts()
-        return self._remarks.take()
+        of_parts = (remark for part in self._parts for remark in part.take_remarks())
+        return (*self._remarks.take(), *of_parts)
 
     def _gather_parts(self) -> None:
-        """Take the faults and remarks of the files of the log that were opened."""
+        """Take the faults of the files of the log that were opened."""
         for part in self._parts:
             part.move_faults(self._faults)
-            for remark in part.take_remarks():
-                self._remarks.add(remark)
 
     def _counted(self, columns: Columns, topics: Collection[str], name: str | None = None) -> Columns:
         """Yield all messages of some topics, then compare their number with what the log declares."""
@@ -441,6 +441,7 @@ class MessageReader(ABC):
             read.update(each.topics)
             yield each
         for topic in self._topics:
-            if topic.name in topics and topic.count not in (None, found := read[topic.name]):
+            found = read[topic.name]
+            if topic.name in topics and topic.count not in (None, found):
                 declared = f"it declares {topic.count} messages on {topic.name!r}"
                 self._faults.add(f"{name or self.name}: {declared}; {found} could be read")

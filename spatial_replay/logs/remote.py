@@ -8,6 +8,7 @@ import logging
 import os
 import shutil
 import tempfile
+from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -142,7 +143,9 @@ class HeldBytes:
     """Parts of a file that do not overlap; the oldest are dropped when there are too many."""
 
     def __init__(self) -> None:
+        self._begins: list[int] = []
         self._parts: dict[int, bytes] = {}
+        self._size = 0
 
     def missing(self, begin: int, end: int) -> list[Range]:
         """Return the parts of a range that are not held."""
@@ -162,14 +165,21 @@ class HeldBytes:
     def add(self, begin: int, data: bytes) -> None:
         """Take in what is not held of a part."""
         for start, end in self.missing(begin, begin + len(data)):
+            self._begins.insert(bisect_right(self._begins, start), start)
             self._parts[start] = data[start - begin : end - begin]
-        while len(self._parts) > 1 and sum(map(len, self._parts.values())) > MOST_HELD_BYTES:
-            del self._parts[next(iter(self._parts))]
+            self._size += end - start
+        while len(self._parts) > 1 and self._size > MOST_HELD_BYTES:
+            oldest = next(iter(self._parts))
+            self._size -= len(self._parts.pop(oldest))
+            self._begins.remove(oldest)
 
     def _overlapping(self, begin: int, end: int) -> list[tuple[int, bytes]]:
         """Return the parts that reach into a range, in order, with where they begin."""
-        parts = self._parts.items()
-        return sorted((start, data) for start, data in parts if start < end and start + len(data) > begin)
+        first = max(bisect_right(self._begins, begin) - 1, 0)
+        parts = (
+            (start, self._parts[start]) for start in self._begins[first : bisect_left(self._begins, end)]
+        )
+        return [(start, data) for start, data in parts if start + len(data) > begin]
 
 
 _CREDENTIALS: Final = {

@@ -110,7 +110,6 @@ class Movables:
         Args:
             later: objects that may still have to be moved after this motion.
             refine: refine the target, if the settings want that.
-
         """
         tracked, settings = self.sample.objects[name], self.settings
         gradient = self.gradient(name, consideration.progress.cubes, consideration.constraints.cubes)

@@ -116,6 +116,11 @@ def test_a_row_without_a_frame_costs_only_itself(annotations: Write, bad: str) -
     assert all(fault.startswith("annotations.txt:2: ") for fault in trace.faults)
 
 
+def test_a_file_of_bad_rows_alone_says_what_is_wrong(annotations: Write) -> None:
+    with pytest.raises(LogError, match=r"annotations\.txt:1: the box is '5 0 1 9'"):
+        read_trace(annotations(row(0, 0, box="5 0 1 9"), row(0, 1, box="5 0 1 9")), allow_damage=True)
+
+
 def test_an_object_twice_in_a_frame_costs_the_frame(annotations: Write) -> None:
     trace = read_trace(annotations(row(0, 5), row(0, 5), row(0, 6)), allow_damage=True)
     assert len(trace) == 1

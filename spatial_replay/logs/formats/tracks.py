@@ -482,7 +482,7 @@ def iter_annotations(
     boxes, labels, broken = _read_boxes(path, faults, _last_frame(rate))
     frames, starts = np.unique(boxes["frame"], return_index=True)
     sound = ~np.isin(frames, np.fromiter(broken, np.int64))
-    frames, starts, ends = frames[sound], starts[sound], np.append(starts[1:], len(boxes))[sound]
+    frames, starts, ends = frames[sound], starts[sound], np.append(starts, len(boxes))[1:][sound]
     classes, period = tuple(label or None for label in labels), frame_times(rate)
     after = 0
     while after < len(frames):
