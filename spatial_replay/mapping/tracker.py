@@ -372,7 +372,8 @@ class Tracker:
         # codes follow the log; a trace must not depend on the order of its messages
         by_code = self.classes.by_code
         classes_of = class_order(by_code)
-        rank = np.array([classes_of.index(name) for name in by_code], np.int64)
+        places = {name: place for place, name in enumerate(classes_of)}
+        rank = np.array([places[name] for name in by_code], np.int64)
         used, numbered = renumbered(numbered)
         stored = select(stored, used)
         return Trace(

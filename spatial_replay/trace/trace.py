@@ -37,6 +37,7 @@ class MeasurementCache:
 
     def __init__(self) -> None:
         self._arrays: dict[Hashable, Floats] = {}
+        self._bytes = 0
         self._lock = Lock()
 
     def get(self, key: Hashable) -> Floats | None:
@@ -50,10 +51,11 @@ class MeasurementCache:
     def put(self, key: Hashable, array: Floats) -> None:
         """Store an array, which must not be written to afterwards."""
         with self._lock:
-            self._arrays.pop(key, None)
+            replaced = self._arrays.pop(key, None)
+            self._bytes += array.nbytes - (0 if replaced is None else replaced.nbytes)
             self._arrays[key] = array
-            while len(self._arrays) > 1 and sum(each.nbytes for each in self._arrays.values()) > _BYTES:
-                del self._arrays[next(iter(self._arrays))]
+            while len(self._arrays) > 1 and self._bytes > _BYTES:
+                self._bytes -= self._arrays.pop(next(iter(self._arrays))).nbytes
 
 
 _DURATION = re.compile(
