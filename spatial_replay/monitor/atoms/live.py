@@ -139,6 +139,11 @@ class PackedPlan(NamedTuple):
     real: Floats
     leaves: int
 
+    @property
+    def nbytes(self) -> int:
+        """The memory of both."""
+        return self.whole.nbytes + self.real.nbytes
+
     @classmethod
     def of(cls, arrays: PlanArrays) -> PackedPlan:
         whole, real = [np.zeros(2 * len(arrays), np.int64)], [np.zeros(0)]
@@ -712,7 +717,8 @@ def _enlargement(term: Term) -> float:
 
 
 MOST_PLANS = 64
-"""Stored plans; the least recently used go first."""
+_MOST_BYTES = 1 << 22
+"""Limits on stored plans, by number and memory; the least recently used go first, never the newest."""
 _MOST_CLASSES = 1024
 """Classes whose codes are kept: objects name them in any case."""
 
@@ -764,7 +770,7 @@ class SampleLeaves:
             self._prefix += "?"
         self._own_members: frozenset[Member] = frozenset()  # grows, but no further than the specification
         self._code_of = lru_cache(_MOST_CLASSES)(partial(_class_code, self._frame.classes))
-        self._plan = lru_cache(MOST_PLANS)(partial(_plan, self._frame, self._prefix))
+        self._plans: dict[tuple[frozenset[Member], _Counts], LeafPlan] = {}
         self._only_plan = None if open_classes else LeafPlan(self._frame, frozenset(), {})
 
     def look_at(self, sample: Sample) -> list[Sample | None]:
@@ -790,10 +796,10 @@ class SampleLeaves:
         unnamed = self._unnamed_members(samples)
         counts = {classes: _room(len(names)) for classes, names in unnamed.items()}
         try:
-            plan = self._plan(self._own_members, tuple(sorted(counts.items())))
+            plan = self._plan_for(counts)
         except UsageError:  # the rounded-up counts exceed the limit of bindings; the exact ones may not
             counts = {classes: len(names) for classes, names in unnamed.items()}
-            plan = self._plan(self._own_members, tuple(sorted(counts.items())))
+            plan = self._plan_for(counts)
         stands_for: dict[str, str] = {}
         for classes, names in unnamed.items():
             stands_for.update(zip_longest(plan.placeholders[classes], names, fillvalue=_NO_OBJECT))
@@ -823,6 +829,18 @@ class SampleLeaves:
         for name, kind in found.items():
             kinds.setdefault(kind, []).append(name)
         return kinds
+
+    def _plan_for(self, counts: Mapping[_Classes, int]) -> LeafPlan:
+        """Return the plan for the given number of unnamed members of each kind."""
+        key, plans = (self._own_members, tuple(sorted(counts.items()))), self._plans
+        plan = plans.pop(key, None)
+        if plan is None:
+            plan = _plan(self._frame, self._prefix, *key)
+            room = _MOST_BYTES - plan.packed.nbytes
+            while plans and (len(plans) >= MOST_PLANS or sum(p.packed.nbytes for p in plans.values()) > room):
+                del plans[next(iter(plans))]
+        plans[key] = plan
+        return plan
 
 
 def _plan(frame: PlanContext, prefix: str, own_members: frozenset[Member], counts: _Counts) -> LeafPlan:
