@@ -387,17 +387,17 @@ class RemoteFile(PathLike[str]):
 
     def iter_pieces(self, pieces: Sequence[Range], at_once: int = _AT_ONCE) -> Iterator[bytes]:
         """Read ranges at the same time, and yield the bytes of each in their order; none of them is held."""
-        with ThreadPoolExecutor(max(1, min(at_once, len(pieces))), "remote-reading") as threads:
-            waiting: deque[Future[bytes]] = deque()
-            try:
-                for piece in pieces:
-                    waiting.append(threads.submit(self._range, piece))
-                    if len(waiting) >= at_once:
-                        yield waiting.popleft().result()
-                while waiting:
+        threads = ThreadPoolExecutor(max(1, min(at_once, len(pieces))), "remote-reading")
+        waiting: deque[Future[bytes]] = deque()
+        try:
+            for piece in pieces:
+                waiting.append(threads.submit(self._range, piece))
+                if len(waiting) >= at_once:
                     yield waiting.popleft().result()
-            finally:
-                threads.shutdown(wait=False, cancel_futures=True)
+            while waiting:
+                yield waiting.popleft().result()
+        finally:
+            threads.shutdown(wait=False, cancel_futures=True)
 
     def iter_whole(self) -> Iterator[bytes]:
         """Read the file from its beginning to its end, in parts."""
@@ -771,8 +771,11 @@ class RemoteFolder:
             MissingFileError: one is not there; it may have been joined with others by another batch.
                 UsageError, RemoteError: one cannot be read.
         """
-        with ThreadPoolExecutor(_FILES_AT_ONCE, "remote-reading") as threads:
+        threads = ThreadPoolExecutor(_FILES_AT_ONCE, "remote-reading")
+        try:
             yield from threads.map(self._read, names)
+        finally:
+            threads.shutdown(wait=False, cancel_futures=True)
 
     def write(self, name: str, data: bytes) -> None:
         """Write a file, which is whole or, where that fails, as before.

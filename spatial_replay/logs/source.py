@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -181,11 +180,15 @@ def read_blocks(
 
 def read_ahead(blocks: Generator[_Read, None, None]) -> Iterator[_Read]:
     """Yield the same blocks, each read while the previous one is processed."""
-    with closing(blocks), ThreadPoolExecutor(1, "reading-ahead") as thread:
+    thread = ThreadPoolExecutor(1, "reading-ahead")
+    try:
         waiting = thread.submit(next, blocks, None)
         while (block := waiting.result()) is not None:
             waiting = thread.submit(next, blocks, None)
             yield block
+    finally:
+        # garbage collection may end this within the start of any thread, which must not wait for another one
+        thread.shutdown(wait=False, cancel_futures=True)
 
 
 def reading_only(source: Source, keep: tuple[str, ...] = ()) -> Source:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import io
 import os
 import random
@@ -9,6 +10,7 @@ import re
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
+from threading import Thread
 
 import numpy as np
 import pytest
@@ -49,6 +51,7 @@ from spatial_replay.logs import (
 from spatial_replay.logs.mcap.write import CHUNK_BYTES
 from spatial_replay.logs.messages import BLOCK_SAMPLES
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
+from spatial_replay.logs.source import read_ahead
 from spatial_replay.logs.topics import OBJECTS, ROBUSTNESS, protobuf_channel
 from spatial_replay.sources import open_source
 
@@ -165,6 +168,20 @@ def test_a_log_that_fails_midway_raises_once():
     with pytest.raises(OutputError, match="no space"), LogWriter(Full()) as writer:
         writer.write_messages(messages(SAMPLES, trace.times_ns, encode_objects(trace)))
         writer.flush()
+
+
+def test_garbage_collection_of_a_log_half_read_waits_for_no_thread(monkeypatch):
+    # it may happen within the start of a thread, where waiting for another one never ends
+    joined = []
+    monkeypatch.setattr(Thread, "join", lambda thread, timeout=None: joined.append(thread.name))
+    source = open_source(Path(__file__).parents[2] / "recordings" / "push.mcap")
+    for blocks in (source.iter_blocks(), read_ahead(source.iter_blocks())):
+        next(blocks)
+        cycle = [blocks]
+        cycle.append(cycle)
+        del blocks, cycle
+        gc.collect()
+    assert not joined
 
 
 def test_a_log_truncated_anywhere_gives_a_prefix(log):

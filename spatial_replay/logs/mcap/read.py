@@ -17,7 +17,7 @@ from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import compress
-from threading import Lock
+from threading import RLock
 from types import MappingProxyType
 from typing import Any, BinaryIO, Final, TypeAlias
 from zlib import crc32
@@ -144,10 +144,12 @@ def iter_records(
     While the caller processes one, other threads read the next ones, so it must not use the stream.
     """
     plan_reads(stream, ((place.offset, place.offset + place.length) for place in places))
-    reading = Lock()
+    reading, is_over = RLock(), False
 
     def read(place: ChunkPlace) -> bytes | DamageError:
         with reading:
+            if is_over:
+                return b""
             stream.seek(place.offset)
             record = stream.read(place.length)
         try:
@@ -157,21 +159,23 @@ def iter_records(
 
     waiting: deque[tuple[ChunkPlace, Future[bytes | DamageError]]] = deque()
     ahead = 0
-    with ThreadPoolExecutor(cores(), "reading") as threads:
-        try:
-            for place in places:
-                waiting.append((place, threads.submit(read, place)))
-                ahead += max(place.length, place.size)
-                while ahead > _AHEAD_BYTES and len(waiting) > cores():
-                    first, reading_first = waiting.popleft()
-                    ahead -= max(first.length, first.size)
-                    yield first, reading_first.result()
-            while waiting:
+    threads = ThreadPoolExecutor(cores(), "reading")
+    try:
+        for place in places:
+            waiting.append((place, threads.submit(read, place)))
+            ahead += max(place.length, place.size)
+            while ahead > _AHEAD_BYTES and len(waiting) > cores():
                 first, reading_first = waiting.popleft()
+                ahead -= max(first.length, first.size)
                 yield first, reading_first.result()
-        finally:
-            # a caller that has seen enough does not wait for the rest
-            threads.shutdown(cancel_futures=True)
+        while waiting:
+            first, reading_first = waiting.popleft()
+            yield first, reading_first.result()
+    finally:
+        # garbage collection may end this within the start of any thread, which must not wait for another one
+        threads.shutdown(wait=False, cancel_futures=True)
+        with reading:
+            is_over = True
 
 
 MessageHeads: TypeAlias = np.ndarray[Any, np.dtype[np.void]]
