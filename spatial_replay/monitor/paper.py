@@ -6,16 +6,15 @@ of minima and maxima. And where something is unknown: every number that depends 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from functools import reduce
-from types import MappingProxyType
-from typing import Final, TypeAlias
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from spatial_replay.compiled import kernel
+from spatial_replay.compiled import inlined, kernel, piece
 from spatial_replay.errors import UsageError
-from spatial_replay.geometry.arrays import Booleans, Empty, Floats, Integers
+from spatial_replay.geometry.arrays import Empty, Flags, Floats, Integers
 from spatial_replay.monitor.atoms.delays import iter_delays
 from spatial_replay.monitor.online.codes import low_and_high
 from spatial_replay.spec.diagnostics import SourceText
@@ -29,98 +28,507 @@ from spatial_replay.spec.formula import (
     Truth,
     iter_nodes,
 )
-from spatial_replay.spec.walks import has_rate, is_spatial, leaf_key, nodes_with_operands
-
-Numbers: TypeAlias = Floats
-"""(2, …): numbers, NaN where they are left out, and whether something unknown matters to them (1, else 0)."""
-
-_LEFT_OUT: Final = np.array([[np.nan], [0.0]])
-_PICKS: Mapping[str, np.ufunc] = MappingProxyType({"X": np.fmax, "F": np.fmax, "G": np.fmin, "U": np.fmax})
-OPERATORS = frozenset(_PICKS)
-"""The temporal operators that there are."""
+from spatial_replay.spec.walks import has_rate, is_spatial
 
 
-def _joined(numbers: Floats, lost: Floats) -> Numbers:
-    made = np.empty((2, *numbers.shape))
-    made[0], made[1] = numbers, lost
-    return made
+class PaperMemory(NamedTuple):
+    """State between samples; each array of numbers has a parallel one of lost numbers.
+
+    Attributes:
+        stamps: (room,), times of the samples in ns; of the first alone if nothing keeps a column.
+        columns: (K, room), numbers at each sample, on the samples so far.
+        value: (N,), each node at the first sample.
+        now: (N,), each node at the newest sample.
+        left: (N,), of an until at the first sample: the least of its left operand.
+        starts: (N,), where the window of the earliest sample that is still open begins; -1 for not yet.
+        opens: (N,), the earliest sample whose window is still open.
+        pairs: the left operand of an until for each end of its run, one row after the other.
+        pair_starts: (P, room), sample s of the row of end t is at `pair_starts[p, t] + s`.
+        pair_end: (1,), how much of `pairs` is used.
+    """
+
+    stamps: Integers
+    columns: Floats
+    lost_columns: Flags
+    value: Floats
+    lost_value: Flags
+    now: Floats
+    lost_now: Flags
+    left: Floats
+    lost_left: Flags
+    starts: Integers
+    opens: Integers
+    pairs: Floats
+    lost_pairs: Flags
+    pair_starts: Integers
+    pair_end: Integers
 
 
-def _combined(operator: str, operands: Sequence[Numbers]) -> Numbers:
-    """Apply a Boolean operator."""
-    numbers = [each[0] for each in operands]
-    one, other = numbers[0], numbers[-1]
-    match operator:
-        case "not":
-            number = -one
-        case "and":
-            number = reduce(np.fmin, numbers)
-        case "or":
-            number = reduce(np.fmax, numbers)
-        case "->":
-            number = np.fmax(-one, other)
-        case "xor":
-            number = np.fmax(np.fmin(one, -other), np.fmin(-one, other))
-        case "<->":
-            number = np.fmin(np.fmax(-one, other), np.fmax(-other, one))
-        case _:
-            number = one
-    return _joined(number, reduce(np.maximum, [each[1] for each in operands]))
+@piece
+def _set_now(rows: Integers, operands: Integers, n: int, numbers: Floats, lost: Flags) -> None:
+    """Compute a node on the newest sample alone, from its operands there."""
+    code, first, end = rows[n, CODE], rows[n, FIRST], rows[n, END]
+    if code == NEXT or (code > NEXT and rows[n, LOW] > 0):
+        numbers[n], lost[n] = np.nan, 0
+        return
+    operand = operands[first]
+    if code in (EVENTUALLY, ALWAYS):
+        numbers[n], lost[n] = numbers[operand], lost[operand]
+        return
+    if code > ALWAYS:
+        other = operands[end - 1]
+        numbers[n], lost[n] = least(numbers[operand], numbers[other]), lost[operand] | lost[other]
+        return
+    _fold(code, operands[first:end], numbers, lost, n)
 
 
-def _accumulated(pick: np.ufunc, numbers: Numbers) -> Numbers:
-    """Return the least or greatest number so far."""
-    return _joined(pick.accumulate(numbers[0]), np.maximum.accumulate(numbers[1]))
+@piece
+def _fold(code: int, operands: Integers, numbers: Floats, lost: Flags, n: int) -> None:
+    """Compute a Boolean node from its operands."""
+    number, is_lost = numbers[operands[0]], lost[operands[0]]
+    number = combine(code, number, number) if len(operands) == 1 else number
+    for each in operands[1:]:
+        number = combine(code, number, numbers[each])
+        is_lost |= lost[each]
+    numbers[n], lost[n] = number, is_lost
 
 
-def _to_the_end(pick: np.ufunc, numbers: Numbers) -> Numbers:
-    """Return the least or greatest number from each place to the last one."""
-    return _accumulated(pick, numbers[:, ::-1])[:, ::-1]
+@piece
+def _set_column(rows: Integers, operands: Integers, n: int, last: int, memory: PaperMemory) -> None:
+    """Compute a Boolean node at every sample, from its operands."""
+    code, first, end = rows[n, CODE], rows[n, FIRST], rows[n, END]
+    row = rows[n, COLUMN]
+    into, lost = memory.columns[row], memory.lost_columns[row]
+    other_row = rows[operands[first], COLUMN]
+    other, other_lost = memory.columns[other_row], memory.lost_columns[other_row]
+    for t in range(last + 1):
+        into[t] = combine(code, other[t], other[t]) if end - first == 1 else other[t]
+        lost[t] = other_lost[t]
+    for each in range(first + 1, end):
+        other_row = rows[operands[each], COLUMN]
+        other, other_lost = memory.columns[other_row], memory.lost_columns[other_row]
+        for t in range(last + 1):
+            into[t] = combine(code, into[t], other[t])
+            lost[t] |= other_lost[t]
 
 
-def _carried(pick: np.ufunc, before: Numbers, numbers: Numbers) -> Numbers:
-    """Return the least or greatest number so far, and before."""
-    return _accumulated(pick, np.concatenate([before, numbers], axis=1))[:, 1:]
+@piece
+def _window_at_first(rows: Integers, n: int, last: int, time_ns: int, memory: PaperMemory) -> bool:
+    """Return whether the last sample is in the first one's window; note where that window begins."""
+    passed = time_ns - memory.stamps[0] if rows[n, IS_IN_NS] else last
+    if memory.starts[n] < 0 and passed >= rows[n, LOW]:
+        memory.starts[n] = last
+    return bool(memory.starts[n] >= 0 and (rows[n, HIGH] < 0 or passed <= rows[n, HIGH]))
+
+
+@piece
+def _step_first(
+    rows: Integers, operands: Integers, n: int, last: int, time_ns: int, memory: PaperMemory
+) -> None:
+    """Update a temporal node that is needed at the first sample only."""
+    code, value, lost = rows[n, CODE], memory.value, memory.lost_value
+    right = operands[rows[n, END] - 1]
+    right_row = rows[right, COLUMN]
+    is_plain = rows[right, IS_PLAIN] != 0
+    if code == NEXT:
+        if is_plain and last == 1:
+            value[n], lost[n] = memory.now[right], memory.lost_now[right]
+        if not is_plain and last >= 1:
+            value[n], lost[n] = memory.columns[right_row, 1], memory.lost_columns[right_row, 1]
+        return
+    if not _window_at_first(rows, n, last, time_ns, memory):
+        return
+    start = memory.starts[n]
+    if code in (EVENTUALLY, ALWAYS):
+        if is_plain:
+            value[n] = pick(code == ALWAYS, value[n], memory.now[right])
+            lost[n] |= memory.lost_now[right]
+        else:
+            numbers, marks = memory.columns[right_row], memory.lost_columns[right_row]
+            value[n], lost[n] = total(code == ALWAYS, numbers, marks, start, last)
+        return
+    left = operands[rows[n, FIRST]]
+    if rows[left, IS_PLAIN]:
+        memory.left[n] = least(memory.left[n], memory.now[left])
+        memory.lost_left[n] |= memory.lost_now[left]
+    else:
+        left_row = rows[left, COLUMN]
+        numbers, marks = memory.columns[left_row], memory.lost_columns[left_row]
+        memory.left[n], memory.lost_left[n] = total(True, numbers, marks, start, last)
+    if is_plain:
+        value[n] = most(value[n], least(memory.now[right], memory.left[n]))
+        lost[n] |= memory.lost_now[right] | memory.lost_left[n]
+        return
+    inner = rows[n, INNER]
+    memory.columns[inner, last], memory.lost_columns[inner, last] = memory.left[n], memory.lost_left[n]
+    value[n], lost[n] = np.nan, 0
+    for t in range(start, last + 1):
+        value[n] = most(value[n], least(memory.columns[right_row, t], memory.columns[inner, t]))
+        lost[n] |= memory.lost_columns[right_row, t] | memory.lost_columns[inner, t]
+
+
+@piece
+def _apart(rows: Integers, n: int, earlier: int, later: int, memory: PaperMemory) -> int:
+    """Return the distance of two samples, in the unit of a node's window."""
+    return memory.stamps[later] - memory.stamps[earlier] if rows[n, IS_IN_NS] else later - earlier
+
+
+@piece
+def _step_column(rows: Integers, operands: Integers, n: int, last: int, memory: PaperMemory) -> None:
+    """Update a temporal node that is needed at every sample, where its window was still open."""
+    code = rows[n, CODE]
+    row, inner = rows[n, COLUMN], rows[n, INNER]
+    into, into_lost = memory.columns[row], memory.lost_columns[row]
+    right_row = rows[operands[rows[n, END] - 1], COLUMN]
+    right, right_lost = memory.columns[right_row], memory.lost_columns[right_row]
+    if code == NEXT:
+        for t in range(last):
+            into[t], into_lost[t] = right[t + 1], right_lost[t + 1]
+        into[last], into_lost[last] = np.nan, 0
+        return
+    low, high = rows[n, LOW], rows[n, HIGH]
+    while high >= 0 and _apart(rows, n, memory.opens[n], last, memory) > high:
+        memory.opens[n] += 1
+    start = max(memory.starts[n], memory.opens[n])
+    while start <= last and _apart(rows, n, memory.opens[n], start, memory) < low:
+        start += 1
+    memory.starts[n] = start
+    if start <= last:
+        _scan_node(rows, operands, n, start, last, memory)
+    if inner == row:
+        return
+    for t in range(memory.opens[n], last + 1):
+        while start <= last and _apart(rows, n, t, start, memory) < low:
+            start += 1
+        if start <= last:
+            into[t], into_lost[t] = memory.columns[inner, start], memory.lost_columns[inner, start]
+        else:
+            into[t], into_lost[t] = np.nan, 0
+
+
+@piece
+def _scan_node(
+    rows: Integers, operands: Integers, n: int, start: int, last: int, memory: PaperMemory
+) -> None:
+    """Run the unbounded operator from each sample, from `start` on, to the last one."""
+    code, inner = rows[n, CODE], rows[n, INNER]
+    into, into_lost = memory.columns[inner], memory.lost_columns[inner]
+    right_node, left_node = operands[rows[n, END] - 1], operands[rows[n, FIRST]]
+    right_row, left_row = rows[right_node, COLUMN], rows[left_node, COLUMN]
+    right, right_lost = memory.columns[right_row], memory.lost_columns[right_row]
+    left, left_lost = memory.columns[left_row], memory.lost_columns[left_row]
+    if code in (EVENTUALLY, ALWAYS):
+        scan(code == ALWAYS, right, right_lost, start, last, into, into_lost)
+    elif rows[left_node, IS_PLAIN]:
+        scan_until(left, left_lost, right, right_lost, start, last, into, into_lost)
+    elif rows[right_node, IS_PLAIN]:
+        scan_until_by_last(left, left_lost, right[last], right_lost[last], start, last, into, into_lost)
+    else:
+        pair_starts, end = memory.pair_starts[rows[n, PAIRS]], memory.pair_end[0]
+        pair_starts[last] = end - start
+        memory.pair_end[0] = end + last + 1 - start
+        row, lost_row = memory.pairs[end:], memory.lost_pairs[end:]
+        scan(True, left[start:], left_lost[start:], 0, last - start, row, lost_row)
+        scan_until_by_pairs(
+            memory.pairs, memory.lost_pairs, pair_starts, right, right_lost, start, last, into, into_lost
+        )
 
 
 @kernel
-def scan_until(left: Floats, right: Floats, into: Floats) -> None:
-    """Run until from each sample to the last one; the left operand depends on no later sample.
+def step_paper(
+    rows: Integers, operands: Integers, leaves: Floats, lost_leaves: Flags, times_ns: Integers,
+    t: int, count: int, position: int, memory: PaperMemory, series: Floats,
+) -> None:  # fmt: skip
+    """Run the samples t up to t + count; `position` samples came before.
+
+    Args:
+        leaves: (A, T); NaN where one is left out.
+        lost_leaves: (A, T), 1 where one is not known.
+        series: (N, 4, T), receives value, now, lower and upper of each node.
+    """
+    nodes = rows.shape[0]
+    for k in range(t, t + count):
+        last = position + k - t
+        if last < memory.stamps.shape[0]:
+            memory.stamps[last] = times_ns[k]
+        for n in range(nodes - 1, -1, -1):
+            code, is_plain = rows[n, CODE], rows[n, IS_PLAIN] != 0
+            if code == LEAF_NODE:
+                leaf = rows[n, LEAF]
+                memory.now[n], memory.lost_now[n] = leaves[leaf, k], lost_leaves[leaf, k]
+            elif code == TRUTH:
+                memory.now[n] = np.inf * rows[n, LEAF]
+            else:
+                _set_now(rows, operands, n, memory.now, memory.lost_now)
+            column = rows[n, COLUMN]
+            if is_plain:
+                if column >= 0:
+                    memory.columns[column, last] = memory.now[n]
+                    memory.lost_columns[column, last] = memory.lost_now[n]
+                if last == 0:
+                    memory.value[n], memory.lost_value[n] = memory.now[n], memory.lost_now[n]
+            elif column >= 0:
+                if code >= NEXT:
+                    _step_column(rows, operands, n, last, memory)
+                else:
+                    _set_column(rows, operands, n, last, memory)
+                memory.value[n] = memory.columns[column, 0]
+                memory.lost_value[n] = memory.lost_columns[column, 0]
+            elif code >= NEXT:
+                _step_first(rows, operands, n, last, times_ns[k], memory)
+            else:
+                own = operands[rows[n, FIRST] : rows[n, END]]
+                _fold(code, own, memory.value, memory.lost_value, n)
+            # adding zero turns -0.0 into 0.0, so that equal numbers are equal bits
+            series[n, 0, k] = np.nan if memory.lost_value[n] else memory.value[n] + 0.0
+            series[n, 1, k] = np.nan if memory.lost_now[n] else memory.now[n] + 0.0
+            series[n, 2, k] = series[n, 3, k] = series[n, 0, k]
+
+
+# columns of the table
+CODE, FIRST, END, IS_IN_NS, LOW, HIGH, IS_PLAIN, COLUMN, INNER, PAIRS, LEAF = range(11)
+WIDTH = 11
+NOTHING = -1
+"""No upper end, no column, no table of pairs."""
+
+# codes of nodes; a row is a node as written, since Def. 16 gives a number to each
+LEAF_NODE, TRUTH = 0, 1
+NOT, AND, OR, XOR, IMPLIES, IFF, SAME = 2, 3, 4, 5, 6, 7, 8
+NEXT, EVENTUALLY, ALWAYS, UNTIL = 9, 10, 11, 12
+
+_BOOLEAN_CODES = {"not": NOT, "and": AND, "or": OR, "xor": XOR, "->": IMPLIES, "<->": IFF, "spec": SAME}
+_TEMPORAL_CODES = {"X": NEXT, "F": EVENTUALLY, "G": ALWAYS, "U": UNTIL}
+OPERATORS = frozenset(_TEMPORAL_CODES)
+"""The temporal operators that there are."""
+
+
+@dataclass(frozen=True, eq=False)
+class PaperTable:
+    """A formula's nodes, by id.
+
+    Attributes:
+        rows: (N, WIDTH): code; begin and end of the node's operands in `operands`; its window; whether it is
+            plain; its places in `PaperMemory`; a leaf's number, or the sign of a constant.
+        operands: ids of the operands, node after node.
+        columns: how many columns are kept.
+        pairs: how many tables over pairs of samples are kept.
+    """
+
+    rows: Integers
+    operands: Integers
+    columns: int
+    pairs: int
+
+
+def paper_table(formula: Formula, leaves: Sequence[Atom | Quantified]) -> PaperTable:
+    """Compile a formula of `OPERATORS` over these leaves."""
+    nodes = [(node, parent) for _, parent, node in iter_nodes(formula)]
+    operands: list[list[int]] = [[] for _ in nodes]
+    for identifier, (_, parent) in enumerate(nodes):
+        if parent is not None:
+            operands[parent].append(identifier)
+    is_plain = [is_spatial(node) for node, _ in nodes]
+    has_column = _columns(nodes, operands, is_plain)
+    rows = np.zeros((len(nodes), WIDTH), np.int64)
+    columns = pairs = begin = 0
+    for identifier, (node, _) in enumerate(nodes):
+        row, own = rows[identifier], operands[identifier]
+        row[[CODE, LEAF]] = _code(node, leaves)
+        row[[FIRST, END]] = begin, begin + len(own)
+        row[IS_PLAIN] = is_plain[identifier]
+        row[[HIGH, COLUMN, INNER, PAIRS]] = NOTHING
+        begin += len(own)
+        if has_column[identifier]:
+            row[COLUMN], columns = columns, columns + 1
+        if isinstance(node, Temporal):
+            if node.bound is not None:
+                upper = NOTHING if node.bound.upper is None else node.bound.upper
+                row[[IS_IN_NS, LOW, HIGH]] = node.bound.unit == "ns", node.bound.lower, upper
+            is_until_nested = node.operator == "U" and not is_plain[own[-1]]
+            if has_column[identifier] and row[LOW] == 0 and row[HIGH] == NOTHING:
+                row[INNER] = row[COLUMN]
+            elif has_column[identifier] or is_until_nested:
+                row[INNER], columns = columns, columns + 1
+            if has_column[identifier] and is_until_nested and not is_plain[own[0]]:
+                row[PAIRS], pairs = pairs, pairs + 1
+    return PaperTable(rows, np.array([i for own in operands for i in own], np.int64), columns, pairs)
+
+
+def _columns(
+    nodes: Sequence[tuple[Formula, int | None]], operands: Sequence[Sequence[int]], is_plain: Sequence[bool]
+) -> list[bool]:
+    """Return which nodes are needed at all samples; parents come before their operands."""
+    wanted = [False] * len(nodes)
+    for identifier, (node, _) in enumerate(nodes):
+        for operand in operands[identifier]:
+            if isinstance(node, Temporal):
+                wanted[operand] = wanted[identifier] or not is_plain[operand]
+            else:
+                wanted[operand] = wanted[identifier] and not is_plain[identifier]
+    return wanted
+
+
+def _code(node: Formula, leaves: Sequence[Atom | Quantified]) -> tuple[int, int]:
+    """Return a node's code, and its leaf or the sign of its infinity."""
+    match node:
+        case Truth():
+            return TRUTH, 1 if node.value else -1
+        case Boolean():
+            return _BOOLEAN_CODES[node.operator], 0
+        case Temporal():
+            return _TEMPORAL_CODES[node.operator], 0
+        case _:
+            return LEAF_NODE, _leaf_number(node, leaves)
+
+
+def _leaf_number(node: Atom | Quantified, leaves: Sequence[Atom | Quantified]) -> int:
+    for number, leaf in enumerate(leaves):
+        if isinstance(node, Atom):
+            if isinstance(leaf, Atom) and leaf.expression == node.expression:
+                return number
+        elif isinstance(leaf, Quantified) and _meaning(leaf) == _meaning(node):
+            return number
+    raise ValueError(f"{node!r} is none of the leaves")
+
+
+def _meaning(leaf: Quantified) -> tuple[object, ...]:
+    return leaf.quantifier, leaf.variables, leaf.group, leaf.body
+
+
+@inlined
+def least(one: float, other: float) -> float:
+    """Return the lesser number, of those not left out; NaN if both are."""
+    if np.isnan(one):
+        return other
+    if np.isnan(other):
+        return one
+    return min(one, other)
+
+
+@inlined
+def most(one: float, other: float) -> float:
+    """Return the greater number, of those not left out; NaN if both are."""
+    if np.isnan(one):
+        return other
+    if np.isnan(other):
+        return one
+    return max(one, other)
+
+
+@inlined
+def pick(is_least: bool, one: float, other: float) -> float:
+    """Return `least` or `most` of two numbers."""
+    return least(one, other) if is_least else most(one, other)
+
+
+@inlined
+def combine(code: int, one: float, other: float) -> float:
+    """Apply a Boolean operator; for one operand, both are that operand."""
+    if code == AND:
+        return least(one, other)
+    if code == OR:
+        return most(one, other)
+    if code == NOT:
+        return -one
+    if code == IMPLIES:
+        return most(-one, other)
+    if code == XOR:
+        return most(least(one, -other), least(-one, other))
+    if code == IFF:
+        return least(most(-one, other), most(-other, one))
+    return one
+
+
+@piece
+def total(
+    is_least: bool, numbers: Floats, lost: Flags, first: int, last: int
+) -> tuple[float, int]:  # fmt: skip
+    """Return the least or the greatest number from `first` to `last`."""
+    result, is_lost = np.nan, 0
+    for t in range(first, last + 1):
+        result = pick(is_least, result, numbers[t])
+        is_lost |= lost[t]
+    return result, is_lost
+
+
+@piece
+def scan(
+    is_least: bool, numbers: Floats, lost: Flags, first: int, last: int, into: Floats, into_lost: Flags
+) -> None:
+    """Compute, from each sample from `first` on, the least or greatest number up to `last`."""
+    result, is_lost = np.nan, 0
+    for t in range(last, first - 1, -1):
+        result = pick(is_least, result, numbers[t])
+        is_lost |= lost[t]
+        into[t], into_lost[t] = result, is_lost
+
+
+@piece
+def scan_until(
+    left: Floats, left_lost: Flags, right: Floats, right_lost: Flags,
+    first: int, last: int, into: Floats, into_lost: Flags,
+) -> None:  # fmt: skip
+    """Run until from each sample from `first` on to `last`; the left operand depends on no later sample.
 
     The best over later ends is capped by the left operand here. An end of which everything was left out so
     far takes on the left operand here, which is then as good as any.
-
-    Args:
-        left, right, into: (2, T), as `Numbers`.
     """
-    best, is_lost, is_any_left_out = np.nan, 0.0, False
-    for t in range(left.shape[1] - 1, -1, -1):
-        mine, other = left[0, t], right[0, t]
-        if not np.isnan(mine):
+    best, is_lost, is_any_left_out = np.nan, 0, False
+    for t in range(last, first - 1, -1):
+        here = least(right[t], left[t])
+        if not np.isnan(left[t]):
             if is_any_left_out:
-                best = mine
+                best = left[t]
             elif not np.isnan(best):
-                best = min(mine, best)
+                best = min(left[t], best)
             is_any_left_out = False
-        here = mine if np.isnan(other) else other if np.isnan(mine) else min(other, mine)
         if np.isnan(here):
             is_any_left_out = True
-        elif np.isnan(best) or here > best:
-            best = here
-        is_lost = max(is_lost, left[1, t], right[1, t])
-        into[0, t], into[1, t] = best, is_lost
+        best = most(best, here)
+        is_lost |= left_lost[t] | right_lost[t]
+        into[t], into_lost[t] = best, is_lost
 
 
+@piece
+def scan_until_by_last(
+    left: Floats, left_lost: Flags, right: float, right_lost: int,
+    first: int, last: int, into: Floats, into_lost: Flags,
+) -> None:  # fmt: skip
+    """Run until from each sample to `last`, given until to the sample before it."""
+    still, is_lost = np.nan, right_lost
+    into[last], into_lost[last] = np.nan, 0
+    for t in range(last, first - 1, -1):
+        still = least(still, left[t])
+        is_lost |= left_lost[t]
+        into[t] = most(into[t], least(right, still))
+        into_lost[t] |= is_lost
+
+
+@piece
+def scan_until_by_pairs(
+    still: Floats, still_lost: Flags, starts: Integers, right: Floats, right_lost: Flags,
+    first: int, last: int, into: Floats, into_lost: Flags,
+) -> None:  # fmt: skip
+    """Run until from each sample to `last`, given the least left operand for each beginning and end."""
+    into[first : last + 1], into_lost[first : last + 1] = np.nan, 0
+    for end in range(first, last + 1):
+        for t in range(first, end + 1):
+            at = starts[end] + t
+            into[t] = most(into[t], least(right[end], still[at]))
+            into_lost[t] |= right_lost[end] | still_lost[at]
+
+
+_TILE = 256
+_FIRST_ROOM = 1024
 MAX_PAIRS = 1 << 27
-"""The most pairs of samples that untils may store a number for: about 11,000 samples, 2 GB."""
+"""The most pairs of samples that untils may store a number for: about 16,000 samples, 1.2 GB."""
 
 
 class PaperRun:
     """The numbers of every node on every prefix by Def. 16.
 
-    A temporal operator over plain formulas, which are about one sample, carries one number. Below another
-    temporal operator it carries numbers for every sample so far, and each sample takes time in proportion to
-    them.
+    A temporal operator over plain formulas carries one number. Below another temporal operator it carries
+    numbers for every sample so far, and each sample takes time in proportion to them.
     """
 
     def __init__(
@@ -133,35 +541,10 @@ class PaperRun:
             max_pairs: the most pairs of samples to compare.
         """
         self._max_pairs = max_pairs
-        tree = nodes_with_operands(formula)
-        self._nodes, self._operands = [node for node, _ in tree], [operands for _, operands in tree]
-        keys = [leaf_key(leaf) for leaf in leaves]
-        is_leaf = [isinstance(node, Atom | Quantified) for node in self._nodes]
-        self._leaf = {n: keys.index(leaf_key(node)) for n, node in enumerate(self._nodes) if is_leaf[n]}
-        self._is_plain = [is_spatial(node) for node in self._nodes]
-        # which nodes are needed at every sample, and which of all later samples change in more than one place
-        self._is_wanted = [False] * len(self._nodes)
-        self._nested: list[int] = []
-        for n, (node, operands) in enumerate(tree):
-            if self._is_plain[n]:
-                is_nested = False
-            elif isinstance(node, Temporal):
-                is_nested = self._is_wanted[n] or not all(self._is_plain[each] for each in operands)
-            else:
-                is_nested = self._is_wanted[n]
-            for each in operands:
-                self._is_wanted[each] = is_nested
-            if is_nested:
-                self._nested.insert(0, n)
-        self._position, self._first_ns = 0, 0
-        self._elapsed = np.empty(0, np.int64)
-        kept = [n for n, is_wanted in enumerate(self._is_wanted) if is_wanted or n in self._nested]
-        self._columns = {n: np.empty((2, 0)) for n in kept}
-        untils = [n for n in self._nested if len(self._operands[n]) == 2 and self._is_until(n)]
-        self._pairs = {n: np.empty((2, 0, 0)) for n in untils if not any(self._plain_sides(n))}
-        self._ends = {n: np.empty((2, 0)) for n in untils if self._plain_sides(n) == [False, True]}
-        self._value = np.repeat(_LEFT_OUT, len(self._nodes), axis=1)
-        self._least_left = np.repeat(_LEFT_OUT, len(self._nodes), axis=1)
+        self._table = paper_table(formula, leaves)
+        self._memory = _first_memory(self._table)
+        self._position = 0
+        self._value = np.full(len(self._table.rows), np.nan)
 
     def __len__(self) -> int:
         """Return how many samples were added."""
@@ -170,7 +553,7 @@ class PaperRun:
     @property
     def final(self) -> Floats:
         """(N, 2): twice each node's value on the samples so far; NaN where it is undetermined."""
-        return np.repeat(_determined(self._value)[:, None], 2, axis=1)
+        return np.repeat(self._value[:, None], 2, axis=1)
 
     def extend(self, leaves: Floats, times_ns: Integers, empty: Empty = np.empty) -> Floats:
         """Add samples.
@@ -186,192 +569,50 @@ class PaperRun:
         Raises:
             UsageError: more pairs of samples than allowed.
         """
-        series = empty((len(self._nodes), 4, len(times_ns)))
-        if not len(times_ns):
-            return series
-        if self._position == 0:
-            self._first_ns = int(times_ns[0])
-        now = self._now(leaves)
-        elapsed = times_ns - self._first_ns
-        values: dict[int, Numbers] = {}
-        if self._nested:
-            self._make_room(elapsed)
-            values = self._run_nested(now)
-        for n in reversed(range(len(self._nodes))):
-            if n not in values:
-                values[n] = self._at_first(n, now, values, elapsed)
-            self._value[:, n] = values[n][:, -1]
-            series[n, 0] = series[n, 2] = series[n, 3] = _determined(values[n])
-            series[n, 1] = _determined(now[n])
-        self._position += len(times_ns)
-        return series
-
-    def _now(self, leaves: Floats) -> dict[int, Numbers]:
-        """Return each node on each sample alone."""
         # Def. 16 knows no uncertainty: nominal ends only, and a number is lost where they differ
         low, high = low_and_high(len(leaves), wide=False)
-        now: dict[int, Numbers] = {}
-        for n in reversed(range(len(self._nodes))):
-            node, operands = self._nodes[n], [now[each] for each in self._operands[n]]
-            match node:
-                case Truth():
-                    now[n] = np.zeros((2, leaves.shape[2]))
-                    now[n][0] = np.inf if node.value else -np.inf
-                case Boolean():
-                    now[n] = _combined(node.operator, operands)
-                case Temporal():
-                    is_later = node.operator == "X" or (node.bound is not None and node.bound.lower > 0)
-                    now[n] = _combined("and", operands)
-                    if is_later:
-                        now[n][:] = _LEFT_OUT
-                case _:
-                    ends = leaves[low, self._leaf[n]], leaves[high, self._leaf[n]]
-                    now[n] = _joined(ends[0], (ends[0] != ends[1]) & ~np.isnan(ends[0]))
-        return now
+        numbers = np.ascontiguousarray(leaves[low])
+        lost = ((numbers != leaves[high]) & ~np.isnan(numbers)).astype(np.int8)
+        times_ns = np.array(times_ns, np.int64)  # writable, since kernels are compiled for that
+        series = empty((len(self._table.rows), 4, len(times_ns)))
+        for t in range(0, len(times_ns), _TILE):
+            count = min(_TILE, len(times_ns) - t)
+            self._make_room(self._position + count)
+            step_paper(
+                self._table.rows, self._table.operands, numbers, lost, times_ns,
+                t, count, self._position, self._memory, series,
+            )  # fmt: skip
+            self._position += count
+        if len(times_ns):
+            self._value = series[:, 0, -1].copy()
+        return series
 
-    def _at_first(
-        self, n: int, now: Mapping[int, Numbers], values: Mapping[int, Numbers], elapsed: Integers
-    ) -> Numbers:
-        """Return a node that is not nested at the first sample, on the samples up to each."""
-        node, count = self._nodes[n], len(elapsed)
-        if self._is_plain[n]:
-            return np.repeat(self._value[:, [n]] if self._position else now[n][:, :1], count, axis=1)
-        if isinstance(node, Boolean):
-            return _combined(node.operator, [values[each] for each in self._operands[n]])
-        assert isinstance(node, Temporal)
-        positions = np.arange(self._position, self._position + count)
-        inside = _is_within(node, elapsed if _is_timed(node) else positions)
-        right = np.where(inside, now[self._operands[n][-1]], _LEFT_OUT)
-        if node.operator == "U":
-            left = np.where(inside, now[self._operands[n][0]], _LEFT_OUT)
-            least = _carried(np.fmin, self._least_left[:, [n]], left)
-            self._least_left[:, n] = least[:, -1]
-            right = np.where(inside, _combined("and", [right, least]), _LEFT_OUT)
-        return _carried(_PICKS[node.operator], self._value[:, [n]], right)
-
-    # ------------------------------------------------------------------------------ one below another
-
-    def _make_room(self, elapsed: Integers) -> None:
-        """Add the times of the next samples, and room for numbers at them."""
-        if self._pairs and self._position**2 > self._max_pairs:
-            raise UsageError(
-                f"after {self._position} samples, an until of two temporal operands below a temporal "
-                "operator compares too many pairs of them; bound it, evaluate fewer samples, or use "
-                "the semantics 'ltlf'"
+    def _make_room(self, samples: int) -> None:
+        """Grow the memory to hold the given number of samples."""
+        memory, pairs = self._memory, self._table.pairs
+        if self._table.columns and samples > len(memory.stamps):
+            more = max(samples, 2 * len(memory.stamps)) - len(memory.stamps)
+            memory = memory._replace(
+                stamps=_longer(memory.stamps, more),
+                columns=_longer(memory.columns, more),
+                lost_columns=_longer(memory.lost_columns, more),
+                pair_starts=_longer(memory.pair_starts, more),
             )
-        self._elapsed = np.concatenate([self._elapsed[: self._position], elapsed])
-        wanted = self._position + len(elapsed)
-        for columns in (self._columns, self._ends):
-            for n, column in columns.items():
-                columns[n] = _with_room(column, wanted, 1)
-        for n, pairs in self._pairs.items():
-            pairs = _with_room(pairs, wanted, 1)
-            self._pairs[n] = _with_room(pairs, wanted if self._is_wanted[n] else 1, 2)
-
-    def _run_nested(self, now: Mapping[int, Numbers]) -> dict[int, Numbers]:
-        """Return the nested nodes at the first sample, on the samples up to each of some."""
-        count = now[0].shape[1]
-        values = {n: np.empty((2, count)) for n in self._nested}
-        plain = [n for n in self._columns if self._is_plain[n]]
-        for n in plain:
-            self._columns[n][:, self._position : self._position + count] = now[n]
-        for k in range(count):
-            for n in self._nested:
-                self._update(n, self._position + k)
-                values[n][:, k] = self._columns[n][:, 0]
-        return values
-
-    def _update(self, n: int, last: int) -> None:
-        """Compute a node on the samples up to `last`, at each sample where that changes it."""
-        node, into = self._nodes[n], self._columns[n]
-        operands = [self._columns[each][:, : last + 1] for each in self._operands[n]]
-        if isinstance(node, Boolean):
-            into[:, : last + 1] = _combined(node.operator, operands)
-            return
-        assert isinstance(node, Temporal)
-        size = last + 1 if self._is_wanted[n] else 1
-        if node.operator == "X":
-            size = min(size, last)
-            into[:, :size] = operands[0][:, 1 : size + 1]
-            return
-        here, starts = np.arange(size), np.arange(size)
-        if node.bound is not None:
-            # the samples in whose windows the last one is, and where these windows begin
-            places = self._elapsed[: last + 1] if _is_timed(node) else np.arange(last + 1)
-            here = np.flatnonzero(_is_within(node, places[last] - places[:size]))
-            starts = np.searchsorted(places, places[here] + node.bound.lower)
-        if len(here):
-            first = int(starts[0])
-            if node.operator == "U":
-                inner = self._until(n, operands[0], operands[1], first)
-            else:
-                inner = _to_the_end(_PICKS[node.operator], operands[0][:, first:])
-            into[:, here] = inner[:, starts - first]
-
-    def _until(self, n: int, left: Numbers, right: Numbers, first: int) -> Numbers:
-        """Return until to the last sample, from each sample from `first` on."""
-        last, left, right = left.shape[1] - 1, left[:, first:], right[:, first:]
-        if self._plain_sides(n)[0]:
-            inner = np.empty(left.shape)
-            scan_until(np.ascontiguousarray(left), np.ascontiguousarray(right), inner)
-            return inner
-        still = _to_the_end(np.fmin, left)
-        if n in self._ends:
-            # until to the sample before is known
-            inner = self._ends[n][:, first : last + 1]
-            best = _combined("and", [still, np.repeat(right[:, -1:], still.shape[1], axis=1)])
-            inner[:] = _combined("or", [inner, best])
-            return inner
-        # each end has its own least of the left operand, on the samples up to it
-        begins = slice(first, last + 1) if self._is_wanted[n] else slice(0, 1)
-        pairs = self._pairs[n]
-        pairs[:, last, begins] = still[:, : begins.stop - begins.start]
-        ends = pairs[:, first : last + 1, begins]
-        numbers, lost = np.fmin(ends[0], right[0][:, None]), np.maximum(ends[1], right[1][:, None])
-        is_later = np.tri(*numbers.shape, dtype=np.bool_)
-        greatest = np.fmax.reduce(numbers, axis=0, where=is_later, initial=np.nan)
-        return _joined(greatest, lost.max(axis=0, where=is_later, initial=0.0))
-
-    def _is_until(self, n: int) -> bool:
-        node = self._nodes[n]
-        return isinstance(node, Temporal) and node.operator == "U"
-
-    def _plain_sides(self, n: int) -> list[bool]:
-        """Return which operands of a node are about one sample."""
-        return [self._is_plain[each] for each in self._operands[n]]
-
-
-def _is_timed(node: Temporal) -> bool:
-    return node.bound is not None and node.bound.unit == "ns"
-
-
-def _is_within(node: Temporal, distances: Integers) -> Booleans:
-    """Return which distances from a sample are in the window of an operator there."""
-    lower, upper = (0, None) if node.bound is None else (node.bound.lower, node.bound.upper)
-    if node.operator == "X":
-        lower = upper = 1
-    is_within: Booleans = distances >= lower
-    return is_within if upper is None else is_within & (distances <= upper)
-
-
-def _determined(numbers: Numbers) -> Floats:
-    """Return numbers, (…), NaN where something unknown matters.
-
-    Adding zero turns -0.0 into 0.0, so that equal numbers are equal bits.
-    """
-    return np.where(np.isnan(numbers[0]) | (numbers[1] > 0.0), np.nan, numbers[0] + 0.0)
-
-
-def _with_room(numbers: Numbers, wanted: int, axis: int) -> Numbers:
-    """Return numbers with room for so many along an axis, or more; what is new is left out."""
-    length = numbers.shape[axis]
-    if wanted <= length:
-        return numbers
-    shape = [*numbers.shape]
-    shape[axis] = max(wanted, 2 * length) - length
-    new = np.zeros(shape)
-    new[0] = np.nan
-    return np.concatenate([numbers, new], axis=axis)
+        if pairs:
+            used = int(memory.pair_end[0])
+            wanted = used + pairs * samples * (samples - self._position)
+            if used > self._max_pairs:
+                raise UsageError(
+                    f"after {self._position} samples, an until of two temporal operands below a temporal "
+                    "operator compares too many pairs of them; bound it, evaluate fewer samples, or use "
+                    "the semantics 'ltlf'"
+                )
+            if wanted > len(memory.pairs):
+                more = max(wanted, 2 * used) - len(memory.pairs)
+                memory = memory._replace(
+                    pairs=_longer(memory.pairs, more), lost_pairs=_longer(memory.lost_pairs, more)
+                )
+        self._memory = memory
 
 
 def left_out(
@@ -396,6 +637,32 @@ def left_out(
             if duration_ns is not None:
                 row |= times_ns - duration_ns < first_ns
     return np.where(is_before, np.nan, values) if is_before.any() else values
+
+
+def _first_memory(table: PaperTable) -> PaperMemory:
+    nodes, room = len(table.rows), _FIRST_ROOM if table.columns else 1
+    return PaperMemory(
+        stamps=np.zeros(room, np.int64),
+        columns=np.full((table.columns, room), np.nan),
+        lost_columns=np.zeros((table.columns, room), np.int8),
+        value=np.full(nodes, np.nan),
+        lost_value=np.zeros(nodes, np.int8),
+        now=np.full(nodes, np.nan),
+        lost_now=np.zeros(nodes, np.int8),
+        left=np.full(nodes, np.nan),
+        lost_left=np.zeros(nodes, np.int8),
+        starts=np.full(nodes, -1, np.int64),
+        opens=np.zeros(nodes, np.int64),
+        pairs=np.empty(0),
+        lost_pairs=np.empty(0, np.int8),
+        pair_starts=np.zeros((table.pairs, room), np.int64),
+        pair_end=np.zeros(1, np.int64),
+    )
+
+
+def _longer(array: np.ndarray, more: int) -> np.ndarray:
+    """Return the array with room for more along its last axis."""
+    return np.concatenate([array, np.zeros((*array.shape[:-1], more), array.dtype)], axis=-1)
 
 
 def check_operators(specification: Specification) -> None:
