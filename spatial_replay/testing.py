@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from types import SimpleNamespace
-from typing import Unpack
+from typing import Any, Unpack
 
 from spatial_replay.api import Evaluating, Log, Specifications, replay_log
 from spatial_replay.batch.suite import Expectation
@@ -45,17 +45,17 @@ def assert_satisfied(
     expectation = Expectation(at_least=at_least, tolerance=tolerance, allow=frozenset(allow))
     reasons = []
     for result in replayed.results:
-        failure = expectation.failure(
-            SimpleNamespace(
-                verdict=result.verdict,
-                lower=result.lower,
-                tested=result.tested,
-                untested=[each.message for each in result.untested],
-                vacuous=result.vacuous,
-                dropped=replayed.dropped.text,
-                faults=(),
-            )
+        # those fields of a row of a batch that decide
+        outcome: Any = SimpleNamespace(
+            verdict=result.verdict,
+            lower=result.lower,
+            tested=result.tested,
+            untested=[each.message for each in result.untested],
+            vacuous=result.vacuous,
+            dropped=replayed.dropped.text,
+            faults=(),
         )
+        failure = expectation.failure(outcome)
         if failure is not None:
             title = result.name if result.object is None else f"{result.name}[{result.object}]"
             explanation = result.sentences(replayed.first_ns) if result.can_explain else ()
