@@ -51,8 +51,7 @@ if TYPE_CHECKING:
     from spatial_replay.sources.open_log import read_trace
     from spatial_replay.spec.formula import Specification
     from spatial_replay.spec.load import load_specification, parse_specification
-    from spatial_replay.trace.sample import Sample
-    from spatial_replay.trace.trace import Trace
+    from spatial_replay.trace.trace import Sample, Trace
 
 __version__ = "0.2.0"
 

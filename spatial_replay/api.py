@@ -32,8 +32,7 @@ from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import load_specifications
 from spatial_replay.spec.relations import DEFAULT_PROFILE
 from spatial_replay.text import refuse_unknown
-from spatial_replay.trace.sample import FOREVER
-from spatial_replay.trace.trace import Trace
+from spatial_replay.trace.trace import FOREVER, Trace
 from spatial_replay.tuning.margins import load_runs
 from spatial_replay.tuning.tuned import Tuning, tune_runs
 

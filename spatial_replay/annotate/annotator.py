@@ -50,8 +50,7 @@ from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.spec.formula import Outline, Specification, iter_nodes
-from spatial_replay.trace.sample import LATEST_NS
-from spatial_replay.trace.trace import Trace
+from spatial_replay.trace.trace import LATEST_NS, Trace
 
 _MOST_RECENT: Final = 20
 """The most events in a message on recent ones."""

@@ -37,7 +37,7 @@ from spatial_replay.spec.formula import Formula, Quantified, Specification, iter
 from spatial_replay.spec.relations import RELATION_NAMES
 from spatial_replay.spec.walks import declared_unit, looks_ahead, substitute
 from spatial_replay.text import requirement_text, time_text, with_unit
-from spatial_replay.trace.sample import LATEST_NS
+from spatial_replay.trace.trace import LATEST_NS
 
 LASTING: Final = 3
 """Samples in a row that a sign must last."""

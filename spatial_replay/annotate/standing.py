@@ -23,7 +23,7 @@ from spatial_replay.logs.wire import WireTemplate, placed, rounded, words_of
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.spec.formula import Formula, iter_nodes
 from spatial_replay.spec.walks import looks_ahead
-from spatial_replay.trace.sample import LATEST_NS
+from spatial_replay.trace.trace import LATEST_NS
 
 _MOST_TEMPLATES: Final = 1024
 

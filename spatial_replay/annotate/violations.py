@@ -27,8 +27,7 @@ from spatial_replay.monitor.online.codes import low_and_high
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.spec.formula import ANY_CLASS, Formula, Outline, Quantified, TrackedName, iter_nodes
 from spatial_replay.spec.walks import iter_terms, leaf_key, looks_back, substitute
-from spatial_replay.trace.sample import LATEST_NS
-from spatial_replay.trace.trace import Trace
+from spatial_replay.trace.trace import LATEST_NS, Trace
 
 _MOST_BINDINGS: Final = 64
 """If a quantifier binds more, all members have the number of the worst."""

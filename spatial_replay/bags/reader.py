@@ -29,7 +29,7 @@ from spatial_replay.logs.messages import Attachment, Channel, Messages
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.logs.remote import LogFile
 from spatial_replay.text import Instant, encodable
-from spatial_replay.trace.sample import LATEST_NS
+from spatial_replay.trace.trace import LATEST_NS
 
 _TOGETHER = 512
 """Messages made at once: fewer than the garbage collector lets pass before it runs."""

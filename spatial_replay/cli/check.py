@@ -285,7 +285,7 @@ class _CutResults:
         # only needed with --log: the monitor loads the numerical libraries
         from spatial_replay.monitor.instances import find_instances
         from spatial_replay.monitor.stream import EvaluationStream
-        from spatial_replay.trace.sample import FOREVER
+        from spatial_replay.trace.trace import FOREVER
 
         self._specification = specification
         plain = tuple(each for each in specification.specs if each.parameter is None)

@@ -31,8 +31,7 @@ from spatial_replay.replay.engine import run_replay
 from spatial_replay.runs.planned import warm_up_planner
 from spatial_replay.sources.open_log import open_source
 from spatial_replay.spec import parse_specification
-from spatial_replay.trace.sample import Sample
-from spatial_replay.trace.trace import Trace
+from spatial_replay.trace.trace import Sample, Trace
 
 _SPECIFICATION = """\
 region goal = box(0, 0, 4, 4)

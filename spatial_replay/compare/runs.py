@@ -42,8 +42,7 @@ from spatial_replay.text import (
     names_from_unit,
     with_unit,
 )
-from spatial_replay.trace.sample import FOREVER
-from spatial_replay.trace.trace import Trace
+from spatial_replay.trace.trace import FOREVER, Trace
 from spatial_replay.trace.units import OTHER_UNITS, require_same_units
 
 AlignmentKind: TypeAlias = Literal["time", "event", "progress"]

@@ -37,7 +37,7 @@ from spatial_replay.spec.diagnostics import Diagnostic, nearest_hint
 from spatial_replay.spec.formula import Atom, Formula, NamedSpec, Outline, Quantified, Specification
 from spatial_replay.spec.resolve import MAX_SIZE
 from spatial_replay.text import Instant, Sentence, counted, counted_from, json_number, with_unit
-from spatial_replay.trace.sample import FOREVER
+from spatial_replay.trace.trace import FOREVER
 
 _MOST_EVALUATIONS: Final = 256
 """Formulas that are evaluated to find the cause of one change; the cause found by then stands."""

@@ -50,7 +50,7 @@ from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import load_specifications
 from spatial_replay.spec.walks import declared_unit
 from spatial_replay.text import counted, json_number, named_arguments, with_unit
-from spatial_replay.trace.sample import Sample
+from spatial_replay.trace.trace import Sample
 
 _MOST_FAILURES: Final = 20
 """The most failures in the text; JSON has all."""

@@ -28,8 +28,7 @@ from spatial_replay.simulation.world import Box, Injection, Kind, Start
 from spatial_replay.sources.open_log import read_trace
 from spatial_replay.spec.formula import Specification
 from spatial_replay.text import nearest_hint
-from spatial_replay.trace.sample import Sample
-from spatial_replay.trace.trace import Trace, duration_ns_from_text
+from spatial_replay.trace.trace import Sample, Trace, duration_ns_from_text
 
 # ------------------------------------------------------------------------------------------------- parameters
 

@@ -15,7 +15,7 @@ from typing import Any, Final, NamedTuple, TypeAlias
 
 from spatial_replay.errors import LogError, RemoteError, UsageError, importing, system_reason
 from spatial_replay.logs.messages import Channel, Schema
-from spatial_replay.trace.sample import LATEST_NS
+from spatial_replay.trace.trace import LATEST_NS
 
 SUBPROTOCOLS: Final = ("foxglove.sdk.v1", "foxglove.websocket.v1")
 """In the order of preference: that of the Foxglove SDK, and that of foxglove_bridge before it."""

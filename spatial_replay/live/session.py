@@ -49,8 +49,7 @@ from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import listed_specifications
 from spatial_replay.text import counted
-from spatial_replay.trace.sample import Sample
-from spatial_replay.trace.trace import ABSENT, Trace
+from spatial_replay.trace.trace import ABSENT, Sample, Trace
 
 if TYPE_CHECKING:
     from spatial_replay.serve.server import RunServer

@@ -14,7 +14,7 @@ from typing import Final, Literal, TypedDict, cast, get_args
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.footprint import Concave
 from spatial_replay.text import named_arguments
-from spatial_replay.trace.sample import LATEST_NS
+from spatial_replay.trace.trace import LATEST_NS
 
 Lost = Literal["drop", "keep"]
 """Whether rows marked as out of the picture are dropped."""

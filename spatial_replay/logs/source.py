@@ -14,8 +14,7 @@ from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.messages import BLOCK_SAMPLES, Attachment, Block, noting_pauses
 from spatial_replay.logs.read_options import FaultList, gap_ns
 from spatial_replay.text import encodable
-from spatial_replay.trace.sample import Sample
-from spatial_replay.trace.trace import Trace, within
+from spatial_replay.trace.trace import Sample, Trace, within
 from spatial_replay.trace.units import OUR_AXES, Axes
 
 _Read = TypeVar("_Read")

@@ -32,8 +32,7 @@ from spatial_replay.mapping.topic_reader import MISFITS, Extractor, ReadingPlan,
 from spatial_replay.mapping.tracker import Remarks, Tracker
 from spatial_replay.mapping.transforms import HISTORY_NS, FrameTree
 from spatial_replay.text import Instant, Sentence, counted, nearest_hint, number_text, times_apart
-from spatial_replay.trace.sample import FOREVER, LATEST_NS
-from spatial_replay.trace.trace import Trace
+from spatial_replay.trace.trace import FOREVER, LATEST_NS, Trace
 
 _FIRST_STEP: Final = 256
 _LONGEST_STEP: Final = 8_192

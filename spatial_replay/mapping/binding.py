@@ -41,7 +41,7 @@ from spatial_replay.mapping.field_paths import (
 )
 from spatial_replay.mapping.mapping_file import Measure, Stamp
 from spatial_replay.mapping.message_types import Alternatives, MessageLayout
-from spatial_replay.trace.sample import LATEST_NS
+from spatial_replay.trace.trace import LATEST_NS
 
 BY_PLACE = "only the places in the list distinguish objects without an id: objects swap where these change"
 """Remark on objects that are named by their indices."""

@@ -29,8 +29,7 @@ from spatial_replay.mapping.assemble import Assembler
 from spatial_replay.mapping.mapping_file import LogMapping
 from spatial_replay.mapping.topic_reader import ReadingPlan
 from spatial_replay.text import encodable
-from spatial_replay.trace.sample import FOREVER, LATEST_NS
-from spatial_replay.trace.trace import Trace
+from spatial_replay.trace.trace import FOREVER, LATEST_NS, Trace
 from spatial_replay.trace.units import Axes
 
 _WAITING_BYTES = 2**26

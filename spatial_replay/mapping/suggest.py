@@ -52,7 +52,7 @@ from spatial_replay.mapping.message_types import (
 from spatial_replay.mapping.topic_reader import doubts_of
 from spatial_replay.mapping.yaml_document import LARGEST_TEXT
 from spatial_replay.text import counted
-from spatial_replay.trace.sample import FOREVER
+from spatial_replay.trace.trace import FOREVER
 
 _DEEPEST = 4
 """Levels of nested fields to search."""

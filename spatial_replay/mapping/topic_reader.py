@@ -76,7 +76,7 @@ from spatial_replay.mapping.message_types import (
 )
 from spatial_replay.mapping.transforms import HISTORY_NS, LEAST_STEP_NS, TransformReader
 from spatial_replay.text import counted, names_from_unit, nearest_hint, text_number
-from spatial_replay.trace.sample import LATEST_NS
+from spatial_replay.trace.trace import LATEST_NS
 
 
 @dataclass(frozen=True, slots=True)

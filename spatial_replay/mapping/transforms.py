@@ -31,7 +31,7 @@ from spatial_replay.mapping.field_paths import (
     tuple_getter,
 )
 from spatial_replay.text import Instant, Sentence, counted
-from spatial_replay.trace.sample import LATEST_NS
+from spatial_replay.trace.trace import LATEST_NS
 
 _LEAST_NORM = 1e-6
 _UPRIGHT = 1e-9

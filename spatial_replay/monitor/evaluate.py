@@ -23,8 +23,7 @@ from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import require_specification
 from spatial_replay.text import named_arguments
-from spatial_replay.trace.sample import FOREVER, require_time
-from spatial_replay.trace.trace import Trace, window_of
+from spatial_replay.trace.trace import FOREVER, Trace, require_time, window_of
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,8 +23,7 @@ from spatial_replay.spec.formula import NamedSpec, Specification, iter_nodes
 from spatial_replay.spec.load import require_specification
 from spatial_replay.spec.walks import declared_unit
 from spatial_replay.text import counted, named_arguments, time_text, times_apart
-from spatial_replay.trace.sample import Sample, require_sample, require_time
-from spatial_replay.trace.trace import duration_ns_from_text
+from spatial_replay.trace.trace import Sample, duration_ns_from_text, require_sample, require_time
 from spatial_replay.trace.units import checked_units
 
 _MOST_KNOWN: Final = 1000

@@ -26,7 +26,7 @@ from spatial_replay.monitor.online.codes import OFFLINE_TARGET, low_and_high
 from spatial_replay.monitor.online.operators import SignalTable, array_of_rows
 from spatial_replay.monitor.online.signals import past_value
 from spatial_replay.spec.formula import Atom, Formula, Quantified, Temporal, iter_nodes
-from spatial_replay.trace.sample import LATEST_NS
+from spatial_replay.trace.trace import LATEST_NS
 
 
 class Steps(NamedTuple):

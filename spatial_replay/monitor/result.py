@@ -40,7 +40,7 @@ from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Formula, NamedSpec, iter_nodes, operator_of
 from spatial_replay.spec.walks import declared_unit
 from spatial_replay.text import Instant, Sentence, counted_from, shortened_formula
-from spatial_replay.trace.sample import LATEST_NS
+from spatial_replay.trace.trace import LATEST_NS
 
 _UNTESTED: Final = Sentence("Nothing tested the verdict.")
 

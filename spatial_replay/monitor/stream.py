@@ -28,8 +28,7 @@ from spatial_replay.monitor.semantics import Evaluator, Semantics
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.spec.formula import Outline, Specification
 from spatial_replay.text import times_apart
-from spatial_replay.trace.sample import Sample
-from spatial_replay.trace.trace import Trace, window_of
+from spatial_replay.trace.trace import Sample, Trace, window_of
 
 NEVER = -1
 """In place of a time: no sample settled it."""

@@ -33,8 +33,7 @@ from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import NamedSpec, Number, Signal, Specification
 from spatial_replay.spec.walks import declared_unit
 from spatial_replay.text import Instant, Sentence, with_unit
-from spatial_replay.trace.sample import FOREVER, Sample
-from spatial_replay.trace.trace import Trace
+from spatial_replay.trace.trace import FOREVER, Sample, Trace
 
 REMEMBERED = 1024
 """Samples that a monitor keeps to look for the atom that settled a violation."""

@@ -29,7 +29,7 @@ from spatial_replay.planning.decisions import Candidate, Consideration, Step
 from spatial_replay.planning.maps import FREE, REASONS, GradientMap
 from spatial_replay.planning.read import LoggedStep
 from spatial_replay.text import counted
-from spatial_replay.trace.sample import Sample
+from spatial_replay.trace.trace import Sample
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

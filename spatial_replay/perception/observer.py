@@ -25,7 +25,7 @@ from spatial_replay.perception.plane import (
 )
 from spatial_replay.perception.tags_file import LEAST_REFERENCES, MountedTag, TaggedObject, TagsFile
 from spatial_replay.text import counted
-from spatial_replay.trace.sample import Sample
+from spatial_replay.trace.trace import Sample
 
 _STEP: Final = 1e-3
 """Pixels by which corners are moved for derivatives."""

@@ -62,7 +62,7 @@ from spatial_replay.planning.maps import MOST_LAYERS, GradientMap, MapLayers, ma
 from spatial_replay.planning.planner import Planner
 from spatial_replay.planning.settings import Settings, text_from_settings
 from spatial_replay.text import counted, json_number, time_text
-from spatial_replay.trace.sample import Sample
+from spatial_replay.trace.trace import Sample
 
 # ------------------------------------------------------------------------------------------------------- maps
 

@@ -26,8 +26,7 @@ from spatial_replay.planning.maps import Cube, concerns
 from spatial_replay.planning.settings import Settings
 from spatial_replay.spec.formula import Boolean, Formula, Outline, Specification, Truth, expand
 from spatial_replay.spec.walks import iter_formulas
-from spatial_replay.trace.sample import Sample
-from spatial_replay.trace.trace import Trace
+from spatial_replay.trace.trace import Sample, Trace
 
 # ---------------------------------------------------------------------------------------------------- demands
 

@@ -58,8 +58,7 @@ from spatial_replay.planning.targets import nearest_meeting
 from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import Atom, Formula, Outline, Quantified, SignedDistance, TrackedName
 from spatial_replay.spec.walks import base_of, iter_formulas, terms_of
-from spatial_replay.trace.sample import Sample
-from spatial_replay.trace.trace import Trace
+from spatial_replay.trace.trace import Sample, Trace
 
 # ----------------------------------------------------------------------------------------------- arrangements
 

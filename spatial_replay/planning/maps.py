@@ -49,8 +49,7 @@ from spatial_replay.spec.formula import (
     expand,
 )
 from spatial_replay.spec.walks import base_of, iter_expressions, iter_formulas, looks_back, terms_of
-from spatial_replay.trace.sample import Sample
-from spatial_replay.trace.trace import Trace
+from spatial_replay.trace.trace import Sample, Trace
 
 Cube: TypeAlias = tuple[tuple[int, bool], ...]
 """A conjunction of literals: number of a proposition, and whether it has to hold. The empty one is true."""

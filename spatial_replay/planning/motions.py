@@ -60,7 +60,7 @@ from spatial_replay.planning.targets import (
     target_in,
 )
 from spatial_replay.spec.formula import Atom, Formula, Outline, SignedDistance, TrackedName
-from spatial_replay.trace.sample import Sample
+from spatial_replay.trace.trace import Sample
 
 # ------------------------------------------------------------------------------------------------- candidates
 

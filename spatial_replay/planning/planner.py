@@ -48,7 +48,7 @@ from spatial_replay.planning.settings import Settings, Workspace, kind_faults, r
 from spatial_replay.spec.formula import Specification, Temporal
 from spatial_replay.spec.walks import iter_formulas
 from spatial_replay.text import counted, named_arguments, times_apart
-from spatial_replay.trace.sample import Sample, require_sample
+from spatial_replay.trace.trace import Sample, require_sample
 
 _LONGEST_WANTED: Final = 60
 """The most characters of a proposition that a reason shows if it has a spec to name instead."""

@@ -52,8 +52,7 @@ from spatial_replay.spec import parse_specification
 from spatial_replay.spec.format import format_specification
 from spatial_replay.spec.formula import Specification
 from spatial_replay.text import counted, time_text
-from spatial_replay.trace.sample import Sample
-from spatial_replay.trace.trace import window_of
+from spatial_replay.trace.trace import Sample, window_of
 
 PLANNER_TOPICS: Final = (PLAN_DECISION, GRADIENT_MAP, PLAN_PATH)
 

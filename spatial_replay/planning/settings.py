@@ -22,7 +22,7 @@ from spatial_replay.geometry.footprint import ConvexPart, Footprint
 from spatial_replay.logs.remote import log_file
 from spatial_replay.mapping.yaml_document import checked_document, read_yaml_text, schema_of
 from spatial_replay.text import named_arguments
-from spatial_replay.trace.sample import Sample
+from spatial_replay.trace.trace import Sample
 
 # ---------------------------------------------------------------------------------------------- the workspace
 

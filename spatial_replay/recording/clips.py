@@ -34,8 +34,7 @@ from spatial_replay.recording.log import (
 )
 from spatial_replay.spec.formula import Specification, iter_nodes
 from spatial_replay.text import counted, named_arguments, nearest_hint
-from spatial_replay.trace.sample import Sample
-from spatial_replay.trace.trace import Trace
+from spatial_replay.trace.trace import Sample, Trace
 from spatial_replay.trace.units import Axes
 
 MOST_BYTES: Final = 256 * 2**20

@@ -60,8 +60,7 @@ from spatial_replay.spec import object_names, signal_names
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.walks import declared_unit
 from spatial_replay.text import requirement_text
-from spatial_replay.trace.sample import FOREVER, Sample
-from spatial_replay.trace.trace import Trace
+from spatial_replay.trace.trace import FOREVER, Sample, Trace
 from spatial_replay.trace.units import Axes
 
 if TYPE_CHECKING:

@@ -46,8 +46,7 @@ from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import listed_specifications
 from spatial_replay.text import counted_from, named_arguments, times_apart
-from spatial_replay.trace.sample import LATEST_NS, Sample, require_sample
-from spatial_replay.trace.trace import Trace
+from spatial_replay.trace.trace import LATEST_NS, Sample, Trace, require_sample
 from spatial_replay.trace.units import Axes, checked_units
 
 if TYPE_CHECKING:

@@ -57,8 +57,7 @@ from spatial_replay.spec.format import format_specification
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import SpecificationText, load_specifications, parse_specification
 from spatial_replay.text import Instant, Sentence, counted, counted_from
-from spatial_replay.trace.sample import FOREVER
-from spatial_replay.trace.trace import LONG_PAUSE, Trace
+from spatial_replay.trace.trace import FOREVER, LONG_PAUSE, Trace
 
 if TYPE_CHECKING:
     from spatial_replay.annotate.automaton_state import SpecAutomaton

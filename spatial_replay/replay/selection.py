@@ -40,8 +40,7 @@ from spatial_replay.spec.format import format_bound, format_duration
 from spatial_replay.spec.formula import Specification, Temporal
 from spatial_replay.spec.walks import iter_formulas
 from spatial_replay.text import time_text
-from spatial_replay.trace.sample import FOREVER
-from spatial_replay.trace.trace import Trace, window_of, within
+from spatial_replay.trace.trace import FOREVER, Trace, window_of, within
 
 if TYPE_CHECKING:
     from spatial_replay.bags.reader import MessageReader

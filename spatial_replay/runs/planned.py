@@ -38,7 +38,7 @@ from spatial_replay.simulation.world import Injection, Start, TreeTick
 from spatial_replay.spec import parse_specification
 from spatial_replay.spec.formula import Atom, Formula, Misalignment, Specification
 from spatial_replay.spec.walks import base_of, iter_expressions, iter_formulas
-from spatial_replay.trace.sample import Sample
+from spatial_replay.trace.trace import Sample
 
 _TREES = protobuf_channel(BEHAVIOUR_TREE, BehaviourTree)
 

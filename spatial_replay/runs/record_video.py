@@ -44,7 +44,7 @@ from spatial_replay.perception.video import H264Encoder
 from spatial_replay.recording.log import VerdictChange, VerdictChanges, refuse_templates
 from spatial_replay.runs.scripted import RunLog, run_log
 from spatial_replay.spec.formula import ANY_CLASS, Specification
-from spatial_replay.trace.sample import Sample
+from spatial_replay.trace.trace import Sample
 from spatial_replay.trace.units import Axes
 
 # --------------------------------------------------------------------------------------------------- messages

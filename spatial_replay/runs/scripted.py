@@ -24,8 +24,7 @@ from spatial_replay.simulation.tabletop import Tabletop, default_specification, 
 from spatial_replay.simulation.world import Execution, Injection, Start
 from spatial_replay.spec import check_names
 from spatial_replay.spec.formula import Specification
-from spatial_replay.trace.sample import Sample
-from spatial_replay.trace.trace import Trace
+from spatial_replay.trace.trace import Sample, Trace
 from spatial_replay.trace.units import Axes
 
 _STRETCH = 30

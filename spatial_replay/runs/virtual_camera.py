@@ -31,7 +31,7 @@ from spatial_replay.perception.opencv import (
 from spatial_replay.perception.video import VideoWriter
 from spatial_replay.simulation.tabletop import SAMPLES_PER_S, Tabletop
 from spatial_replay.simulation.world import Body, Box, Pose
-from spatial_replay.trace.sample import Sample
+from spatial_replay.trace.trace import Sample
 
 # -------------------------------------------------------------------------------------------------- rendering
 

@@ -62,8 +62,7 @@ from spatial_replay.spec.walks import (
     terms_of,
 )
 from spatial_replay.text import is_text_number
-from spatial_replay.trace.sample import Sample
-from spatial_replay.trace.trace import Trace
+from spatial_replay.trace.trace import Sample, Trace
 
 # ------------------------------------------------------------------------------------------------------- sums
 

@@ -51,8 +51,7 @@ from spatial_replay.spec.formula import (
     TrackedName,
 )
 from spatial_replay.spec.walks import base_of, iter_expressions, iter_formulas, measured_terms, terms_of
-from spatial_replay.trace.sample import Sample
-from spatial_replay.trace.trace import Trace
+from spatial_replay.trace.trace import Sample, Trace
 
 # ------------------------------------------------------------------------------------------- regions as boxes
 

@@ -43,7 +43,7 @@ from spatial_replay.simulation.world import (
 from spatial_replay.spec import parse_specification
 from spatial_replay.spec.formula import Specification
 from spatial_replay.text import nearest_hint
-from spatial_replay.trace.sample import Sample
+from spatial_replay.trace.trace import Sample
 
 # -------------------------------------------------------------------------------------------------- scenarios
 

@@ -26,7 +26,7 @@ from spatial_replay.logs.remote import LogFile, local_files
 from spatial_replay.logs.topics import ENDING, METADATA, RECOVERY
 from spatial_replay.sources.open_log import format_of, is_bag_folder, readable_file
 from spatial_replay.text import Instant, Sentence, counted, counted_from
-from spatial_replay.trace.sample import FOREVER
+from spatial_replay.trace.trace import FOREVER
 
 _MOST_GAPS = 1_000
 """Gaps among samples that are listed; the samples in later ones are counted in the last one listed."""

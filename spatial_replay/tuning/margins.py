@@ -51,8 +51,7 @@ from spatial_replay.spec.formula import (
 )
 from spatial_replay.spec.syntax import Duration
 from spatial_replay.spec.walks import iter_expressions, iter_formulas
-from spatial_replay.trace.sample import FOREVER
-from spatial_replay.trace.trace import Trace, window_of
+from spatial_replay.trace.trace import FOREVER, Trace, window_of
 
 Numbers: TypeAlias = Mapping[str, float]
 """Values of constants, durations in nanoseconds."""

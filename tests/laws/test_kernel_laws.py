@@ -20,7 +20,7 @@ from laws.strategies_monitor import recordings, specifications
 from spatial_replay.compiled import only
 from spatial_replay.monitor.instances import find_instances
 from spatial_replay.monitor.stream import EvaluationStream
-from spatial_replay.trace.sample import FOREVER
+from spatial_replay.trace.trace import FOREVER
 
 RECORDINGS = Path(__file__).resolve().parents[2] / "recordings"
 FORMS = ("interpreted", "compiled")

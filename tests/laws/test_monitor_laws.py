@@ -47,7 +47,7 @@ from spatial_replay.monitor.online.step import OnlineRun
 from spatial_replay.monitor.stream import EvaluationStream
 from spatial_replay.monitor.verdict import final_verdict, online_verdict
 from spatial_replay.spec.formula import Boolean, Bound, Temporal, Truth, iter_nodes
-from spatial_replay.trace.sample import FOREVER
+from spatial_replay.trace.trace import FOREVER
 
 VALUE, NOW, LOWER, UPPER = range(4)
 

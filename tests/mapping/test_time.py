@@ -11,7 +11,7 @@ from mapping.feeding import SECOND, Feed, header, make, pose_stamped, ros
 from spatial_replay import LogError, Trace, UsageError
 from spatial_replay.bags.reader import MessageColumns
 from spatial_replay.mapping import Assembler, ReadingPlan, parse_mapping
-from spatial_replay.trace.sample import LATEST_NS
+from spatial_replay.trace.trace import LATEST_NS
 
 MS = 10**6
 

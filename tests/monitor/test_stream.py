@@ -10,7 +10,7 @@ from spatial_replay import Footprint, Sample, Trace, TraceError, parse_specifica
 from spatial_replay.monitor.atoms.delays import look_back
 from spatial_replay.monitor.instances import find_instances
 from spatial_replay.monitor.stream import EvaluationStream
-from spatial_replay.trace.sample import FOREVER
+from spatial_replay.trace.trace import FOREVER
 
 
 def stream_of(text, *, start_ns=0, end_ns=FOREVER, traces=(), each=None):

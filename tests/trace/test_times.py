@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from spatial_replay import UsageError
-from spatial_replay.trace.sample import LATEST_NS
 from spatial_replay.trace.trace import (
+    LATEST_NS,
     TimePoint,
     duration_ns_from_text,
     time_point_from_text,

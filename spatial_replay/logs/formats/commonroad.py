@@ -19,8 +19,7 @@ from spatial_replay.errors import GeometryError, LogError, UsageError
 from spatial_replay.geometry.footprint import Concave, Footprint
 from spatial_replay.logs.formats.tracks import ObjectReport, ReportedSample, iter_traces, open_text
 from spatial_replay.logs.read_options import FaultList
-from spatial_replay.trace.sample import LATEST_NS
-from spatial_replay.trace.trace import Trace
+from spatial_replay.trace.trace import LATEST_NS, Trace
 
 LARGEST_FILE = 512 * 2**20
 """Bytes, decompressed."""

@@ -27,8 +27,7 @@ from spatial_replay.logs.messages import BLOCK_SAMPLES
 from spatial_replay.logs.read_options import FaultList, Lost, frame_times
 from spatial_replay.text import Instant, Sentence, is_encodable, text_number, times_apart
 from spatial_replay.trace.observations import Observations, trace_from_observations
-from spatial_replay.trace.sample import LATEST_NS
-from spatial_replay.trace.trace import Trace, class_order, require_few
+from spatial_replay.trace.trace import LATEST_NS, Trace, class_order, require_few
 
 GZIP_MAGIC = b"\x1f\x8b"
 LONGEST_LINE = 16 * 2**20

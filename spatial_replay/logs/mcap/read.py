@@ -59,8 +59,7 @@ from spatial_replay.logs.read_options import FaultList, gap_ns
 from spatial_replay.logs.remote import LogFile, RemoteFile, file_size, open_file, plan_reads
 from spatial_replay.logs.topics import ALL, DERIVED, METADATA, OBJECTS, RECOVERY, is_kept
 from spatial_replay.text import Instant, Sentence, counted, encodable
-from spatial_replay.trace.sample import LATEST_NS
-from spatial_replay.trace.trace import Trace
+from spatial_replay.trace.trace import LATEST_NS, Trace
 from spatial_replay.trace.units import Axes
 
 ALWAYS_ALLOWED, MOST_TIMES_LARGER = 2**26, 1_000

@@ -30,7 +30,7 @@ from spatial_replay.logs.mcap.index import RECORD_HEAD, encoded
 from spatial_replay.logs.messages import Channel, Messages, Schema, messages_of
 from spatial_replay.logs.output_file import output_error
 from spatial_replay.logs.topics import LIBRARY, MAGIC, OWN_PREFIX
-from spatial_replay.trace.sample import FOREVER
+from spatial_replay.trace.trace import FOREVER
 
 CHUNK_BYTES = 512 * 2**10
 """A chunk is closed when it holds this much, uncompressed."""

@@ -10,8 +10,7 @@ import numpy as np
 
 from spatial_replay.spec.formula import Earlier, Formula
 from spatial_replay.spec.walks import has_rate, iter_terms, standing
-from spatial_replay.trace.sample import Sample
-from spatial_replay.trace.trace import Trace
+from spatial_replay.trace.trace import Sample, Trace
 
 
 class Delay(NamedTuple):

@@ -62,7 +62,7 @@ from spatial_replay.spec.formula import (
 from spatial_replay.spec.relations import computed_signal
 from spatial_replay.spec.walks import base_of, is_centre, iter_terms, measured_terms, named_members, standing
 from spatial_replay.text import TEXTS
-from spatial_replay.trace.sample import Sample
+from spatial_replay.trace.trace import Sample
 
 ABSENT = -1
 ANY = -1
