@@ -42,10 +42,9 @@ if TYPE_CHECKING:
     from spatial_replay.monitor.monitor import Monitor
     from spatial_replay.monitor.verdict import Verdict
     from spatial_replay.planning.decisions import Outcome
-    from spatial_replay.planning.planner import Planner
+    from spatial_replay.planning.planner import Planner, plan
     from spatial_replay.planning.settings import Settings
     from spatial_replay.recording.clips import Trigger
-    from spatial_replay.recording.plan_loop import plan
     from spatial_replay.recording.recorder import Recorder
     from spatial_replay.sanity.examine import doctor
     from spatial_replay.sources.open_log import read_trace

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from spatial_replay.annotate.deciding_leaf import LeafPairs, Pair, SettledViolation, pair_of
 from spatial_replay.annotate.requirements import ClassMembers, Requirement
 from spatial_replay.geometry.arrays import Floats, Integers
-from spatial_replay.geometry.contact import contacts
-from spatial_replay.geometry.measure import Operand
+from spatial_replay.geometry.measure import Operand, contacts
 from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.monitor.instances import Instance

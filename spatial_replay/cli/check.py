@@ -38,8 +38,8 @@ from spatial_replay.spec.tokens import quoted
 from spatial_replay.text import counted, counted_from, json_number
 
 if TYPE_CHECKING:
+    from spatial_replay.logs.messages import Source
     from spatial_replay.logs.read_options import Reading
-    from spatial_replay.logs.source import Source
     from spatial_replay.monitor.plausibility import ThresholdRange
     from spatial_replay.monitor.stream import SeriesBlock
     from spatial_replay.sanity.examine import Examination
@@ -238,7 +238,7 @@ def _compare_with_log(
 ) -> _Compared:
     """Compare names, thresholds, regions and windows with what a log has."""
     # only needed with --log: log readers load the numerical libraries
-    from spatial_replay.logs.source import axes_of, reading_only
+    from spatial_replay.logs.messages import axes_of, reading_only
     from spatial_replay.monitor.plausibility import LogNumbers, plausibility_warnings, window_lines
     from spatial_replay.replay.selection import LogNames
     from spatial_replay.sources.open_log import open_source
@@ -300,7 +300,7 @@ class _CutResults:
 
     def warnings(self, source: Source) -> Iterator[Diagnostic]:
         """Yield a warning for each result, at its window."""
-        from spatial_replay.logs.source import axes_of, reading_only
+        from spatial_replay.logs.messages import axes_of, reading_only
         from spatial_replay.monitor.result import SpecResult
         from spatial_replay.monitor.stream import join_blocks
         from spatial_replay.monitor.witness.evidence import Evidence

@@ -30,8 +30,8 @@ from spatial_replay.text import counted, counted_from, escaped, requirement_text
 
 if TYPE_CHECKING:
     from spatial_replay.logs.mcap.read import LogSummary
+    from spatial_replay.logs.messages import Source
     from spatial_replay.logs.read_options import Reading
-    from spatial_replay.logs.source import Source
     from spatial_replay.sources.overview import Overview, Survey
     from spatial_replay.spec.formula import NamedSpec
     from spatial_replay.spec.load import SpecificationText
@@ -216,7 +216,7 @@ def _print_fitness(log: LogFile, reading: Reading) -> int:
 def _print_layout(log: LogFile, *, panels: bool) -> int:
     """Print the layout stored in a log, or the one for viewers that have the extension."""
     from spatial_replay.annotate.foxglove_layout import layout_text, with_panels
-    from spatial_replay.logs.topics import LAYOUT
+    from spatial_replay.logs.messages import LAYOUT
     from spatial_replay.sources.open_log import open_source
 
     source = open_source(log)
@@ -278,7 +278,7 @@ def _requirements(source: Source) -> dict[str, NamedSpec]:
 
 def _verdicts(container: LogSummary, about: Mapping[str, NamedSpec]) -> Iterator[dict[str, str | None]]:
     """Yield the verdicts stored in a log, each with the requirement that it is about."""
-    from spatial_replay.logs.topics import VERDICTS
+    from spatial_replay.logs.messages import VERDICTS
 
     for data in (data for name, data in container.metadata if name == VERDICTS):
         for result, verdict in data.items():
@@ -433,7 +433,7 @@ def _survey_lines(survey: Survey, *, mapped: bool) -> Iterator[str]:
 
 
 def _container_lines(container: LogSummary, about: Mapping[str, NamedSpec], *, topics: bool) -> Iterator[str]:
-    from spatial_replay.logs.topics import VERDICTS
+    from spatial_replay.logs.messages import VERDICTS
 
     if verdicts := list(_verdicts(container, about)):
         kinds = [(each["verdict"] or "").split(",")[0] for each in verdicts]

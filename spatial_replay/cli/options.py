@@ -23,8 +23,8 @@ from spatial_replay.trace.trace import time_point_from_text
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from spatial_replay.logs.messages import Source
     from spatial_replay.logs.read_options import Reading
-    from spatial_replay.logs.source import Source
     from spatial_replay.monitor.semantics import Semantics
     from spatial_replay.recording.recorder import Recorded
     from spatial_replay.replay.engine import Replayed

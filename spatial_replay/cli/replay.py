@@ -105,7 +105,7 @@ def replay(
       spatial-replay replay drive.bag --mapping drive.yaml -o annotated.mcap --topics '/camera/*'
     """
     # imported here so that --help stays fast
-    from spatial_replay.logs.topics import MAPPED
+    from spatial_replay.logs.messages import MAPPED
     from spatial_replay.replay.engine import run_replay
     from spatial_replay.replay.selection import default_keep
 

@@ -81,7 +81,7 @@ def _serve(
     evaluated: Evaluated, files: SpecificationFiles | None, serving: ServingArguments, play: bool
 ) -> ExitCode | None:
     # imported here so that --help stays fast
-    from spatial_replay.serve.serving import open_server
+    from spatial_replay.serve.player import open_server
 
     host, port, origins = serving.host, serving.port, serving.origins
     with open_server(evaluated, host=host, port=port, play=play, origins=origins) as server:

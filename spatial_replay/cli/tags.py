@@ -17,7 +17,7 @@ from spatial_replay.logs.remote import LogFile, local_files
 from spatial_replay.text import counted
 
 if TYPE_CHECKING:
-    from spatial_replay.perception.frame import Frame
+    from spatial_replay.perception.opencv import Frame
 
 _MOST = 1000
 _LENGTH = re.compile(r"([0-9]*\.?[0-9]+)(mm|cm|m)")

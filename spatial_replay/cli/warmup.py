@@ -18,12 +18,11 @@ import click
 
 from spatial_replay.bags.ros1 import record_table
 from spatial_replay.cli.terminal import progress, show
-from spatial_replay.code_cache import cache_folder
 from spatial_replay.compare.runs import diff_sources
-from spatial_replay.compiled import compilations, compile_ahead
+from spatial_replay.compiled import cache_folder, compilations, compile_ahead
 from spatial_replay.errors import OutputError
 from spatial_replay.geometry.footprint import Footprint, TrackedObject
-from spatial_replay.logs.source import MemorySource
+from spatial_replay.logs.messages import MemorySource
 from spatial_replay.monitor.evaluate import evaluate
 from spatial_replay.monitor.monitor import Monitor
 from spatial_replay.recording.recorder import Recorder

@@ -14,8 +14,8 @@ import numpy as np
 from spatial_replay.compare.runs import file_of
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats, Integers
+from spatial_replay.logs.messages import Source
 from spatial_replay.logs.remote import RemoteFile
-from spatial_replay.logs.source import Source
 from spatial_replay.monitor.atoms.delays import look_back
 from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene

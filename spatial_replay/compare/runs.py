@@ -19,8 +19,8 @@ from spatial_replay.geometry.arrays import Booleans, Floats, Integers, count_in_
 from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.geometry.measure import MeasureRequest, Operand, measure
 from spatial_replay.lazy import Displayed
+from spatial_replay.logs.messages import Source
 from spatial_replay.logs.schemas.PlanDecision_pb2 import PlanDecision
-from spatial_replay.logs.source import Source
 from spatial_replay.monitor.evaluate import Evaluation, evaluate
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.semantics import require_ltlf

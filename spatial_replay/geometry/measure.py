@@ -1,8 +1,11 @@
-"""Measurements of footprints and orientations over many samples, in one kernel call.
+"""Measurements of footprints and orientations over many samples, in one kernel call; points of contact.
 
 The closest two of many footprints are found by a sweep over bounding boxes. It leaves out pairs whose boxes
 are farther apart than the closest two so far. The signed distance of two footprints is at least the gap
 between their boxes along either axis, even a negative one. The result equals that of all pairs, bit for bit.
+
+Contacts are where two footprints are nearest, overlap deepest, or where one protrudes farthest from another.
+They are for pictures and explanations only.
 """
 
 from __future__ import annotations
@@ -16,12 +19,18 @@ from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
-from spatial_replay.compiled import elementwise, inlined, kernel, long_kernel
-from spatial_replay.cores import over_cores
+from spatial_replay.compiled import elementwise, inlined, kernel, long_kernel, over_cores
 from spatial_replay.errors import GeometryError
 from spatial_replay.geometry.arrays import Floats, Integers, writable
-from spatial_replay.geometry.footprint import FootprintBatch
-from spatial_replay.geometry.kernels import NOTHING, Rows, fill_row, measure_rows, rows_distance
+from spatial_replay.geometry.footprint import ConvexPart, Footprint, FootprintBatch
+from spatial_replay.geometry.kernels import (
+    NOTHING,
+    Rows,
+    fill_contacts,
+    fill_row,
+    measure_rows,
+    rows_distance,
+)
 
 Quantity: TypeAlias = Literal[
     "signed_distance", "protrusion", "min_x", "max_x", "min_y", "max_y", "min_z", "max_z",
@@ -332,3 +341,73 @@ def closest_rows(
                 low = min(low, distance - spread)
                 high = min(high, distance + spread)
         result[t, 0], result[t, 1], result[t, 2] = least, low, high
+
+
+Point = tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Contact:
+    """A pair of points, one on each of two footprints.
+
+    Attributes:
+        first, second: the nearest points of disjoint footprints; for overlapping ones, the ends of the
+            shortest translation that separates them.
+        distance: signed, negative for overlap; its absolute value is the distance of the points.
+    """
+
+    first: Point
+    second: Point
+    distance: float
+
+
+def contact(a: Footprint, b: Footprint) -> Contact:
+    """Return where the signed distance of two footprints is attained (Def. 2-4)."""
+    return _contact(a, b, is_protrusion=False)
+
+
+def protrusion_contact(inner: Footprint, outer: Footprint) -> Contact:
+    """Return `inner`'s point farthest outside `outer` or least deep in it, and the nearest on its boundary.
+
+    The distance is the protrusion: positive where `inner` sticks out (Prop. 2).
+    """
+    return _contact(inner, outer, is_protrusion=True)
+
+
+def _contact(first: Footprint, second: Footprint, *, is_protrusion: bool) -> Contact:
+    batch = FootprintBatch.from_footprints([first, second])
+    operands = [Operand(np.array([[row]])) for row in range(2)]
+    x, y, other_x, other_y, distance, _ = contacts(batch, *operands, is_protrusion=is_protrusion)[0].tolist()
+    return Contact((x, y), (other_x, other_y), distance)
+
+
+def enlarged(footprint: Footprint, radius: float) -> Footprint:
+    """Return the Minkowski sum of a footprint with a disc of the given radius (at least 0)."""
+    return Footprint(tuple(ConvexPart(part.vertices, part.radius + radius) for part in footprint.parts))
+
+
+def contacts(batch: FootprintBatch, first: Operand, second: Operand, *, is_protrusion: bool) -> Floats:
+    """Return where the signed distance (or protrusion) of two operands is attained in each sample.
+
+    Heights are ignored.
+
+    Returns:
+        (T, 6): a point of `first`, a point of `second`, and their signed distance (or protrusion). The last
+        column is the upper end of the higher footprint, NaN if neither has a height. NaN where an operand is
+        empty.
+    """
+    result = np.full((len(first.rows), 6), np.nan)
+    fill_contacts(
+        batch.part_start,
+        batch.vertex_start,
+        batch.vertices,
+        batch.radius,
+        batch.top,
+        np.ascontiguousarray(first.rows),
+        np.ascontiguousarray(second.rows),
+        float(first.enlargement),
+        float(second.enlargement),
+        is_protrusion,
+        result,
+    )
+    return result

@@ -21,11 +21,10 @@ from spatial_replay.bags.decoders import decoder_of, topic_of, topics_by_name
 from spatial_replay.bags.reader import DISORDER_NS, Message
 from spatial_replay.errors import LogError, UsageError, importing
 from spatial_replay.live.client import Client, Connected, Disconnected, Inbox, Offered, Received, Warned
-from spatial_replay.logs.messages import Channel, MemorySink, Messages
+from spatial_replay.logs.messages import OBJECTS, Channel, MemorySink, Messages, is_kept, protobuf_channel
 from spatial_replay.logs.objects import decode_objects
 from spatial_replay.logs.read_options import FaultKinds
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
-from spatial_replay.logs.topics import OBJECTS, is_kept, protobuf_channel
 from spatial_replay.mapping import LiveAssembler, LogMapping, ReadingPlan, load_mapping
 from spatial_replay.mapping.assemble import rehearse
 from spatial_replay.mapping.message_types import TRANSFORM_TYPES, short_type

@@ -12,9 +12,17 @@ from spatial_replay.lazy import loaded_when_used
 if TYPE_CHECKING:
     from spatial_replay.logs.mcap.read import McapSource, summarise_mcap
     from spatial_replay.logs.mcap.write import LogWriter
-    from spatial_replay.logs.messages import Attachment, Block, Channel, MemorySink, Messages, Schema
+    from spatial_replay.logs.messages import (
+        Attachment,
+        Block,
+        Channel,
+        MemorySink,
+        MemorySource,
+        Messages,
+        Schema,
+        Source,
+    )
     from spatial_replay.logs.objects import decode_objects, encode_objects
-    from spatial_replay.logs.source import MemorySource, Source
 
 __all__ = [
     "Attachment",

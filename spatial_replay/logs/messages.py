@@ -1,4 +1,4 @@
-"""Messages of a log as columns, blocks of samples with their messages, and sinks that take messages.
+"""Logs as values: messages as columns, blocks of samples with their messages, sources, sinks, and names.
 
 Messages of several channels are merged in an order that depends on what the channels are, not on their
 numbers, so that equal logs give equal files.
@@ -6,17 +6,28 @@ numbers, so that equal logs give equal files.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
 from functools import wraps
+from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar, cast
 
 import numpy as np
 
+from spatial_replay.errors import LogError
 from spatial_replay.geometry.arrays import Integers, concatenated, select
-from spatial_replay.text import Sentence
-from spatial_replay.trace.trace import Pauses, Trace
+from spatial_replay.geometry.footprint import Concave
+from spatial_replay.logs.read_options import FaultList, gap_ns
+from spatial_replay.text import Sentence, encodable
+from spatial_replay.trace.trace import Pauses, Sample, Trace, within
+from spatial_replay.trace.units import OUR_AXES, Axes
+
+if TYPE_CHECKING:
+    from google.protobuf.descriptor import FileDescriptor
+    from google.protobuf.message import Message
 
 BLOCK_SAMPLES = 12_288
 """A block holds at most this many samples, so that memory stays bounded whatever the log's length."""
@@ -240,3 +251,337 @@ def _without_gaps(before: Trace, trace: Trace, max_gap_ns: int) -> Trace:
         parts += [trace.slice(done, begin), unknown]
         done = begin
     return Trace.concatenate([*parts, trace.slice(done, len(trace))]) if gaps else trace
+
+
+OWN_PREFIX = "/spatial/"
+"""Topics of ours; a log has them in chunks of their own."""
+
+OBJECTS = "/spatial/objects"
+SCENE = "/spatial/scene"
+SPECIFICATION = "/spatial/specification"
+FRAME = "/spatial/frame"
+STANDING = "/spatial/standing"
+ROBUSTNESS = "/spatial/robustness"
+AUTOMATON = "/spatial/automaton"
+EVENTS = "/spatial/events"
+EVENT_LOG = "/spatial/log"
+RECENT_EVENTS = "/spatial/recent_events"
+
+DERIVED = frozenset(
+    {SCENE, FRAME, SPECIFICATION, STANDING, ROBUSTNESS, AUTOMATON, EVENTS, EVENT_LOG, RECENT_EVENTS}
+)
+"""Topics computed from the samples and a specification: a replay replaces them."""
+
+CURVES_TOPIC = "/spatial/curves"
+"""Curves of the whole log, published by a live server; no file has this topic."""
+
+PLAN_DECISION = "/plan/decision"
+GRADIENT_MAP = "/plan/gradient_map"
+PLAN_PATH = "/plan/path"
+REDONE_DECISION = "/plan/redone/decision"
+REDONE_MAP = "/plan/redone/gradient_map"
+REDONE_PATH = "/plan/redone/path"
+BEHAVIOUR_TREE = "/plan/behaviour_tree"
+"""Topics that a planner writes, what it would have decided otherwise, and the robot; a replay copies them."""
+
+CAMERA_VIDEO = "/camera/video"
+CAMERA_ANNOTATIONS = "/camera/annotations"
+CAMERA_CALIBRATION = "/camera/calibration"
+CAMERA_FRAMES = "/tf"
+"""Topics of a run that a camera saw; a replay copies them."""
+
+
+def topic_of_camera(topic: str, number: int) -> str:
+    """Return the topic of one of several cameras, from 1: `/camera/video`, `/camera2/video`."""
+    return topic if number == 1 else topic.replace("/camera/", f"/camera{number}/", 1)
+
+
+MAGIC = b"\x89MCAP0\r\n"
+"""The first bytes of an MCAP file, and the last."""
+
+LIBRARY = "spatial-replay"
+"""How our writer names itself in the header of a log."""
+
+METADATA = "spatial_replay"
+"""The metadata record that comes first: who wrote the log, from what, with which options."""
+
+ENDING = "spatial_replay_ending"
+"""The metadata record at the end of a recording: how many samples it holds, and how it ended."""
+
+TRIGGER = "spatial_replay_trigger"
+"""The metadata record of a clip: what fired, when, and how much around it was asked for and held."""
+
+CERTIFICATE = "spatial_replay_certificate"
+"""The metadata record that comes last: hashes of inputs and results."""
+
+PLAN_METADATA = "spatial_replay_plan"
+"""The metadata record with the settings and the specification that a planner's decisions depend on."""
+
+RECOVERY = "spatial_replay_recovery"
+"""The metadata record of a log that was recovered from a damaged one: what is missing in it."""
+
+VERDICTS = "spatial_replay_verdicts"
+"""The metadata record with the verdict and robustness of each result of a replay."""
+
+AUTOMATA = "spatial_replay_automata"
+"""The metadata record with the sizes of automata, and why a specification has none."""
+
+AUTOMATA_PREFIX = "automata/"
+"""Attachments with automata; the prefix of their specification comes next."""
+
+LAYOUT = "layout.json"
+"""The attachment that arranges a viewer's panels; a replay replaces it."""
+
+RECORDED_PREFIX = "recorded/"
+"""Inputs of a recording as attachments; they stay in every copy."""
+
+CAMERA_PREFIX = "camera/"
+"""The tags file of a camera's run as an attachment; it stays in every copy."""
+
+REPLAYED_PREFIX = "replayed/"
+"""Inputs of a replay as attachments; the next replay replaces them."""
+
+
+_IMAGES = frozenset({"CompressedImage", "CompressedVideo", "Image", "RawImage"})
+
+
+def is_image_type(name: str) -> bool:
+    """Return whether messages of a type are images or frames of a video: of ROS or of Foxglove."""
+    package, _, short = name.replace(".", "/").rpartition("/")
+    return short in _IMAGES and package.split("/")[0] in ("sensor_msgs", "foxglove", "foxglove_msgs")
+
+
+def image_topics(channels: Iterable[Channel]) -> set[str]:
+    """Return the topics whose messages are images."""
+    return {each.topic for each in channels if each.schema is not None and is_image_type(each.schema.name)}
+
+
+ALL, MAPPED = "all", "mapped"
+"""Values of `is_kept` besides patterns: every topic, or the topics of the samples."""
+
+
+def is_kept(topic: str, keep: Collection[str], mapped: Collection[str]) -> bool:
+    """Return whether a copy of a log keeps the messages of a topic.
+
+    Args:
+        keep: "all", "mapped", or patterns of topics such as "/camera/*"; one that says so is enough.
+        mapped: the topics that the samples are made of.
+    """
+    return any(
+        each == ALL or (each == MAPPED and topic in mapped) or fnmatchcase(topic, each) for each in keep
+    )
+
+
+def protobuf_channel(topic: str, message: type[Message]) -> Channel:
+    """Return the channel of a topic with messages of one protobuf type, with all it takes to decode them."""
+    # imported here since readers need none of it
+    from google.protobuf.descriptor_pb2 import FileDescriptorSet
+
+    descriptors = FileDescriptorSet()
+    for file in _with_dependencies(message.DESCRIPTOR.file, {}):
+        file.CopyToProto(descriptors.file.add())
+    data = descriptors.SerializeToString(deterministic=True)
+    return Channel(topic, "protobuf", Schema(message.DESCRIPTOR.full_name, "protobuf", data))
+
+
+def _with_dependencies(file: Any, found: dict[str, FileDescriptor]) -> Iterable[FileDescriptor]:
+    """Return a file of message types and all that it imports, each behind its own imports."""
+    for each in file.dependencies:
+        if each.name not in found:
+            _with_dependencies(each, found)
+    found[file.name] = file
+    return found.values()
+
+
+_Read = TypeVar("_Read")
+
+
+class Source(Protocol):
+    """A log that can be read, any number of times, in blocks of bounded size."""
+
+    @property
+    def name(self) -> str:
+        """The base name of its file."""
+
+    @property
+    def kind(self) -> str:
+        """The format, in a word."""
+
+    def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
+        """Return the samples from the first at or after `start_ns` to the last before `end_ns`.
+
+        Unreadable parts are in `trace.faults` of the blocks; the last block may hold nothing else.
+
+        Raises:
+            LogError: nothing in the log can be read as a sample.
+            UsageError: a log without damage that has no topic for samples.
+        """
+
+    def attachments(self) -> tuple[Attachment, ...]:
+        """Return the attachments of the log."""
+
+    def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
+        """Return the metadata records of the log, with their names."""
+
+
+class _Bare:
+    """A source of samples only."""
+
+    def attachments(self) -> tuple[Attachment, ...]:
+        """See `Source.attachments`."""
+        return ()
+
+    def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
+        """See `Source.metadata`."""
+        return ()
+
+
+@dataclass(frozen=True)
+class MemorySource(_Bare):
+    """A trace, or samples, in memory."""
+
+    trace: Trace
+    name: str = "memory"
+    kind: str = "memory"
+
+    @property
+    def axes(self) -> Axes:
+        """Ours, with the units that the trace declares."""
+        return Axes.of_units(self.trace.units)
+
+    @classmethod
+    def from_samples(cls, samples: Iterable[Sample], name: str = "memory") -> MemorySource:
+        return cls(Trace.from_samples(samples), name)
+
+    def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
+        """See `Source.iter_blocks`."""
+        window = within(self.trace, start_ns, end_ns)
+        if len(window) <= BLOCK_SAMPLES:
+            yield Block(window)
+            return
+        for begin in range(0, len(window), BLOCK_SAMPLES):
+            block = window.slice(begin, begin + BLOCK_SAMPLES)
+            yield Block(block if begin == 0 else replace(block, faults=()))
+
+
+IterTraces = Callable[..., Iterator[Trace]]
+
+
+@dataclass(frozen=True)
+class TrackSource(_Bare):
+    """A track file.
+
+    Attributes:
+        options: those with which it is read, where they are not the defaults.
+        axes: those of the file; samples have ours.
+    """
+
+    path: Path
+    kind: str
+    concave: Concave
+    iter_traces: IterTraces
+    options: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
+    axes: Axes = OUR_AXES
+
+    @property
+    def name(self) -> str:
+        return encodable(self.path.name)
+
+    @property
+    def max_gap_ns(self) -> int | None:
+        return gap_ns(cast("str | None", self.options.get("max_gap")))
+
+    @noting_pauses
+    def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
+        """See `Source.iter_blocks`."""
+        faults = FaultList()
+        any_sample = False
+        first_fault: str | None = None
+        for trace in self.iter_traces(self.path, faults, concave=self.concave):
+            any_sample = any_sample or len(trace) > 0
+            lost = faults.take()
+            first_fault = first_fault or next(iter(lost), None)
+            window = self.axes.convert_trace(within(trace, start_ns, end_ns))
+            yield Block(replace(window, faults=lost))
+        rest = faults.take(last=True)
+        if not any_sample:
+            reason = first_fault or next(iter(rest), f"{self.name} is empty")
+            raise LogError(f"{self.name} holds no sample: {reason}")
+        if rest:
+            yield Block(replace(Trace.from_samples(()), faults=rest))
+
+
+@dataclass(frozen=True)
+class SourceOf:
+    """Attributes that a derived source takes from its original: everything but its blocks."""
+
+    source: Source
+
+    @property
+    def name(self) -> str:
+        return self.source.name
+
+    @property
+    def kind(self) -> str:
+        return self.source.kind
+
+    @property
+    def axes(self) -> Axes:
+        return axes_of(self.source)
+
+    def attachments(self) -> tuple[Attachment, ...]:
+        """See `Source.attachments`."""
+        return self.source.attachments()
+
+    def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
+        """See `Source.metadata`."""
+        return self.source.metadata()
+
+
+def read_blocks(
+    source: Source, start_ns: int | None = None, end_ns: int | None = None
+) -> Generator[Block, None, None]:
+    """Yield the blocks of a source, as `Source.iter_blocks` does.
+
+    Raises:
+        LogError: what that raises, and if the disk fails or is gone.
+    """
+    try:
+        yield from source.iter_blocks(start_ns, end_ns)
+    except OSError as error:
+        reason = error.strerror or error
+        raise LogError(f"{source.name} could not be read: {reason}; copy it to another disk") from error
+
+
+def read_ahead(blocks: Generator[_Read, None, None]) -> Iterator[_Read]:
+    """Yield the same blocks, each read while the previous one is processed."""
+    thread = ThreadPoolExecutor(1, "reading-ahead")
+    try:
+        waiting = thread.submit(next, blocks, None)
+        while (block := waiting.result()) is not None:
+            waiting = thread.submit(next, blocks, None)
+            yield block
+    finally:
+        # garbage collection may end this within the start of any thread, which must not wait for another one
+        thread.shutdown(wait=False, cancel_futures=True)
+
+
+def reading_only(source: Source, keep: tuple[str, ...] = ()) -> Source:
+    """Return a source that reads its samples and, beside them, only messages of some topics.
+
+    Args:
+        keep: as `is_kept` takes them.
+    """
+    return cast(Source, replace(cast(Any, source), keep=keep)) if hasattr(source, "keep") else source
+
+
+def axes_of(source: Source) -> Axes:
+    """Return the axes of a source, or of what a log was recorded from; its samples have ours."""
+    axes = getattr(source, "axes", None)
+    return axes if isinstance(axes, Axes) else OUR_AXES
+
+
+def reading_options(source: Source) -> dict[str, object]:
+    """Return the options of a source that are not the defaults, for a log's metadata."""
+    concave = getattr(source, "concave", "decompose")
+    return dict(getattr(source, "options", {})) | ({} if concave == "decompose" else {"concave": concave})

@@ -21,10 +21,19 @@ from spatial_replay.bags.reader import Columns, MessageColumns, MessageReader, i
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import concatenated, select
 from spatial_replay.geometry.footprint import Concave
-from spatial_replay.logs.messages import Attachment, Block, Channel, Messages, noting_pauses
+from spatial_replay.logs.messages import (
+    DERIVED,
+    MAPPED,
+    OBJECTS,
+    Attachment,
+    Block,
+    Channel,
+    Messages,
+    is_kept,
+    noting_pauses,
+)
 from spatial_replay.logs.read_options import FaultList, OnTimeJump, gap_ns, late_ns
 from spatial_replay.logs.remote import LogFile, RemoteFile
-from spatial_replay.logs.topics import DERIVED, MAPPED, OBJECTS, is_kept
 from spatial_replay.mapping.assemble import Assembler
 from spatial_replay.mapping.mapping_file import LogMapping
 from spatial_replay.mapping.topic_reader import ReadingPlan

@@ -18,7 +18,7 @@ from types import MappingProxyType
 from typing import Literal, TypeAlias
 
 from spatial_replay.bags.decoders import Topic
-from spatial_replay.logs.topics import DERIVED
+from spatial_replay.logs.messages import DERIVED
 from spatial_replay.mapping.binding import BY_PLACE, Codes, Namer
 from spatial_replay.mapping.field_paths import (
     INDEX,

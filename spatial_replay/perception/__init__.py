@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 from spatial_replay.lazy import loaded_when_used
 
 if TYPE_CHECKING:
-    from spatial_replay.perception.frame import Frame
     from spatial_replay.perception.image_sources import CameraFrames, open_frames
     from spatial_replay.perception.observer import Observation, TagObserver, observe_cameras, observe_frames
+    from spatial_replay.perception.opencv import Frame
     from spatial_replay.perception.tags_file import TagsFile, load_tags, parse_tags
 
 __all__ = [

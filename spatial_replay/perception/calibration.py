@@ -18,8 +18,7 @@ import numpy as np
 
 from spatial_replay.errors import LogError, OutputError, UsageError, importing
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.perception.frame import Frame
-from spatial_replay.perception.opencv import Calibration, Camera, TagDetector, calibrate, tag_cells
+from spatial_replay.perception.opencv import Calibration, Camera, Frame, TagDetector, calibrate, tag_cells
 from spatial_replay.perception.tags_file import MountedTag
 from spatial_replay.text import counted
 

@@ -13,8 +13,7 @@ import numpy as np
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.geometry.footprint import ConvexPart, Footprint, TrackedObject
-from spatial_replay.perception.frame import Detection, Frame
-from spatial_replay.perception.opencv import TagDetector, rotations
+from spatial_replay.perception.opencv import Detection, Frame, TagDetector, rotations
 from spatial_replay.perception.plane import (
     CameraPlane,
     Fit,

@@ -23,7 +23,7 @@ from typing import Any, Final, NamedTuple, Self, cast
 import numpy as np
 
 from spatial_replay.errors import LogError, MissingFileError, OutputError, UsageError, importing
-from spatial_replay.perception.frame import LARGEST_PICTURE, Frame, Image
+from spatial_replay.perception.opencv import LARGEST_PICTURE, Frame, Image
 from spatial_replay.text import counted
 
 # --------------------------------------------------------------------------------------------------- decoding

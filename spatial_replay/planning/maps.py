@@ -16,7 +16,7 @@ from typing import Final, Literal, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from spatial_replay.cores import over_cores
+from spatial_replay.compiled import over_cores
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Booleans, Floats
 from spatial_replay.geometry.footprint import (

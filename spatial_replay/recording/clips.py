@@ -18,9 +18,8 @@ import numpy as np
 
 from spatial_replay.errors import OutputError, UsageError, system_reason
 from spatial_replay.logs.mcap.write import LogWriter
-from spatial_replay.logs.messages import Channel, Messages
+from spatial_replay.logs.messages import TRIGGER, Channel, Messages
 from spatial_replay.logs.output_file import open_output
-from spatial_replay.logs.topics import TRIGGER
 from spatial_replay.monitor.monitor import Monitor, Update
 from spatial_replay.recording.log import (
     GATHER_S,

@@ -31,15 +31,10 @@ from spatial_replay.annotate.specification import logged_specifications, specifi
 from spatial_replay.compiled import compile_ahead
 from spatial_replay.errors import OutputError, UsageError
 from spatial_replay.geometry.arrays import select
-from spatial_replay.geometry.contact import contacts
 from spatial_replay.geometry.footprint import Footprint, FootprintBatch, TrackedObject
-from spatial_replay.geometry.measure import Operand
+from spatial_replay.geometry.measure import Operand, contacts
 from spatial_replay.logs.mcap.write import LogWriter
-from spatial_replay.logs.messages import Attachment, Channel, Messages, Sink, merge, messages_of
-from spatial_replay.logs.objects import encode_objects
-from spatial_replay.logs.output_file import Durability, open_output, refuse_ending
-from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
-from spatial_replay.logs.topics import (
+from spatial_replay.logs.messages import (
     AUTOMATA,
     CERTIFICATE,
     DERIVED,
@@ -49,9 +44,18 @@ from spatial_replay.logs.topics import (
     PLAN_METADATA,
     RECORDED_PREFIX,
     VERDICTS,
+    Attachment,
+    Channel,
+    Messages,
+    Sink,
     image_topics,
+    merge,
+    messages_of,
     protobuf_channel,
 )
+from spatial_replay.logs.objects import encode_objects
+from spatial_replay.logs.output_file import Durability, open_output, refuse_ending
+from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.monitor.instances import find_instances
 from spatial_replay.monitor.monitor import SpecUpdate, Update
 from spatial_replay.monitor.sentences import verdict_text

@@ -27,10 +27,20 @@ from google.protobuf.message import DecodeError, Message
 
 from spatial_replay.errors import LogError, OutputError, SpatialReplayError, TraceError, UsageError
 from spatial_replay.logs.mcap.write import LogWriter
-from spatial_replay.logs.messages import Channel, Messages, Schema
+from spatial_replay.logs.messages import (
+    GRADIENT_MAP,
+    PLAN_DECISION,
+    PLAN_PATH,
+    Channel,
+    Messages,
+    Schema,
+    Source,
+    axes_of,
+    protobuf_channel,
+    read_blocks,
+    reading_options,
+)
 from spatial_replay.logs.output_file import Durability, open_output, refuse_inputs
-from spatial_replay.logs.source import Source, axes_of, read_blocks, reading_options
-from spatial_replay.logs.topics import GRADIENT_MAP, PLAN_DECISION, PLAN_PATH, protobuf_channel
 from spatial_replay.recording.clips import ClipLog, Trigger, TriggeredClip
 from spatial_replay.recording.log import (
     FileLog,

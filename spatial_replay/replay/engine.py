@@ -20,9 +20,7 @@ from spatial_replay.annotate.specification import (
     specification_attachments,
 )
 from spatial_replay.errors import SpecificationError, UsageError
-from spatial_replay.logs.messages import Attachment, Block, Messages, Sink, merge
-from spatial_replay.logs.source import Source, axes_of, read_ahead, reading_options
-from spatial_replay.logs.topics import (
+from spatial_replay.logs.messages import (
     AUTOMATA,
     AUTOMATA_PREFIX,
     CERTIFICATE,
@@ -33,7 +31,16 @@ from spatial_replay.logs.topics import (
     RECORDED_PREFIX,
     REPLAYED_PREFIX,
     VERDICTS,
+    Attachment,
+    Block,
+    Messages,
+    Sink,
+    Source,
+    axes_of,
     image_topics,
+    merge,
+    read_ahead,
+    reading_options,
 )
 from spatial_replay.monitor.result import SpecResult, worst_first
 from spatial_replay.monitor.semantics import Semantics

@@ -15,20 +15,29 @@ from spatial_replay.bags.decoders import Topic, decoder_of, full_type_name
 from spatial_replay.errors import LogError, SpecificationError, UsageError
 from spatial_replay.geometry.arrays import select
 from spatial_replay.logs.mcap.read import McapSource
-from spatial_replay.logs.messages import SAMPLES_A_GAP, Block, Channel, Messages, merge, messages_of
-from spatial_replay.logs.objects import encode_objects
-from spatial_replay.logs.remote import LogFile
-from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
-from spatial_replay.logs.source import (
+from spatial_replay.logs.messages import (
+    ALL,
+    MAPPED,
+    OBJECTS,
+    SAMPLES_A_GAP,
+    Block,
+    Channel,
     MemorySource,
+    Messages,
     Source,
     SourceOf,
     axes_of,
+    is_kept,
+    merge,
+    messages_of,
+    protobuf_channel,
     read_ahead,
     read_blocks,
     reading_only,
 )
-from spatial_replay.logs.topics import ALL, MAPPED, OBJECTS, is_kept, protobuf_channel
+from spatial_replay.logs.objects import encode_objects
+from spatial_replay.logs.remote import LogFile
+from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.mapping.field_paths import get_field
 from spatial_replay.mapping.message_types import TRANSFORM_TYPES, short_type
 from spatial_replay.monitor.atoms.delays import look_back

@@ -21,18 +21,11 @@ import numpy as np
 
 from spatial_replay import __version__
 from spatial_replay.annotate.certificate import PLAN_SHA256, plan_sha256
-from spatial_replay.bags.mcap_log import McapLog
+from spatial_replay.bags.open import McapLog
 from spatial_replay.bags.reader import Message
 from spatial_replay.errors import LogError, MissingFileError, UsageError
 from spatial_replay.logs.mcap.read import McapSource
-from spatial_replay.logs.messages import Messages
-from spatial_replay.logs.read_options import KEYS
-from spatial_replay.logs.remote import LogFile
-from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
-from spatial_replay.logs.schemas.Robustness_pb2 import Robustness
-from spatial_replay.logs.schemas.Specification_pb2 import Specification as SpecificationMessage
-from spatial_replay.logs.source import Source
-from spatial_replay.logs.topics import (
+from spatial_replay.logs.messages import (
     CERTIFICATE,
     DERIVED,
     METADATA,
@@ -40,7 +33,14 @@ from spatial_replay.logs.topics import (
     PLAN_METADATA,
     ROBUSTNESS,
     SPECIFICATION,
+    Messages,
+    Source,
 )
+from spatial_replay.logs.read_options import KEYS
+from spatial_replay.logs.remote import LogFile
+from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
+from spatial_replay.logs.schemas.Robustness_pb2 import Robustness
+from spatial_replay.logs.schemas.Specification_pb2 import Specification as SpecificationMessage
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.replay.engine import Replay, load_files, run_replay
 from spatial_replay.replay.selection import CLIP_METADATA, KEEP_ALL, ReplayOptions, Window, clipped_source

@@ -9,8 +9,8 @@ from typing import Any, TypeAlias
 from spatial_replay import __version__
 from spatial_replay.compare.runs import DecisionDiff, LogDiff
 from spatial_replay.compare.specifications import SpecificationDiff
+from spatial_replay.logs.messages import Source
 from spatial_replay.logs.output_file import replacing
-from spatial_replay.logs.source import Source
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.notebook.figures import Html, element
 from spatial_replay.replay.selection import ReplayOptions

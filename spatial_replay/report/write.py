@@ -17,11 +17,10 @@ from foxglove_schemas_protobuf.Event_pb2 import Event
 
 from spatial_replay.annotate.specification import unit_of
 from spatial_replay.errors import UsageError
-from spatial_replay.logs import topics as log_topics
-from spatial_replay.logs.messages import Messages
+from spatial_replay.logs import messages as log_topics
+from spatial_replay.logs.messages import Messages, Source, axes_of
 from spatial_replay.logs.output_file import refuse_inputs, replacing
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
-from spatial_replay.logs.source import Source, axes_of
 from spatial_replay.monitor.sentences import gap_sentence
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.replay.engine import Replay, Replayed, planned_for

@@ -16,9 +16,10 @@ from spatial_replay.errors import OutputError, UsageError
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.logs.output_file import refuse_inputs
 from spatial_replay.perception.calibration import camera_text
-from spatial_replay.perception.frame import Frame, Image
 from spatial_replay.perception.opencv import (
     Camera,
+    Frame,
+    Image,
     blur,
     enlarge,
     fit_homography,

@@ -13,16 +13,14 @@ from typing import Any
 import numpy as np
 
 from spatial_replay.bags.decoders import Decoder, Topic
-from spatial_replay.bags.mcap_log import McapLog
-from spatial_replay.bags.open import open_messages
+from spatial_replay.bags.open import McapLog, open_messages
 from spatial_replay.bags.reader import Message, MessageReader
 from spatial_replay.errors import LogError, MissingFileError, UsageError
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.mcap.read import LogSummary, McapSource, summarise_mcap
+from spatial_replay.logs.messages import OBJECTS, Source, TrackSource, axes_of, read_blocks, reading_only
 from spatial_replay.logs.read_options import FaultList, gap_ns
 from spatial_replay.logs.remote import RemoteFile, log_file
-from spatial_replay.logs.source import Source, TrackSource, axes_of, read_blocks, reading_only
-from spatial_replay.logs.topics import OBJECTS
 from spatial_replay.mapping.suggest import EXAMPLES, suggest_mapping, suggest_topics
 from spatial_replay.sources.open_log import is_bag_folder, readable_file
 from spatial_replay.text import Instant, Sentence

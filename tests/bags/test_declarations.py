@@ -25,7 +25,7 @@ from bags.bag_files import (
     write_ros2,
 )
 from spatial_replay import LogError, read_trace
-from spatial_replay.bags.mcap_log import McapLog
+from spatial_replay.bags.open import McapLog
 from spatial_replay.cli import run
 from spatial_replay.logs.read_options import FaultList, count_of
 

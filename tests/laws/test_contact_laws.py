@@ -9,9 +9,16 @@ from hypothesis import given
 
 from laws.strategies_geometry import footprints, radii
 from spatial_replay import Footprint
-from spatial_replay.geometry.contact import contact, contacts, enlarged, protrusion_contact
 from spatial_replay.geometry.footprint import FootprintBatch
-from spatial_replay.geometry.measure import MeasureRequest, Operand, measure
+from spatial_replay.geometry.measure import (
+    MeasureRequest,
+    Operand,
+    contact,
+    contacts,
+    enlarged,
+    measure,
+    protrusion_contact,
+)
 
 TOLERANCE = 1e-6
 

@@ -33,8 +33,8 @@ from spatial_replay.logs import (
     summarise_mcap,
 )
 from spatial_replay.logs.mcap.write import CHUNK_BYTES
+from spatial_replay.logs.messages import OBJECTS, protobuf_channel
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
-from spatial_replay.logs.topics import OBJECTS, protobuf_channel
 from spatial_replay.logs.wire import WireTemplate
 from spatial_replay.sources import open_source
 

@@ -47,8 +47,7 @@ from spatial_replay.bags import open_messages
 from spatial_replay.cli import run
 from spatial_replay.live import LiveSession, LiveUpdate, monitor
 from spatial_replay.live.client import LARGEST_FRAME, Client, Inbox, Received
-from spatial_replay.logs.messages import Channel
-from spatial_replay.logs.topics import OBJECTS, ROBUSTNESS, SCENE
+from spatial_replay.logs.messages import OBJECTS, ROBUSTNESS, SCENE, Channel
 
 TURTLES = """
 topics:

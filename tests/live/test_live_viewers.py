@@ -21,8 +21,7 @@ from live.robots import MAPPING, SPEC, Robot, files, messages_of, occurrence, ro
 from serve.viewer import PROTOCOL, viewer
 from spatial_replay.cli import run
 from spatial_replay.live.session import open_viewing
-from spatial_replay.logs.schemas.Robustness_pb2 import RecentEvents, Robustness
-from spatial_replay.logs.topics import (
+from spatial_replay.logs.messages import (
     AUTOMATON,
     EVENTS,
     OBJECTS,
@@ -32,6 +31,7 @@ from spatial_replay.logs.topics import (
     SPECIFICATION,
     STANDING,
 )
+from spatial_replay.logs.schemas.Robustness_pb2 import RecentEvents, Robustness
 
 SHOWN = (OBJECTS, ROBUSTNESS, STANDING, AUTOMATON, SCENE)
 

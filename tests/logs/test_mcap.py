@@ -49,10 +49,8 @@ from spatial_replay.logs import (
     summarise_mcap,
 )
 from spatial_replay.logs.mcap.write import CHUNK_BYTES
-from spatial_replay.logs.messages import BLOCK_SAMPLES
+from spatial_replay.logs.messages import BLOCK_SAMPLES, OBJECTS, ROBUSTNESS, protobuf_channel, read_ahead
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
-from spatial_replay.logs.source import read_ahead
-from spatial_replay.logs.topics import OBJECTS, ROBUSTNESS, protobuf_channel
 from spatial_replay.sources import open_source
 
 SAMPLES = protobuf_channel(OBJECTS, ObjectStates)

@@ -23,10 +23,7 @@ from examples import examples
 from replay.runs import STEP_NS, PiecewiseSource, content_of, record, run, sample
 from spatial_replay.annotate.robustness import CURVES_CHANNEL
 from spatial_replay.logs import Channel, LogWriter, Messages, Source, encode_objects
-from spatial_replay.logs.messages import merge, messages_of
-from spatial_replay.logs.output_file import open_output
-from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
-from spatial_replay.logs.topics import (
+from spatial_replay.logs.messages import (
     CURVES_TOPIC,
     EVENT_LOG,
     EVENTS,
@@ -36,8 +33,12 @@ from spatial_replay.logs.topics import (
     SCENE,
     SPECIFICATION,
     STANDING,
+    merge,
+    messages_of,
     protobuf_channel,
 )
+from spatial_replay.logs.output_file import open_output
+from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.replay.engine import run_replay
 from spatial_replay.replay.loaded_log import LoadedLog, Playback
 from spatial_replay.replay.selection import ReplayOptions, Window

@@ -10,7 +10,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from spatial_replay.cli import run
-from spatial_replay.code_cache import cache_folder
+from spatial_replay.compiled import cache_folder
 from spatial_replay.logs.remote import user_cache_folder
 from users import plain_user
 

@@ -36,12 +36,7 @@ from serve.viewer import (
 from spatial_replay import UsageError
 from spatial_replay.annotate.robustness import MOST_POINTS
 from spatial_replay.logs import Channel, LogWriter, MemorySource, Schema, encode_objects
-from spatial_replay.logs.output_file import open_output
-from spatial_replay.logs.schemas.Curves_pb2 import Curves
-from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
-from spatial_replay.logs.schemas.Robustness_pb2 import Robustness, StandingUpdate
-from spatial_replay.logs.schemas.Specification_pb2 import Specification
-from spatial_replay.logs.topics import (
+from spatial_replay.logs.messages import (
     CURVES_TOPIC,
     OBJECTS,
     ROBUSTNESS,
@@ -50,9 +45,14 @@ from spatial_replay.logs.topics import (
     STANDING,
     protobuf_channel,
 )
+from spatial_replay.logs.output_file import open_output
+from spatial_replay.logs.schemas.Curves_pb2 import Curves
+from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
+from spatial_replay.logs.schemas.Robustness_pb2 import Robustness, StandingUpdate
+from spatial_replay.logs.schemas.Specification_pb2 import Specification
 from spatial_replay.replay.engine import run_replay
 from spatial_replay.replay.loaded_log import LoadedLog
-from spatial_replay.serve.serving import Serving, open_server
+from spatial_replay.serve.player import Serving, open_server
 from spatial_replay.sources import open_source
 
 TEXT = """\

@@ -15,7 +15,7 @@ import spatial_replay as sr
 from bags.bag_files import START_NS, drive, write_json_mcap, write_ros1
 from spatial_replay import read_trace
 from spatial_replay.cli import run
-from spatial_replay.logs.source import axes_of
+from spatial_replay.logs.messages import axes_of
 from spatial_replay.sources import open_source
 from spatial_replay.trace.units import Axes
 

@@ -41,9 +41,9 @@ class Clients:
         self._serving: Any = None
 
     def ready(self) -> None:
-        from spatial_replay.logs.source import MemorySource
+        from spatial_replay.logs.messages import MemorySource
         from spatial_replay.replay.loaded_log import LoadedLog
-        from spatial_replay.serve.serving import open_server
+        from spatial_replay.serve.player import open_server
 
         samples = [
             sr.Sample(n * 10**8, {"a": sr.Footprint.box(n, 0, n + 1, 1), "b": sr.Footprint.disc(5, 5, 1)})

@@ -20,8 +20,7 @@ import zstandard
 from mcap.reader import make_reader
 
 from spatial_replay.geometry.footprint import FootprintBatch
-from spatial_replay.logs.messages import Block
-from spatial_replay.logs.source import reading_only
+from spatial_replay.logs.messages import Block, reading_only
 from spatial_replay.recording.recorder import record_source
 from spatial_replay.replay.engine import run_replay
 from spatial_replay.sources.open_log import open_source

@@ -17,9 +17,8 @@ from mcap.reader import make_reader
 
 import spatial_replay as sr
 from spatial_replay.logs import Channel, LogWriter, Schema, encode_objects
-from spatial_replay.logs.messages import messages_of
+from spatial_replay.logs.messages import OBJECTS, messages_of, protobuf_channel
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
-from spatial_replay.logs.topics import OBJECTS, protobuf_channel
 from spatial_replay.sources.open_log import open_source
 
 LATENCY_S = 0.03

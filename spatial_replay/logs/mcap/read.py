@@ -28,7 +28,7 @@ import zstandard
 from mcap import records
 from mcap.opcode import Opcode
 
-from spatial_replay.cores import cores
+from spatial_replay.compiled import cores
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import Integers, concatenated, select
 from spatial_replay.geometry.footprint import Concave
@@ -46,18 +46,23 @@ from spatial_replay.logs.mcap.index import (
     read_directory,
 )
 from spatial_replay.logs.messages import (
+    ALL,
     BLOCK_SAMPLES,
+    DERIVED,
+    METADATA,
+    OBJECTS,
+    RECOVERY,
     Attachment,
     Block,
     Channel,
     Messages,
     Schema,
+    is_kept,
     noting_pauses,
 )
 from spatial_replay.logs.objects import decode_objects
 from spatial_replay.logs.read_options import FaultList, gap_ns
 from spatial_replay.logs.remote import LogFile, RemoteFile, file_size, open_file, plan_reads
-from spatial_replay.logs.topics import ALL, DERIVED, METADATA, OBJECTS, RECOVERY, is_kept
 from spatial_replay.text import Instant, Sentence, counted, encodable
 from spatial_replay.trace.trace import LATEST_NS, Trace
 from spatial_replay.trace.units import Axes

@@ -23,13 +23,12 @@ import zstandard
 from mcap import records
 from mcap.opcode import Opcode
 
-from spatial_replay.cores import cores
+from spatial_replay.compiled import cores
 from spatial_replay.errors import OutputError
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.mcap.index import RECORD_HEAD, encoded
-from spatial_replay.logs.messages import Channel, Messages, Schema, messages_of
+from spatial_replay.logs.messages import LIBRARY, MAGIC, OWN_PREFIX, Channel, Messages, Schema, messages_of
 from spatial_replay.logs.output_file import output_error
-from spatial_replay.logs.topics import LIBRARY, MAGIC, OWN_PREFIX
 from spatial_replay.trace.trace import FOREVER
 
 CHUNK_BYTES = 512 * 2**10

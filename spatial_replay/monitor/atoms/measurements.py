@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from spatial_replay.cores import over_cores
+from spatial_replay.compiled import over_cores
 from spatial_replay.geometry.arrays import Booleans, Flags, Floats
 from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.geometry.measure import (

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.geometry.contact import Contact, contact, enlarged, protrusion_contact
 from spatial_replay.geometry.footprint import Footprint
-from spatial_replay.geometry.measure import candidate_pairs
+from spatial_replay.geometry.measure import Contact, candidate_pairs, contact, enlarged, protrusion_contact
 from spatial_replay.monitor.atoms.closest_pair import closest_pair_of
 from spatial_replay.monitor.atoms.measurements import leaf_values, measured, quantity_of
 from spatial_replay.monitor.atoms.terms import TraceScene
