@@ -34,7 +34,7 @@ from spatial_replay.trace.trace import duration_ns_from_text
 if TYPE_CHECKING:
     from spatial_replay.live import LiveSession, LiveUpdate
     from spatial_replay.live.session import Viewing
-    from spatial_replay.mapping import LogMapping
+    from spatial_replay.mapping.mapping_file import LogMapping
     from spatial_replay.recording.clips import Trigger
     from spatial_replay.recording.recorder import Recorder, SampleWriter
     from spatial_replay.spec.formula import Specification
@@ -190,7 +190,7 @@ def monitor(
     from spatial_replay.live import LiveSession, open_recorders
     from spatial_replay.live.session import layout_of_run
     from spatial_replay.logs.output_file import refuse_inputs
-    from spatial_replay.mapping import load_mapping
+    from spatial_replay.mapping.mapping_file import load_mapping
 
     if not specs:
         raise UsageError("there is nothing to monitor; give --spec FILE")

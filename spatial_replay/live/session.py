@@ -25,9 +25,10 @@ from spatial_replay.logs.messages import OBJECTS, Channel, MemorySink, Messages,
 from spatial_replay.logs.objects import decode_objects
 from spatial_replay.logs.read_options import FaultKinds
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
-from spatial_replay.mapping import LiveAssembler, LogMapping, ReadingPlan, load_mapping
-from spatial_replay.mapping.assemble import rehearse
+from spatial_replay.mapping.assemble import LiveAssembler, rehearse
+from spatial_replay.mapping.mapping_file import LogMapping, load_mapping
 from spatial_replay.mapping.message_types import TRANSFORM_TYPES, short_type
+from spatial_replay.mapping.topic_reader import ReadingPlan
 from spatial_replay.monitor.monitor import Ending, Monitor, NodeUpdate, SpecUpdate, Update
 from spatial_replay.monitor.result import no_such_node
 from spatial_replay.monitor.verdict import Verdict, worst_verdict

@@ -304,7 +304,8 @@ def _open_messages(path: LogFile, kind: str, options: ReadOptions) -> Source:
             f"{shlex.quote(str(path))} --suggest-mapping"
         )
     # readers of external logs are loaded when there is one
-    from spatial_replay.mapping import MappedSource, load_mapping
+    from spatial_replay.mapping.mapped_source import MappedSource
+    from spatial_replay.mapping.mapping_file import load_mapping
 
     mapping = load_mapping(options.mapping)
     return MappedSource(

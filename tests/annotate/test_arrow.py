@@ -11,8 +11,7 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap.reader import make_reader
 
 import spatial_replay as sr
-from spatial_replay.logs import MemorySource
-from spatial_replay.logs.messages import SCENE
+from spatial_replay.logs.messages import SCENE, MemorySource
 from spatial_replay.replay.engine import run_replay
 
 STEP_NS = 100_000_000

@@ -14,7 +14,7 @@ from spatial_replay.annotate.specification import ReportedTree, encode_specifica
 from spatial_replay.automata import stored_text
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.guards import Propositions
-from spatial_replay.logs import Attachment, MemorySink
+from spatial_replay.logs.messages import Attachment, MemorySink
 from spatial_replay.logs.schemas import AutomatonState_pb2
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.schemas.Specification_pb2 import Specification as SpecificationMessage

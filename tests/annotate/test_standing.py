@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 
 import spatial_replay as sr
-from spatial_replay.logs import MemorySource
+from spatial_replay.logs.messages import MemorySource
 from spatial_replay.logs.schemas.Robustness_pb2 import (
     HOLDS_SO_FAR,
     PENDING,

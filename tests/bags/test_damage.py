@@ -26,7 +26,8 @@ from bags.bag_files import (
     write_ros2,
 )
 from spatial_replay import LogError, read_trace
-from spatial_replay.bags import Message, open_messages
+from spatial_replay.bags.open import open_messages
+from spatial_replay.bags.reader import Message
 from spatial_replay.cli import run
 
 SENT = drive(60)

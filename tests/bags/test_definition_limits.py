@@ -6,9 +6,8 @@ import pytest
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
 from spatial_replay import LogError
-from spatial_replay.bags import Topic
-from spatial_replay.bags.decoders import decoder_of
-from spatial_replay.logs import Schema
+from spatial_replay.bags.decoders import Topic, decoder_of
+from spatial_replay.logs.messages import Schema
 
 LINE = "=" * 80
 

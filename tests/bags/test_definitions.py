@@ -18,7 +18,7 @@ from spatial_replay.bags.decoders import (
     ros_definitions,
     standard_schema,
 )
-from spatial_replay.logs import Schema
+from spatial_replay.logs.messages import Schema
 
 SEPARATOR = "=" * 80
 

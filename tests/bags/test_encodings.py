@@ -25,7 +25,7 @@ from bags.bag_files import (
     write_mcap,
 )
 from spatial_replay import LogError, read_trace
-from spatial_replay.bags import open_messages
+from spatial_replay.bags.open import open_messages
 
 POSES = build_file_descriptor_set(PosesInFrame).SerializeToString()
 

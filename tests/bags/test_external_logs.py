@@ -35,7 +35,7 @@ from bags.bag_files import (
 from spatial_replay import Footprint, LogError, Trace, UsageError, read_trace
 from spatial_replay.annotate.certificate import SampleHash
 from spatial_replay.cli import run
-from spatial_replay.logs import Block
+from spatial_replay.logs.messages import Block
 from spatial_replay.sources import open_source
 from spatial_replay.trace.trace import within
 

@@ -31,8 +31,8 @@ from bags.bag_files import (
     write_ros2,
 )
 from spatial_replay import read_trace
-from spatial_replay.bags import open_messages
-from spatial_replay.mapping import MappedSource
+from spatial_replay.bags.open import open_messages
+from spatial_replay.mapping.mapped_source import MappedSource
 from spatial_replay.sources import open_source
 
 BAGS = ("apriltags_table.bag", "two_turtles.bag", "two_turtles_lz4.bag", "pose_db3", "talker_mcap")

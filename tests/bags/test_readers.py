@@ -31,7 +31,9 @@ from spatial_replay import (
     UsageError,
     read_trace,
 )
-from spatial_replay.bags import MessageReader, Topic, open_messages
+from spatial_replay.bags.decoders import Topic
+from spatial_replay.bags.open import open_messages
+from spatial_replay.bags.reader import MessageReader
 from spatial_replay.cli import run
 
 Write = Callable[[Path, list[Sent]], Path]

@@ -14,7 +14,7 @@ from replay.runs import SPECIFICATION, PiecewiseSource
 from replay.runs import run as recorded_run
 from spatial_replay import parse_specification
 from spatial_replay.cli import run
-from spatial_replay.mapping import parse_mapping
+from spatial_replay.mapping.mapping_file import parse_mapping
 from spatial_replay.replay.engine import run_replay
 
 CUBE = '{"name": "cube", "class": "block", "polygon": [[0, 0], [1, 0], [1, 1]]}'

@@ -15,9 +15,9 @@ from click.testing import CliRunner
 import spatial_replay as sr
 from cli.program import PROGRAM, written_on_terminal
 from planning.plans import PUSH, record_plan_of, write_usual_run
-from spatial_replay.bags import open_messages
+from spatial_replay.bags.open import open_messages
 from spatial_replay.cli.application import application
-from spatial_replay.logs import LogWriter
+from spatial_replay.logs.mcap.write import LogWriter
 from spatial_replay.logs.messages import CERTIFICATE, OBJECTS
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.replay.verification import statement

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import foxglove
 
-from spatial_replay.bags import open_messages
 from spatial_replay.bags.decoders import channel_of
+from spatial_replay.bags.open import open_messages
 
 
 def say(text: str) -> None:

@@ -21,8 +21,8 @@ from websockets.exceptions import WebSocketException
 from websockets.sync.server import ServerConnection, serve
 from websockets.typing import Subprotocol
 
-from spatial_replay.bags import open_messages
 from spatial_replay.bags.decoders import channel_of
+from spatial_replay.bags.open import open_messages
 from spatial_replay.logs.messages import EVENTS
 
 PATIENCE_S = 300.0

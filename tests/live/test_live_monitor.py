@@ -43,7 +43,7 @@ from live.robots import (
     until,
 )
 from spatial_replay import LogError, Sample, Trace, Trigger, UsageError
-from spatial_replay.bags import open_messages
+from spatial_replay.bags.open import open_messages
 from spatial_replay.cli import run
 from spatial_replay.live import LiveSession, LiveUpdate, monitor
 from spatial_replay.live.client import LARGEST_FRAME, Client, Inbox, Received

@@ -38,18 +38,20 @@ from spatial_replay import (
 )
 from spatial_replay.cli import run
 from spatial_replay.geometry.arrays import select
-from spatial_replay.logs import (
+from spatial_replay.logs.mcap.read import McapSource, summarise_mcap
+from spatial_replay.logs.mcap.write import CHUNK_BYTES, LogWriter
+from spatial_replay.logs.messages import (
+    BLOCK_SAMPLES,
+    OBJECTS,
+    ROBUSTNESS,
     Channel,
-    LogWriter,
-    McapSource,
     MemorySource,
     Messages,
     Schema,
-    encode_objects,
-    summarise_mcap,
+    protobuf_channel,
+    read_ahead,
 )
-from spatial_replay.logs.mcap.write import CHUNK_BYTES
-from spatial_replay.logs.messages import BLOCK_SAMPLES, OBJECTS, ROBUSTNESS, protobuf_channel, read_ahead
+from spatial_replay.logs.objects import encode_objects
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.sources import open_source
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from spatial_replay import ConvexPart, Footprint, Sample, Trace, TrackedObject
-from spatial_replay.logs import decode_objects, encode_objects
+from spatial_replay.logs.objects import decode_objects, encode_objects
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 
 

@@ -25,7 +25,8 @@ from logs.web_server import WebServer, serving
 from spatial_replay import LogError, MissingFileError, UsageError
 from spatial_replay.cli import run
 from spatial_replay.errors import RemoteError
-from spatial_replay.logs import Channel, LogWriter, Messages, Schema
+from spatial_replay.logs.mcap.write import LogWriter
+from spatial_replay.logs.messages import Channel, Messages, Schema
 from spatial_replay.logs.remote import joined_ranges, matching_addresses
 
 RECORDINGS = Path(__file__).parents[2] / "recordings"

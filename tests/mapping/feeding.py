@@ -11,8 +11,11 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from spatial_replay import Trace
-from spatial_replay.bags import Decoder, Message, Topic
-from spatial_replay.mapping import Assembler, ReadingPlan, parse_mapping
+from spatial_replay.bags.decoders import Decoder, Topic
+from spatial_replay.bags.reader import Message
+from spatial_replay.mapping.assemble import Assembler
+from spatial_replay.mapping.mapping_file import parse_mapping
+from spatial_replay.mapping.topic_reader import ReadingPlan
 
 SECOND = 10**9
 

@@ -18,7 +18,9 @@ from bags.bag_files import write_mcap
 from examples import examples
 from mapping.feeding import SECOND, Feed, header, make, pose, pose_stamped, ros, tf, transform
 from spatial_replay import Trace
-from spatial_replay.mapping import MappedSource, ReadingPlan, parse_mapping
+from spatial_replay.mapping.mapped_source import MappedSource
+from spatial_replay.mapping.mapping_file import parse_mapping
+from spatial_replay.mapping.topic_reader import ReadingPlan
 from spatial_replay.mapping.transforms import FrameTree
 
 MS = 10**6

@@ -8,7 +8,9 @@ from hypothesis import strategies as st
 from examples import examples
 from mapping.feeding import SECOND, Feed, make, pose_stamped, tf, transform
 from spatial_replay import Trace
-from spatial_replay.mapping import LiveAssembler, ReadingPlan, parse_mapping
+from spatial_replay.mapping.assemble import LiveAssembler
+from spatial_replay.mapping.mapping_file import parse_mapping
+from spatial_replay.mapping.topic_reader import ReadingPlan
 
 MS = 10**6
 TWO = """

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from spatial_replay.mapping import parse_mapping
+from spatial_replay.mapping.mapping_file import parse_mapping
 from spatial_replay.mapping.message_types import BUILT_IN
 
 ROOT = Path(__file__).parents[2]

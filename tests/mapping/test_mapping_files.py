@@ -11,9 +11,17 @@ from jsonschema import Draft202012Validator
 
 from mapping.feeding import Feed, make, pose_stamped
 from spatial_replay import MissingFileError, UsageError
-from spatial_replay.bags import Topic
-from spatial_replay.mapping import ReadingPlan, load_mapping, parse_mapping
-from spatial_replay.mapping.mapping_file import FOREVER_NS, Sampling, ShapeMapping, SignalMapping, Uncertainty
+from spatial_replay.bags.decoders import Topic
+from spatial_replay.mapping.mapping_file import (
+    FOREVER_NS,
+    Sampling,
+    ShapeMapping,
+    SignalMapping,
+    Uncertainty,
+    load_mapping,
+    parse_mapping,
+)
+from spatial_replay.mapping.topic_reader import ReadingPlan
 
 EXAMPLE = """
 fixed_frame: world

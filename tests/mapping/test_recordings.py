@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from spatial_replay import Trace
-from spatial_replay.bags import open_messages
+from spatial_replay.bags.open import open_messages
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.mapping import Assembler, ReadingPlan, parse_mapping
+from spatial_replay.mapping.assemble import Assembler
+from spatial_replay.mapping.mapping_file import parse_mapping
+from spatial_replay.mapping.topic_reader import ReadingPlan
 
 TURTLES = ("two_turtles.bag", "two_turtles_lz4.bag", "two_turtles_mcap", "two_turtles_sqlite3")
 POSES = """

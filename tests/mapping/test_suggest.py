@@ -10,10 +10,10 @@ import pytest
 from mcap.writer import Writer
 
 from spatial_replay import UsageError, read_trace
-from spatial_replay.bags import Topic
+from spatial_replay.bags.decoders import Topic
 from spatial_replay.cli import run
-from spatial_replay.mapping import LogMapping, parse_mapping, suggest_mapping
-from spatial_replay.mapping.mapping_file import FOREVER_NS, ShapeMapping
+from spatial_replay.mapping.mapping_file import FOREVER_NS, LogMapping, ShapeMapping, parse_mapping
+from spatial_replay.mapping.suggest import suggest_mapping
 from spatial_replay.sources import open_source
 
 POINT = {"x": 1.0, "y": 2.0, "z": 0.0}

@@ -10,7 +10,9 @@ import pytest
 from mapping.feeding import SECOND, Feed, header, make, pose_stamped, ros
 from spatial_replay import LogError, Trace, UsageError
 from spatial_replay.bags.reader import MessageColumns
-from spatial_replay.mapping import Assembler, ReadingPlan, parse_mapping
+from spatial_replay.mapping.assemble import Assembler
+from spatial_replay.mapping.mapping_file import parse_mapping
+from spatial_replay.mapping.topic_reader import ReadingPlan
 from spatial_replay.trace.trace import LATEST_NS
 
 MS = 10**6

@@ -10,8 +10,10 @@ from hypothesis import strategies as st
 
 from mapping.feeding import SECOND, Feed, make, pose_stamped, tf, transform
 from spatial_replay import UsageError
-from spatial_replay.bags import Topic
-from spatial_replay.mapping import Assembler, ReadingPlan, parse_mapping
+from spatial_replay.bags.decoders import Topic
+from spatial_replay.mapping.assemble import Assembler
+from spatial_replay.mapping.mapping_file import parse_mapping
+from spatial_replay.mapping.topic_reader import ReadingPlan
 
 HUGE = 10**400
 

@@ -11,7 +11,7 @@ from typing import Any
 from mcap.reader import make_reader
 
 from spatial_replay import ConvexPart, Footprint, Sample, Trace, TrackedObject
-from spatial_replay.logs import Attachment, Block
+from spatial_replay.logs.messages import Attachment, Block
 from spatial_replay.recording.recorder import record_source
 from spatial_replay.trace.trace import within
 

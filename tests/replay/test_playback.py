@@ -22,7 +22,7 @@ from annotate.message_paths import values
 from examples import examples
 from replay.runs import STEP_NS, PiecewiseSource, content_of, record, run, sample
 from spatial_replay.annotate.robustness import CURVES_CHANNEL
-from spatial_replay.logs import Channel, LogWriter, Messages, Source, encode_objects
+from spatial_replay.logs.mcap.write import LogWriter
 from spatial_replay.logs.messages import (
     CURVES_TOPIC,
     EVENT_LOG,
@@ -33,10 +33,14 @@ from spatial_replay.logs.messages import (
     SCENE,
     SPECIFICATION,
     STANDING,
+    Channel,
+    Messages,
+    Source,
     merge,
     messages_of,
     protobuf_channel,
 )
+from spatial_replay.logs.objects import encode_objects
 from spatial_replay.logs.output_file import open_output
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.replay.engine import run_replay

@@ -24,7 +24,7 @@ from spatial_replay import (
     load_specification,
     parse_specification,
 )
-from spatial_replay.logs import Block
+from spatial_replay.logs.messages import Block
 from spatial_replay.recording.recorder import record_source
 from spatial_replay.replay.document import document_from_replay, explain_results
 from spatial_replay.replay.engine import Replayed, load_files, run_replay

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import spatial_replay as sr
-from spatial_replay.logs import Channel, Messages
+from spatial_replay.logs.messages import Channel, Messages
 from spatial_replay.replay.verification import verify_certificate
 from spatial_replay.runs.scripted import RunLog, run_log
 from spatial_replay.sources import open_source

@@ -35,7 +35,7 @@ from serve.viewer import (
 )
 from spatial_replay import UsageError
 from spatial_replay.annotate.robustness import MOST_POINTS
-from spatial_replay.logs import Channel, LogWriter, MemorySource, Schema, encode_objects
+from spatial_replay.logs.mcap.write import LogWriter
 from spatial_replay.logs.messages import (
     CURVES_TOPIC,
     OBJECTS,
@@ -43,8 +43,12 @@ from spatial_replay.logs.messages import (
     SCENE,
     SPECIFICATION,
     STANDING,
+    Channel,
+    MemorySource,
+    Schema,
     protobuf_channel,
 )
+from spatial_replay.logs.objects import encode_objects
 from spatial_replay.logs.output_file import open_output
 from spatial_replay.logs.schemas.Curves_pb2 import Curves
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates

@@ -15,7 +15,7 @@ from mcap.writer import Writer
 import spatial_replay as sr
 from bags.bag_files import drive, write_json_mcap, write_ros1, write_ros2
 from replay.runs import content_of
-from spatial_replay.bags import open_messages
+from spatial_replay.bags.open import open_messages
 from spatial_replay.cli.application import application
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from mcap.writer import Writer
 
-from spatial_replay.bags import MessageReader
-from spatial_replay.mapping import parse_mapping
+from spatial_replay.bags.reader import MessageReader
+from spatial_replay.mapping.mapping_file import parse_mapping
 from spatial_replay.sources import messages_in, survey
 
 Write = Callable[[dict[str, Sequence[object]]], MessageReader]

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import spatial_replay as sr
 from spatial_replay.live import LiveSession
-from spatial_replay.mapping import parse_mapping
+from spatial_replay.mapping.mapping_file import parse_mapping
 
 OBJECTS = 6
 MAPPING = """

@@ -16,8 +16,9 @@ import numpy as np
 from mcap.reader import make_reader
 
 import spatial_replay as sr
-from spatial_replay.logs import Channel, LogWriter, Schema, encode_objects
-from spatial_replay.logs.messages import OBJECTS, messages_of, protobuf_channel
+from spatial_replay.logs.mcap.write import LogWriter
+from spatial_replay.logs.messages import OBJECTS, Channel, Schema, messages_of, protobuf_channel
+from spatial_replay.logs.objects import encode_objects
 from spatial_replay.logs.schemas.ObjectStates_pb2 import ObjectStates
 from spatial_replay.sources.open_log import open_source
 
