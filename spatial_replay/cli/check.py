@@ -238,19 +238,18 @@ def _compare_with_log(
 ) -> _Compared:
     """Compare names, thresholds, regions and windows with what a log has."""
     # only needed with --log: log readers load the numerical libraries
-    from spatial_replay.logs.messages import axes_of, reading_only
     from spatial_replay.monitor.plausibility import LogNumbers, plausibility_warnings, window_lines
     from spatial_replay.replay.selection import LogNames
     from spatial_replay.sources.open_log import open_source
 
     source = open_source(log, **reading)
-    specification = with_numbers(specification, axes_of(source).units)
+    specification = with_numbers(specification, source.axes.units)
     numbers, names = LogNumbers(specification), LogNames()
     evaluation = _CutResults(specification)
     faults: list[str] = []
     first_ns: int | None = None
     with progress("samples") as advance:
-        for block in reading_only(source).iter_blocks():
+        for block in source.keeping().iter_blocks():
             names.add(block.trace)
             numbers.add(block.trace)
             evaluation.add(block.trace)
@@ -300,15 +299,14 @@ class _CutResults:
 
     def warnings(self, source: Source) -> Iterator[Diagnostic]:
         """Yield a warning for each result, at its window."""
-        from spatial_replay.logs.messages import axes_of, reading_only
         from spatial_replay.monitor.result import SpecResult
         from spatial_replay.monitor.stream import join_blocks
         from spatial_replay.monitor.witness.evidence import Evidence
 
         def traces() -> Iterator[Trace]:
-            return (block.trace for block in reading_only(source).iter_blocks())
+            return (block.trace for block in source.keeping().iter_blocks())
 
-        own, units = self._specification, axes_of(source).units
+        own, units = self._specification, source.axes.units
         text = SourceText.of(own.source, own.filename)
         for stream, kept in zip(self._stream.streams, self._kept, strict=True):
             if not len(stream):

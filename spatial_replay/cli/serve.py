@@ -20,6 +20,7 @@ from spatial_replay.cli.options import (
 from spatial_replay.cli.output import print_verdicts
 from spatial_replay.cli.terminal import show, show_file
 from spatial_replay.cli.watching import files_to_watch, follow_saves, load_log, watch_option
+from spatial_replay.errors import importing
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -81,7 +82,8 @@ def _serve(
     evaluated: Evaluated, files: SpecificationFiles | None, serving: ServingArguments, play: bool
 ) -> ExitCode | None:
     # imported here so that --help stays fast
-    from spatial_replay.serve.player import open_server
+    with importing("serving takes foxglove-sdk", extra="live"):
+        from spatial_replay.serve.server import open_server
 
     host, port, origins = serving.host, serving.port, serving.origins
     with open_server(evaluated, host=host, port=port, play=play, origins=origins) as server:

@@ -398,7 +398,7 @@ def cut_clip(
 
 def _size_of(source: Source) -> int | None:
     """Return the size of a log that is one file."""
-    path = getattr(source, "path", None)
+    path = source.path
     if isinstance(path, RemoteFile):
         return path.size
     return path.stat().st_size if isinstance(path, Path) and path.is_file() else None

@@ -658,7 +658,7 @@ def compare_decisions(sources: tuple[Source, Source]) -> DecisionDiff | None:
     """Return the first decision that differs, or None; of logs that were not planned, None."""
     decisions: list[tuple[PlanDecision, ...]] = []
     for source in sources:
-        path = getattr(source, "path", None)
+        path = source.path
         found: tuple[PlanDecision, ...] = ()
         if isinstance(path, Path) and source.kind == "MCAP":
             with suppress(UsageError):

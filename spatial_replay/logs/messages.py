@@ -8,19 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from fnmatch import fnmatchcase
 from functools import wraps
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypeVar
 
 import numpy as np
 
 from spatial_replay.errors import LogError
 from spatial_replay.geometry.arrays import Integers, concatenated, select
-from spatial_replay.geometry.footprint import Concave
-from spatial_replay.logs.read_options import FaultList, gap_ns
+from spatial_replay.logs.read_options import DEFAULTS, FaultList, ReadOptions, gap_ns
+from spatial_replay.logs.remote import LogFile
 from spatial_replay.text import Sentence, encodable
 from spatial_replay.trace.trace import Pauses, Sample, Trace, within
 from spatial_replay.trace.units import OUR_AXES, Axes
@@ -396,16 +396,48 @@ def _with_dependencies(file: Any, found: dict[str, FileDescriptor]) -> Iterable[
 _Read = TypeVar("_Read")
 
 
-class Source(Protocol):
+class Source:
     """A log that can be read, any number of times, in blocks of bounded size."""
+
+    path: LogFile | None = None
 
     @property
     def name(self) -> str:
         """The base name of its file."""
+        raise NotImplementedError
 
     @property
     def kind(self) -> str:
         """The format, in a word."""
+        raise NotImplementedError
+
+    @property
+    def axes(self) -> Axes:
+        """Axes of the source, or of what a log was recorded from; its samples have ours."""
+        return OUR_AXES
+
+    @property
+    def options(self) -> Mapping[str, object]:
+        """The options of reading that are not the defaults, for a log's metadata."""
+        return {}
+
+    @property
+    def max_gap_ns(self) -> int | None:
+        """Objects and signals are unknown in a longer pause; None for no limit."""
+        return None
+
+    @property
+    def begin_ns(self) -> int | None:
+        """A time before the first sample, close to it, if that is known without reading the samples."""
+        return None
+
+    def keeping(self, keep: tuple[str, ...] = ()) -> Source:
+        """Return a source that reads its samples and, beside them, only messages of some topics.
+
+        Args:
+            keep: as `is_kept` takes them.
+        """
+        return self
 
     def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
         """Return the samples from the first at or after `start_ns` to the last before `end_ns`.
@@ -416,28 +448,19 @@ class Source(Protocol):
             LogError: nothing in the log can be read as a sample.
             UsageError: a log without damage that has no topic for samples.
         """
+        raise NotImplementedError
 
     def attachments(self) -> tuple[Attachment, ...]:
         """Return the attachments of the log."""
-
-    def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
-        """Return the metadata records of the log, with their names."""
-
-
-class _Bare:
-    """A source of samples only."""
-
-    def attachments(self) -> tuple[Attachment, ...]:
-        """See `Source.attachments`."""
         return ()
 
     def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
-        """See `Source.metadata`."""
+        """Return the metadata records of the log, with their names."""
         return ()
 
 
 @dataclass(frozen=True)
-class MemorySource(_Bare):
+class MemorySource(Source):
     """A trace, or samples, in memory."""
 
     trace: Trace
@@ -464,32 +487,48 @@ class MemorySource(_Bare):
             yield Block(block if begin == 0 else replace(block, faults=()))
 
 
+@dataclass(frozen=True)
+class FileSource(Source):
+    """The file of a log, with the options for reading it."""
+
+    path: LogFile
+    kind: str = ""
+    reading: ReadOptions = DEFAULTS
+
+    @property
+    def name(self) -> str:
+        return encodable(self.path.name or Path(self.path).absolute().name)
+
+    @property
+    def options(self) -> Mapping[str, object]:
+        """See `Source.options`."""
+        concave = self.reading.concave
+        return {**self._given, **({} if concave == "decompose" else {"concave": concave})}
+
+    @property
+    def _given(self) -> Mapping[str, object]:
+        return self.reading.given()
+
+    @property
+    def max_gap_ns(self) -> int | None:
+        """See `Source.max_gap_ns`."""
+        return gap_ns(self.reading.max_gap)
+
+
 IterTraces = Callable[..., Iterator[Trace]]
 
 
 @dataclass(frozen=True)
-class TrackSource(_Bare):
+class TrackSource(FileSource):
     """A track file.
 
     Attributes:
-        options: those with which it is read, where they are not the defaults.
         axes: those of the file; samples have ours.
     """
 
-    path: Path
-    kind: str
-    concave: Concave
+    _: KW_ONLY
     iter_traces: IterTraces
-    options: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
     axes: Axes = OUR_AXES
-
-    @property
-    def name(self) -> str:
-        return encodable(self.path.name)
-
-    @property
-    def max_gap_ns(self) -> int | None:
-        return gap_ns(cast("str | None", self.options.get("max_gap")))
 
     @noting_pauses
     def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
@@ -497,7 +536,7 @@ class TrackSource(_Bare):
         faults = FaultList()
         any_sample = False
         first_fault: str | None = None
-        for trace in self.iter_traces(self.path, faults, concave=self.concave):
+        for trace in self.iter_traces(self.path, faults, concave=self.reading.concave):
             any_sample = any_sample or len(trace) > 0
             lost = faults.take()
             first_fault = first_fault or next(iter(lost), None)
@@ -512,7 +551,7 @@ class TrackSource(_Bare):
 
 
 @dataclass(frozen=True)
-class SourceOf:
+class SourceOf(Source):
     """Attributes that a derived source takes from its original: everything but its blocks."""
 
     source: Source
@@ -527,7 +566,7 @@ class SourceOf:
 
     @property
     def axes(self) -> Axes:
-        return axes_of(self.source)
+        return self.source.axes
 
     def attachments(self) -> tuple[Attachment, ...]:
         """See `Source.attachments`."""
@@ -564,24 +603,3 @@ def read_ahead(blocks: Generator[_Read, None, None]) -> Iterator[_Read]:
     finally:
         # garbage collection may end this within the start of any thread, which must not wait for another one
         thread.shutdown(wait=False, cancel_futures=True)
-
-
-def reading_only(source: Source, keep: tuple[str, ...] = ()) -> Source:
-    """Return a source that reads its samples and, beside them, only messages of some topics.
-
-    Args:
-        keep: as `is_kept` takes them.
-    """
-    return cast(Source, replace(cast(Any, source), keep=keep)) if hasattr(source, "keep") else source
-
-
-def axes_of(source: Source) -> Axes:
-    """Return the axes of a source, or of what a log was recorded from; its samples have ours."""
-    axes = getattr(source, "axes", None)
-    return axes if isinstance(axes, Axes) else OUR_AXES
-
-
-def reading_options(source: Source) -> dict[str, object]:
-    """Return the options of a source that are not the defaults, for a log's metadata."""
-    concave = getattr(source, "concave", "decompose")
-    return dict(getattr(source, "options", {})) | ({} if concave == "decompose" else {"concave": concave})

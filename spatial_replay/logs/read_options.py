@@ -144,6 +144,8 @@ def _nanoseconds(text: object) -> int | None:
     return int(Fraction(match[1]) * (10**9 if match[2] == "s" else 10**6)) if match else None
 
 
+DEFAULTS: Final = ReadOptions()
+
 _REASONS = {
     "mapping": "it names its objects itself",
     "on_time_jump": "its times never go back",

@@ -7,7 +7,7 @@ The raw messages and their definitions go into copies of the log, so that viewer
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
@@ -20,7 +20,6 @@ from spatial_replay.bags.open import files_of_bag_around, open_messages
 from spatial_replay.bags.reader import Columns, MessageColumns, MessageReader, in_pieces, without_jumps
 from spatial_replay.errors import LogError, UsageError
 from spatial_replay.geometry.arrays import concatenated, select
-from spatial_replay.geometry.footprint import Concave
 from spatial_replay.logs.messages import (
     DERIVED,
     MAPPED,
@@ -28,16 +27,16 @@ from spatial_replay.logs.messages import (
     Attachment,
     Block,
     Channel,
+    FileSource,
     Messages,
     is_kept,
     noting_pauses,
 )
-from spatial_replay.logs.read_options import FaultList, OnTimeJump, gap_ns, late_ns
-from spatial_replay.logs.remote import LogFile, RemoteFile
+from spatial_replay.logs.read_options import FaultList, late_ns
+from spatial_replay.logs.remote import RemoteFile
 from spatial_replay.mapping.assemble import Assembler
 from spatial_replay.mapping.mapping_file import LogMapping
 from spatial_replay.mapping.topic_reader import ReadingPlan
-from spatial_replay.text import encodable
 from spatial_replay.trace.trace import FOREVER, LATEST_NS, Trace
 from spatial_replay.trace.units import Axes
 
@@ -49,32 +48,25 @@ _MOST_UNREAD = 20
 
 
 @dataclass(frozen=True)
-class MappedSource:
+class MappedSource(FileSource):
     """An external log, with a mapping from its messages to objects.
 
     Attributes:
         keep: messages that its blocks hold for a copy, byte for byte: "mapped" for topics that the mapping
             reads, "all", or patterns of topics such as "/camera/*". Several add up.
-        late: how late messages may come, or "all".
-        max_gap: what lies in a longer pause is unknown; None for what the mapping says.
     """
 
-    path: LogFile
+    _: KW_ONLY
     mapping: LogMapping
-    kind: str
-    concave: Concave = "decompose"
-    on_time_jump: OnTimeJump = "error"
     keep: tuple[str, ...] = (MAPPED,)
-    late: str = "1s"
-    max_gap: str | None = None
+
+    def keeping(self, keep: tuple[str, ...] = ()) -> MappedSource:
+        """See `Source.keeping`."""
+        return replace(self, keep=keep)
 
     @property
     def max_gap_ns(self) -> int | None:
-        return gap_ns(self.max_gap) or self.mapping.max_gap_ns
-
-    @property
-    def name(self) -> str:
-        return encodable(self.path.name or Path(self.path).absolute().name)
+        return super().max_gap_ns or self.mapping.max_gap_ns
 
     @property
     def axes(self) -> Axes:
@@ -82,12 +74,9 @@ class MappedSource:
         return self.mapping.axes
 
     @property
-    def options(self) -> Mapping[str, object]:
-        """The options of reading, for the metadata of a copy."""
+    def _given(self) -> Mapping[str, object]:
         mapping = {"mapping": self.mapping.name, "mapping_sha256": self.mapping.sha256}
-        given: dict[str, object] = {} if self.on_time_jump == "error" else {"on_time_jump": self.on_time_jump}
-        given |= {} if self.late == "1s" else {"max_lateness": self.late}
-        return mapping | given | ({} if self.max_gap is None else {"max_gap": self.max_gap})
+        return {**mapping, **self.reading.given(), **mapping}
 
     @property
     def begin_ns(self) -> int | None:
@@ -117,8 +106,8 @@ class MappedSource:
             name=self.name,
             start_ns=start_ns,
             end_ns=end_ns,
-            on_time_jump=self.on_time_jump,
-            concave=self.concave,
+            on_time_jump=self.reading.on_time_jump,
+            concave=self.reading.concave,
         )
         blocks = _Blocks(assembler, reader, copied, start_ns or 0, end_ns)
         blocks.remarks.extend(
@@ -135,7 +124,7 @@ class MappedSource:
         if static:
             # they count from before a window, and the first of a frame before it was recorded, too
             assembler.know_static(open_messages(self.path).iter_messages(static))
-        as_recorded = self.on_time_jump == "split"
+        as_recorded = self.reading.on_time_jump == "split"
         columns = _columns(reader, plan, read, start_ns, end_ns, as_recorded=as_recorded)
         if not as_recorded and plan.late_ns < LATEST_NS:
             columns = without_jumps(columns, self.name, mapped, plan.late_ns)
@@ -173,7 +162,7 @@ class MappedSource:
             raise LogError("\n".join([*texts, *reader.take_faults()]))
         try:
             mapping = replace(self.mapping, max_gap_ns=self.max_gap_ns)
-            return ReadingPlan.of(mapping, topics, late_ns(self.late))
+            return ReadingPlan.of(mapping, topics, late_ns(self.reading.max_lateness))
         except UsageError as error:
             faults = reader.take_faults()
             if faults:

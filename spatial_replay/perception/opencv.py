@@ -59,7 +59,6 @@ class Frame:
         time_ns: its stamp, on the clock of the samples.
         image: (height, width) grey, or (height, width, 3) blue, green, red.
         data: the frame as H.264 in Annex B form, where it came like that; b"" otherwise.
-        is_key: whether `data` can be decoded without the frames before.
         detections: the tags that a robot found in it, which is not there itself; None to find them.
 
     Raises:
@@ -69,7 +68,6 @@ class Frame:
     time_ns: int
     image: Image
     data: bytes = field(default=b"", repr=False)
-    is_key: bool = False
     detections: tuple[Detection, ...] | None = None
 
     def __post_init__(self) -> None:

@@ -414,7 +414,7 @@ class VideoFile:
                     continue
                 widest_ns = max(widest_ns, time_ns - last_ns) if last_ns >= 0 else 0
                 before_ns, last_ns = last_ns, time_ns
-                frame = Frame(time_ns, picture(found), found.of, has_key(found.of))
+                frame = Frame(time_ns, picture(found), found.of)
                 if found.is_true:
                     yield frame
                 else:

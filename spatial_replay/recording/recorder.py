@@ -35,10 +35,8 @@ from spatial_replay.logs.messages import (
     Messages,
     Schema,
     Source,
-    axes_of,
     protobuf_channel,
     read_blocks,
-    reading_options,
 )
 from spatial_replay.logs.output_file import Durability, open_output, refuse_inputs
 from spatial_replay.recording.clips import ClipLog, Trigger, TriggeredClip
@@ -1049,7 +1047,7 @@ def record_source(
     traces = _traces(source, tally)
     # a source without samples raises here, before the output is touched
     first = next(traces)
-    about = {"source": source.name, "options": json.dumps(reading_options(source))}
+    about = {"source": source.name, "options": json.dumps(dict(source.options))}
     about |= _units_metadata(source, unit)
     stream = open_output(output, durability)
     try:
@@ -1065,7 +1063,7 @@ def record_source(
 
 def _units_metadata(source: Source, unit: str) -> dict[str, str]:
     """Return the entries for the log's metadata with axes and units; `unit` is that of lengths, if given."""
-    axes = axes_of(source)
+    axes = source.axes
     if unit and axes.unit not in ("", unit):
         raise UsageError(f"{source.name} declares lengths in {axes.unit}, and not in {unit}; leave that out")
     unit = checked_units({"": unit})[""] if unit else axes.unit

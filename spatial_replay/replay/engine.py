@@ -36,11 +36,9 @@ from spatial_replay.logs.messages import (
     Messages,
     Sink,
     Source,
-    axes_of,
     image_topics,
     merge,
     read_ahead,
-    reading_options,
 )
 from spatial_replay.monitor.result import SpecResult, worst_first
 from spatial_replay.monitor.semantics import Semantics
@@ -171,7 +169,7 @@ class Replay:
         self._source = source
         self._written_files = files
         self._selection = Selection(source, files, options)
-        self.files = logged_specifications(files, axes_of(source).units)
+        self.files = logged_specifications(files, source.axes.units)
         self._evaluation = AnnotatedEvaluation(
             self.files,
             [self._selection.instances(file) for file in self.files],
@@ -179,7 +177,7 @@ class Replay:
             source.attachments,
             show=show,
             arrow=options.arrow,
-            units=axes_of(source).units,
+            units=source.axes.units,
         )
         self.trees = self._evaluation.trees
         self._keep_series, self._keep_leaves = keep_series, keep_leaves
@@ -254,7 +252,7 @@ class Replay:
     def layout(self) -> Attachment:
         """Return the viewer layout of the annotated log; call it after `run`."""
         planned = planned_for(self._source, self.files)
-        return self._evaluation.layout(self._topics, axes_of(self._source), self._images, planned)
+        return self._evaluation.layout(self._topics, self._source.axes, self._images, planned)
 
     def _evaluated(self, *, messages: bool) -> Generator[tuple[Block, Trace, list[SeriesBlock]], None, None]:
         """Yield each block with its samples and their evaluation."""
@@ -555,7 +553,7 @@ def _begin(sink: Sink, source: Source, replay: Replay, options: ReplayOptions, *
         "specifications": specifications_json(replay.files),
         "options": json.dumps(_recorded_options(source, options, layer=layer)),
     }
-    about |= axes_of(source).metadata()
+    about |= source.axes.metadata()
     recorded = {key: value for key, value in before.items() if key not in about and key != "source"}
     if not is_replayed and "options" in before:
         recorded["recorded_options"] = before["options"]
@@ -580,7 +578,7 @@ def _copy_attached(sink: Sink, source: Source) -> None:
 def _recorded_options(source: Source, options: ReplayOptions, *, layer: bool) -> dict[str, object]:
     """Return the options that differ from the defaults, as `verification` reads them back."""
     whole = Window()
-    recorded: dict[str, object] = reading_options(source)
+    recorded = dict(source.options)
     recorded |= {
         name: getattr(options.window, name)
         for name in ("start_ns", "end_ns", "every")

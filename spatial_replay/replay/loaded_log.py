@@ -35,7 +35,6 @@ from spatial_replay.logs.messages import (
     MemorySource,
     Messages,
     Source,
-    axes_of,
     join,
     merge,
     read_ahead,
@@ -273,7 +272,7 @@ class LoadedLog:
         self._source, self._saved = source, saved
         self._looks_back = look_before(files)
         self._attachments = source.attachments
-        self._files, self._kept = tuple(files), logged_specifications(files, axes_of(source).units)
+        self._files, self._kept = tuple(files), logged_specifications(files, source.axes.units)
         self.own = OwnMessages(selection)
         traces: list[Trace] = []
         remarks: list[str] = []
@@ -282,7 +281,7 @@ class LoadedLog:
             remarks += block.remarks
             self.own.add(block)
             advance(len(trace))
-        self.trace = replace(Trace.concatenate(traces), units=axes_of(source).units)
+        self.trace = replace(Trace.concatenate(traces), units=source.axes.units)
         self.faults, self.remarks = tuple(self.trace.faults), tuple(dict.fromkeys(remarks))
         self.inside = selection.inside(self.trace)
         if not len(self.inside):

@@ -26,14 +26,12 @@ from spatial_replay.logs.messages import (
     Messages,
     Source,
     SourceOf,
-    axes_of,
     is_kept,
     merge,
     messages_of,
     protobuf_channel,
     read_ahead,
     read_blocks,
-    reading_only,
 )
 from spatial_replay.logs.objects import encode_objects
 from spatial_replay.logs.remote import LogFile
@@ -84,7 +82,7 @@ def source_keeping(source: Source, keep: Sequence[str] | None) -> Source:
     patterns = [each for each in keep if each not in (ALL, MAPPED)]
     if patterns:
         _check_patterns(source, patterns)
-    return reading_only(source, tuple(keep))
+    return source.keeping(tuple(keep))
 
 
 def _check_patterns(source: Source, patterns: Sequence[str]) -> None:
@@ -111,7 +109,7 @@ def _topics(source: Source) -> list[str]:
 
 def _external(source: Source) -> MessageReader | None:
     """Return a reader of the messages that a mapping reads; None for other sources."""
-    path = getattr(source, "path", None)
+    path = source.path
     if not hasattr(source, "mapping") or not isinstance(path, LogFile):
         return None
     # readers of external logs are loaded when there is one
@@ -179,8 +177,8 @@ def first_sample_ns(source: Source) -> int:
     Raises:
         LogError: it has none.
     """
-    source = reading_only(source)
-    begin_ns = getattr(source, "begin_ns", None)
+    source = source.keeping()
+    begin_ns = source.begin_ns
     # its first chunks, if the log says when they are; else, or if nothing is in them, all of it
     for end_ns in (None,) if begin_ns is None else (begin_ns + _FIRST_NS, None):
         for block in read_blocks(source, None, end_ns):
@@ -199,7 +197,7 @@ def known_start_ns(source: Source) -> int:
 
 def has_samples_from(source: Source, time_ns: int) -> bool:
     """Say whether a log has samples at or after a time."""
-    return any(len(block.trace) for block in read_blocks(reading_only(source), time_ns))
+    return any(len(block.trace) for block in read_blocks(source.keeping(), time_ns))
 
 
 @dataclass(slots=True)
@@ -242,7 +240,7 @@ class Selection:
         object.__setattr__(self, "source", source_keeping(self.source, self.options.keep))
         templates = [spec for file in self.files for spec in file.results if spec.parameter is not None]
         check_parameters(templates, self.options.each)
-        _check_windows(self.files, getattr(self.source, "max_gap_ns", None) or 0)
+        _check_windows(self.files, self.source.max_gap_ns or 0)
         checked_semantics(self.options.semantics, self.files)
 
     @property
@@ -259,7 +257,7 @@ class Selection:
         # every Nth sample is counted from the log's first, wherever the window starts
         from_start = look_before(self.files) or window.every > 1
         read = 0
-        source = self.source if messages else reading_only(self.source)
+        source = self.source if messages else self.source.keeping()
         for block in read_blocks(source, None if from_start else window.start_ns, window.end_ns):
             trace = block.trace
             if window.every > 1:
@@ -287,7 +285,7 @@ class Selection:
         for trace in self.iter_traces():
             traces.append(trace)
             advance(len(trace))
-        return replace(Trace.concatenate(traces), units=axes_of(self.source).units)
+        return replace(Trace.concatenate(traces), units=self.source.axes.units)
 
     def inside(self, trace: Trace) -> Trace:
         """Return those samples that are in the window."""
@@ -332,7 +330,7 @@ class Selection:
         if missing and not self.window.is_whole:
             # an object that appears outside the window is no mistake in the specification
             whole = LogNames()
-            for block in read_blocks(reading_only(self.source)):
+            for block in read_blocks(self.source.keeping()):
                 whole.add(block.trace)
             missing = self._missing_names(whole)
         if missing and self.options.strict_names:
@@ -348,7 +346,7 @@ class Selection:
         name = self.source.name
         spans = [
             (int(block.trace.times_ns[0]), int(block.trace.times_ns[-1]))
-            for block in read_blocks(reading_only(self.source))
+            for block in read_blocks(self.source.keeping())
             if len(block.trace)
         ]
         if not spans:

@@ -290,7 +290,7 @@ def pictures_of(
         span_ns: from when to when.
         decided_ns: samples whose pictures are among them, as far as there is room.
     """
-    path = getattr(source, "path", None)
+    path = source.path
     topic = _image_topic(path) if isinstance(path, LogFile) else None
     if topic is None or not isinstance(path, LogFile):
         return NO_PICTURES

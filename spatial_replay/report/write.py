@@ -18,7 +18,7 @@ from foxglove_schemas_protobuf.Event_pb2 import Event
 from spatial_replay.annotate.specification import unit_of
 from spatial_replay.errors import UsageError
 from spatial_replay.logs import messages as log_topics
-from spatial_replay.logs.messages import Messages, Source, axes_of
+from spatial_replay.logs.messages import Messages, Source
 from spatial_replay.logs.output_file import refuse_inputs, replacing
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.monitor.sentences import gap_sentence
@@ -131,9 +131,9 @@ def report_of(
     replayed = replay.run(collector.add, advance=advance)
     report = RunReport(
         replayed,
-        axes_of(source),
+        source.axes,
         tuple(replay.files),
-        tuple(_results(replay, replayed, collector, axes_of(source).units)),
+        tuple(_results(replay, replayed, collector, source.axes.units)),
         _gaps(replayed),
         collector.scene,
         tuple(collector.events),

@@ -16,7 +16,6 @@ from functools import partial
 from os import PathLike
 from pathlib import Path
 from reprlib import repr as shortened
-from types import MappingProxyType
 from typing import NamedTuple, Unpack
 from urllib.parse import quote
 
@@ -30,7 +29,7 @@ from spatial_replay.logs.formats.tracks import (
     iter_jsonl,
     open_text,
 )
-from spatial_replay.logs.messages import MAGIC, IterTraces, Source, TrackSource, axes_of, reading_only
+from spatial_replay.logs.messages import MAGIC, IterTraces, Source, TrackSource
 from spatial_replay.logs.read_options import Reading, ReadOptions, count_of
 from spatial_replay.logs.remote import (
     BAG_METADATA,
@@ -107,7 +106,7 @@ def read_trace(path: str | PathLike[str], *, allow_damage: bool = False, **readi
         LogError: the file is not a log, or is damaged and `allow_damage` is not set.
     """
     source = open_source(path, **reading)
-    blocks = reading_only(source).iter_blocks()
+    blocks = source.keeping().iter_blocks()
     traces = [replace(block.trace, remarks=block.remarks) for block in blocks]
     trace = Trace.concatenate(traces)
     first_ns = int(trace.times_ns[0]) if len(trace) else 0
@@ -116,7 +115,7 @@ def read_trace(path: str | PathLike[str], *, allow_damage: bool = False, **readi
         others = count_of(trace.faults) - 1
         more = f"\n… and {others} more" if others else ""
         raise LogError(f"{faults[0]}{more}; allow_damage=True reads the rest")
-    return replace(trace, remarks=remarks, faults=faults, units=axes_of(source).units)
+    return replace(trace, remarks=remarks, faults=faults, units=source.axes.units)
 
 
 def readable_file(path: str | PathLike[str]) -> LogFile:
@@ -271,9 +270,7 @@ def _track_source(
 ) -> Source:
     """Return the source of a file, with the axes that are usual in its format unless options say others."""
     axes = usual if options.y_down is None else replace(usual, y="down" if options.y_down else "up")
-    return TrackSource(
-        Path(path), kind, options.concave, iter_traces, MappingProxyType(options.given()), axes
-    )
+    return TrackSource(path, kind, options, iter_traces=iter_traces, axes=axes)
 
 
 def _open_annotations(path: LogFile, kind: str, options: ReadOptions) -> Source:
@@ -307,23 +304,14 @@ def _open_messages(path: LogFile, kind: str, options: ReadOptions) -> Source:
     from spatial_replay.mapping.mapped_source import MappedSource
     from spatial_replay.mapping.mapping_file import load_mapping
 
-    mapping = load_mapping(options.mapping)
-    return MappedSource(
-        path,
-        mapping,
-        kind,
-        options.concave,
-        options.on_time_jump,
-        late=options.max_lateness,
-        max_gap=options.max_gap,
-    )
+    return MappedSource(path, kind, options, mapping=load_mapping(options.mapping))
 
 
 def _open_mcap(path: LogFile, kind: str, options: ReadOptions) -> Source:
     """Open our own log, which names its objects, or an external one, given a mapping."""
     from spatial_replay.logs.mcap.read import McapSource
 
-    source = McapSource(path, kind, options.concave, max_gap=options.max_gap)
+    source = McapSource(path, kind, options)
     if not options.given().keys() - {"max_gap"}:
         return source
     if source.has_samples:

@@ -18,7 +18,7 @@ from spatial_replay.bags.reader import Message, MessageReader
 from spatial_replay.errors import LogError, MissingFileError, UsageError
 from spatial_replay.geometry.arrays import Integers
 from spatial_replay.logs.mcap.read import LogSummary, McapSource, summarise_mcap
-from spatial_replay.logs.messages import OBJECTS, Source, TrackSource, axes_of, read_blocks, reading_only
+from spatial_replay.logs.messages import OBJECTS, Source, TrackSource, read_blocks
 from spatial_replay.logs.read_options import FaultList, gap_ns
 from spatial_replay.logs.remote import RemoteFile, log_file
 from spatial_replay.mapping.suggest import EXAMPLES, suggest_mapping, suggest_topics
@@ -198,7 +198,7 @@ def fitness_of(path: str | PathLike[str], source: Source) -> Fitness:
     """
     tally, none = _Tally(), np.empty(0, np.int64)
     times = [none]
-    for block in read_blocks(reading_only(source)):
+    for block in read_blocks(source.keeping()):
         tally.add(block.trace)
         times.append(block.trace.times_ns)
     samples = np.concatenate(times)
@@ -342,7 +342,7 @@ def overview_of(source: Source, advance: Callable[[int], object] = lambda sample
     if container is None or container.has_objects:
         try:
             # the whole log, with all its damage, unless it lies elsewhere
-            read = reading_only(source) if isinstance(getattr(source, "path", None), RemoteFile) else source
+            read = source.keeping() if isinstance(source.path, RemoteFile) else source
             for block in read.iter_blocks():
                 tally.add(block.trace)
                 remarks += block.remarks
@@ -366,7 +366,7 @@ def overview_of(source: Source, advance: Callable[[int], object] = lambda sample
         faults=tuple(dict.fromkeys(faults)),
         container=container,
         remarks=tuple(remarks),
-        axes=axes_of(source),
+        axes=source.axes,
     )
 
 

@@ -452,7 +452,7 @@ def test_a_window_of_a_log_with_frames_is_a_slice_of_the_whole(
     messages = [(topic, at, json.dumps(content).encode()) for topic, at, content in sent]
     log = write_mcap(tmp_path / "log.mcap", channels, messages, chunk_bytes=300)
     mapping = parse_mapping("fixed_frame: map\nmax_age: 2s\ntopics: {/p: {shape: {disc: 1}}}", "m.yaml")
-    source = MappedSource(log, mapping, "MCAP")
+    source = MappedSource(log, "MCAP", mapping=mapping)
     whole = Trace.concatenate([block.trace for block in source.iter_blocks()])
     start_ns, end_ns = (each * tenth for each in window)
     part = Trace.concatenate([block.trace for block in source.iter_blocks(start_ns, end_ns)])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from typing import Any
 from mcap.reader import make_reader
 
 from spatial_replay import ConvexPart, Footprint, Sample, Trace, TrackedObject
-from spatial_replay.logs.messages import Attachment, Block
+from spatial_replay.logs.messages import Block, Source
 from spatial_replay.recording.recorder import record_source
 from spatial_replay.trace.trace import within
 
@@ -42,7 +42,7 @@ def run(count: int = 12) -> Trace:
 
 
 @dataclass(frozen=True)
-class PiecewiseSource:
+class PiecewiseSource(Source):
     """A trace handed over in blocks of a chosen size."""
 
     trace: Trace
@@ -55,12 +55,6 @@ class PiecewiseSource:
         for begin in range(0, max(1, len(window)), self.size):
             block = window.slice(begin, begin + self.size)
             yield Block(block if begin == 0 else replace(block, faults=()))
-
-    def attachments(self) -> tuple[Attachment, ...]:
-        return ()
-
-    def metadata(self) -> tuple[tuple[str, Mapping[str, str]], ...]:
-        return ()
 
 
 def record(trace: Trace, output: Path) -> Path:

@@ -56,7 +56,7 @@ from spatial_replay.logs.schemas.Robustness_pb2 import Robustness, StandingUpdat
 from spatial_replay.logs.schemas.Specification_pb2 import Specification
 from spatial_replay.replay.engine import run_replay
 from spatial_replay.replay.loaded_log import LoadedLog
-from spatial_replay.serve.player import Serving, open_server
+from spatial_replay.serve.server import Serving, open_server
 from spatial_replay.sources import open_source
 
 TEXT = """\

@@ -15,7 +15,6 @@ import spatial_replay as sr
 from bags.bag_files import START_NS, drive, write_json_mcap, write_ros1
 from spatial_replay import read_trace
 from spatial_replay.cli import run
-from spatial_replay.logs.messages import axes_of
 from spatial_replay.sources import open_source
 from spatial_replay.trace.units import Axes
 
@@ -78,7 +77,7 @@ def test_drone_annotations_point_down_by_default(tmp_path: Path) -> None:
     above = sr.parse_specification('"1" above "2"')
     assert sr.evaluate(above, read_trace(path)).verdict == "satisfied"
     assert sr.evaluate(above, read_trace(path, y_down=False)).verdict == "violated"
-    assert axes_of(open_source(path)) == Axes("down")
+    assert open_source(path).axes == Axes("down")
 
 
 def test_a_recording_of_an_image_is_not_turned_over_again(
@@ -91,7 +90,7 @@ def test_a_recording_of_an_image_is_not_turned_over_again(
     assert run(["replay", str(annotated)]) == 0
     assert run(["replay", str(tracks), "--spec", str(spec)]) == 1
     assert read_trace(annotated) == read_trace(recorded) == read_trace(tracks, y_down=True)
-    assert axes_of(open_source(annotated)) == axes_of(open_source(recorded)) == Axes("down")
+    assert open_source(annotated).axes == open_source(recorded).axes == Axes("down")
     capsys.readouterr()
     for log in (recorded, annotated):
         assert run(["info", str(log)]) == 0

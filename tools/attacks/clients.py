@@ -43,7 +43,7 @@ class Clients:
     def ready(self) -> None:
         from spatial_replay.logs.messages import MemorySource
         from spatial_replay.replay.loaded_log import LoadedLog
-        from spatial_replay.serve.player import open_server
+        from spatial_replay.serve.server import open_server
 
         samples = [
             sr.Sample(n * 10**8, {"a": sr.Footprint.box(n, 0, n + 1, 1), "b": sr.Footprint.disc(5, 5, 1)})

@@ -16,7 +16,7 @@ import numpy as np
 
 import spatial_replay as sr
 from spatial_replay.geometry.footprint import FootprintBatch
-from spatial_replay.logs.messages import BLOCK_SAMPLES, Block
+from spatial_replay.logs.messages import BLOCK_SAMPLES, Block, Source
 from spatial_replay.recording.recorder import record_source
 
 SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
@@ -67,14 +67,12 @@ def bench_diff(measure: Any) -> None:
 
 
 @dataclass(frozen=True)
-class Passing:
+class Passing(Source):
     """A source of a robot and a person who comes too near to it in one sample, made block by block."""
 
     samples: int
     name: str = "passing"
     kind: str = "generated"
-    metadata: tuple[Any, ...] = ()
-    attachments: tuple[Any, ...] = ()
 
     def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
         for begin in range(0, self.samples, BLOCK_SAMPLES):

@@ -55,15 +55,16 @@ from spatial_replay.logs.messages import (
     Attachment,
     Block,
     Channel,
+    FileSource,
     Messages,
     Schema,
     is_kept,
     noting_pauses,
 )
 from spatial_replay.logs.objects import decode_objects
-from spatial_replay.logs.read_options import FaultList, gap_ns
-from spatial_replay.logs.remote import LogFile, RemoteFile, file_size, open_file, plan_reads
-from spatial_replay.text import Instant, Sentence, counted, encodable
+from spatial_replay.logs.read_options import FaultList
+from spatial_replay.logs.remote import RemoteFile, file_size, open_file, plan_reads
+from spatial_replay.text import Instant, Sentence, counted
 from spatial_replay.trace.trace import LATEST_NS, Trace
 from spatial_replay.trace.units import Axes
 
@@ -329,28 +330,25 @@ class ChunkWalk:
 
 
 @dataclass(frozen=True)
-class McapSource:
+class McapSource(FileSource):
     """An MCAP log with the topic /spatial/objects; its index is read once for all uses of the source.
 
     Attributes:
         keep: which of its other messages its blocks hold, as `is_kept` takes them. Chunks without these
             topics are skipped, if chunks list their topics.
-        max_gap: between samples that are farther apart, everything is unknown.
     """
 
-    path: LogFile
     kind: str = "MCAP"
-    concave: Concave = "decompose"
     keep: tuple[str, ...] = (ALL,)
-    max_gap: str | None = None
+
+    def keeping(self, keep: tuple[str, ...] = ()) -> McapSource:
+        """See `Source.keeping`."""
+        return replace(self, keep=keep)
 
     @property
-    def max_gap_ns(self) -> int | None:
-        return gap_ns(self.max_gap)
-
-    @property
-    def name(self) -> str:
-        return encodable(self.path.name)
+    def _given(self) -> Mapping[str, object]:
+        # a log of ours has the options that it was recorded with in its metadata
+        return {}
 
     @noting_pauses
     def iter_blocks(self, start_ns: int | None = None, end_ns: int | None = None) -> Iterator[Block]:
@@ -566,7 +564,9 @@ class _BlockDecoder:
         columns = replace(messages, channels=MappingProxyType(wanted))
         samples = [number for number, channel in wanted.items() if self._is_objects(channel)]
         own = np.flatnonzero(np.isin(columns.channel, samples))
-        trace, sound = decode_samples(columns, own, self._latest_ns, self._fault, self._source.concave)
+        trace, sound = decode_samples(
+            columns, own, self._latest_ns, self._fault, self._source.reading.concave
+        )
         self._latest_ns = int(columns.log_time_ns[own].max(initial=self._latest_ns))
         if len(sound) < len(own):
             # a copy holds the samples that were read, and is sound
@@ -634,10 +634,6 @@ class LogSummary:
     metadata: tuple[tuple[str, Mapping[str, str]], ...]
     attachments: tuple[AttachmentSummary, ...]
     faults: tuple[str, ...]
-
-    @property
-    def damaged(self) -> bool:
-        return bool(self.faults)
 
     @property
     def has_objects(self) -> bool:
