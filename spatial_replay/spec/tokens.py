@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from itertools import pairwise
+from itertools import islice, pairwise
 from types import MappingProxyType
 
 from lark import Token
@@ -170,11 +170,13 @@ def read_spellings(tokens: list[Token], faults: Faults) -> list[Token]:
             result.append(_as(token, "COMMA", ","))
         elif token.type == "NAME" and following and not _is_quoted(token):
             written = _word(token, result, following, macros)
-            holds_formula = following[0].value in macros or _holds_formula(tokens[index + 1 :])
-            if written.type == "ERROR" and not holds_formula:
-                written = token
             if written.type == "ERROR":
-                _report(token, faults)
+                # so far and no further, or a text full of such words would take quadratic time
+                after = islice(tokens, index + 1, index + 1000)
+                if following[0].value in macros or _holds_formula(after):
+                    _report(token, faults)
+                else:
+                    written = token
             if token.value in RATES and following[0].type == "LPAR" and token.value not in macros:
                 written = _as(token, "RATE", token.value)
             result.append(written)
@@ -199,7 +201,7 @@ def _plain(token: Token) -> str:
     return str(token.value).lower().removesuffix("_")
 
 
-def _holds_formula(after: Sequence[Token]) -> bool:
+def _holds_formula(after: Iterable[Token]) -> bool:
     """Return whether what follows is no list of arguments: up to its closing bracket, it relates objects."""
     depth = 0
     for token in after:
