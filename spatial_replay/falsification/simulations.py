@@ -22,9 +22,9 @@ from spatial_replay.logs.output_file import replacing
 from spatial_replay.recording.log import refuse_templates
 from spatial_replay.runs.planned import record_plan
 from spatial_replay.runs.scripted import about_run, refuse_unknown_names, run_log, simulate_script
-from spatial_replay.simulation.arm import least_distance, rectangle
+from spatial_replay.simulation.arm import least_distance
 from spatial_replay.simulation.tabletop import Placement, default_specification, make_world, scenario_of
-from spatial_replay.simulation.world import Box, Injection, Kind, Start
+from spatial_replay.simulation.world import Box, Conditions, Injection, Kind, Start, rectangle
 from spatial_replay.sources.open_log import read_trace
 from spatial_replay.spec.formula import Specification
 from spatial_replay.text import nearest_hint
@@ -340,7 +340,7 @@ class ScenarioRuns:
 
     def is_possible(self, case: Case) -> bool:
         """See `OwnSimulation`."""
-        starts = {start.name: start for start in _conditions(case).starts}
+        starts = {start.name: start for start in _conditions(case)["starts"]}
         scenario = scenario_of(self.name)
         outlines = {each: _outline(each, starts, scenario.scatter_m) for each in scenario.placements}
         return all(
@@ -354,8 +354,8 @@ class ScenarioRuns:
         given = _conditions(case)
         if self.is_planned:
             return self._plan(given)
-        samples = simulate_script(self.name, **given._asdict())
-        about = about_run(self.name, **given._asdict())
+        samples = simulate_script(self.name, **given)
+        about = about_run(self.name, **given)
         return SimulatedCase(
             Trace.from_samples(samples), lambda output: _write(output, samples, self.files, about), unit="m"
         )
@@ -363,12 +363,12 @@ class ScenarioRuns:
     def command(self, case: Case) -> str:
         """See `OwnSimulation`."""
         given = _conditions(case)
-        options = ["--seed", str(given.seed)]
-        if given.noise_m:
-            options += ["--noise", f"{given.noise_m:.12g}"]
-        for each in given.injections:
+        options = ["--seed", str(given["seed"])]
+        if given["noise_m"]:
+            options += ["--noise", f"{given['noise_m']:.12g}"]
+        for each in given["injections"]:
             options += ["--inject", str(each)]
-        for start in given.starts:
+        for start in given["starts"]:
             options += ["--start", str(start)]
         # what the planner knows nothing of
         others = ["--also" if word == "--spec" else word for word in self.spec_options]
@@ -376,7 +376,7 @@ class ScenarioRuns:
         words = ["spatial-replay", *verb, "-o", "again.mcap", *options]
         return shlex.join(words)
 
-    def _plan(self, given: _Conditions) -> SimulatedCase:
+    def _plan(self, given: Conditions) -> SimulatedCase:
         own = default_specification(self.name)
         task, also = own, [each for each in self.files if each != own]
         if self.spec_options and "--spec" not in self.spec_options:
@@ -384,7 +384,7 @@ class ScenarioRuns:
             (task,), also = self.files, []
         with TemporaryDirectory() as folder:
             log = Path(folder, "run.mcap")
-            record_plan(self.name, log, task, also=also, **given._asdict())
+            record_plan(self.name, log, task, also=also, **given)
             trace, data = read_trace(log), log.read_bytes()
 
         def write(output: Path) -> None:
@@ -468,16 +468,7 @@ class ScenarioRuns:
 Simulation: TypeAlias = OwnSimulation | ScenarioRuns
 
 
-class _Conditions(NamedTuple):
-    """How a case is simulated."""
-
-    seed: int
-    noise_m: float
-    injections: list[Injection]
-    starts: list[Start]
-
-
-def _conditions(case: Case) -> _Conditions:
+def _conditions(case: Case) -> Conditions:
     injections = [Injection(kind, round(at * 1e9)) for kind in _KINDS if (at := case.get(kind)) is not None]
     starts = []
     for name in case:
@@ -486,7 +477,8 @@ def _conditions(case: Case) -> _Conditions:
             x, y, turn = case[name], case[f"{group}.y"], case[f"{group}.turn"]
             if x is not None and y is not None:
                 starts.append(Start(group.removeprefix("start."), x, y, turn))
-    return _Conditions(int(case.get("seed") or 0), case.get("noise") or 0.0, injections, starts)
+    seed, noise_m = int(case.get("seed") or 0), case.get("noise") or 0.0
+    return Conditions(seed=seed, noise_m=noise_m, injections=injections, starts=starts)
 
 
 def _outline(placement: Placement, starts: Mapping[str, Start], scatter_m: float) -> Footprint:

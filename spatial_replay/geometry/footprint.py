@@ -540,17 +540,9 @@ def radius_of(tracked: TrackedObject) -> float:
 
 def moved_object(tracked: TrackedObject, x: float, y: float, turn: float = 0.0) -> TrackedObject:
     """Return the object with its centre at (x, y), turned by an angle in radians; heights stay."""
-    footprint = tracked.footprint
-    centre = np.array(centre_of(footprint))
-    place = np.array([[x, y]])
-    parts = []
-    for part in footprint.parts:
-        corners = part.vertices
-        placed = np.empty((1, *corners.shape))
-        fill_placed(corners, centre, place, turn, placed)
-        parts.append(ConvexPart(placed[0], part.radius))
+    placed = with_poses(FootprintBatch.unknown(0), tracked, np.array([[x, y]]), np.array([turn]))
     yaw = None if tracked.yaw is None else tracked.yaw + turn
-    return replace(tracked, footprint=Footprint(tuple(parts)), yaw=yaw)
+    return replace(tracked, footprint=placed.footprint(0), yaw=yaw)
 
 
 def with_poses(
@@ -570,8 +562,15 @@ def with_poses(
     vertices = np.empty((len(batch.vertices) + count * len(corners), 2))
     vertices[: len(batch.vertices)] = batch.vertices
     placed = vertices[len(batch.vertices) :].reshape(len(turns), len(positions), len(corners), 2)
+    # both coordinates in one go, as complex numbers, and along the many positions, not along the few vertices
+    at = np.ascontiguousarray(positions, np.float64).view(np.complex128)[..., 0]
+    filled = placed.view(np.complex128)[..., 0]
+    x, y = (corners - centre).T
     for number, turn in enumerate(turns.tolist()):
-        fill_placed(corners, centre, positions, turn, placed[number])
+        cosine, sine = (math.cos(turn), math.sin(turn)) if turn else (1.0, 0.0)
+        turned = zip((x * cosine - y * sine).tolist(), (x * sine + y * cosine).tolist(), strict=True)
+        for corner, local in enumerate(turned):
+            np.add(at, complex(*local), out=filled[number, :, corner])
     return FootprintBatch.trusted(
         part_start=np.concatenate((batch.part_start[:-1], part_start)),
         vertex_start=np.concatenate((batch.vertex_start[:-1], vertex_start)),
@@ -580,17 +579,3 @@ def with_poses(
         bottom=np.concatenate((batch.bottom, np.full(count, bottom))),
         top=np.concatenate((batch.top, np.full(count, top))),
     )
-
-
-def fill_placed(vertices: Floats, centre: Floats, positions: Floats, turn: float, placed: Floats) -> None:
-    """Fill `placed` (M, n, 2): vertices (n, 2) turned around the centre, moved to each position (M, 2)."""
-    local = vertices - centre
-    if turn != 0.0:
-        cosine, sine = math.cos(turn), math.sin(turn)
-        x, y = local[:, 0], local[:, 1]
-        local = np.stack((x * cosine - y * sine, x * sine + y * cosine), axis=1)
-    # both coordinates in one go, as complex numbers, and along the many positions, not along the few vertices
-    at = np.ascontiguousarray(positions, np.float64).view(np.complex128)[..., 0]
-    filled = placed.view(np.complex128)[..., 0]
-    for number, (x, y) in enumerate(local.tolist()):
-        np.add(at, complex(x, y), out=filled[:, number])

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from copy import copy
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Literal, TypeAlias, get_args
@@ -89,55 +88,12 @@ def measure(batch: FootprintBatch, operands: Sequence[Operand], requests: Sequen
         GeometryError: operands over different numbers of samples, a row the batch does not have, a
             request for an operand that does not exist.
     """
-    values, prepared = _prepared(batch, operands, requests)
-    arguments = (*prepared, np.empty((len(batch.vertices), 4)), values)
-    least = _SHARE // max(len(requests), 1) + 1
-    over_cores(measure_rows, lambda *share: measure_rows(*arguments, *share), values.shape[1], least)
-    return values
-
-
-class Remeasured:
-    """Requests that are measured again and again, of footprints with other outlines each time.
-
-    Each thread needs its own, since it measures in the same room each time.
-    """
-
-    def __init__(
-        self, batch: FootprintBatch, operands: Sequence[Operand], requests: Sequence[MeasureRequest]
-    ) -> None:
-        self._values, prepared = _prepared(batch, operands, requests)
-        self._before, self._after = prepared[:2], prepared[3:]
-        self._edges = np.empty((len(batch.vertices), 4))
-
-    def another(self) -> Remeasured:
-        """Return the same with room of its own."""
-        made = copy(self)
-        made._values, made._edges = self._values.copy(), np.empty_like(self._edges)
-        return made
-
-    def measure(self, vertices: Floats) -> Floats:
-        """Return (K, T), kept until the next call; between footprints that rest nothing is measured again.
-
-        Args:
-            vertices: (V or more, 2), in the places of the batch's.
-        """
-        values, room = self._values, (self._edges, self._values)
-        arguments: Any = (*self._before, writable(vertices), *self._after, *room, 0, values.shape[1])
-        measure_rows(*arguments)
-        return values
-
-
-def _prepared(
-    batch: FootprintBatch, operands: Sequence[Operand], requests: Sequence[MeasureRequest]
-) -> tuple[Floats, Any]:
-    """Return values (K, T), of requests that rest already measured, and what `measure_rows` takes first."""
     samples = {operand.rows.shape[0] for operand in operands}
     if len(samples) > 1:
         raise GeometryError(f"operands span {sorted(samples)} samples; give each the same number")
     members = np.concatenate([np.ravel(operand.rows) for operand in operands] or [_NO_ROWS])
     if members.size and members.max() >= len(batch):
         raise GeometryError(f"an operand has row {members.max()}; the batch has {len(batch)} rows, from 0")
-    width = np.array([operand.rows.shape[1] for operand in operands], dtype=np.int64)
     size = np.array([operand.rows.size for operand in operands], dtype=np.int64)
     for request in requests:
         _check_request(request, len(operands))
@@ -150,16 +106,21 @@ def _prepared(
             once = [Operand(operand.rows[:1], operand.enlargement) for operand in operands]
             values[still] = measure(batch, once, [requests[k] for k in still])
             codes[still] = NOTHING
-    return values, (
+    arguments: Any = (
         *_arrays_of(batch),
         members,
         np.concatenate([[0], np.cumsum(size)]),
-        width,
+        np.array([operand.rows.shape[1] for operand in operands], dtype=np.int64),
         np.array([operand.enlargement for operand in operands], dtype=np.float64),
         codes,
         np.array([request.first for request in requests], dtype=np.int64),
         np.array([request.second for request in requests], dtype=np.int64),
+        np.empty((len(batch.vertices), 4)),
+        values,
     )
+    least = _SHARE // max(len(requests), 1) + 1
+    over_cores(measure_rows, lambda *share: measure_rows(*arguments, *share), values.shape[1], least)
+    return values
 
 
 def _arrays_of(batch: FootprintBatch) -> Any:

@@ -199,11 +199,6 @@ class Line:
         ends = {"always": "always", "finally": "at_end", "eventually": "once"}
         return f"{self.fact.name}_{ends[self.pattern]}"
 
-    @property
-    def facts(self) -> tuple[LimitedRelation, ...]:
-        """Its facts."""
-        return (self.fact,) if self.later is None else (self.fact, self.later)
-
 
 def ordered(first: LimitedRelation, later: LimitedRelation) -> Line:
     """Return that a fact holds before another one does, in the words that need the fewer negations."""

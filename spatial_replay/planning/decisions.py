@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import TYPE_CHECKING, Literal, Protocol, TypeAlias, get_args
@@ -100,6 +100,14 @@ class Target:
     def length(self) -> float:
         """Length of the path, in footprint units."""
         return sum(math.dist(one, other) for one, other in pairwise(self.waypoints))
+
+
+def points_along(waypoints: Sequence[tuple[float, float]], step: float) -> Iterator[tuple[float, float]]:
+    """Yield points on a way, no farther apart than a step."""
+    yield waypoints[0]
+    for (u, v), (x, y) in pairwise(waypoints):
+        count = max(1, math.ceil(math.dist((u, v), (x, y)) / step))
+        yield from ((u + k / count * (x - u), v + k / count * (y - v)) for k in range(1, count + 1))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -201,20 +209,12 @@ class Step(Displayed):
     @property
     def progress(self) -> Guards:
         """Progress set: propositions that have to hold next; empty without an aim."""
-        return self.aim.progress if self.aim is not None else _NOTHING
-
-    @property
-    def constraints(self) -> Guards:
-        """Constraint set: propositions that must not hold on the way; empty without an aim."""
-        return self.aim.constraints if self.aim is not None else _NOTHING
+        return self.aim.progress if self.aim is not None else Guards((), ())
 
     @property
     def candidates(self) -> tuple[Candidate, ...]:
         """The objects considered for the aim."""
         return self.aim.candidates if self.aim is not None else ()
-
-
-_NOTHING = Guards((), ())
 
 
 @dataclass(frozen=True, slots=True)

@@ -43,7 +43,15 @@ from spatial_replay.planning.edges import (
     with_moved,
     with_objects,
 )
-from spatial_replay.planning.maps import AVOIDED_CELLS, concerns, distance_to, gradient_map, proposition_maps
+from spatial_replay.planning.maps import (
+    AVOIDED_CELLS,
+    concerns,
+    distance_between,
+    distance_to,
+    gradient_map,
+    literal_text,
+    proposition_maps,
+)
 from spatial_replay.planning.motions import (
     Expectations,
     MotionOrder,
@@ -55,8 +63,7 @@ from spatial_replay.planning.motions import (
 )
 from spatial_replay.planning.settings import Grid, Settings, Workspace
 from spatial_replay.planning.targets import nearest_meeting
-from spatial_replay.spec.format import format_formula
-from spatial_replay.spec.formula import Atom, Formula, Outline, Quantified, SignedDistance, TrackedName
+from spatial_replay.spec.formula import Atom, Formula, Outline, Quantified, TrackedName
 from spatial_replay.spec.walks import base_of, iter_formulas, terms_of
 from spatial_replay.trace.trace import Sample, Trace
 
@@ -289,10 +296,7 @@ class Arranger:
         workspace = self._settings.workspace
         others = [each for each in self._movable if each != name and each not in workspace.supports]
         about = [each for each in self._demands if name in self._about[each]]
-        distances = [
-            Atom("", "dist", SignedDistance(TrackedName(name), TrackedName(each))) for each in others
-        ]
-        formulas = [*(each.formula for each in about), *distances]
+        formulas = [*(each.formula for each in about), *(distance_between(name, each) for each in others)]
         free = replace(workspace, supports=workspace.supports | set(others))
         maps = proposition_maps(formulas, self._regions, self._sample, name, free)
         met = dict(zip(about, map(surplus, maps.lower, maps.upper, about), strict=True))
@@ -474,9 +478,7 @@ class Arranger:
             frozenset((name, other)) for name in poses for other in others if name not in workspace.supports
         }
         apart = [
-            Demand(
-                Atom("", "dist", SignedDistance(*map(TrackedName, sorted(each)))), True, workspace.clearance
-            )
+            Demand(distance_between(*sorted(each)), True, workspace.clearance)
             for each in sorted(pairs, key=sorted)
             if len(each) == 2
         ]
@@ -599,6 +601,7 @@ _MOST_EDGES: Final = 12
 """The most edges that are tried from one state that is foreseen."""
 _MOST_ORDERED: Final = 6
 """The most arrangements of which the order of motions is looked for."""
+_NOT_FOUND: Final = "no arrangement of objects brings it about"
 _STILL_TURN: Final = math.radians(1.0)
 """The widest turn of an object that stays as it is."""
 
@@ -927,35 +930,27 @@ class Lookahead:
         core = list(demands)
         for each in reversed(demands):
             fewer = tuple(other for other in core if other != each)
-            if fewer and budget.left > 0 and not self._is_possible(sample, fewer, budget):
+            if fewer and budget.left > 0 and self._why_impossible(sample, fewer, budget):
                 core = list(fewer)
         about = Arranger(sample, self._regions, self._settings, core, budget)
-        what = " and ".join(_text_of(each) for each in core)
+        what = " and ".join(literal_text(each.formula, each.wanted) for each in core)
         if why := about.why_hopeless():
             return f"{what}: {'; '.join(filter(None, (why, about.cell_hint(self._settings.motions))))}"
         stands = about.what_stands()
         said = "no places were found for all at once", stands, about.cell_hint(self._settings.motions)
         return f"{what}: {'; '.join(filter(None, said))}"
 
-    def _is_possible(self, sample: Sample, demands: Sequence[Demand], budget: Budget) -> bool:
-        """Return whether demands hold in some arrangement, as far as that is looked for."""
+    def _why_impossible(self, sample: Sample, demands: Sequence[Demand], budget: Budget) -> str:
+        """Return why demands hold in no arrangement, as far as that is looked for; "" if they do."""
         about = Arranger(sample, self._regions, self._settings, demands, budget)
         why = about.why_hopeless()
-        return not why and next(about.arrangements(self._settings.motions), None) is not None
+        found = None if why else next(about.arrangements(self._settings.motions), None)
+        return why or (_NOT_FOUND if found is None else "")
 
     def _why_hopeless(self, sample: Sample, number: int, wanted: bool, budget: Budget) -> str:
         why = "it never holds"
         for demands in demands_of(((number, wanted),), self._formulas, self._settings.margin):
-            about = Arranger(sample, self._regions, self._settings, demands, budget)
-            why = about.why_hopeless()
-            if not why:
-                found = next(about.arrangements(self._settings.motions), None)
-                if found is not None or budget.left <= 0:
-                    return ""
-                why = "no arrangement of objects brings it about"
+            why = self._why_impossible(sample, demands, budget)
+            if not why or (why == _NOT_FOUND and budget.left <= 0):
+                return ""
         return why
-
-
-def _text_of(demand: Demand) -> str:
-    text = format_formula(demand.formula)
-    return text if demand.wanted else f"not ({text})"

@@ -7,30 +7,21 @@ conjunct limits a cell, and what blocks it.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from copy import copy
 from dataclasses import dataclass, field
+from functools import reduce
+from itertools import chain
 from typing import Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from spatial_replay.compiled import over_cores
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Booleans, Floats
-from spatial_replay.geometry.footprint import (
-    Footprint,
-    FootprintBatch,
-    TrackedObject,
-    centre_of,
-    fill_placed,
-    with_poses,
-)
-from spatial_replay.geometry.kernels import measure_rows
-from spatial_replay.geometry.measure import MeasureRequest, Operand, Remeasured
+from spatial_replay.geometry.footprint import Footprint, FootprintBatch, TrackedObject, with_poses
+from spatial_replay.geometry.measure import MeasureRequest, Operand, measure
 from spatial_replay.lazy import Displayed
-from spatial_replay.monitor.atoms.measurements import MovedLeaves, leaf_values
+from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.planning.decisions import Candidate, Target
 from spatial_replay.planning.settings import Grid, Settings, Workspace, refuse_faults
@@ -64,9 +55,6 @@ OUT_OF_REACH: Final = 3
 UNKNOWN: Final = 4
 REASONS: Final = ("free", "a constraint would hold", "an obstacle is there", "out of reach", "unknown")
 """Why a cell is blocked, by its number in `GradientMap.blocked`."""
-
-_TILE: Final = 2048
-"""So many poses at most are measured together: what that takes stays in the processor's cache."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,13 +136,8 @@ def danger_of(maps: PropositionMaps, constraints: Cubes) -> Floats:
 
 def _greatest(positive: Floats, negative: Floats, cubes: Cubes, shape: tuple[int, ...]) -> Floats:
     """Return the greatest robustness of a cube (see `cube_robustness`); -inf without cubes."""
-    if not cubes:
-        return np.full(shape, -np.inf)
-    first, *others = cubes
-    greatest = cube_robustness(positive, negative, first, shape)
-    for cube in others:
-        np.maximum(greatest, cube_robustness(positive, negative, cube, shape), out=greatest)
-    return greatest
+    each = (cube_robustness(positive, negative, cube, shape) for cube in cubes)
+    return reduce(np.maximum, each, np.full(shape, -np.inf))
 
 
 def cube_robustness(positive: Floats, negative: Floats, cube: Cube, shape: tuple[int, ...]) -> Floats:
@@ -163,13 +146,8 @@ def cube_robustness(positive: Floats, negative: Floats, cube: Cube, shape: tuple
     Args:
         positive, negative: bounds of propositions, for those that have to hold, and that must not.
     """
-    if not cube:
-        return np.full(shape, np.inf)
-    (number, wanted), *others = cube
-    least: Floats = positive[number].copy() if wanted else -negative[number]
-    for number, wanted in others:
-        np.minimum(least, positive[number] if wanted else -negative[number], out=least)
-    return least
+    each = (positive[number] if wanted else -negative[number] for number, wanted in cube)
+    return reduce(np.minimum, each, np.full(shape, np.inf))
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,65 +220,27 @@ def proposition_maps(
         present = ", ".join(sample.objects) or "none"
         raise UsageError(f"there is no object {name!r} to move; the sample has: {present}")
     cells = workspace.grid if grid is None else grid
-    turns, centres = workspace.turns(tracked.yaw), cells.centres()
+    turns = workspace.turns(tracked.yaw)
+    shape = len(turns), *cells.shape
     moves = np.array([concerns(each, name) for each in propositions], np.bool_)
     concerned = [each for each, is_moving in zip(propositions, moves, strict=True) if is_moving]
     others = [each for each, is_moving in zip(propositions, moves, strict=True) if not is_moving]
     obstacles = [each for each in sorted(sample.objects) if each not in (name, *workspace.supports)]
-    formulas = [*concerned, *_obstacle_distances(propositions, name, obstacles)]
+    distances = _obstacle_distances(propositions, name, obstacles)
     here = Trace.from_samples([sample])
-    lower, upper = (np.empty((len(propositions), len(turns), len(centres))) for _ in range(2))
-    distances = np.empty((len(obstacles) + 1, len(turns), len(centres)))
+    everywhere = _trace_over_poses(here, tracked, name, cells.centres(), turns)
+    found = leaf_values(TraceScene(everywhere, regions), [*concerned, *distances], {})[:2]
+    found = found.reshape(*found.shape[:2], *shape)
     # propositions that do not depend on the object have the same value in every cell
-    fixed = leaf_values(TraceScene(here, regions), others, {})[:2]
-    tiles = list(_tiles(len(turns), len(centres)))
-    differ = [False] * len(tiles)
-
-    def poses_of(tile: tuple[slice, slice]) -> _Poses:
-        some = centres[tile[1]], turns[tile[0]]
-        return _Poses(here, tracked, name, formulas, regions, workspace.obstacles, *some)
-
-    first = poses_of(tiles[0])
-
-    def measure_tiles(begin: int, end: int) -> None:
-        poses = first if begin == 0 else first.another()
-        for number in range(begin, end):
-            turn, cell = tiles[number]
-            if not poses.suits(turns[turn]):
-                poses = poses_of(tiles[number])
-            found, distances[-1, turn, cell] = poses.measure(centres[cell], turns[turn])
-            lower[moves, turn, cell] = found[0, : len(concerned)]
-            distances[:-1, turn, cell] = found[0, len(concerned) :]
-            differ[number] = len(found) > 1
-            if differ[number]:
-                upper[moves, turn, cell] = found[1, : len(concerned)]
-
-    over_cores(measure_rows, measure_tiles, len(tiles), 1)
-    lower[~moves] = fixed[0][..., None]
-    # where all is known, as in most maps, there is one array
-    if any(differ) or len(fixed) > 1:
-        for (turn, cell), is_set in zip(tiles, differ, strict=True):
-            if not is_set:
-                upper[:, turn, cell] = lower[:, turn, cell]
-        upper[~moves] = fixed[-1][..., None]
-    else:
-        upper = lower
-    shape = (-1, len(turns), *cells.shape)
-    distances = distances.reshape(shape)
+    fixed = leaf_values(TraceScene(here, regions), others, {})[:2, :, :, None, None]
+    # where all is known, as in most maps, both ends are one array
+    bounds = np.empty((max(len(found), len(fixed)), len(propositions), *shape))
+    bounds[:, moves], bounds[:, ~moves] = found[:, : len(concerned)], fixed
+    static = _static_distance(everywhere, name, workspace.obstacles).reshape(1, *shape)
+    to_obstacles = np.concatenate((found[0, len(concerned) :], static))
     about = MapSubject(tuple(propositions), regions, sample)
-    ways = distances.min(axis=0), distances, turns, (*obstacles, "")
-    return PropositionMaps(name, cells, lower.reshape(shape), upper.reshape(shape), *ways, about)
-
-
-def _tiles(turns: int, cells: int) -> Iterator[tuple[slice, slice]]:
-    """Yield the turns and the cells of each tile: all tiles are of one size, so some may overlap."""
-    most = min(max(_TILE // cells, 1), turns)
-    size = math.ceil(cells / math.ceil(cells / _TILE))
-    for turn in range(0, turns, most):
-        first = min(turn, turns - most)
-        for cell in range(0, cells, size):
-            begin = min(cell, cells - size)
-            yield slice(first, first + most), slice(begin, begin + size)
+    ways = to_obstacles.min(axis=0), to_obstacles, turns, (*obstacles, "")
+    return PropositionMaps(name, cells, bounds[0], bounds[-1], *ways, about)
 
 
 def _obstacle_distances(propositions: Sequence[Formula], name: str, obstacles: Sequence[str]) -> list[Atom]:
@@ -311,85 +251,24 @@ def _obstacle_distances(propositions: Sequence[Formula], name: str, obstacles: S
     """
     atoms_read = (each for one in propositions for each in iter_formulas(one) if isinstance(each, Atom))
     measured = {part for each in atoms_read for part in iter_expressions(each.expression)}
-    atoms = []
-    for other in obstacles:
-        one, two = TrackedName(name), TrackedName(other)
-        # in the order of a proposition's own measurement, so that the kernel computes it only once
-        swapped = SignedDistance(two, one)
-        atoms.append(Atom("", "dist", swapped if swapped in measured else SignedDistance(one, two)))
-    return atoms
+    pairs = ((distance_between(name, other), distance_between(other, name)) for other in obstacles)
+    # in the order of a proposition's own measurement, so that the kernel computes it only once
+    return [swapped if swapped.expression in measured else each for each, swapped in pairs]
 
 
-class _Poses:
-    """Measurements with one object of a sample in several poses, and all others in place.
+def distance_between(one: str, other: str) -> Atom:
+    """Return the atom whose robustness is the signed distance of two objects."""
+    return Atom("", "dist", SignedDistance(TrackedName(one), TrackedName(other)))
 
-    Each thread needs its own, since it measures in the same room each time.
 
-    Args:
-        here: a trace of the one sample.
-        tracked, name: the object.
-        formulas: without temporal operators, with `regions`.
-        obstacles: those that are no objects of the sample.
-        centres, turns: (M, 2) and (A,), poses of which all others have the number.
-    """
-
-    def __init__(
-        self,
-        here: Trace,
-        tracked: TrackedObject,
-        name: str,
-        formulas: Sequence[Formula],
-        regions: Mapping[str, Outline],
-        obstacles: Sequence[Footprint],
-        centres: Floats,
-        turns: Floats,
-    ) -> None:
-        everywhere = _trace_over_poses(here, tracked, name, centres, turns)
-        scene = TraceScene(everywhere, regions)
-        self._leaves, self._turns = MovedLeaves(scene, formulas, {}), turns
-        batch = scene.batch
-        self._static = None
-        if obstacles:
-            # after all others, so that these stay in their places
-            rows = np.tile(np.arange(len(obstacles), dtype=np.int64) + len(batch), (len(everywhere), 1))
-            batch = FootprintBatch.concatenate([batch, FootprintBatch.from_footprints(obstacles)])
-            operands = (Operand(everywhere.rows[:, [everywhere.names.index(name)]]), Operand(rows))
-            self._static = Remeasured(batch, operands, [MeasureRequest("signed_distance", 0, 1)])
-        self._vertices = batch.vertices.copy()
-        self._corners = np.concatenate([part.vertices for part in tracked.footprint.parts])
-        self._centre = np.array(centre_of(tracked.footprint))
-        self._first = len(here.footprints.vertices)
-        self._shape = (len(turns), len(centres))
-
-    def another(self) -> _Poses:
-        """Return the same with room of its own."""
-        made = copy(self)
-        made._vertices, made._leaves = self._vertices.copy(), self._leaves.another()
-        made._static = self._static and self._static.another()
-        return made
-
-    def suits(self, turns: Floats) -> bool:
-        """Return whether these poses can be turned by the given angles (A,), too."""
-        return not self._leaves.compares_turns or np.array_equal(turns, self._turns)
-
-    def measure(self, centres: Floats, turns: Floats) -> tuple[Floats, Floats]:
-        """Return the lower and the upper end of K formulas, and the distance to the nearest obstacle.
-
-        Args:
-            centres, turns: (M, 2) and (A,).
-
-        Returns:
-            (C, K, A, M), with C = 1 where both ends are equal everywhere, and (A, M), +inf without obstacles.
-        """
-        places = self._vertices[self._first : self._first + math.prod(self._shape) * len(self._corners)]
-        placed = places.reshape(*self._shape, *self._corners.shape)
-        for number, turn in enumerate(turns.tolist()):
-            fill_placed(self._corners, self._centre, centres, turn, placed[number])
-        found = self._leaves.values(self._vertices)[:2]
-        static = np.full(self._shape, np.inf)
-        if self._static is not None:
-            static = self._static.measure(self._vertices)[0].reshape(self._shape)
-        return found.reshape(*found.shape[:2], *self._shape), static
+def _static_distance(trace: Trace, name: str, obstacles: Sequence[Footprint]) -> Floats:
+    """Return (T,): the distance from an object to the nearest of obstacles; +inf without any."""
+    if not obstacles:
+        return np.full(len(trace), np.inf)
+    batch = FootprintBatch.concatenate([trace.footprints, FootprintBatch.from_footprints(obstacles)])
+    rows = np.tile(np.arange(len(trace.footprints), len(batch)), (len(trace), 1))
+    operands = Operand(trace.rows[:, [trace.names.index(name)]]), Operand(rows)
+    return np.asarray(measure(batch, operands, [MeasureRequest("signed_distance", 0, 1)])[0])
 
 
 def _trace_over_poses(
@@ -535,17 +414,24 @@ def map_layers(
     """
     parts, shape = gradient.made_of, gradient.blocked.shape
     formulas = parts.then.about.propositions
-    progress = _any([_every([_Part(formulas[n], wanted) for n, wanted in cube]) for cube in parts.progress])
-    leaves = tuple(dict.fromkeys(_leaves(progress)))
+    cubes = [[_Part.of(formulas[number], wanted) for number, wanted in cube] for cube in parts.progress]
+    leaves = tuple(dict.fromkeys(leaf for cube in cubes for each in cube for leaf in each.leaves()))
     lower, upper = _measured(parts.then, [each.formula for each in leaves])
     layers = np.empty((len(leaves), *shape))
     for place, leaf in enumerate(leaves):
         layers[place] = lower[place] if leaf.wanted else -upper[place]
     places = {leaf: place for place, leaf in enumerate(leaves)}
-    _, limiting = _limit(progress, layers, places)
+    limits = (
+        _limit_of([each.limit(layers, places) for each in cube], shape, is_every=True) for cube in cubes
+    )
+    _, limiting = _limit_of(limits, shape, is_every=False)
     causes, blocked_by = _causes(gradient, avoided_cells(gradient, settings, failed))
     texts = tuple(each.text for each in leaves)
-    return MapLayers(texts, layers, np.broadcast_to(limiting, shape), causes, blocked_by)
+    return MapLayers(texts, layers, limiting, causes, blocked_by)
+
+
+_Limit: TypeAlias = tuple[Floats, NDArray[np.int64]]
+"""Robustness in each cell, and the number of the relation that has it; -1 if there is none."""
 
 
 class _Part(NamedTuple):
@@ -554,60 +440,57 @@ class _Part(NamedTuple):
     formula: Formula
     wanted: bool
 
+    @classmethod
+    def of(cls, formula: Formula, wanted: bool) -> _Part:
+        """Return a part without definitions and negations around it."""
+        formula = expand(formula)
+        if isinstance(formula, Boolean) and formula.operator == "not":
+            return cls.of(formula.operands[0], not wanted)
+        return cls(formula, wanted)
+
     @property
     def text(self) -> str:
-        text = format_formula(self.formula)
-        return text if self.wanted else f"not ({text})"
+        return literal_text(self.formula, self.wanted)
+
+    @property
+    def members(self) -> list[_Part]:
+        """The parts that it is made of; none of a relation."""
+        operands = self.formula.operands if isinstance(self.formula, Boolean) else ()
+        return [_Part.of(each, self.wanted) for each in operands]
+
+    @property
+    def is_every(self) -> bool:
+        """Whether all its members have to hold, not any one."""
+        return not isinstance(self.formula, Boolean) or (self.formula.operator == "and") == self.wanted
+
+    def leaves(self) -> Iterator[_Part]:
+        """Iterate over the relations that it is made of."""
+        members = self.members
+        yield from chain.from_iterable(each.leaves() for each in members) if members else (self,)
+
+    def options(self) -> Iterator[_Part]:
+        """Iterate over parts of which any one has to hold for this to hold."""
+        yield from (self,) if self.is_every else chain.from_iterable(each.options() for each in self.members)
+
+    def limit(self, layers: Floats, places: Mapping[_Part, int]) -> _Limit:
+        """Return its robustness, and which of its relations has it, by layers of these."""
+        shape = layers.shape[1:]
+        if (place := places.get(self)) is not None:
+            return layers[place], np.full(shape, place, np.int64)
+        limits = (each.limit(layers, places) for each in self.members)
+        return _limit_of(limits, shape, is_every=self.is_every)
 
 
-class _Joined(NamedTuple):
-    """Parts of which every one has to hold, or any one."""
-
-    is_every: bool
-    members: tuple[_Part | _Joined, ...]
-
-
-def _every(members: Iterable[_Part | _Joined]) -> _Joined:
-    return _Joined(True, tuple(map(_split, members)))
+def literal_text(formula: Formula, wanted: bool) -> str:
+    """Return a formula that has to hold, or its negation, as text."""
+    text = format_formula(formula)
+    return text if wanted else f"not ({text})"
 
 
-def _any(members: Iterable[_Part | _Joined]) -> _Joined:
-    return _Joined(False, tuple(map(_split, members)))
-
-
-def _split(part: _Part | _Joined) -> _Part | _Joined:
-    """Return a part as what it is made of, down to relations."""
-    if isinstance(part, _Joined):
-        return part
-    formula, wanted = expand(part.formula), part.wanted
-    if not isinstance(formula, Boolean):
-        return _Part(formula, wanted)
-    if formula.operator == "not":
-        return _split(_Part(formula.operands[0], not wanted))
-    members = (_Part(each, wanted) for each in formula.operands)
-    return _every(members) if (formula.operator == "and") == wanted else _any(members)
-
-
-def _leaves(part: _Part | _Joined) -> Iterator[_Part]:
-    if isinstance(part, _Part):
-        yield part
-    else:
-        for each in part.members:
-            yield from _leaves(each)
-
-
-def _limit(
-    part: _Part | _Joined, layers: Floats, places: Mapping[_Part, int]
-) -> tuple[Floats, NDArray[np.int64]]:
-    """Return the robustness of a part in each cell, and the leaf that has it; -1 if there is none."""
-    if isinstance(part, _Part):
-        place = places[part]
-        return layers[place], np.full(layers.shape[1:], place, np.int64)
-    value = np.full(layers.shape[1:], np.inf if part.is_every else -np.inf)
-    limiting = np.full(layers.shape[1:], -1, np.int64)
-    for each in part.members:
-        other, its_limiting = _limit(each, layers, places)
-        better = other < value if part.is_every else other > value
+def _limit_of(parts: Iterable[_Limit], shape: tuple[int, ...], *, is_every: bool) -> _Limit:
+    value, limiting = np.full(shape, np.inf if is_every else -np.inf), np.full(shape, -1, np.int64)
+    for other, its_limiting in parts:
+        better = other < value if is_every else other > value
         value, limiting = np.where(better, other, value), np.where(better, its_limiting, limiting)
     return value, limiting
 
@@ -661,7 +544,7 @@ def most_dangerous(parts: MapParts, shape: tuple[int, ...]) -> tuple[tuple[str, 
     guards: list[tuple[_Part, ...]] = []
     for cube in parts.constraints:
         literals = tuple(_Part(formulas[number], wanted) for number, wanted in cube)
-        guards += [(each,) for each in _options(literals[0])] if len(literals) == 1 else [literals]
+        guards += [(each,) for each in _Part.of(*literals[0]).options()] if len(literals) == 1 else [literals]
     guards = list(dict.fromkeys(guards))
     members = list(dict.fromkeys(each for guard in guards for each in guard))
     lower, upper = _measured(parts.now, [each.formula for each in members])
@@ -673,18 +556,6 @@ def most_dangerous(parts: MapParts, shape: tuple[int, ...]) -> tuple[tuple[str, 
         which[robustness > danger] = number
         np.maximum(danger, robustness, out=danger)
     return tuple(" and ".join(each.text for each in guard) for guard in guards), which
-
-
-def _options(part: _Part) -> Iterator[_Part]:
-    """Iterate over parts of which any one has to hold for a part to hold."""
-    formula, wanted = expand(part.formula), part.wanted
-    if isinstance(formula, Boolean) and formula.operator == "not":
-        yield from _options(_Part(formula.operands[0], not wanted))
-    elif isinstance(formula, Boolean) and (formula.operator == "or") == wanted:
-        for each in formula.operands:
-            yield from _options(_Part(each, wanted))
-    else:
-        yield _Part(formula, wanted)
 
 
 def near(failed: Collection[tuple[float, float]], grid: Grid) -> Booleans:

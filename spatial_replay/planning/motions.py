@@ -17,7 +17,7 @@ from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.guards import Transition
 from spatial_replay.geometry.arrays import Booleans, Floats
 from spatial_replay.geometry.footprint import Footprint, TrackedObject, centre_of, moved_object, radius_of
-from spatial_replay.planning.decisions import Candidate, Consideration, Guards, Reason, Target
+from spatial_replay.planning.decisions import Candidate, Consideration, Guards, Reason, Target, points_along
 from spatial_replay.planning.edges import (
     BESIDE,
     Attempts,
@@ -41,6 +41,7 @@ from spatial_replay.planning.maps import (
     PropositionMaps,
     concerns,
     danger_of,
+    distance_between,
     distance_to,
     gradient_map,
     most_dangerous,
@@ -55,11 +56,10 @@ from spatial_replay.planning.targets import (
     find_target,
     is_repeated,
     nearest_target,
-    points_along,
     refined,
     target_in,
 )
-from spatial_replay.spec.formula import Atom, Formula, Outline, SignedDistance, TrackedName
+from spatial_replay.spec.formula import Formula, Outline
 from spatial_replay.trace.trace import Sample
 
 # ------------------------------------------------------------------------------------------------- candidates
@@ -379,7 +379,7 @@ class Expectations:
     def clearances(self, sample: Sample, name: str, others: Collection[str]) -> list[float]:
         """Return the distance of an object of a sample to each of others."""
         self.budget.spend(_LOOK)
-        apart = [Atom("", "dist", SignedDistance(TrackedName(name), TrackedName(each))) for each in others]
+        apart = [distance_between(name, each) for each in others]
         return values_in(sample, apart, self.regions)[0] if apart else []
 
     def movables(self, scene: PredictedState) -> Movables:

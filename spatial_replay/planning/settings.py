@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from os import PathLike
 from types import MappingProxyType
 from typing import Any, Final, Literal, TypeAlias
@@ -285,19 +285,6 @@ RoomFrom: TypeAlias = Literal["later", "all"]
 
 _SKILLS = ("push", "place")
 _ROOM_FROM = ("later", "all")
-_PLAIN = (
-    "skill",
-    "movable",
-    "margin",
-    "constraint_margin",
-    "room",
-    "room_from",
-    "attempts",
-    "motions",
-    "lift",
-    "refine",
-)
-"""Settings that stand in the text as they are."""
 
 
 @named_arguments
@@ -360,6 +347,10 @@ class Settings:
         if self.room_from not in _ROOM_FROM:
             yield f"room_from is {self.room_from!r}; give {' or '.join(_ROOM_FROM)}"
         yield from kind_faults("refine", self.refine, bool, "True or False")
+
+
+_PLAIN: Final = tuple(each.name for each in fields(Settings) if each.name != "workspace")
+"""Settings that stand in the text as they are."""
 
 
 def text_from_settings(settings: Settings) -> str:

@@ -6,7 +6,7 @@ A target is then refined: from the middle of its cell to a better place and turn
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import Final
@@ -15,7 +15,7 @@ import numpy as np
 
 from spatial_replay.geometry.arrays import Booleans, Floats
 from spatial_replay.geometry.footprint import TrackedObject, centre_of, radius_of
-from spatial_replay.planning.decisions import Target
+from spatial_replay.planning.decisions import Target, points_along
 from spatial_replay.planning.maps import (
     CONSTRAINED,
     FREE,
@@ -120,14 +120,6 @@ def nearest_target(
         return _nearest_cell(gradient, good, tracked, settings, failures)
     away = distance_to([centre_of(tracked.footprint)], gradient.grid)
     return _best_target(gradient, np.where(good, -away, -np.inf), tracked)
-
-
-def points_along(waypoints: Sequence[tuple[float, float]], step: float) -> Iterator[tuple[float, float]]:
-    """Yield points on a way, no farther apart than a step."""
-    yield waypoints[0]
-    for (u, v), (x, y) in pairwise(waypoints):
-        count = max(1, math.ceil(math.dist((u, v), (x, y)) / step))
-        yield from ((u + k / count * (x - u), v + k / count * (y - v)) for k in range(1, count + 1))
 
 
 def _best_target(gradient: GradientMap, values: Floats, tracked: TrackedObject) -> Target:

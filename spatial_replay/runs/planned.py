@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Any, Final, Unpack
 
 from spatial_replay.annotate.automaton_state import SpecAutomaton
 from spatial_replay.annotate.specification import logged_specifications
@@ -33,7 +33,7 @@ from spatial_replay.runs.scripted import RunLog, about_run, refuse_unknown_names
 from spatial_replay.runs.virtual_camera import open_film
 from spatial_replay.sanity import refuse_unsatisfiable
 from spatial_replay.simulation.tabletop import SAMPLES_PER_S, Tabletop, default_specification, make_world
-from spatial_replay.simulation.world import Injection, Start, TreeTick
+from spatial_replay.simulation.world import Conditions, TreeTick
 from spatial_replay.spec import parse_specification
 from spatial_replay.spec.formula import Atom, Formula, Misalignment, Specification
 from spatial_replay.spec.walks import base_of, iter_expressions, iter_formulas
@@ -127,10 +127,8 @@ def execute_in(world: Tabletop, settings: Settings, step: Step) -> Outcome:
     if settings.skill == "push":
         # strokes turn objects, which matters only where orientations are planned
         yaw = target.yaw if settings.workspace.yaws else None
-        done = world.push(target.name, target.waypoints[1:] or target.waypoints, yaw)
-    else:
-        done = world.place(target.name, target.x, target.y, target.yaw, target.waypoints[1:-1])
-    return Outcome(done.succeeded, done.reason, done.at)
+        return world.push(target.name, target.waypoints[1:] or target.waypoints, yaw)
+    return world.place(target.name, target.x, target.y, target.yaw, target.waypoints[1:-1])
 
 
 class PlanLoop:
@@ -229,11 +227,6 @@ def record_plan(
     file: Specification | None = None,
     *,
     name: str | None = None,
-    seed: int = 0,
-    noise_m: float = 0.0,
-    injections: Sequence[Injection] = (),
-    starts: Sequence[Start] = (),
-    gui: bool = False,
     cameras: Sequence[Path] = (),
     inputs: Sequence[Path] = (),
     advance: Callable[[int], None] = lambda samples: None,
@@ -241,6 +234,7 @@ def record_plan(
     changes: Mapping[str, Any] = MappingProxyType({}),
     timings: bool = False,
     also: Sequence[Specification] = (),
+    **conditions: Unpack[Conditions],
 ) -> PlannedRun:
     """Let a planner satisfy a specification in a scenario's world; equal arguments give equal bytes.
 
@@ -248,7 +242,6 @@ def record_plan(
         file: the specification to plan for; None takes that of the scenario.
         also: further specifications to evaluate, of which the planner knows nothing.
         name: the result to plan for, if there are several. All are evaluated.
-        starts: where bodies are at the beginning, in place of where the seed puts them.
         cameras: one or two videos to make of the run; beside the first, their tags file is written.
         inputs: files that the output must not be.
         advance: called with the number of new samples.
@@ -268,11 +261,9 @@ def record_plan(
     _refuse_missing(kept, name)
     for planned in [name] if name else [spec.name for spec in kept.results if len(kept.results) == 1]:
         refuse_unsatisfiable(kept, planned)
-    made = about_run(scenario, seed=seed, noise_m=noise_m, injections=injections, starts=starts)
-    about = {**made, "planned": "true"}
+    about = {**about_run(scenario, **conditions), "planned": "true"}
     # an error in the world or the planner leaves the output untouched
-    opened = make_world(scenario, seed=seed, noise_m=noise_m, injections=injections, starts=starts, gui=gui)
-    with closing(opened) as world:
+    with closing(make_world(scenario, **conditions)) as world:
         refuse_unknown_names([kept, *others], world.sample())
         spec = chosen_spec(kept, name)
         settings = _settings(world, spec.formula, changes)
@@ -281,7 +272,7 @@ def record_plan(
         # a replay does not know the rate, and has no automaton for bounds in seconds: neither has the log
         known = [SpecAutomaton(spec.name, kept, spec, planner.automaton)] if planner.rate_hz is None else []
         with (
-            open_film(world, cameras, seed=seed) as film,
+            open_film(world, cameras, seed=conditions.get("seed", 0)) as film,
             run_log(output, [kept, *others], about, inputs, known, durability) as log,
         ):
             log.add_metadata(PLAN_METADATA, plan_metadata(planner, kept.filename))

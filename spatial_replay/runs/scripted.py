@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Unpack
 
 import numpy as np
 
@@ -17,11 +18,12 @@ from spatial_replay.logs.mcap.write import LogWriter
 from spatial_replay.logs.messages import Channel, Messages, merge, messages_of
 from spatial_replay.logs.output_file import Durability, open_output, refuse_inputs
 from spatial_replay.monitor.verdict import Verdict
+from spatial_replay.planning.decisions import Outcome
 from spatial_replay.recording.log import Recording, RunEnd, refuse_templates
 from spatial_replay.recording.recorder import leaving, terminable, uninterrupted
 from spatial_replay.runs.virtual_camera import Film, open_film
 from spatial_replay.simulation.tabletop import Tabletop, default_specification, make_world
-from spatial_replay.simulation.world import Execution, Injection, Start
+from spatial_replay.simulation.world import Conditions
 from spatial_replay.spec import check_names
 from spatial_replay.spec.formula import Specification
 from spatial_replay.trace.trace import Sample, Trace
@@ -204,24 +206,19 @@ def record_script(
     output: Path,
     files: Sequence[Specification] | None = None,
     *,
-    seed: int = 0,
     duration_ns: int | None = None,
-    noise_m: float = 0.0,
-    injections: Sequence[Injection] = (),
-    starts: Sequence[Start] = (),
-    gui: bool = False,
     cameras: Sequence[Path] = (),
     inputs: Sequence[Path] = (),
     advance: Callable[[int], None] = lambda samples: None,
     durability: Durability = "process",
+    **conditions: Unpack[Conditions],
 ) -> SimulatedRun:
     """Record a scenario's world while its robot follows the script; equal arguments give equal bytes.
 
     Args:
         files: specifications to evaluate during the run; None takes that of the scenario.
-        starts: where bodies are at the beginning, in place of where the seed puts them.
-        cameras: one or two videos to make of the run; beside the first, their tags file is written.
         duration_ns: duration in simulated time; None ends with the script.
+        cameras: one or two videos to make of the run; beside the first, their tags file is written.
         inputs: files that the output must not be.
         advance: called with the number of new samples.
         durability: "disk" for a log of which the disk has each chunk as soon as it is written.
@@ -234,13 +231,12 @@ def record_script(
     if duration_ns is not None and duration_ns <= 0:
         raise UsageError("a run of 0 s has no sample; give a longer duration")
     files = [default_specification(scenario)] if files is None else list(files)
-    about = about_run(scenario, seed=seed, noise_m=noise_m, injections=injections, starts=starts)
+    about = about_run(scenario, **conditions)
     # an error in the world or a missing name leaves the output untouched
-    made = make_world(scenario, seed=seed, noise_m=noise_m, injections=injections, starts=starts, gui=gui)
-    with closing(made) as world:
+    with closing(make_world(scenario, **conditions)) as world:
         refuse_unknown_names(files, world.sample())
         with (
-            open_film(world, cameras, seed=seed) as film,
+            open_film(world, cameras, seed=conditions.get("seed", 0)) as film,
             run_log(output, files, about, inputs, durability=durability) as log,
         ):
             result = _follow_script(world, log, film, duration_ns, advance)
@@ -248,32 +244,24 @@ def record_script(
         return SimulatedRun(log.samples, log.seconds, tuple(world.scene.bodies), outcome)
 
 
-def simulate_script(
-    scenario: str,
-    *,
-    seed: int = 0,
-    noise_m: float = 0.0,
-    injections: Sequence[Injection] = (),
-    starts: Sequence[Start] = (),
-) -> list[Sample]:
+def simulate_script(scenario: str, **conditions: Unpack[Conditions]) -> list[Sample]:
     """Return the samples of a scripted run without a log; those that `record_script` records.
 
     Raises:
         UsageError: no such scenario, no simulator.
     """
     samples: list[Sample] = []
-    made = make_world(scenario, seed=seed, noise_m=noise_m, injections=injections, starts=starts)
-    with closing(made) as world:
+    with closing(make_world(scenario, **conditions)) as world:
         world.attach(samples.append)
         world.follow(world.script(), None)
     return samples
 
 
-def about_run(
-    scenario: str, *, seed: int, noise_m: float, injections: Sequence[Injection], starts: Sequence[Start]
-) -> dict[str, str]:
+def about_run(scenario: str, **conditions: Unpack[Conditions]) -> dict[str, str]:
     """Return the metadata about how a run was made."""
-    options = {"seed": seed, "noise_m": noise_m, "inject": [str(each) for each in injections]}
+    seed, starts = conditions.get("seed", 0), conditions.get("starts", ())
+    injected = [str(each) for each in conditions.get("injections", ())]
+    options = {"seed": seed, "noise_m": conditions.get("noise_m", 0.0), "inject": injected}
     if starts:
         options["start"] = [str(each) for each in starts]
     # worlds are simulated in metres
@@ -283,7 +271,7 @@ def about_run(
 
 def _follow_script(
     world: Tabletop, log: RunLog, film: Film | None, duration_ns: int | None, advance: Callable[[int], None]
-) -> Execution | None:
+) -> Outcome | None:
     """Follow the script and log every sample; return its result, None if the duration ended before it."""
 
     def observe(sample: Sample) -> None:

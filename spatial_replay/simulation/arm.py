@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import islice
 from typing import TypeAlias
 
 import numpy as np
@@ -13,8 +13,9 @@ import numpy as np
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.geometry.footprint import Footprint, FootprintBatch
 from spatial_replay.geometry.measure import MeasureRequest, Operand, measure
+from spatial_replay.planning.decisions import Outcome, Stage, points_along
 from spatial_replay.simulation.bullet import REST, STEPS_PER_S, Engine, downwards, joints_for, tool_frame
-from spatial_replay.simulation.world import Body, Box, Execution, Pose, Stage, TreeTick, footprint, height
+from spatial_replay.simulation.world import Body, Box, Pose, TreeTick, footprint, height, rectangle
 
 TICKS_PER_S = 60
 """Commands of the arm per second."""
@@ -237,13 +238,6 @@ def extent(covered: Footprint, angle: float) -> tuple[float, float]:
     return low, max(float(values.max()) + radius for values, radius in spans)
 
 
-def rectangle(x: float, y: float, length: float, width: float, yaw: float) -> Footprint:
-    """Return a rectangle around a point, with its length along `yaw`."""
-    turn = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])
-    corners: Floats = np.array([(1, 1), (-1, 1), (-1, -1), (1, -1)]) * np.array([length, width]) / 2
-    return Footprint.polygon(corners @ turn + np.array([x, y]))
-
-
 # ----------------------------------------------------------------------------------------------------- grasps
 
 Point = tuple[float, float]
@@ -280,21 +274,21 @@ class Grasp:
 
 def best_grasp(
     scene: Scene, name: str, goal: Point, yaw: float | None, *, is_lifted: bool = True
-) -> Grasp | Execution:
+) -> Grasp | Outcome:
     """Return the grasp with the most clearance, preferring thin sides; or the failure if there is none.
 
     A body that is not lifted is turned the shorter way round.
     """
     start = scene.place_of(name)
     if not in_reach(*start):
-        return Execution(False, f"{name} lies out of the robot's reach", "pick")
+        return Outcome(False, f"{name} lies out of the robot's reach", "pick")
     if not in_reach(*goal):
-        return Execution(False, f"({goal[0]:.2f}, {goal[1]:.2f}) is out of the robot's reach", "place")
+        return Outcome(False, f"({goal[0]:.2f}, {goal[1]:.2f}) is out of the robot's reach", "place")
     angles = _angles(scene, name)
     across = [(thickness, angle) for thickness, angle in angles if thickness <= _THICKEST]
     if not across:
         thinnest = f"{min(angles)[0] * 100:.1f} cm, and {_THICKEST * 100:.1f} cm fit between the fingers"
-        return Execution(False, f"{name} is too thick for the gripper as it lies: {thinnest}", "pick")
+        return Outcome(False, f"{name} is too thick for the gripper as it lies: {thinnest}", "pick")
     bottom, top = scene.height(name)
     above_bottom = max(FINGERTIP + 0.003, top - bottom - _BELOW_TOP)
     best, best_room, can_turn_hand, can_pick, can_place = None, _ROOM, False, False, False
@@ -312,14 +306,14 @@ def best_grasp(
     if best is not None:
         return best
     if not can_turn_hand:
-        return Execution(False, f"the hand cannot turn as far as {name} has to be turned", "place")
+        return Outcome(False, f"the hand cannot turn as far as {name} has to be turned", "place")
     if can_pick and can_place:
         said = f"no grasp of {name} has room for the fingers both where it lies and where it should go"
-        return Execution(False, said, "place")
+        return Outcome(False, said, "place")
     where = (
         "where it lies" if can_place else "where it should go" if can_pick else "where it lies and should go"
     )
-    return Execution(False, f"no room for the fingers around {name} {where}", "place" if can_pick else "pick")
+    return Outcome(False, f"no room for the fingers around {name} {where}", "place" if can_pick else "pick")
 
 
 def surface(scene: Scene, name: str, goal: Point) -> float:
@@ -391,10 +385,10 @@ _NEAR = 0.02
 
 def picking(
     scene: Scene, name: str, goal: Point, yaw: float | None, via: Sequence[Point] = ()
-) -> Generator[None, None, Execution]:
+) -> Generator[None, None, Outcome]:
     """Pick a body up and place its centre at a point, along others, with `yaw` unless that is None."""
     grasp = best_grasp(scene, name, goal, yaw)
-    if isinstance(grasp, Execution):
+    if isinstance(grasp, Outcome):
         return grasp
     stood = scene.pose(name).stands
     at: Stage = "pick"
@@ -405,7 +399,7 @@ def picking(
         at, trouble = "place", (yield from set_down(scene, name, goal))
     yield from let_go(scene, grasp.opening)
     trouble = trouble or missed(scene, name, goal, stood=stood)
-    return Execution(False, trouble, at) if trouble else Execution(True, f"placed {name}")
+    return Outcome(False, trouble, at) if trouble else Outcome(True, f"placed {name}")
 
 
 def pick_up(scene: Scene, name: str, grasp: Grasp) -> Generator[None, None, str]:
@@ -435,7 +429,9 @@ def carry(
     scene: Scene, name: str, grasp: Grasp, goal: Point, via: Sequence[Point] = ()
 ) -> Generator[None, None, str]:
     """Move the held body above a point, along others; return the reason of a failure, or ""."""
-    for point in _fine(scene.place_of(name), (*via, goal)) if via else (goal,):
+    # the tool's way hardly leaves straight lines between points that are so close
+    way = (scene.place_of(name), *via, goal)
+    for point in islice(points_along(way, _STRAIGHT), 1, None) if via else (goal,):
         x, y = _tool_for(scene, name, point, grasp.turn)
         carried = yield from _holding(scene, name, scene.arm.travel(x, y, grasp.turn))
         if not carried:
@@ -446,7 +442,7 @@ def carry(
 def turn_on_the_spot(scene: Scene, name: str, yaw: float) -> Generator[None, None, str]:
     """Turn a body on its support between the fingers; return the reason of a failure, or ""."""
     grasp = best_grasp(scene, name, scene.place_of(name), yaw, is_lifted=False)
-    if isinstance(grasp, Execution):
+    if isinstance(grasp, Outcome):
         return grasp.reason
     trouble = yield from take_hold(scene, name, grasp)
     if not trouble:
@@ -461,16 +457,6 @@ def put_back(scene: Scene, name: str) -> Motion:
     if scene.engine.fingers_touching(name):
         yield from set_down(scene, name, scene.place_of(name))
     yield from let_go(scene, WIDEST)
-
-
-def _fine(start: Point, points: Sequence[Point]) -> list[Point]:
-    """Return points along straight lines, so close that the tool's way hardly leaves these."""
-    fine = []
-    for begin, end in pairwise((start, *points)):
-        count = max(1, math.ceil(math.dist(begin, end) / _STRAIGHT))
-        shares = (step / count for step in range(1, count + 1))
-        fine += [(begin[0] + s * (end[0] - begin[0]), begin[1] + s * (end[1] - begin[1])) for s in shares]
-    return fine
 
 
 def set_down(scene: Scene, name: str, goal: Point) -> Generator[None, None, str]:
@@ -544,7 +530,7 @@ _STROKES = 4
 
 def pushing(
     scene: Scene, name: str, path: Sequence[Point], yaw: float | None = None
-) -> Generator[None, None, Execution]:
+) -> Generator[None, None, Outcome]:
     """Push a body along a path, one stroke for each straight stretch, with corrections at the end.
 
     With `yaw`, turn it there: a stroke also turns a body a little, as its side comes to lie at the fingers.
@@ -558,16 +544,16 @@ def pushing(
     if trouble is not None:
         return trouble
     if turning := (yield from _turn_to(scene, name, corners[-1], yaw)):
-        return Execution(False, turning, "place")
+        return Outcome(False, turning, "place")
     is_straight = len(corners) == 1
     way = "straight to its place" if is_straight else f"along {len(corners)} straight stretches"
     turned = "" if yaw is None else ", and turned it there"
-    return Execution(True, f"pushed {name} {way}{turned}")
+    return Outcome(True, f"pushed {name} {way}{turned}")
 
 
 def _push_to(
     scene: Scene, name: str, goal: Point, *, strokes: int, allowed: float
-) -> Generator[None, None, Execution | None]:
+) -> Generator[None, None, Outcome | None]:
     """Push a body to a point in several strokes; return the failure, if it fails."""
     missed = 0.0
     for _ in range(strokes):
@@ -579,7 +565,7 @@ def _push_to(
             break
     if missed <= allowed:
         return None
-    return Execution(False, f"{name} ended {missed * 100:.1f} cm from where it was pushed to", "place")
+    return Outcome(False, f"{name} ended {missed * 100:.1f} cm from where it was pushed to", "place")
 
 
 def _turn_to(scene: Scene, name: str, goal: Point, yaw: float | None) -> Generator[None, None, str]:
@@ -617,7 +603,7 @@ def straightened(path: Sequence[Point]) -> list[Point]:
     return straightened(path[: farthest + 1])[:-1] + straightened(path[farthest:])
 
 
-def _stroke(scene: Scene, name: str, goal: Point) -> Generator[None, None, Execution | None]:
+def _stroke(scene: Scene, name: str, goal: Point) -> Generator[None, None, Outcome | None]:
     """Push a body straight towards a point; return the failure, if it fails."""
     x, y = scene.place_of(name)
     length = math.dist((x, y), goal)
@@ -629,12 +615,12 @@ def _stroke(scene: Scene, name: str, goal: Point) -> Generator[None, None, Execu
     behind = (x - u * (back + _AWAY), y - v * (back + _AWAY))
     if not in_reach(*goal):
         said = f"the robot does not reach ({goal[0]:.2f}, {goal[1]:.2f}), where {name} should go"
-        return Execution(False, said, "place")
+        return Outcome(False, said, "place")
     if not in_reach(*behind):
-        return Execution(False, f"the robot does not reach behind {name} where it lies", "pick")
+        return Outcome(False, f"the robot does not reach behind {name} where it lies", "pick")
     gap = _gap(scene, name, behind, heading)
     if gap is None:
-        return Execution(False, f"no room for the fingers behind {name}", "pick")
+        return Outcome(False, f"no room for the fingers behind {name}", "pick")
     arm = scene.arm
     yield from arm.travel(*behind, turn_towards(heading, *behind))
     yield from arm.grip(gap)
@@ -644,7 +630,7 @@ def _stroke(scene: Scene, name: str, goal: Point) -> Generator[None, None, Execu
     x, y, z = arm.commanded
     yield from arm.move(x - 0.02 * u, y - 0.02 * v, z)
     yield from arm.move(x - 0.02 * u, y - 0.02 * v, 0.1)
-    return None if reached else Execution(False, f"the fingers lost {name}", "way")
+    return None if reached else Outcome(False, f"the fingers lost {name}", "way")
 
 
 def _advance(

@@ -8,12 +8,14 @@ from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from importlib import import_module, resources
 from types import MappingProxyType
-from typing import TypeVar
+from typing import TypeVar, Unpack
 
 import numpy as np
 
 from spatial_replay.errors import UsageError, importing
 from spatial_replay.geometry.footprint import TrackedObject
+from spatial_replay.planning.decisions import Outcome
+from spatial_replay.planning.settings import Skill
 from spatial_replay.simulation.arm import (
     STEPS_PER_TICK,
     TICKS_PER_S,
@@ -30,11 +32,10 @@ from spatial_replay.simulation.bullet import Engine
 from spatial_replay.simulation.world import (
     Body,
     Box,
-    Execution,
+    Conditions,
     Injection,
     Pose,
     ReachableArea,
-    Skill,
     Start,
     TreeTick,
     footprint,
@@ -47,11 +48,11 @@ from spatial_replay.trace.trace import Sample
 
 # -------------------------------------------------------------------------------------------------- scenarios
 
-Placing = Callable[[Scene, str, Point, float | None, Sequence[Point]], Generator[None, None, Execution]]
+Placing = Callable[[Scene, str, Point, float | None, Sequence[Point]], Generator[None, None, Outcome]]
 """How the robot picks a body up, carries it along some points and places it: `picking`, or a behaviour tree
 around it."""
 
-Script = Callable[[Scene], Generator[None, None, Execution]]
+Script = Callable[[Scene], Generator[None, None, Outcome]]
 """The motion of the robot without a planner."""
 
 
@@ -135,15 +136,7 @@ class Tabletop:
         starts: Sequence[Start] = (),
         gui: bool = False,
     ) -> None:
-        """Create the world at time 0.
-
-        Args:
-            seed: of the initial poses and of the noise.
-            noise_m: the maximum error of detected positions, in metres; samples have it as uncertainty.
-            injections: failures, and when they happen.
-            starts: where bodies are at the beginning; the seed decides about the others.
-            gui: show a window, and run no faster than real time.
-        """
+        """Create the world at time 0; for the arguments see `Conditions`."""
         if noise_m < 0 or not math.isfinite(noise_m):
             raise UsageError(f"the noise is {noise_m} m; give 0 or more")
         for injection in injections:
@@ -249,7 +242,7 @@ class Tabletop:
         """Advance to the time of the next sample; the robot holds still."""
         self.run(self._scene.arm.wait(1 / SAMPLES_PER_S))
 
-    def push(self, name: str, path: Sequence[tuple[float, float]], yaw: float | None = None) -> Execution:
+    def push(self, name: str, path: Sequence[tuple[float, float]], yaw: float | None = None) -> Outcome:
         """Push an object along a path of points (x, y) of its centre, and turn it there to `yaw` if given.
 
         Raises:
@@ -261,7 +254,7 @@ class Tabletop:
 
     def place(
         self, name: str, x: float, y: float, yaw: float | None = None, via: Sequence[tuple[float, float]] = ()
-    ) -> Execution:
+    ) -> Outcome:
         """Pick an object up, carry it along points and place its centre at (x, y); None keeps its yaw.
 
         Raises:
@@ -270,7 +263,7 @@ class Tabletop:
         self._refuse_unless("place", name, [x, y, 0.0 if yaw is None else yaw])
         return self._move(name, self._scenario.placing(self._scene, name, (x, y), yaw, via))
 
-    def script(self) -> Generator[None, None, Execution]:
+    def script(self) -> Generator[None, None, Outcome]:
         """Return the motion of the robot without a planner."""
         return self._scenario.script(self._scene)
 
@@ -291,7 +284,7 @@ class Tabletop:
             self.tick()
         return None
 
-    def _move(self, name: str, motion: Generator[None, None, Execution]) -> Execution:
+    def _move(self, name: str, motion: Generator[None, None, Outcome]) -> Outcome:
         """Run a motion of a body to its end, or until the listener stops it."""
         self._halt = ""
         if (result := self.run(motion, lambda: self._halt)) is not None:
@@ -302,7 +295,7 @@ class Tabletop:
             self.run(put_back(self._scene, name))
         elif self._scene.arm.holds:
             self.run(let_go(self._scene, WIDEST))
-        return Execution(False, reason)
+        return Outcome(False, reason)
 
     def follow(self, motion: Generator[None, None, _Result], duration_ns: int | None) -> _Result | None:
         """Run a motion for a time; the robot holds still after its end. Return None if it does not end.
@@ -400,22 +393,13 @@ SCENARIOS: tuple[str, ...] = ("push", "pick-place", "table-setting")
 """Each has a module in `scenarios` and a specification next to it."""
 
 
-def make_world(
-    name: str,
-    *,
-    seed: int = 0,
-    noise_m: float = 0.0,
-    injections: Sequence[Injection] = (),
-    starts: Sequence[Start] = (),
-    gui: bool = False,
-) -> Tabletop:
-    """Create the world of a scenario at time 0; for the arguments see `Tabletop`.
+def make_world(name: str, **conditions: Unpack[Conditions]) -> Tabletop:
+    """Create the world of a scenario at time 0; for the arguments see `Conditions`.
 
     Raises:
         UsageError: there is no such scenario, or an argument of `Tabletop` is invalid.
     """
-    scenario = scenario_of(name)
-    return Tabletop(scenario, seed=seed, noise_m=noise_m, injections=injections, starts=starts, gui=gui)
+    return Tabletop(scenario_of(name), **conditions)
 
 
 def default_specification(name: str) -> Specification:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, TypeAlias, get_args
+from typing import Literal, NamedTuple, TypeAlias, TypedDict, get_args
 
 import numpy as np
 
@@ -89,7 +90,7 @@ def footprint(shape: Shape, pose: Pose) -> Footprint:
         case Cylinder(radius=radius) if pose.stands:
             return Footprint.disc(x, y, radius)
         case Box(length=length, width=width) if pose.stands:
-            return Footprint.polygon(_rectangle(x, y, length / 2, width / 2, pose.yaw))
+            return rectangle(x, y, length, width, pose.yaw)
         case _:
             return Footprint.polygon(_outline(shape, pose)[:, :2], concave="hull")
 
@@ -105,10 +106,11 @@ def height(shape: Shape, pose: Pose) -> tuple[float, float]:
     return z - half, z + half
 
 
-def _rectangle(x: float, y: float, a: float, b: float, yaw: float) -> list[tuple[float, float]]:
-    cosine, sine = math.cos(yaw), math.sin(yaw)
+def rectangle(x: float, y: float, length: float, width: float, yaw: float) -> Footprint:
+    """Return a rectangle around a point, with its length along `yaw`."""
+    a, b, cosine, sine = length / 2, width / 2, math.cos(yaw), math.sin(yaw)
     corners = ((a, b), (-a, b), (-a, -b), (a, -b))
-    return [(x + u * cosine - v * sine, y + u * sine + v * cosine) for u, v in corners]
+    return Footprint.polygon([(x + u * cosine - v * sine, y + u * sine + v * cosine) for u, v in corners])
 
 
 def _outline(shape: Shape, pose: Pose) -> Floats:
@@ -126,11 +128,6 @@ def _outline(shape: Shape, pose: Pose) -> Floats:
 
 
 # ----------------------------------------------------------------------------------------------------- worlds
-
-Skill = Literal["push", "place"]
-"""A motion of the robot: push an object along a path, or pick and place it."""
-Stage = Literal["pick", "way", "place"]
-"""Stages of a motion: picking the object, moving it, placing it at its goal."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,21 +166,6 @@ class ReachableArea:
     nearest: float = 0.0
     farthest: float = math.inf
     yaws: tuple[float, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class Execution:
-    """The result of a motion.
-
-    Attributes:
-        succeeded: whether the object is at its goal.
-        reason: what happened, as text.
-        at: the stage at which it failed; None if it is not known.
-    """
-
-    succeeded: bool
-    reason: str
-    at: Stage | None = None
 
 
 class TreeNode(NamedTuple):
@@ -292,3 +274,21 @@ class Start:
     def __str__(self) -> str:
         numbers = [self.x, self.y] + ([] if self.turn is None else [self.turn])
         return f"{self.name}={','.join(f'{number:.12g}' for number in numbers)}"
+
+
+class Conditions(TypedDict, total=False):
+    """How a world is simulated, as `make_world` takes it.
+
+    Attributes:
+        seed: of the initial poses and of the noise, 0 if not given.
+        noise_m: the maximum error of detected positions, in metres; samples have it as uncertainty.
+        injections: failures, and when they happen.
+        starts: where bodies are at the beginning; the seed decides about the others.
+        gui: show a window, and run no faster than real time.
+    """
+
+    seed: int
+    noise_m: float
+    injections: Sequence[Injection]
+    starts: Sequence[Start]
+    gui: bool

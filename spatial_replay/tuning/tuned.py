@@ -70,6 +70,15 @@ def last_before(inside: int, outside: int, holds: Callable[[int], bool]) -> int:
     return inside
 
 
+def least_for_all(runs: Iterable[int], most: int, holds: Callable[[int, int], bool]) -> int:
+    """Return the least number from which on `holds(run, number)` for every run; `most` if one never does."""
+    number = 0
+    for run in runs:
+        if not holds(run, number):
+            number = last_before(most, number, partial(holds, run))
+    return number
+
+
 def evolve(
     cost: Callable[[Sequence[int]], float], sizes: Sequence[int], start: Sequence[int], seed: int
 ) -> None:
@@ -173,24 +182,14 @@ class ExactSearch:
         uncovered = list(bad)
         for part in self._single:
             for axis in part.axes:
-                numbers[axis] = self._tightest(good, numbers, axis, level, part)
+                holds = partial(self._holds_at, numbers, axis, level, part.results)
+                numbers[axis] = least_for_all(good, self._steps[axis], holds)
             if not all(self._holds(run, numbers, level, part.results) for run in good):
                 return Feasibility(None)
             uncovered = [run for run in uncovered if not self._holds(run, numbers, level, part.results)]
         if not self._joint.axes:
             return Feasibility(None if uncovered else tuple(numbers))
         return self._in_boxes(good, uncovered, numbers, level)
-
-    def _tightest(
-        self, good: Sequence[int], numbers: Sequence[int], axis: int, level: float, part: _Part
-    ) -> int:
-        """Return the least number of an axis from which on good runs hold; all steps if one never does."""
-        number = 0
-        for run in good:
-            holds = partial(self._holds_at, run, numbers, axis, level, part.results)
-            if not holds(number):
-                number = last_before(self._steps[axis], number, holds)
-        return number
 
     def _in_boxes(
         self, good: Sequence[int], bad: Sequence[int], numbers: Sequence[int], level: float
@@ -249,7 +248,7 @@ class ExactSearch:
         return self._margins.holds(run, self._point_of(numbers), level, results)
 
     def _holds_at(
-        self, run: int, numbers: Sequence[int], axis: int, level: float, results: Sequence[str], number: int
+        self, numbers: Sequence[int], axis: int, level: float, results: Sequence[str], run: int, number: int
     ) -> bool:
         return self._holds(run, _with(numbers, [axis], number), level, results)
 
@@ -428,14 +427,7 @@ class Search:
 
     def _least(self, runs: Iterable[int], most: int, at: Callable[[int], Point]) -> int:
         """Return the least number from which on every run holds; all hold at `most`."""
-        number = 0
-        for run in runs:
-            if not self._margins.holds(run, at(number)):
-                number = last_before(most, number, partial(self._holds_at, run, at))
-        return number
-
-    def _holds_at(self, run: int, at: Callable[[int], Point], number: int, least: float = 0.0) -> bool:
-        return self._margins.holds(run, at(number), least)
+        return least_for_all(runs, most, lambda run, number: self._margins.holds(run, at(number)))
 
     # ------------------------------------------------------------------------------------ several constants
 
@@ -626,10 +618,14 @@ class Search:
         """
         is_looser = (end > point[axis]) == (self._margins.directions[axis] == 1)
         # where the specification is invalid, one good run shows it as well as all
-        for run in [*self._bad, *self._good[:1]] if is_looser else self._good:
-            holds = partial(self._holds_at, run, partial(self._with, point, axis), least=least)
-            if not holds(end):
-                end = last_before(point[axis], end, holds)
+        runs = [*self._bad, *self._good[:1]] if is_looser else self._good
+
+        def holds(run: int, number: int) -> bool:
+            return self._margins.holds(run, self._with(point, axis, number), least)
+
+        for run in runs:
+            if not holds(run, end):
+                end = last_before(point[axis], end, partial(holds, run))
         return end
 
     def _edge(self, point: Point, axis: int, towards: int, least: float) -> int:

@@ -67,7 +67,7 @@ def test_bounds_in_seconds_count_samples_at_the_stated_rate(tmp_path):
 def test_the_planner_does_not_wait_before_a_deadline():
     steps, table = run(planner(f"F[0,600] ({DONE})"), BLOCKS)
     assert [step.kind for step in steps] == ["execute", "hold"]
-    assert steps[0].constraints.texts == ()
+    assert steps[0].aim.constraints.texts == ()
     assert verdict(f"F[0,600] ({DONE})", table.samples) == "satisfied"
 
 

@@ -88,15 +88,6 @@ class TraceScene:
     def _with_centres(self) -> FootprintBatch:
         return FootprintBatch.concatenate([self._whole, centres_of(self._whole)])
 
-    def with_centres(self, vertices: Floats) -> Floats:
-        """Return other vertices of the batch, followed by any, with the centres that belong to them."""
-        if not self._has_centres:
-            return vertices
-        count = len(self._whole.vertices)
-        moved = replace(self._whole, vertices=vertices[:count])
-        centres = centres_of(moved).vertices
-        return np.concatenate((vertices[:count], centres, vertices[count + len(centres) :]))
-
     @cached_property
     def _whole(self) -> FootprintBatch:
         regions = [footprint_from_outline(outline) for outline in self.regions.values()]

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Generator
 
+from spatial_replay.planning.decisions import Outcome
 from spatial_replay.simulation.arm import Scene, picking
 from spatial_replay.simulation.tabletop import Placement, Scenario
-from spatial_replay.simulation.world import Body, Box, Cylinder, Execution, ReachableArea, Shape
+from spatial_replay.simulation.world import Body, Box, Cylinder, ReachableArea, Shape
 
 
 def _thing(
@@ -22,7 +23,7 @@ def _thing(
     return Placement(Body(name, kind, shape), *place, yaw, mass_kg, colour)
 
 
-def _script(scene: Scene) -> Generator[None, None, Execution]:
+def _script(scene: Scene) -> Generator[None, None, Outcome]:
     """Set the breakfast: bun on the plate, banana in front of it, mug and bottle behind, a box aside."""
     x, y = scene.place_of("plate")
     goals = {
@@ -31,7 +32,7 @@ def _script(scene: Scene) -> Generator[None, None, Execution]:
         "mug": (x - 0.05, y + 0.24),
         "bottle": (x - 0.12, y + 0.31),
     }
-    done = Execution(True, "nothing to do")
+    done = Outcome(True, "nothing to do")
     for name, goal in goals.items():
         done = yield from picking(scene, name, goal, None)
         if not done.succeeded:

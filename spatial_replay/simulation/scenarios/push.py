@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Generator
 
+from spatial_replay.planning.decisions import Outcome
 from spatial_replay.simulation.arm import Scene, pushing
 from spatial_replay.simulation.tabletop import Placement, Scenario
-from spatial_replay.simulation.world import Body, Box, Execution, ReachableArea
+from spatial_replay.simulation.world import Body, Box, ReachableArea
 
 _BLOCK = Box(0.04, 0.04, 0.04)
 
@@ -15,7 +16,7 @@ def _block(name: str, x: float, y: float, yaw: float, colour: tuple[float, float
     return Placement(Body(name, "block", _BLOCK), x, y, yaw, 0.08, colour)
 
 
-def _script(scene: Scene) -> Generator[None, None, Execution]:
+def _script(scene: Scene) -> Generator[None, None, Outcome]:
     """Push red above blue, then green to the right of both."""
     blue_x, blue_y = scene.place_of("blue")
     red_x, _ = scene.place_of("red")

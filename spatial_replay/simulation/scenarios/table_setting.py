@@ -14,6 +14,7 @@ from py_trees.behaviour import Behaviour
 from py_trees.common import Status
 from py_trees.decorators import Retry
 
+from spatial_replay.planning.decisions import Outcome, Stage
 from spatial_replay.simulation.arm import (
     Grasp,
     Point,
@@ -26,16 +27,7 @@ from spatial_replay.simulation.arm import (
     set_down,
 )
 from spatial_replay.simulation.tabletop import Placement, Scenario
-from spatial_replay.simulation.world import (
-    Body,
-    Box,
-    Cylinder,
-    Execution,
-    ReachableArea,
-    Stage,
-    TreeNode,
-    TreeTick,
-)
+from spatial_replay.simulation.world import Body, Box, Cylinder, ReachableArea, TreeNode, TreeTick
 
 # ----------------------------------------------------------------------------------------- the behaviour tree
 
@@ -49,7 +41,7 @@ _TURNED = 0.15
 
 def setting_by_tree(
     scene: Scene, goals: Mapping[str, Goal], via: Sequence[Point] = ()
-) -> Generator[None, None, Execution]:
+) -> Generator[None, None, Outcome]:
     """Place bodies one after the other, with a few attempts each; carry them along some points."""
     blackboard = _Blackboard()
     tasks = [_task(scene, name, goal, blackboard, via) for name, goal in goals.items()]
@@ -63,7 +55,7 @@ def setting_by_tree(
     done = f"placed {', '.join(goals)}"
     if blackboard.failures:
         done += f", after this went wrong: {'; '.join(each.reason for each in blackboard.failures)}"
-    return Execution(True, done) if succeeded else blackboard.failures[-1]
+    return Outcome(True, done) if succeeded else blackboard.failures[-1]
 
 
 class _Ticks:
@@ -95,7 +87,7 @@ class _Blackboard:
 
     def __init__(self) -> None:
         self.grasps: dict[str, Grasp] = {}
-        self.failures: list[Execution] = []
+        self.failures: list[Outcome] = []
 
 
 def _task(scene: Scene, name: str, goal: Goal, blackboard: _Blackboard, via: Sequence[Point]) -> Behaviour:
@@ -157,7 +149,7 @@ class _Moving(Behaviour):
             next(self._motion)
         except StopIteration as end:
             if end.value and self._blackboard is not None:
-                self._blackboard.failures.append(Execution(False, end.value, self._stage))
+                self._blackboard.failures.append(Outcome(False, end.value, self._stage))
             return Status.FAILURE if end.value else Status.SUCCESS
         return Status.RUNNING
 
@@ -172,7 +164,7 @@ class _Detecting(Behaviour):
     def update(self) -> Status:
         """Choose the grasp."""
         grasp = best_grasp(self._scene, self._body, *self._goal)
-        if isinstance(grasp, Execution):
+        if isinstance(grasp, Outcome):
             self._blackboard.failures.append(grasp)
             return Status.FAILURE
         self._blackboard.grasps[self._body] = grasp
@@ -203,11 +195,11 @@ _STEEL = (0.75, 0.77, 0.8)
 
 def _placing(
     scene: Scene, name: str, goal: Point, yaw: float | None, via: Sequence[Point]
-) -> Generator[None, None, Execution]:
+) -> Generator[None, None, Outcome]:
     return setting_by_tree(scene, {name: (goal, yaw)}, via)
 
 
-def _script(scene: Scene) -> Generator[None, None, Execution]:
+def _script(scene: Scene) -> Generator[None, None, Outcome]:
     x, y = scene.place_of("plate")
     goals: dict[str, tuple[Point, float | None]] = {
         "fork": ((x - 0.14, y), _UPRIGHT),
