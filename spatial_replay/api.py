@@ -389,15 +389,7 @@ def evaluate_logs(
     for log in named:
         if not isinstance(log, str | PathLike):
             raise UsageError(f"logs holds {shortened(log)}; give paths; evaluate takes a trace")
-    mapping = reading.get("mapping")
-    conditions = Conditions(
-        mapping=None if mapping is None else sendable(mapping),
-        reading=tuple(sorted((name, value) for name, value in reading.items() if name != "mapping")),
-        each=tuple(sorted((each or {}).items())),
-        semantics=semantics,
-        strict_names=strict_names,
-        constants=tuple(sorted((constants or {}).items())),
-    )
+    conditions = Conditions.given(reading, each, constants, semantics=semantics, strict_names=strict_names)
     if specifications is None:
         if len(named) != 1 or conditions != Conditions():
             raise UsageError(

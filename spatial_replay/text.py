@@ -7,8 +7,8 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Callable, Collection, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass
 from functools import partial, wraps
 from inspect import signature
 from reprlib import repr as shortened
@@ -144,10 +144,44 @@ def json_number(number: float) -> float | str | None:
     return number
 
 
+def json_value(value: Any) -> Any:
+    """Return a value as valid JSON: numbers as `json_number` has them, records by their fields."""
+    if isinstance(value, float):
+        return json_number(value)
+    if isinstance(value, str):
+        return str(value)
+    if isinstance(value, Mapping):
+        return {str(key): json_value(each) for key, each in value.items()}
+    if is_dataclass(value) or hasattr(value, "_fields"):
+        return json_fields(value)
+    return [json_value(each) for each in value] if isinstance(value, tuple | list) else value
+
+
+def json_fields(record: Any, *names: str) -> dict[str, Any]:
+    """Return attributes of a record for JSON, by their names without "is_"; without names, all its fields."""
+    own = names or getattr(record, "_fields", None) or [each.name for each in fields(record)]
+    return {name.removeprefix("is_"): json_value(getattr(record, name)) for name in own}
+
+
 def printable(text: str, longest: int = _LONGEST) -> str:
     """Return a text with blanks in place of unprintable characters, cut to a length."""
-    shown = "".join(character if character.isprintable() else " " for character in text)
-    return shown if len(shown) <= longest else shown[: longest - 1] + "…"
+    return cut("".join(character if character.isprintable() else " " for character in text), longest)
+
+
+def cut(text: str, longest: int) -> str:
+    """Return a text of bounded length, with an ellipsis where it was cut."""
+    return text if len(text) <= longest else f"{text[: longest - 1]}…"
+
+
+def listed(names: Sequence[str], most: int = 8) -> str:
+    """Return the first of some names, with an ellipsis where there are more."""
+    return ", ".join([*names[:most], *["…"] * (len(names) > most)])
+
+
+def first_lines(lines: Sequence[str], most: int) -> list[str]:
+    """Return the first lines, and how many more there are."""
+    more = [f"… and {len(lines) - most:,} more"] if len(lines) > most else []
+    return [*lines[:most], *more]
 
 
 def escaped(text: str, kept: str = "") -> str:

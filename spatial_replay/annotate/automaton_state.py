@@ -24,6 +24,7 @@ from spatial_replay.monitor.offline import evaluate_offline
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.spec.formula import Atom, Formula, NamedSpec, Quantified, Specification, iter_nodes
+from spatial_replay.text import listed
 
 _NOW = 1
 """The place of `now` among the numbers of a node."""
@@ -123,7 +124,7 @@ class AutomatonRun:
 
     def _described(self, states: tuple[int, ...]) -> str:
         """Return some states in words: what they decide, or what is still to be done."""
-        numbers = ", ".join(map(str, states[:_MOST_NAMED])) + (", …" if len(states) > _MOST_NAMED else "")
+        numbers = listed([*map(str, states)], _MOST_NAMED)
         title = f"state {numbers}" if len(states) == 1 else f"one of the states {numbers}"
         accepting, can_accept, can_reject = self._about[list(states)].T
         possible = {

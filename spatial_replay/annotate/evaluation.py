@@ -18,7 +18,7 @@ from spatial_replay.monitor.instances import Instance
 from spatial_replay.monitor.semantics import Semantics
 from spatial_replay.monitor.stream import EvaluationStream, SeriesBlock
 from spatial_replay.spec.formula import Specification
-from spatial_replay.text import nearest_hint
+from spatial_replay.text import listed, nearest_hint
 from spatial_replay.trace.trace import Trace
 from spatial_replay.trace.units import OUR_AXES, Axes
 
@@ -90,8 +90,7 @@ class AnnotatedEvaluation:
         """
         if title and not any(tree.is_called(title) for tree in self.trees):
             titles = [tree.title for tree in self.trees]
-            more = ", …" if len(titles) > _MOST_NAMED else ""
-            hint = nearest_hint(title, titles) or f"the results are: {', '.join(titles[:_MOST_NAMED])}{more}"
+            hint = nearest_hint(title, titles) or f"the results are: {listed(titles, _MOST_NAMED)}"
             raise UsageError(f"there is no result {title!r} for the arrow to point at; {hint}")
 
     def extend(self, trace: Trace) -> list[SeriesBlock]:

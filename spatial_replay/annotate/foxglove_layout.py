@@ -36,7 +36,7 @@ from spatial_replay.logs.schemas.Robustness_pb2 import HOLDS_SO_FAR, PENDING, SA
 from spatial_replay.palette import CURVES, hexadecimal, lighter
 from spatial_replay.spec.formula import Formula
 from spatial_replay.spec.walks import looks_ahead
-from spatial_replay.text import number_text
+from spatial_replay.text import cut, number_text
 from spatial_replay.trace.units import OUR_AXES, Axes
 
 _MOST_CURVES: Final = 12
@@ -259,7 +259,7 @@ def _plots(name: str, title: str, curves: Sequence[_Curve]) -> list[Panel]:
                 # viewers draw samples as dots of this colour darkened, which cover a dense curve
                 "color": lighter(CURVES[index % len(CURVES)]),
                 "enabled": True,
-                "label": _short(curve.label),
+                "label": cut(curve.label, _LONGEST_LABEL),
                 "timestampMethod": "receiveTime",
                 "value": curve.path,
             }
@@ -282,10 +282,6 @@ def _plots(name: str, title: str, curves: Sequence[_Curve]) -> list[Panel]:
 
 def _standing_path(title: str, field: str) -> str:
     return f"{STANDING}.results[:]{{name=={_quoted(title)}}}.{field}"
-
-
-def _short(text: str) -> str:
-    return text if len(text) <= _LONGEST_LABEL else f"{text[: _LONGEST_LABEL - 1]}…"
 
 
 def _curves_path(tree: ReportedTree, identifier: int) -> str:

@@ -8,7 +8,6 @@ import os
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Literal
 from urllib.parse import quote
@@ -38,9 +37,9 @@ from spatial_replay.logs.output_file import output_error, replacing
 from spatial_replay.logs.remote import is_address
 from spatial_replay.notebook.figures import Html, element
 from spatial_replay.report.compact import sentence_parts
-from spatial_replay.report.page import policy, text, theme
+from spatial_replay.report.page import asset, html_page, text
 from spatial_replay.report.write import write_report
-from spatial_replay.text import counted, printable
+from spatial_replay.text import counted, cut, printable
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -283,7 +282,7 @@ def _case(
         kind = row["error_kind"] or f"{verdict_word(row)}{damage_word(row)}"
         texts = [*dict.fromkeys([*row["explanation"], *row["vacuous"]])] or [row["failure"]]
         text = "\n".join(filter(None, [requirement_of(row), *texts, *tested]))
-        text = text if limit is None or len(text) <= limit else text[: limit - 1] + "…"
+        text = cut(text, limit or len(text))
         message = printable(row["failure"], limit or 1_000)
         yield f"<{tag} type={_quoted(kind)} message={_quoted(message)}>{_text(text)}</{tag}>\n"
         if (row["case"], row["log"]) in reports:
@@ -321,7 +320,7 @@ _MOST_SPECS: Final = 60
 _BINS: Final = 24
 _WIDTH: Final = 240.0
 _HEIGHT: Final = 60.0
-_STYLES: Final = ("report:browser/page.css", "batch:overview.css")
+_STYLES: Final = ("browser/page.css", "batch:overview.css")
 
 
 def overview_page(table: pa.Table, name: str, reports: Mapping[tuple[str, str], str]) -> bytes:
@@ -332,25 +331,9 @@ def overview_page(table: pa.Table, name: str, reports: Mapping[tuple[str, str], 
         name: of the suite.
         reports: for cases and logs by name, the address of the page about them, relative to this one.
     """
-    style = "\n".join([theme(), *map(_asset, _STYLES)])
-    script = _asset("batch:overview.js")
-    parts = [
-        '<!doctype html>\n<html lang="en" data-read><head><meta charset="utf-8">',
-        f'<meta http-equiv="Content-Security-Policy" content="{policy([script], style)}">',
-        '<meta name="viewport" content="width=device-width, initial-scale=1">',
-        '<meta name="color-scheme" content="light dark">',
-        element("title", text(f"{name}: {_headline(table)}")),
-        f"<style>{style}</style></head><body>",
-        _header(table, name),
-        element("main", *_panels(table, reports)),
-        f"<script>{script}</script></body></html>\n",
-    ]
-    return "".join(parts).encode("utf-8")
-
-
-def _asset(name: str) -> str:
-    room, _, file = name.partition(":")
-    return files(f"spatial_replay.{room}").joinpath(file).read_text("utf-8")
+    body = [_header(table, name), element("main", *_panels(table, reports))]
+    scripts = [asset("batch:overview.js")]
+    return html_page(f"{name}: {_headline(table)}", body, scripts, _STYLES, marks=" data-read")
 
 
 def _headline(table: pa.Table) -> str:

@@ -25,7 +25,7 @@ from spatial_replay.errors import (
 )
 from spatial_replay.logs.messages import MAPPED, Source
 from spatial_replay.logs.remote import log_file
-from spatial_replay.monitor.result import SpecResult
+from spatial_replay.monitor.result import RESULT_COLUMNS, SpecResult
 from spatial_replay.monitor.vacuity import Tested, UntestedPart
 from spatial_replay.monitor.verdict import Verdict
 from spatial_replay.replay.engine import Replay, Replayed
@@ -35,7 +35,7 @@ from spatial_replay.sources.overview import fitness_of
 from spatial_replay.spec.diagnostics import Diagnostic, SourceText
 from spatial_replay.spec.formula import NamedSpec, Specification
 from spatial_replay.spec.load import SpecificationText, load_specifications
-from spatial_replay.text import counted_from, encodable, printable
+from spatial_replay.text import counted_from, encodable, first_lines, printable
 from spatial_replay.trace.trace import time_point_from_text
 
 ErrorKind: TypeAlias = Literal["usage", "log", "unfit", "machine"]
@@ -278,21 +278,12 @@ def _row(about: ResultRow, result: SpecResult, first_ns: int) -> ResultRow:
     deciding = None if witness is None else witness.deciding
     return replace(
         about,
-        object=result.object,
-        verdict=result.verdict,
-        unit=result.unit,
-        robustness=result.robustness,
-        lower=result.lower,
-        upper=result.upper,
-        first_satisfied_ns=result.first_satisfied_ns,
-        violated_at_ns=result.violated_at_ns,
-        satisfied_at_ns=result.satisfied_at_ns,
+        **{name: getattr(result, name) for name in (*RESULT_COLUMNS, "unit", "tested") if name != "name"},
         atom=None if deciding is None else _cut(deciding.text),
         atom_time_ns=None if witness is None else witness.time_ns,
         atom_objects=() if deciding is None else tuple(deciding.objects),
         reason=_cut(result.reason(first_ns)),
         explanation=_some(result.sentences(first_ns)),
-        tested=result.tested,
         untested=_some(counted_from((part.message for part in result.untested), first_ns)),
         vacuous=_some(counted_from((part.message for part in result.vacuous), first_ns)),
     )
@@ -323,8 +314,7 @@ def spec_lines(file: Specification) -> dict[str, int]:
 
 def _some(texts: Sequence[str]) -> tuple[str, ...]:
     """Return texts of bounded length and number, with a note on what is left out."""
-    listed = [_cut(text) for text in texts[:_MOST]]
-    return (*listed, f"… and {len(texts) - _MOST} more") if len(texts) > _MOST else tuple(listed)
+    return tuple(map(_cut, first_lines(texts, _MOST)))
 
 
 def _cut(text: str) -> str:

@@ -53,7 +53,7 @@ from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.format import format_specification
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import SpecificationText
-from spatial_replay.text import counted, encodable
+from spatial_replay.text import counted, encodable, first_lines
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -177,8 +177,7 @@ def find_logs(patterns: Sequence[LogPattern], folder: Path) -> list[FoundLog]:
         if len(found) > _MOST_LOGS:
             raise UsageError(f"{pattern.text}: more than {counted(_MOST_LOGS, 'log')}; split the batch")
     if faults:
-        more = [f"… and {len(faults) - _MOST_FAULTS} more"] if len(faults) > _MOST_FAULTS else []
-        raise UsageError("\n".join(faults[:_MOST_FAULTS] + more))
+        raise UsageError("\n".join(first_lines(faults, _MOST_FAULTS)))
     return list(found.values())
 
 
@@ -415,8 +414,7 @@ class _Faults:
             raise SpecificationError(list(self.diagnoses.values()))
         if lines:
             lines = [*sorted(lines, key=self._line), *map(_in_one_line, self.diagnoses.values())]
-            more = [f"… and {len(lines) - MOST_FAULTS} more"] if len(lines) > MOST_FAULTS else []
-            raise UsageError("\n".join(lines[:MOST_FAULTS] + more))
+            raise UsageError("\n".join(first_lines(lines, MOST_FAULTS)))
 
     def _line(self, fault: str) -> float:
         """Return the line of the suite that a fault is in; others come last."""

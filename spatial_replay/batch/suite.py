@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeAlias, TypeVar
 
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.read_options import KEYS
-from spatial_replay.logs.remote import is_address
+from spatial_replay.logs.remote import is_address, sendable
 from spatial_replay.mapping.yaml_document import (
     Document,
     Place,
@@ -68,6 +68,30 @@ class Conditions:
     constants: Pairs[float | str] = ()
     profile: str | None = None
     requires: str = ""
+
+    @classmethod
+    def given(
+        cls,
+        reading: Mapping[str, Any],
+        each: Mapping[str, str] | None,
+        constants: Mapping[str, float | str] | None,
+        **others: Any,
+    ) -> Conditions:
+        """Return conditions from tables.
+
+        Args:
+            reading: keyword arguments of `open_source`, the mapping among them.
+            others: further attributes.
+        """
+        own = dict(reading)
+        mapping = own.pop("mapping", None)
+        return cls(
+            mapping=None if mapping is None else sendable(mapping),
+            reading=_pairs(own),
+            each=_pairs(each or {}),
+            constants=_pairs(constants or {}),
+            **others,
+        )
 
 
 DEFAULT_CONDITIONS: Final = Conditions()

@@ -75,7 +75,14 @@ COMMANDS: dict[str, str] = {
 }
 """Name and summary, also of commands that the help leaves out; `cli/NAME.py` defines the command NAME."""
 
-FAMILIES = {"results": "batch", "doctor": "check", "learn": "tune"}
+FAMILIES = {
+    "results": "batch",
+    "doctor": "check",
+    "learn": "tune",
+    "report": "replay",
+    "export": "replay",
+    "recover": "clip",
+}
 """Commands that share the module of another one."""
 
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import TYPE_CHECKING, Any, Final
 
 import click
 
@@ -19,18 +19,20 @@ from spatial_replay.cli.options import (
     ConditionArguments,
     add_options,
     allow_option,
+    check_outputs,
     condition_options,
     fail_on_option,
     gather,
     naming_option,
     objects_by_parameter,
+    refuse_given,
     semantics_option,
 )
 from spatial_replay.cli.output import VERDICT_COLOURS
 from spatial_replay.cli.terminal import Coloured, progress, show, show_diagnostics, show_file, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import local_files, sendable
-from spatial_replay.text import counted, json_number, with_unit
+from spatial_replay.text import counted, first_lines, json_value, with_unit
 from spatial_replay.trace.trace import time_point_from_text
 
 if TYPE_CHECKING:
@@ -40,7 +42,6 @@ if TYPE_CHECKING:
     from spatial_replay.batch.run_table import By, Difference, Tolerance, Total
     from spatial_replay.batch.suite import Suite
     from spatial_replay.batch.workers import Workers
-    from spatial_replay.logs.remote import LogFile
     from spatial_replay.monitor.semantics import Semantics
 
 
@@ -125,7 +126,7 @@ def write_json_lines(table: pa.Table, file: str, inputs: Sequence[Path]) -> None
     from spatial_replay.logs.output_file import replacing
 
     def lines(rows: pa.Table) -> str:
-        return "".join(f"{json.dumps(_json_row(row), ensure_ascii=False)}\n" for row in rows.to_pylist())
+        return "".join(f"{json.dumps(json_value(row), ensure_ascii=False)}\n" for row in rows.to_pylist())
 
     batches = (table.slice(begin, _BATCH) for begin in range(0, len(table), _BATCH))
     if file == "-":
@@ -163,10 +164,6 @@ def _title(total: Total, by: By, with_case: bool) -> str:
     if total.requirement:
         title = f"{title} [{total.requirement}]"
     return f"{group['case']}: {title}" if with_case else title
-
-
-def _json_row(row: dict[str, Any]) -> dict[str, Any]:
-    return {name: json_number(value) if isinstance(value, float) else value for name, value in row.items()}
 
 
 _WORST = 10
@@ -278,7 +275,7 @@ def batch(
     if folder is None:
         folder = "results" if suite.path is None else str(suite.folder / f"{suite.name}.results")
     tolerance, before = _baseline(outputs)
-    _check_outputs(outputs, suite)
+    check_outputs({"--junit": outputs.junit, "--json": outputs.json_file}, _inputs(suite))
     workers = workers_of(jobs or os.cpu_count() or 1, dask, warn)
     found = _run(cases, folder, workers, fail_on)
     differences = None if before is None else compare(found.table, before, tolerance)
@@ -327,20 +324,9 @@ def _suite(logs: tuple[str, ...], given: ConditionArguments, semantics: Semantic
     """
     from spatial_replay.batch.suite import Conditions, Suite, load_suite
 
-    reading = dict(given.reading)
-    mapping = reading.pop("mapping", None)
-    conditions = Conditions(
-        mapping=None if mapping is None else sendable(cast("LogFile", mapping)),
-        reading=tuple(sorted(reading.items())),
-        start=given.start,
-        end=given.end,
-        every=given.every,
-        each=tuple(sorted(objects_by_parameter(given.choices).items())),
-        semantics=semantics,
-        strict_names=given.strict_names,
-        constants=tuple(sorted(given.constants.items())),
-        profile=given.profile,
-    )
+    others = {name: getattr(given, name) for name in ("start", "end", "every", "strict_names", "profile")}
+    each = objects_by_parameter(given.choices)
+    conditions = Conditions.given(given.reading, each, given.constants, semantics=semantics, **others)
     suites = [log for log in logs if log.endswith((".yaml", ".yml")) and Path(log).name != "metadata.yaml"]
     if not suites:
         if not given.specs:
@@ -370,27 +356,14 @@ def _inputs(suite: Suite) -> list[Path]:
     return local_files([*own, *dict.fromkeys([*specs, *(each for each in mappings if each is not None)])])
 
 
-def _check_outputs(outputs: BatchOutputs, suite: Suite) -> None:
-    """Refuse outputs that could not be written, before the work is done."""
-    from spatial_replay.logs.output_file import refuse_inputs
-
-    files = [outputs.junit, None if outputs.json_file in (None, "-") else Path(outputs.json_file or "")]
-    named = [file for file in files if file is not None]
-    for file in named:
-        refuse_inputs(file, _inputs(suite))
-    if len({file.resolve() for file in named}) < len(named):
-        raise UsageError(f"--junit and --json both name {named[0]}; give them different names")
-
-
 def _baseline(outputs: BatchOutputs) -> tuple[Tolerance, pa.Table | None]:
     """Return the tolerance, and the table of the baseline if there is one."""
     from spatial_replay.batch.run_table import Tolerance
     from spatial_replay.batch.store import ResultsFolder, result_files
 
     if outputs.baseline is None:
-        if outputs.tolerance is not None or outputs.update_baseline:
-            option = "--update-baseline" if outputs.update_baseline else "--tolerance"
-            raise UsageError(f"{option} applies to a baseline; add --baseline RESULTS")
+        given = {"--update-baseline": outputs.update_baseline, "--tolerance": outputs.tolerance}
+        refuse_given(given, "applies to a baseline; add --baseline RESULTS")
         return Tolerance(), None
     with naming_option("--tolerance"):
         tolerance = Tolerance.parse(outputs.tolerance or "0")
@@ -454,8 +427,7 @@ def _warn_of_names(table: pa.Table) -> None:
             for message in messages:
                 logs.setdefault(message.removeprefix(f"{Path(log).name}: "), {})[log] = None
     found = [f"{message} (in {_listed(list(names))})" for message, names in logs.items()]
-    more = [f"… and {len(found) - _MOST_WARNINGS} more"] if len(found) > _MOST_WARNINGS else []
-    warn(*found[:_MOST_WARNINGS], *more)
+    warn(*first_lines(found, _MOST_WARNINGS))
 
 
 def _warn_of_damage(table: pa.Table) -> None:
@@ -485,10 +457,8 @@ def _print_differences(differences: Sequence[Difference], to_errors: bool) -> bo
     heads = ["worse than the baseline, or gone" if worse else "nothing is worse than the baseline"]
     heads += [f"{better:,} better: --update-baseline keeps that"] if better else []
     show("; ".join(heads) + (":" if worse else ""), err=to_errors)
-    for each in worse[:_MOST_DIFFERENCES]:
-        show(f"  {each.text}", err=to_errors)
-    if len(worse) > _MOST_DIFFERENCES:
-        show(f"  … and {len(worse) - _MOST_DIFFERENCES:,} more", err=to_errors)
+    for line in first_lines([each.text for each in worse], _MOST_DIFFERENCES):
+        show(f"  {line}", err=to_errors)
     return bool(worse)
 
 

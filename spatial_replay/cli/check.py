@@ -23,6 +23,7 @@ from spatial_replay.cli.options import (
     load_spec_options,
     profile_option,
     reading_options,
+    refuse_given,
     require_choice,
     strict_names_option,
 )
@@ -35,7 +36,7 @@ from spatial_replay.spec.diagnostics import Diagnostic, SourceText
 from spatial_replay.spec.format import iter_branches, label_of, title_text
 from spatial_replay.spec.formula import Formula, NamedSpec, Specification, iter_nodes, operator_of
 from spatial_replay.spec.tokens import quoted
-from spatial_replay.text import counted, counted_from, json_number
+from spatial_replay.text import counted, counted_from, json_fields
 
 if TYPE_CHECKING:
     from spatial_replay.logs.messages import Source
@@ -176,10 +177,8 @@ def check(
     # imported here so that --help stays fast
     from spatial_replay.sanity import doctor as examine
 
-    if of is not None and dfa is None:
-        raise UsageError("--result chooses an automaton; add --dfa FILE")
-    if hz is not None and dfa is None:
-        raise UsageError("--hz is for an automaton; add --dfa FILE")
+    if dfa is None:
+        refuse_given({"--result": of, "--hz": hz is not None}, "is for an automaton; add --dfa FILE")
     if as_json and dfa == "-":
         raise UsageError("--json and --dfa - both write to standard output; give --dfa a file")
     if form != "text" and (as_json or dfa == "-"):
@@ -346,50 +345,35 @@ def _document(
         "profile": specification.profile,
         "specifications": [
             {
-                "name": spec.name,
-                "parameter": spec.parameter,
+                **json_fields(spec, "name", "parameter", "title"),
                 "requirement": spec.id,
-                "title": spec.title,
                 "nodes": _node_rows(spec.formula),
             }
             for spec in specification.results
         ],
         "constants": {
-            name: {"value": each.value, "duration_ns": each.duration_ns, "range": each.range}
+            name: json_fields(each, "value", "duration_ns", "range")
             for name, each in specification.constants.items()
         },
         "windows": list(compared.windows),
         "thresholds": [
             {
                 "atom": each.atom.text,
-                "objects": each.objects,
-                "least": json_number(each.least) if each.least <= each.greatest else None,
-                "greatest": json_number(each.greatest) if each.least <= each.greatest else None,
-                "known": each.known,
-                "holding": each.holding,
-                "failing": each.failing,
+                **json_fields(each, "objects", "known", "holding", "failing", "least", "greatest"),
+                **({} if each.least <= each.greatest else {"least": None, "greatest": None}),
             }
             for each in compared.ranges
         ],
-        "warnings": [
-            {"line": each.line, "column": each.column, "message": each.message, "hint": each.hint}
-            for each in diagnostics
-        ],
+        "warnings": [json_fields(each, "line", "column", "message", "hint") for each in diagnostics],
     }
 
 
 def _node_rows(formula: Formula) -> list[dict[str, object]]:
     """Return the nodes as rows of a table: id, parent, operator, name, text."""
-    return [
-        {
-            "id": identifier,
-            "parent": parent,
-            "operator": operator_of(node),
-            "name": node.name,
-            "text": format_formula(node),
-        }
-        for identifier, parent, node in iter_nodes(formula)
-    ]
+    names = ("id", "parent", "operator", "name", "text")
+    nodes = iter_nodes(formula)
+    rows = ((*place, operator_of(node), node.name, format_formula(node)) for *place, node in nodes)
+    return [dict(zip(names, row, strict=True)) for row in rows]
 
 
 def _check_automaton_options(

@@ -19,7 +19,7 @@ from spatial_replay.cli.options import (
     open_inputs,
     warn_of_input,
 )
-from spatial_replay.cli.output import MANY, VERDICT_COLOURS, counts_text, others_text, worst_of
+from spatial_replay.cli.output import MANY, VERDICT_COLOURS, others_text, worst_of
 from spatial_replay.cli.terminal import (
     Coloured,
     Line,
@@ -29,6 +29,7 @@ from spatial_replay.cli.terminal import (
     warn,
 )
 from spatial_replay.errors import UsageError
+from spatial_replay.monitor.verdict import counts_text
 from spatial_replay.text import requirement_text, time_text
 from spatial_replay.trace.trace import time_point_from_text
 

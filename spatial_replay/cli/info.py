@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict
 from datetime import UTC, datetime
 from importlib import resources
 from pathlib import Path
@@ -15,7 +14,7 @@ import click
 
 from spatial_replay.cli.application import ExitCode
 from spatial_replay.cli.options import JsonCommand, LogPath, input_files, output_option, reading_options
-from spatial_replay.cli.output import MANY, WORST_FIRST, counts_text
+from spatial_replay.cli.output import MANY, WORST_FIRST
 from spatial_replay.cli.terminal import (
     printing_to,
     progress,
@@ -26,7 +25,8 @@ from spatial_replay.cli.terminal import (
 )
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import LogFile
-from spatial_replay.text import counted, counted_from, escaped, requirement_text
+from spatial_replay.monitor.verdict import counts_text
+from spatial_replay.text import counted, counted_from, escaped, json_fields, json_value, requirement_text
 
 if TYPE_CHECKING:
     from spatial_replay.logs.mcap.read import LogSummary
@@ -321,23 +321,13 @@ def _document(
 ) -> dict[str, object]:
     container = overview.container
     document: dict[str, object] = {
-        "name": overview.name,
-        "kind": overview.kind,
-        "samples": overview.samples,
-        "start_ns": overview.start_ns,
-        "end_ns": overview.end_ns,
+        **json_fields(overview, "name", "kind", "samples", "start_ns", "end_ns", "objects", "signals"),
         "damaged": bool(faults),
         "faults": faults,
-        "axes": {"y": "up", "source": _declared(asdict(overview.axes))},
-        "objects": [asdict(each) for each in overview.objects],
-        "signals": overview.signals,
+        "axes": {"y": "up", "source": _declared(json_fields(overview.axes))},
     }
     if survey is not None:
-        document["messages"] = {
-            "count": survey.messages,
-            "start_ns": survey.start_ns,
-            "end_ns": survey.end_ns,
-        }
+        document["messages"] = {"count": survey.messages, **json_fields(survey, "start_ns", "end_ns")}
         document["topics"] = [
             {
                 "topic": each.topic.name,
@@ -363,7 +353,7 @@ def _document(
     if container is not None:
         document["verdicts"] = list(_verdicts(container, about))
         document["metadata"] = [{"name": name, "data": dict(data)} for name, data in container.metadata]
-        document["attachments"] = [asdict(each) for each in container.attachments]
+        document["attachments"] = json_value(container.attachments)
     return document
 
 

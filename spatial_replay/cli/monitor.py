@@ -22,6 +22,7 @@ from spatial_replay.cli.options import (
     output_option,
     overwrite_option,
     profile_option,
+    refuse_given,
     serving_options,
     specs_option,
 )
@@ -194,12 +195,11 @@ def monitor(
 
     if not specs:
         raise UsageError("there is nothing to monitor; give --spec FILE")
-    if topics and output is None and clips is None:
-        raise UsageError("--topics says which messages are written; add -o FILE or --clips DIR")
-    if triggers and clips is None:
-        raise UsageError("--trigger writes clips; add --clips DIR")
+    if output is None and clips is None:
+        refuse_given({"--topics": topics}, "says which messages are written; add -o FILE or --clips DIR")
     if clips is None:
-        _refuse_given("before_s", "after_s", "ring")
+        refuse_given({"--trigger": triggers}, "writes clips; add --clips DIR")
+        _refuse_values("before_s", "after_s", "ring")
     for option, given in (
         ("--for", length_s),
         ("--topic-timeout", topic_timeout_s),
@@ -247,7 +247,7 @@ def monitor(
     return run.exit_code
 
 
-def _refuse_given(*names: str) -> None:
+def _refuse_values(*names: str) -> None:
     context = click.get_current_context()
     for parameter in context.command.params:
         if parameter.name in names and context.get_parameter_source(parameter.name) is not _DEFAULT:

@@ -543,6 +543,40 @@ def load_spec_options(
     return load_specifications(sources, profile=profile, constants=constants)
 
 
+def refuse_given(options: Mapping[str, object], why: str) -> None:
+    """Refuse options that do not apply.
+
+    Args:
+        options: values by the names of options.
+        why: follows the name of one that is given.
+
+    Raises:
+        UsageError: one has a value.
+    """
+    for name, value in options.items():
+        if value:
+            raise UsageError(f"{name} {why}")
+
+
+def check_outputs(outputs: Mapping[str, Path | str | None], inputs: Sequence[Path]) -> None:
+    """Refuse outputs that could not be written, before the work is done.
+
+    Args:
+        outputs: files by the names of options; None and "-" for none.
+
+    Raises:
+        UsageError: one is an input, a folder, or in none; or several options name one file.
+    """
+    from spatial_replay.logs.output_file import refuse_inputs
+
+    files = {name: Path(file) for name, file in outputs.items() if file is not None and file != "-"}
+    for file in files.values():
+        refuse_inputs(file, inputs)
+        same = [name for name, other in files.items() if other.resolve() == file.resolve()]
+        if len(same) > 1:
+            raise UsageError(f"{' and '.join(same)} both name {outputs[same[-1]]}; give them different names")
+
+
 def require_choice(specification: Specification, of: str | None) -> None:
     """Require `--result` where a specification has several results.
 

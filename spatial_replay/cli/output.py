@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
 from spatial_replay.cli.terminal import Coloured, Line, show, show_json
+from spatial_replay.monitor.verdict import counts_text
 from spatial_replay.text import counted, counted_from, escaped, requirement_text, time_text, with_unit
 
 if TYPE_CHECKING:
@@ -103,13 +103,6 @@ def write_document(
     text = json.dumps(document, ensure_ascii=False, allow_nan=False)
     with replacing(Path(file), inputs) as stream:
         stream.write(text.encode() + b"\n")
-
-
-def counts_text(verdicts: Iterable[str]) -> str:
-    """Return how many of some verdicts are of each kind, the worst first."""
-    counts = Counter(map(str, verdicts))
-    order = ("violated", "unknown", "pending", "satisfied")
-    return ", ".join(f"{counts[verdict]:,} {verdict}" for verdict in order if counts[verdict])
 
 
 def worst_of(results: Sequence[SpecResult]) -> tuple[Sequence[SpecResult], Sequence[SpecResult]]:

@@ -24,6 +24,7 @@ from spatial_replay.cli.options import (
     overwrite_option,
     profile_option,
     reading_options,
+    refuse_given,
     specs_option,
     warn_of_input,
 )
@@ -32,7 +33,7 @@ from spatial_replay.cli.terminal import progress, show, show_diagnostics, warn
 from spatial_replay.errors import UsageError
 from spatial_replay.logs.remote import LogFile, local_files
 from spatial_replay.spec import check_names
-from spatial_replay.text import counted
+from spatial_replay.text import counted, listed
 from spatial_replay.trace.trace import duration_ns_from_text
 
 if TYPE_CHECKING:
@@ -219,9 +220,7 @@ def _opened(
         ]
         warn(*(each.remark for each in opened if each.remark is not None))
         return [*opened]
-    for option, is_given in (("--topic", bool(topics)), ("--rate", rate is not None)):
-        if is_given:
-            raise UsageError(f"{option} does not apply to a camera; leave it out")
+    refuse_given({"--topic": topics, "--rate": rate is not None}, "does not apply to a camera; leave it out")
     return [CameraFrames(camera, length_ns=length_ns)]
 
 
@@ -476,11 +475,6 @@ def tracks(
     seconds = (recorded.end_ns - recorded.start_ns) / 1e9
     show(
         f"wrote {output}: {counted(recorded.samples, 'sample')} over {seconds:.3f} s of "
-        f"{counted(len(recorded.objects), 'object')}: {_listed(recorded.objects)}"
+        f"{counted(len(recorded.objects), 'object')}: {listed(recorded.objects)}"
     )
     return ExitCode.DAMAGED if recorded.faults else ExitCode.SATISFIED
-
-
-def _listed(names: tuple[str, ...]) -> str:
-    shown = ", ".join(names[:8])
-    return shown if len(names) <= 8 else f"{shown}, …"

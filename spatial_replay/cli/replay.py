@@ -1,4 +1,4 @@
-"""`spatial-replay replay`: evaluate specifications over a recorded run."""
+"""`spatial-replay replay`, `report` and `export`: evaluate a recorded run; as a page; as a table."""
 
 from __future__ import annotations
 
@@ -6,32 +6,38 @@ import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import click
 
-from spatial_replay.cli.application import exit_code_from_verdicts
+from spatial_replay.cli.application import ExitCode, exit_code_from_verdicts
 from spatial_replay.cli.options import (
     EvaluationArguments,
     allow_option,
+    check_outputs,
     evaluation_options,
     fail_on_option,
     keep_option,
     log_output_option,
     naming_option,
     open_inputs,
+    output_option,
+    refuse_given,
     semantics_option,
     warn_of_input,
 )
 from spatial_replay.cli.output import print_verdicts, write_document
-from spatial_replay.cli.terminal import progress, show_message
+from spatial_replay.cli.terminal import progress, show, show_message, warn
 from spatial_replay.cli.watching import watch_log, watch_option
 from spatial_replay.errors import UsageError
+from spatial_replay.text import counted
 from spatial_replay.trace.trace import duration_ns_from_text
 
 if TYPE_CHECKING:
     from spatial_replay.monitor.semantics import Semantics
     from spatial_replay.replay.engine import Replayed
+    from spatial_replay.replay.table import Quantity
 
 
 @click.command()
@@ -109,31 +115,24 @@ def replay(
     from spatial_replay.replay.engine import run_replay
     from spatial_replay.replay.selection import default_keep
 
-    if (series or signal) and json_file is None:
-        option = "--series" if series else "--to-end"
-        raise UsageError(f"{option} adds to the JSON object; add --json FILE or --json -")
-    for option, value in {"--layer": layer, "--topics": keep, "--arrow": arrow}.items():
-        if value and output is None:
-            raise UsageError(f"{option} applies to the annotated log; add -o FILE")
+    if json_file is None:
+        why = "adds to the JSON object; add --json FILE or --json -"
+        refuse_given({"--series": series, "--to-end": signal}, why)
+    if output is None:
+        why = "applies to the annotated log; add -o FILE"
+        refuse_given({"--layer": layer, "--topics": keep, "--arrow": arrow}, why)
     if keep and layer:
         raise UsageError("--layer copies no messages; remove --topics or --layer")
     window_ns = None if width is None else _width_ns(width)
-    if semantics != "ltlf" and (signal or window_ns is not None):
-        option = "--to-end" if signal else "--window"
-        raise UsageError(f"{option} is not defined under --semantics {semantics}; remove one of them")
+    if semantics != "ltlf":
+        why = f"is not defined under --semantics {semantics}; remove one of them"
+        refuse_given({"--to-end": signal, "--window": width}, why)
+    written = {"-o": output, "--json": json_file}
     if watch:
-        others = {
-            "-o": output,
-            "--json": json_file,
-            "--window": width,
-            "--fail-on": fail_on,
-            "--allow": allow,
-        }
-        for option, value in others.items():
-            if value:
-                raise UsageError(f"--watch prints verdicts only; remove {option}")
+        others = {**written, "--window": width, "--fail-on": fail_on, "--allow": allow}
+        refuse_given(others, "is not for --watch, which prints verdicts only; remove it")
         return watch_log(request, semantics)
-    _check_outputs(output, json_file, request.inputs)
+    check_outputs(written, request.inputs)
     inputs = open_inputs(request)
     with progress("samples") as advance:
         replayed = run_replay(
@@ -192,13 +191,103 @@ def _width_ns(text: str) -> int:
     return width_ns
 
 
-def _check_outputs(output: Path | None, json_file: str | None, inputs: tuple[Path, ...]) -> None:
-    """Refuse outputs that could not be written, before the work is done."""
-    from spatial_replay.logs.output_file import refuse_inputs
+@click.command()
+@evaluation_options
+@output_option("Report to write (HTML).  [default: the log's name with .html, in this folder]")
+@semantics_option
+def report(request: EvaluationArguments, output: Path | None, semantics: Semantics) -> int:
+    """Write an HTML report of a recorded run, for any browser.
 
-    if output is not None:
-        refuse_inputs(output, inputs)
-    if json_file is not None and json_file != "-":
-        refuse_inputs(Path(json_file), inputs)
-        if output is not None and output.resolve() == Path(json_file).resolve():
-            raise UsageError(f"-o and --json both name {json_file}; give them different names")
+    It shows verdicts and explanations, the specification's tree, curves, the scene from above, the automaton,
+    events and planner decisions, with one time cursor for all. It needs no network and no other file.
+
+    Exits with 0 if all results are satisfied, 1 if any is violated, 4 if none is violated and any is unknown,
+    3 if the log is damaged.
+
+    \b
+    Examples:
+      spatial-replay report run.mcap
+      spatial-replay report run.mcap --spec blocks.spatial -o run.html
+      spatial-replay report run.mcap --spec edited.spatial --semantics paper -o run.html
+    """
+    # imported here so that --help stays fast
+    from spatial_replay.report.write import refuse_output, write_report
+
+    output = Path(f"{Path(request.log.name.removesuffix('.gz')).stem}.html") if output is None else output
+    refuse_output(output, request.inputs)
+    inputs = open_inputs(request)
+    with progress("samples") as advance:
+        replayed = write_report(
+            inputs.source,
+            inputs.files,
+            output,
+            inputs.options(semantics),
+            inputs=request.inputs,
+            advance=advance,
+        )
+    warn_of_input(replayed)
+    print_verdicts(replayed, output)
+    return exit_code_from_verdicts((result.verdict for result in replayed.results), bool(replayed.faults))
+
+
+@click.command()
+@evaluation_options
+@output_option("Output: FILE.csv or FILE.parquet.", required=True)
+@click.option(
+    "--quantity",
+    type=click.Choice(["value", "now", "lower", "upper"]),
+    default="value",
+    show_default=True,
+    help="Which number of each node to export.",
+)
+def export(request: EvaluationArguments, output: Path, quantity: Quantity) -> int:
+    """Export the robustness in an annotated log as a table: one row per sample, one column per node.
+
+    With --spec, or any option about the evaluation, LOG is evaluated first, and may be of any format.
+
+    A column is named after the named specs on the way to its node, task/deliver, and the text of an unnamed
+    node. Others hold the seconds since the first row and the states of the automata. Empty cells are numbers
+    that are not determined.
+
+    \b
+    Examples:
+      spatial-replay export annotated.mcap -o run.csv
+      spatial-replay export drive.bag --mapping drive.yaml --spec drive.spatial -o run.csv
+    """
+    # imported here so that --help stays fast
+    from spatial_replay.replay.table import check_table_name, export_table
+    from spatial_replay.sources.open_log import open_source
+
+    check_table_name(output)
+    faults: tuple[str, ...] = ()
+    with TemporaryDirectory(prefix="spatial-replay-") as folder:
+        log = request.log
+        if _is_evaluated(request):
+            log = Path(folder, "annotated.mcap")
+            faults = _evaluate(request, log)
+        with progress("rows") as advance:
+            rows, columns, lost = export_table(
+                open_source(log), output, quantity=quantity, inputs=request.inputs, advance=advance
+            )
+    warn(*lost)
+    show(f"wrote {output}: {counted(rows, 'row')}, {counted(columns, 'node')}")
+    return ExitCode.DAMAGED if faults or lost else ExitCode.SATISFIED
+
+
+def _is_evaluated(request: EvaluationArguments) -> bool:
+    """Return whether a log is evaluated first; an annotated one has its numbers already."""
+    options = (request.specs, request.constants, request.choices, request.start, request.end, request.profile)
+    return any(options) or request.every > 1 or request.reading.get("mapping") is not None
+
+
+def _evaluate(request: EvaluationArguments, output: Path) -> tuple[str, ...]:
+    """Evaluate specifications over a log, write what comes out, and return what was lost."""
+    from spatial_replay.replay.engine import run_replay
+
+    inputs = open_inputs(request)
+    with progress("samples") as advance:
+        replayed = run_replay(
+            inputs.source, inputs.files, inputs.options(), output=output, layer=True, advance=advance
+        )
+    warn_of_input(replayed)
+    return replayed.faults

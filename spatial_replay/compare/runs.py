@@ -13,21 +13,21 @@ import numpy as np
 
 from spatial_replay.annotate.automaton_state import AutomatonRun
 from spatial_replay.automata.compile import automaton
-from spatial_replay.compare.specifications import EditOutcome, outcome_text
+from spatial_replay.compare.specifications import EditOutcome, evaluate_with, outcome_text
 from spatial_replay.errors import NoAutomatonError, UsageError
 from spatial_replay.geometry.arrays import Booleans, Floats, Integers, count_in_rows
 from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.geometry.measure import MeasureRequest, Operand, measure
-from spatial_replay.lazy import Displayed
+from spatial_replay.lazy import Displayed, Printed
 from spatial_replay.logs.messages import Source
 from spatial_replay.logs.schemas.PlanDecision_pb2 import PlanDecision
-from spatial_replay.monitor.evaluate import Evaluation, evaluate
+from spatial_replay.monitor.evaluate import Evaluation
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.semantics import require_ltlf
 from spatial_replay.monitor.sentences import cause_reason
 from spatial_replay.monitor.stream import SeriesBlock
 from spatial_replay.planning.read import read_decisions
-from spatial_replay.replay.selection import DEFAULT_OPTIONS, LogNames, ReplayOptions, Selection
+from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions, Selection
 from spatial_replay.spec.checks import with_numbers
 from spatial_replay.spec.diagnostics import Diagnostic, nearest_hint
 from spatial_replay.spec.formula import Atom, Specification, iter_nodes
@@ -38,11 +38,13 @@ from spatial_replay.text import (
     Sentence,
     counted,
     counted_from,
-    json_number,
+    json_fields,
+    json_value,
+    listed,
     names_from_unit,
     with_unit,
 )
-from spatial_replay.trace.trace import FOREVER, Trace
+from spatial_replay.trace.trace import Trace
 from spatial_replay.trace.units import OTHER_UNITS, require_same_units
 
 AlignmentKind: TypeAlias = Literal["time", "event", "progress"]
@@ -293,20 +295,20 @@ class ObjectDiff:
     Attributes:
         first_ns: the first sample of A in which it is not just where, or as, it is in B.
         apart_ns: the first one in which the two footprints do not touch; None if they always do.
-        greatest: the greatest signed distance between the two footprints, at `greatest_ns`; NaN where none
-            was measured.
-        shift: how far its vertices' mean is away at most.
-        only_a, only_b: in how many pairs of samples only one run has it.
+        greatest_distance: the greatest signed distance between the two footprints, at `greatest_ns`; NaN
+            where none was measured.
+        greatest_shift: how far its vertices' mean is away at most.
+        samples_only_in_a, samples_only_in_b: in how many pairs of samples only one run has it.
     """
 
     name: str
     first_ns: int
     apart_ns: int | None
-    greatest: float
+    greatest_distance: float
     greatest_ns: int
-    shift: float
-    only_a: int
-    only_b: int
+    greatest_shift: float
+    samples_only_in_a: int
+    samples_only_in_b: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -315,13 +317,13 @@ class SignalDiff:
 
     Attributes:
         first_ns: the first sample of A in which its value is not that in B.
-        greatest: the greatest difference of two known numbers, at `greatest_ns`; NaN where there are none.
+        greatest_difference: that of two known numbers, at `greatest_ns`; NaN where there are none.
         ratio: how many times as large the median of its magnitudes is in B; NaN if one of them is 0.
     """
 
     name: str
     first_ns: int
-    greatest: float
+    greatest_difference: float
     greatest_ns: int
     ratio: float
 
@@ -366,7 +368,8 @@ def compare_objects(a: Trace, b: Trace, alignment: Alignment) -> tuple[ObjectDif
     names = sorted(set(a.names) & set(b.names))
     if not names and (a.names or b.names):
         raise UsageError(
-            f"the runs have no object in common: A has {_listed(a.names)}; B has {_listed(b.names)}. "
+            f"the runs have no object in common: A has {listed(a.names) or 'none'}; "
+            f"B has {listed(b.names) or 'none'}. "
             "Map the same things to the same names"
         )
     require_same_units(a, b)
@@ -406,9 +409,8 @@ def compare_objects(a: Trace, b: Trace, alignment: Alignment) -> tuple[ObjectDif
             )
         )
     never = int(a.times_ns[-1]) + 1
-    return tuple(
-        sorted(diffs, key=lambda each: (each.apart_ns or never, -each.shift, each.first_ns, each.name))
-    )
+    diffs.sort(key=lambda each: (each.apart_ns or never, -each.greatest_shift, each.first_ns, each.name))
+    return tuple(diffs)
 
 
 def _object_diff(a: Trace, one: Integers, b: Trace, other: Integers) -> tuple[Booleans, Floats, Floats]:
@@ -455,19 +457,16 @@ def _mean_vertices(batch: FootprintBatch, origin: Floats) -> Floats:
     return np.stack(sums) / counts
 
 
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names[:8]) + (", …" if len(names) > 8 else "") or "none"
-
-
 def _movement_sentence(each: ObjectDiff, start_ns: int, unit: str) -> Sentence:
     """Return since when an object moved differently, and how far the two are apart."""
     parts: list[str | Instant] = [f"{each.name}: differs since ", Instant(each.first_ns, start_ns)]
-    if each.shift:
-        parts.append(f", by up to {with_unit(each.shift, unit)}")
+    if each.greatest_shift:
+        parts.append(f", by up to {with_unit(each.greatest_shift, unit)}")
     if each.apart_ns is not None:
+        farthest = with_unit(each.greatest_distance, unit)
         parts += ["; apart from itself since ", Instant(each.apart_ns, start_ns)]
-        parts += [f", farthest by {with_unit(each.greatest, unit)} at ", Instant(each.greatest_ns, start_ns)]
-    for which, count in (("A", each.only_a), ("B", each.only_b)):
+        parts += [f", farthest by {farthest} at ", Instant(each.greatest_ns, start_ns)]
+    for which, count in (("A", each.samples_only_in_a), ("B", each.samples_only_in_b)):
         if count:
             parts.append(f"; only {which} has it in {counted(count, 'sample')}")
     return Sentence(*parts)
@@ -476,8 +475,9 @@ def _movement_sentence(each: ObjectDiff, start_ns: int, unit: str) -> Sentence:
 def _signal_sentence(each: SignalDiff, start_ns: int, unit: str) -> Sentence:
     """Return since when a signal has other values, by how much, and whether its unit may be another."""
     parts: list[str | Instant] = [f"{each.name}: differs since ", Instant(each.first_ns, start_ns)]
-    if each.greatest > 0.0 and not names_from_unit(unit):
-        parts += [f", by up to {with_unit(each.greatest, unit)} at ", Instant(each.greatest_ns, start_ns)]
+    greatest = each.greatest_difference
+    if greatest > 0.0 and not names_from_unit(unit):
+        parts += [f", by up to {with_unit(greatest, unit)} at ", Instant(each.greatest_ns, start_ns)]
     if each.has_other_unit:
         times, which = (each.ratio, "B") if each.ratio > 1.0 else (1.0 / each.ratio, "A")
         parts.append(f"; {times:,.0f} times as large in {which}: it may be in another unit there")
@@ -545,11 +545,11 @@ class RunSpecDiff:
             "name": self.a.name,
             "object": self.a.object,
             "flipped": self.is_flipped,
-            "a": EditOutcome.of(self.a).document,
-            "b": EditOutcome.of(self.b).document,
+            "a": json_value(EditOutcome.of(self.a)),
+            "b": json_value(EditOutcome.of(self.b)),
             "first_ns": self.first_ns,
             "nodes": [{"id": node, "text": self.a.nodes[node].text} for node in self.nodes],
-            "parting": self.parting and self.parting._asdict(),
+            "parting": json_value(self.parting),
             "moved": [each.name for each in self.moved],
         }
 
@@ -708,7 +708,7 @@ _MOST_LISTED: Final = 12
 
 
 @dataclass(frozen=True, eq=False)
-class LogDiff(Displayed):
+class LogDiff(Printed, Displayed):
     """Two runs side by side.
 
     Attributes:
@@ -796,38 +796,16 @@ class LogDiff(Displayed):
             "same": self.is_empty,
             "damaged": bool(self.faults),
             "alignment": {
-                "kind": self.alignment.kind,
-                "about": self.alignment.about,
-                "knots": [list(knot) for knot in self.alignment.knots],
+                **json_fields(self.alignment, "kind", "about"),
+                "knots": list(map(list, self.alignment.knots)),
                 "pairs": len(self.alignment.a),
             },
-            "objects": [
-                {
-                    "name": each.name,
-                    "first_ns": each.first_ns,
-                    "apart_ns": each.apart_ns,
-                    "greatest_distance": json_number(each.greatest),
-                    "greatest_ns": each.greatest_ns,
-                    "greatest_shift": json_number(each.shift),
-                    "samples_only_in_a": each.only_a,
-                    "samples_only_in_b": each.only_b,
-                }
-                for each in self.objects
-            ],
-            "signals": [
-                {
-                    "name": each.name,
-                    "first_ns": each.first_ns,
-                    "greatest_difference": json_number(each.greatest),
-                    "greatest_ns": each.greatest_ns,
-                    "ratio": json_number(each.ratio),
-                }
-                for each in self.signals
-            ],
+            "objects": json_value(self.objects),
+            "signals": json_value(self.signals),
             "only_a": list(self.only_a),
             "only_b": list(self.only_b),
             "specifications": [each.document for each in self.specs],
-            "decision": self.decision and self.decision._asdict(),
+            "decision": json_value(self.decision),
         }
 
     def __repr__(self) -> str:
@@ -860,16 +838,9 @@ def diff_sources(
         Selection(source, tuple(files), replace(each, keep=()))
         for source, each in zip(sources, options, strict=True)
     ]
-    traces = selections[0].trace(advance), selections[1].trace(advance)
-    missing: list[Diagnostic] = []
-    for selection, trace in zip(selections, traces, strict=True):
-        if not len(selection.inside(trace)):
-            raise selection.nothing_to_evaluate(trace.faults)
-        known = LogNames()
-        known.add(trace)
-        missing += selection.missing_names(known)
-    a, b = traces
-    evaluations = [_evaluated(trace, files, own) for trace, own in zip(traces, options, strict=True)]
+    (a, missing), (b, also_missing) = (selection.checked_trace(advance) for selection in selections)
+    pairs = zip((a, b), options, strict=True)
+    evaluations = [[evaluate_with(own, file, trace) for file in files] for trace, own in pairs]
     results = _paired(evaluations)
     alignment = align_runs((a.times_ns, b.times_ns), results, files, align)
     objects = compare_objects(a, b, alignment)
@@ -884,12 +855,12 @@ def diff_sources(
         compare_signals(a, b, alignment),
         _only_in(a, b, titles[0] - titles[1]),
         _only_in(b, a, titles[1] - titles[0]),
-        tuple(compare_results(one, other, alignment, traces, objects, files) for one, other in results),
+        tuple(compare_results(one, other, alignment, (a, b), objects, files) for one, other in results),
         compare_decisions(sources),
         not objects and a == b,
         (*_faults(a), *_faults(b)),
-        traces,
-        tuple(dict.fromkeys(missing)),
+        (a, b),
+        tuple(dict.fromkeys((*missing, *also_missing))),
     )
 
 
@@ -900,21 +871,6 @@ def _only_in(one: Trace, other: Trace, titles: set[str]) -> tuple[str, ...]:
 
 def _faults(trace: Trace) -> tuple[str, ...]:
     return counted_from(trace.faults, int(trace.times_ns[0]))
-
-
-def _evaluated(trace: Trace, files: Sequence[Specification], options: ReplayOptions) -> list[Evaluation]:
-    parameters = [{spec.parameter for spec in file.results} for file in files]
-    return [
-        evaluate(
-            file,
-            trace,
-            semantics=options.semantics,
-            start_ns=options.window.start_ns,
-            end_ns=min(options.window.end_ns, FOREVER),
-            each={name: choice for name, choice in options.each.items() if name in own},
-        )
-        for file, own in zip(files, parameters, strict=True)
-    ]
 
 
 def _paired(evaluations: Sequence[Sequence[Evaluation]]) -> list[tuple[SpecResult, SpecResult]]:

@@ -23,7 +23,7 @@ from spatial_replay.compare.edits import (
 )
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats
-from spatial_replay.lazy import Displayed
+from spatial_replay.lazy import Displayed, Printed
 from spatial_replay.logs.messages import Source
 from spatial_replay.monitor.evaluate import Evaluation, evaluate
 from spatial_replay.monitor.offline import evaluate_offline, new_leaves
@@ -32,12 +32,20 @@ from spatial_replay.monitor.paper import PaperRun
 from spatial_replay.monitor.result import SpecResult
 from spatial_replay.monitor.sentences import cause_reason
 from spatial_replay.monitor.verdict import Verdict, final_verdict
-from spatial_replay.replay.selection import DEFAULT_OPTIONS, LogNames, ReplayOptions, Selection
+from spatial_replay.replay.selection import DEFAULT_OPTIONS, ReplayOptions, Selection
 from spatial_replay.spec.diagnostics import Diagnostic, nearest_hint
 from spatial_replay.spec.formula import Atom, Formula, NamedSpec, Outline, Quantified, Specification
 from spatial_replay.spec.resolve import MAX_SIZE
-from spatial_replay.text import Instant, Sentence, counted, counted_from, json_number, with_unit
-from spatial_replay.trace.trace import FOREVER
+from spatial_replay.text import (
+    Instant,
+    Sentence,
+    counted,
+    counted_from,
+    json_fields,
+    json_value,
+    with_unit,
+)
+from spatial_replay.trace.trace import Trace
 
 _MOST_EVALUATIONS: Final = 256
 """Formulas that are evaluated to find the cause of one change; the cause found by then stands."""
@@ -61,12 +69,6 @@ class EditOutcome(NamedTuple):
             return self.verdict is other.verdict
         pairs = zip(self[1:], other[1:], strict=True)
         return self.verdict is other.verdict and all(a == b or (a != a and b != b) for a, b in pairs)
-
-    @property
-    def document(self) -> dict[str, Any]:
-        """The same as values for JSON."""
-        numbers = {name: json_number(getattr(self, name)) for name in ("robustness", "lower", "upper")}
-        return {"verdict": str(self.verdict), **numbers}
 
 
 class EditOutcomes:
@@ -289,38 +291,26 @@ class SpecDiff(Displayed):
     @property
     def document(self) -> dict[str, Any]:
         """The same as values for JSON."""
-        first = self.first
         return {
-            "name": self.name,
-            "old_name": self.old_name,
+            **json_fields(self, "name", "old_name"),
             "object": self.old.object,
             "flipped": self.is_flipped,
-            "old": EditOutcome.of(self.old).document,
-            "new": EditOutcome.of(self.new).document,
-            "first_difference": None
-            if first is None
-            else {"time_ns": first.time_ns, "old": json_number(first.old), "new": json_number(first.new)},
+            "old": json_value(EditOutcome.of(self.old)),
+            "new": json_value(EditOutcome.of(self.new)),
+            "first_difference": json_value(self.first),
             "cause": [
-                {**self._edit_value(edit), "alone": None if alone is None else alone.document}
+                {**self._edit_value(edit), "alone": json_value(alone)}
                 for edit, alone in zip(self.cause, self.alone, strict=True)
             ],
             "edits": [self._edit_value(edit) for edit in self.edits],
         }
 
     def _edit_value(self, edit: Edit) -> dict[str, Any]:
-        old, new = self.old_places.get(edit), self.new_places.get(edit)
+        sides = {"old": self.old_places.get(edit), "new": self.new_places.get(edit)}
         return {
-            "kind": edit.kind,
-            "spec": edit.spec,
-            "subject": edit.subject,
-            "old": edit.old,
-            "new": edit.new,
-            "old_nodes": list(edit.old_nodes),
-            "new_nodes": list(edit.new_nodes),
-            "old_line": None if old is None else old.line,
-            "new_line": None if new is None else new.line,
-            "old_text": None if old is None else old.text,
-            "new_text": None if new is None else new.text,
+            **json_fields(edit, "kind", "spec", "subject", "old", "new", "old_nodes", "new_nodes"),
+            **{f"{side}_line": place and place.line for side, place in sides.items()},
+            **{f"{side}_text": place and place.text for side, place in sides.items()},
         }
 
     def __repr__(self) -> str:
@@ -337,7 +327,7 @@ def outcome_text(result: SpecResult) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class SpecificationDiff(Displayed):
+class SpecificationDiff(Printed, Displayed):
     """Two versions of a specification over one log.
 
     Attributes:
@@ -434,12 +424,7 @@ def diff_over_source(
         SpecificationError: names that the log never has, if names are strict.
     """
     selection = Selection(source, (old, new), replace(options, keep=()))
-    trace = selection.trace(advance)
-    if not len(selection.inside(trace)):
-        raise selection.nothing_to_evaluate(trace.faults)
-    names = LogNames()
-    names.add(trace)
-    missing = selection.missing_names(names)
+    trace, missing = selection.checked_trace(advance)
     versions = TextVersions(old, new, trace.units)
     old, new = versions.old, versions.new
     pairs, removed, added = _paired(old, new)
@@ -451,14 +436,8 @@ def diff_over_source(
         specs: Sequence[NamedSpec], file: Specification, shapes: Mapping[str, Outline] = regions
     ) -> Evaluation:
         results = tuple(replace(spec, is_result=True) for spec in specs)
-        return evaluate(
-            Specification(results, file.profile, dict(shapes), filename=file.filename),
-            trace,
-            semantics=options.semantics,
-            start_ns=options.window.start_ns,
-            end_ns=min(options.window.end_ns, FOREVER),
-            each=options.each,
-        )
+        version = Specification(results, file.profile, dict(shapes), filename=file.filename)
+        return evaluate_with(options, version, trace)
 
     before, after = evaluated(olds, old), evaluated(news, new)
     spec_names = {spec.name for spec in old.specs}, {spec.name for spec in new.specs}
@@ -490,6 +469,19 @@ def diff_over_source(
         added,
         counted_from(trace.faults, int(trace.times_ns[0])),
         missing,
+    )
+
+
+def evaluate_with(options: ReplayOptions, file: Specification, trace: Trace) -> Evaluation:
+    """Evaluate a specification over a trace, with the options of a replay."""
+    parameters = {spec.parameter for spec in file.results}
+    return evaluate(
+        file,
+        trace,
+        semantics=options.semantics,
+        start_ns=options.window.start_ns,
+        end_ns=options.window.end_ns,
+        each={name: choice for name, choice in options.each.items() if name in parameters},
     )
 
 

@@ -49,7 +49,7 @@ from spatial_replay.spec.format import format_specification
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import load_specifications
 from spatial_replay.spec.walks import declared_unit
-from spatial_replay.text import counted, json_number, named_arguments, with_unit
+from spatial_replay.text import counted, json_fields, json_number, json_value, named_arguments, with_unit
 from spatial_replay.trace.trace import Sample
 
 _MOST_FAILURES: Final = 20
@@ -86,15 +86,8 @@ class SearchedRun:
     @property
     def document(self) -> dict[str, Any]:
         """It as JSON."""
-        return {
-            "run": self.number,
-            "case": dict(self.case),
-            "verdict": str(self.verdict),
-            "robustness": json_number(self.robustness),
-            "spec": self.spec,
-            "unit": self.unit,
-            "seconds": self.seconds,
-        }
+        values = json_fields(self)
+        return {"run": values.pop("number"), **values}
 
     @classmethod
     def from_document(cls, document: Mapping[str, Any]) -> SearchedRun:
@@ -148,16 +141,16 @@ class Coverage:
 
     Attributes:
         low, high: its range; of times in a run, `high` is the end of the first run.
-        tenths: how many runs had a value in each tenth of the range.
-        least: the least robustness of those; None where there were none.
+        runs: how many had a value in each tenth of the range.
+        least_robustness: that of those; None where there were none.
     """
 
     parameter: str
     low: float
     high: float
     unit: str
-    tenths: tuple[int, ...]
-    least: tuple[float | None, ...]
+    runs: tuple[int, ...]
+    least_robustness: tuple[float | None, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,19 +287,7 @@ class Falsification(Printed):
                 }
                 for failure in self.failures
             ],
-            "covered": [
-                {
-                    "parameter": each.parameter,
-                    "low": each.low,
-                    "high": json_number(each.high),
-                    "unit": each.unit,
-                    "runs": list(each.tenths),
-                    "least_robustness": [
-                        None if least is None else json_number(least) for least in each.least
-                    ],
-                }
-                for each in self.coverage
-            ],
+            "covered": json_value(self.coverage),
         }
 
     def _covered(self, parameter: Parameter) -> Coverage:
@@ -342,7 +323,7 @@ def _table(covered: tuple[Coverage, ...]) -> Iterator[str]:
     spans = [f"{each.low:g} to {each.high:g}{f' {each.unit}' if each.unit else ''}" for each in covered]
     width = max(map(len, spans))
     for each, span in zip(covered, spans, strict=True):
-        counts = " ".join(f"{count:3}" for count in each.tenths)
+        counts = " ".join(f"{count:3}" for count in each.runs)
         yield f"  {each.parameter:<{names}}  {span:<{width}}  {counts}"
 
 
@@ -873,35 +854,25 @@ def _claim(files: LocalFolder, identity: Mapping[str, Any]) -> None:
     try:
         (content,) = files.read([_SEARCH])
         other = json.loads(content)
-        differing = [key for key in identity if other.get(key) != identity[key]]
-    except (AttributeError, ValueError):
+        key = next((key for key in identity if other.get(key) != identity[key]), None)
+        varied = [_varied_text(each["varied"]) for each in (other, identity)]
+    except (AttributeError, LookupError, TypeError, ValueError):
         raise LogError(f"{files.path / _SEARCH} is damaged; delete {files}, or give another folder") from None
-    if differing:
-        key = differing[0]
+    if key is not None:
         what = {
             "seed": f"its seed is {other.get('seed')}",
             "simulation": f"it is of {other.get('simulation')}",
-            "varied": _difference(other.get("varied"), identity["varied"]),
+            "varied": f"it varies {varied[0]}, and this one {varied[1]}",
             "specifications": "it has other specifications",
             "version": f"it is of version {other.get('version')}",
         }.get(key, f"its {key} is {other.get(key)}")
         raise UsageError(f"{files} holds another search: {what}; give another folder, or delete it")
 
 
-def _difference(other: object, varied: Mapping[str, list[Any]]) -> str:
-    """Return how what another search varies differs, by the first range that does."""
-    others = other if isinstance(other, dict) else {}
-    for name, ends in varied.items():
-        if name not in others:
-            return f"it does not vary {name}"
-        if others[name] != ends:
-            one, this = (" to ".join(map(_end_text, each)) for each in (others[name], ends))
-            return f"it varies {name} from {one}, not from {this}"
-    return f"it varies {next((name for name in others if name not in varied), 'nothing')}, too"
-
-
-def _end_text(end: object) -> str:
-    return "the end of the run" if end == "inf" else str(end)
+def _varied_text(varied: Mapping[str, Sequence[Any]]) -> str:
+    """Return what a search varies: "speed from 0.6 to 1.4, slip from 0.0 to the end of the run"."""
+    ranges = (f"{name} from {low} to {high}" for name, (low, high) in varied.items())
+    return ", ".join(each.replace("to inf", "to the end of the run") for each in ranges)
 
 
 class _Search:

@@ -29,7 +29,7 @@ from spatial_replay.spec.format import format_formula
 from spatial_replay.spec.formula import NamedSpec, Specification
 from spatial_replay.spec.relations import DEFAULT_PROFILE, PROFILES
 from spatial_replay.spec.tokens import quoted
-from spatial_replay.text import counted, json_number, number_text, printable
+from spatial_replay.text import counted, json_value, number_text, printable
 from spatial_replay.tuning.margins import LabelledRun
 from spatial_replay.tuning.tuned import require_comparable
 
@@ -472,23 +472,10 @@ class Learned(Printed):
         return {
             "found": self.is_found,
             "text": self.text,
-            "lines": [
-                {
-                    "name": line.name,
-                    "title": line.title,
-                    "text": line.text,
-                    "pattern": line.pattern,
-                    "lowest": json_number(line.lowest),
-                    "lowest_run": line.lowest_run,
-                    "violated_by": list(line.violated_by),
-                }
-                for line in self.specs
-            ],
+            "lines": json_value(self.specs),
             "runs": [{"name": name, "good": is_good} for name, is_good in self.runs],
             "missed": list(self.missed),
-            "checked": [
-                {"name": run.name, "good": run.is_good, "verdict": run.verdict} for run in self.checked
-            ],
+            "checked": json_value(self.checked),
             "left_out": list(self.left_out),
         }
 

@@ -23,7 +23,7 @@ from types import MappingProxyType
 from typing import Any, Final, Literal, TypeAlias, TypeGuard
 
 from spatial_replay.errors import UsageError
-from spatial_replay.text import nearest_hint
+from spatial_replay.text import listed, nearest_hint
 
 Style: TypeAlias = Literal["attributes", "keys"]
 
@@ -270,12 +270,11 @@ def leads_somewhere(path: FieldPath, value: object) -> bool:
 def _named(path: FieldPath, value: object, name: str) -> object:
     names = field_names(value)
     if name not in names:
-        known = ", ".join(names[:20]) + (", …" if len(names) > 20 else "")
         hint = nearest_hint(name, names)
         raise FieldError(
             f"{path.text}: {type_name(value)} has no field {name!r}"
             + (f"; {hint}" if hint else "")
-            + (f"; its fields are {known}" if names else "")
+            + (f"; its fields are {listed(names, 20)}" if names else "")
         )
     return get_field(value, name)
 

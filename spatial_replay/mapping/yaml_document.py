@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 from spatial_replay.errors import MissingFileError, UsageError
 from spatial_replay.logs.remote import local_copy, log_file
-from spatial_replay.text import nearest_hint
+from spatial_replay.text import cut, first_lines, nearest_hint
 
 if TYPE_CHECKING:
     import yaml
@@ -221,8 +221,7 @@ def checked_document(
     by_place = faults_by_place(document, schema, contradictions)
     faults = [f"{name}:{line}: {fault}" for line, fault in numbered_faults(document, by_place)]
     if faults:
-        more = [f"… and {len(faults) - MOST_FAULTS} more"] if len(faults) > MOST_FAULTS else []
-        raise UsageError("\n".join(faults[:MOST_FAULTS] + more))
+        raise UsageError("\n".join(first_lines(faults, MOST_FAULTS)))
     return document
 
 
@@ -300,5 +299,4 @@ def _shown(value: object) -> str:
     """Return a short text for a value."""
     if isinstance(value, dict):
         return f"keys {', '.join(map(str, value))[:60]}" if value else "{}"
-    text = json.dumps(value, ensure_ascii=False, default=str)
-    return text if len(text) <= 60 else text[:59] + "…"
+    return cut(json.dumps(value, ensure_ascii=False, default=str), 60)

@@ -43,6 +43,9 @@ from spatial_replay.text import Instant, Sentence, counted_from, shortened_formu
 from spatial_replay.trace.trace import LATEST_NS
 
 _UNTESTED: Final = Sentence("Nothing tested the verdict.")
+RESULT_TIMES: Final = ("first_satisfied_ns", "violated_at_ns", "satisfied_at_ns")
+RESULT_COLUMNS: Final = ("name", "object", "verdict", "robustness", "lower", "upper", *RESULT_TIMES)
+"""Attributes of `SpecResult` that every table and document of results has."""
 
 
 @dataclass(frozen=True, eq=False)

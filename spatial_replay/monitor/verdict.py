@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from enum import StrEnum
 from reprlib import repr as shortened
@@ -72,7 +73,15 @@ def online_verdict(lower: float, upper: float) -> Verdict:
     return Verdict.UNKNOWN if is_nan else Verdict.PENDING
 
 
+def counts_text(verdicts: Iterable[str]) -> str:
+    """Return how many of some verdicts are of each kind, the worst first: "26 violated, 2 satisfied"."""
+    counts = Counter(map(str, verdicts))
+    return ", ".join(f"{counts[each]:,} {each}" for each in reversed(_BEST_FIRST) if counts[each])
+
+
+_BEST_FIRST: Final = (Verdict.SATISFIED, Verdict.PENDING, Verdict.UNKNOWN, Verdict.VIOLATED)
+
+
 def worst_verdict(verdicts: Iterable[Verdict]) -> Verdict:
     """Return the worst: violated, unknown, pending, satisfied; satisfied if there are none."""
-    order = (Verdict.SATISFIED, Verdict.PENDING, Verdict.UNKNOWN, Verdict.VIOLATED)
-    return max(verdicts, key=order.index, default=Verdict.SATISFIED)
+    return max(verdicts, key=_BEST_FIRST.index, default=Verdict.SATISFIED)

@@ -15,7 +15,7 @@ from spatial_replay.errors import UsageError, importing
 from spatial_replay.geometry.arrays import Floats, Integers
 from spatial_replay.monitor.atoms.terms import footprint_from_outline
 from spatial_replay.monitor.evaluate import Evaluation
-from spatial_replay.monitor.result import SpecResult, worst_first
+from spatial_replay.monitor.result import RESULT_COLUMNS, RESULT_TIMES, SpecResult, worst_first
 from spatial_replay.monitor.verdict import Verdict, final_verdict
 from spatial_replay.notebook import html, plot
 from spatial_replay.notebook.figures import (
@@ -284,10 +284,6 @@ def _centres(trace: Trace, rows: Integers) -> Floats:
     return np.asarray((low + high) / 2.0)
 
 
-_TIMES: Final = ("first_satisfied_ns", "violated_at_ns", "satisfied_at_ns")
-_COLUMNS: Final = ("name", "object", "verdict", "robustness", "lower", "upper", *_TIMES)
-
-
 @singledispatch
 def data_frame(value: Any) -> Any:
     """Return a value as a DataFrame.
@@ -302,10 +298,10 @@ def data_frame(value: Any) -> Any:
 def _of_evaluation(evaluation: Evaluation) -> Any:
     """Return a row for each result."""
     pandas = _pandas()
-    rows = [[getattr(each, name) for name in _COLUMNS] for each in evaluation.results]
-    frame = pandas.DataFrame(rows, columns=list(_COLUMNS))
+    rows = [[getattr(each, name) for name in RESULT_COLUMNS] for each in evaluation.results]
+    frame = pandas.DataFrame(rows, columns=list(RESULT_COLUMNS))
     # times are whole numbers, or missing
-    return frame.astype({"verdict": str} | dict.fromkeys(_TIMES, "Int64"))
+    return frame.astype({"verdict": str} | dict.fromkeys(RESULT_TIMES, "Int64"))
 
 
 @data_frame.register
@@ -363,11 +359,6 @@ def result_html(result: SpecResult) -> Html:
     return element("div", _results_table([result]), *_trees([result]))
 
 
-def _title_of(result: SpecResult) -> str:
-    """Return the name of a result, with its object if it has one."""
-    return result.name if result.object is None else f"{result.name} for {result.object}"
-
-
 def _robustness_text(value: float, lower: float, upper: float, unit: str = "") -> str:
     """Return a robustness with its unit, or its interval if it is unknown."""
     return (
@@ -379,7 +370,7 @@ def _results_table(results: Sequence[SpecResult]) -> Html:
     rows = []
     for each in results:
         robustness = _robustness_text(each.robustness, each.lower, each.upper, each.unit)
-        name, verdict = element("b", _title_of(each)), verdict_mark(each.verdict)
+        name, verdict = element("b", each.title), verdict_mark(each.verdict)
         rows.append((name, verdict, robustness, _first_satisfied(each), _tested(each)))
     return table(["result", "verdict", "robustness", "first satisfied", "tested"], rows)
 
@@ -407,7 +398,7 @@ def _trees(results: Sequence[SpecResult]) -> Iterator[Html]:
         left_out = len(result.final) - len(rows)
         more = quiet(f"… and {counted(left_out, 'node')} more") if left_out else Html("")
         nodes = table(["verdict", "robustness", "node"], rows)
-        yield folded(f"tree of {_title_of(result)}, each node at the first sample", nodes, more)
+        yield folded(f"tree of {result.title}, each node at the first sample", nodes, more)
 
 
 def _tree_rows(result: SpecResult) -> Iterator[tuple[str, str, str]]:
@@ -509,7 +500,7 @@ def _curves(result: SpecResult) -> list[_Curve]:
     # the first two colours stand for satisfied and violated
     others = zip(parts, CURVES[2 : _MOST_CURVES + 1], strict=False)
     return [
-        _Curve(_title_of(result), _finite(result, 0), own),
+        _Curve(result.title, _finite(result, 0), own),
         *(_Curve(name, _finite(result, number), colour) for (number, name), colour in others),
     ]
 
@@ -573,4 +564,4 @@ def _apart(places: Sequence[float]) -> list[float]:
 
 def _title(result: SpecResult) -> str:
     robustness = _robustness_text(result.robustness, result.lower, result.upper, result.unit)
-    return plain(f"{_title_of(result)}: {result.verdict}, robustness {robustness}")
+    return plain(f"{result.title}: {result.verdict}, robustness {robustness}")

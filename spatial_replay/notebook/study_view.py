@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -13,6 +13,7 @@ from spatial_replay.compare.runs import LogDiff
 from spatial_replay.compare.specifications import SpecDiff, SpecificationDiff
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats
+from spatial_replay.lazy import page_of
 from spatial_replay.logs.output_file import replacing
 from spatial_replay.notebook import html, plot
 from spatial_replay.notebook.figures import (
@@ -205,23 +206,11 @@ class _Pair(NamedTuple):
     values: tuple[Floats, Floats]
 
 
-@html.register(SpecificationDiff)
-@html.register(LogDiff)
-def diff_html(diff: SpecificationDiff | LogDiff) -> Html:
-    """Return a diff in the words of the command `diff`."""
-    return _lines_html(diff.lines())
-
-
 @html.register(SpecDiff)
-def spec_diff_html(diff: SpecDiff) -> Html:
+def spec_diff_html(diff: SpecDiff) -> str:
     """Return what changed of one spec, in sentences."""
     first_ns = diff.old.evidence.first_ns()
-    return _lines_html([diff.title, *(f"  {sentence}" for sentence in diff.sentences(first_ns))])
-
-
-def _lines_html(lines: Iterable[str]) -> Html:
-    style = "white-space:pre-wrap;text-align:left"
-    return element("pre", "\n".join(lines), style=style)
+    return page_of([diff.title, *(f"  {sentence}" for sentence in diff.sentences(first_ns))])
 
 
 @plot.register(SpecificationDiff)

@@ -23,7 +23,7 @@ from spatial_replay.perception.plane import (
     plane_from_references,
 )
 from spatial_replay.perception.tags_file import LEAST_REFERENCES, MountedTag, TaggedObject, TagsFile
-from spatial_replay.text import counted
+from spatial_replay.text import counted, listed
 from spatial_replay.trace.trace import Sample
 
 _STEP: Final = 1e-3
@@ -488,8 +488,7 @@ class CameraView:
 
 def tags_listed(numbers: list[str]) -> str:
     """Return tags as a sentence lists them, the first of many."""
-    shown = numbers[:_MOST_NAMED] + (["…"] if len(numbers) > _MOST_NAMED else [])
-    return f"tag{'s' if len(numbers) > 1 else ''} {', '.join(shown)}"
+    return f"tag{'s' if len(numbers) > 1 else ''} {listed(numbers, _MOST_NAMED)}"
 
 
 # ---------------------------------------------------------------------------------------------------- samples

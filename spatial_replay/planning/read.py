@@ -55,7 +55,7 @@ from spatial_replay.sources.open_log import open_source
 from spatial_replay.spec import parse_specification
 from spatial_replay.spec.format import format_specification
 from spatial_replay.spec.formula import Specification
-from spatial_replay.text import counted, time_text
+from spatial_replay.text import counted, cut, json_fields, time_text
 from spatial_replay.trace.trace import Sample, window_of
 
 PLANNER_TOPICS: Final = (PLAN_DECISION, GRADIENT_MAP, PLAN_PATH)
@@ -572,12 +572,8 @@ class Replanned(Printed):
             for side, step in (("recorded", self.recorded), ("redone", self.redone))
         }
         return {
-            "name": self.name,
+            **json_fields(self, "name", "changes", "decisions", "same", "alike"),
             "damaged": bool(self.faults),
-            "changes": self.changes,
-            "decisions": self.decisions,
-            "same": self.same,
-            "alike": self.alike,
             "differs_ns": None if self.redone is None else self.redone.sample.time_ns,
             **sides,
         }
@@ -611,14 +607,10 @@ def _maps_side_by_side(redone: Replanned, column: int) -> Iterator[str]:
         yield f"{f'map of {name}':<13}{'recorded':<{column}}redone"
         rows = [_map_rows(side.get(name)) for side in sides]
         for key in dict.fromkeys((*rows[0], *rows[1])):
-            ours, theirs = ([_cut(text, column) for text in row.get(key, ())] for row in rows)
+            ours, theirs = ([cut(text, column - 1) for text in row.get(key, ())] for row in rows)
             for place in range(max(len(ours), len(theirs))):
                 left, right = (each[place] if place < len(each) else "" for each in (ours, theirs))
                 yield f"  {key if not place else '':<11}{left:<{column}}{right}".rstrip()
-
-
-def _cut(text: str, column: int) -> str:
-    return text if len(text) < column else f"{text[: column - 2]}…"
 
 
 def _map_rows(candidate: PlanCandidate | None) -> dict[str, list[str]]:

@@ -21,7 +21,7 @@ from spatial_replay.geometry.arrays import Booleans, Floats
 from spatial_replay.geometry.footprint import ConvexPart, Footprint
 from spatial_replay.logs.remote import log_file
 from spatial_replay.mapping.yaml_document import checked_document, read_yaml_text, schema_of
-from spatial_replay.text import named_arguments
+from spatial_replay.text import cut, named_arguments
 from spatial_replay.trace.trace import Sample
 
 # ---------------------------------------------------------------------------------------------- the workspace
@@ -516,5 +516,4 @@ def changes_text(before: Settings, after: Settings) -> tuple[str, ...]:
 
 
 def _brief(value: Any) -> str:
-    text = json.dumps(value).replace('"', "")
-    return text if len(text) <= 60 else f"{text[:59]}…"
+    return cut(json.dumps(value).replace('"', ""), 60)

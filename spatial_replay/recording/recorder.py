@@ -53,7 +53,7 @@ from spatial_replay.spec import check_names
 from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import listed_specifications
-from spatial_replay.text import counted_from, named_arguments, times_apart
+from spatial_replay.text import counted_from, listed, named_arguments, times_apart
 from spatial_replay.trace.trace import LATEST_NS, Sample, Trace, require_sample
 from spatial_replay.trace.units import Axes, checked_units
 
@@ -228,8 +228,9 @@ def _check_descriptors(topic: str, text: bytes, name: str) -> None:
         ) from None
     known = [full for file in files.file for full in _type_names(file.package, file.message_type)]
     if name not in known:
-        listed = ", ".join(known[:8]) + (", …" if len(known) > 8 else "") or "no message"
-        raise UsageError(f"{topic}: the schema has no message {name!r}; it has {listed}")
+        raise UsageError(
+            f"{topic}: the schema has no message {name!r}; it has {listed(known) or 'no message'}"
+        )
 
 
 def _type_names(prefix: str, types: Any) -> list[str]:

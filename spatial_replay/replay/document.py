@@ -9,7 +9,7 @@ from typing import Any
 from spatial_replay.errors import UsageError
 from spatial_replay.geometry.arrays import Floats
 from spatial_replay.monitor.causes import Cause
-from spatial_replay.monitor.result import SpecResult, no_such_node
+from spatial_replay.monitor.result import RESULT_COLUMNS, NodeResult, SpecResult, no_such_node
 from spatial_replay.monitor.sentences import sentences_of
 from spatial_replay.monitor.vacuity import UntestedPart
 from spatial_replay.monitor.verdict import Verdict, online_verdict
@@ -18,7 +18,7 @@ from spatial_replay.monitor.witness.witness import Witness
 from spatial_replay.replay.engine import Replayed
 from spatial_replay.spec.formula import iter_nodes
 from spatial_replay.spec.walks import units_of, units_text
-from spatial_replay.text import Sentence, counted_from, json_number, names_of
+from spatial_replay.text import Sentence, counted_from, json_fields, json_number, names_of
 
 
 def document_from_replay(
@@ -36,12 +36,8 @@ def document_from_replay(
     return {
         "log": {
             "name": replayed.log,
-            "samples": replayed.samples,
-            "start_ns": replayed.start_ns,
-            "end_ns": replayed.end_ns,
+            **json_fields(replayed, "samples", "start_ns", "end_ns", "faults", "remarks"),
             "damaged": bool(replayed.faults),
-            "faults": list(replayed.faults),
-            "remarks": list(replayed.remarks),
             "missing": [each.message for each in replayed.missing],
             "dropped_samples": replayed.dropped.count,
             "unreadable_observations": replayed.unreadable,
@@ -57,43 +53,21 @@ def document_from_replay(
 
 def _result(result: SpecResult, first_ns: int, signal: bool, window_ns: int | None) -> dict[str, Any]:
     value: dict[str, Any] = {
-        "name": result.name,
-        "object": result.object,
+        **json_fields(result, *RESULT_COLUMNS),
         "requirement": result.spec.id,
         "title": result.spec.title,
-        "verdict": str(result.verdict),
-        "robustness": json_number(result.robustness),
-        "lower": json_number(result.lower),
-        "upper": json_number(result.upper),
-        "first_satisfied_ns": result.first_satisfied_ns,
-        "violated_at_ns": result.violated_at_ns,
-        "satisfied_at_ns": result.satisfied_at_ns,
-        "worst": None,
+        # what headline, arrow and event name
+        "worst": None if result.worst is None else witness_document(result.worst, first_ns),
         "causes": [_cause(each, first_ns) for each in result.causes],
         "tested": result.tested,
         "untested": [_untested(each, first_ns) for each in result.untested],
         "vacuous": [_untested(each, first_ns) for each in result.vacuous],
         "remarks": list(counted_from(result.remarks, first_ns)),
         "nodes": [
-            {
-                "id": node.id,
-                "parent": node.parent,
-                "operator": node.operator,
-                "name": node.name,
-                "requirement": node.requirement,
-                "title": node.title,
-                "text": node.text,
-                "verdict": str(node.verdict),
-                "robustness": json_number(node.robustness),
-                "lower": json_number(node.final_lower),
-                "upper": json_number(node.final_upper),
-            }
+            {**json_fields(node, "id", "parent", "operator", "text"), **_of_node(node)}
             for node in result.nodes
         ],
     }
-    if result.worst is not None:
-        # what headline, arrow and event name
-        value["worst"] = witness_document(result.worst, first_ns)
     if result.has_series:
         value["series"] = {
             "time_ns": result.times_ns.tolist(),
@@ -108,95 +82,65 @@ def _result(result: SpecResult, first_ns: int, signal: bool, window_ns: int | No
     return value
 
 
+def _of_node(node: NodeResult) -> dict[str, Any]:
+    """Return what nodes and explanations of them have in common."""
+    return {
+        **json_fields(node, "name", "requirement", "title", "verdict", "robustness"),
+        "lower": json_number(node.final_lower),
+        "upper": json_number(node.final_upper),
+    }
+
+
 def _cause(cause: Cause, first_ns: int) -> dict[str, Any]:
     return {
-        "spec": cause.spec,
-        "requirement": cause.requirement,
-        "title": cause.title,
-        "node": cause.node,
-        "verdict": str(cause.verdict),
-        "robustness": json_number(cause.robustness),
-        "settled_ns": cause.settled_ns,
+        **json_fields(cause, "spec", "requirement", "title", "node", "verdict", "robustness", "settled_ns"),
         "witness": None if cause.witness is None else witness_document(cause.witness, first_ns),
     }
 
 
 def _untested(part: UntestedPart, first_ns: int) -> dict[str, Any]:
     (message,) = counted_from([part.message], first_ns)
-    return {
-        "node": part.node,
-        "text": part.text,
-        "reason": part.reason,
-        "time_ns": part.time_ns,
-        "message": message,
-    }
+    return {**json_fields(part), "message": message}
 
 
 def witness_document(witness: Witness, first_ns: int) -> dict[str, Any]:
     """Return what decides a node's verdict, with sentences that count time from `first_ns`."""
     deciding, threshold = witness.deciding, witness.threshold
     value: dict[str, Any] = {
-        "node": witness.node,
+        **json_fields(witness, "node", "verdict", "lower", "upper", "time_ns", "obstacle"),
         "name": witness.path[0].name,
-        "verdict": str(witness.verdict),
-        "lower": json_number(witness.lower),
-        "upper": json_number(witness.upper),
-        "time_ns": witness.time_ns,
-        "path": [{"node": step.node, "time_ns": step.time_ns} for step in witness.path],
+        "path": [json_fields(step, "node", "time_ns") for step in witness.path],
         "atom": None,
         "threshold": None,
-        "obstacle": witness.obstacle,
         "missed": None,
         "missing": [
             {
                 "name": gap.name,
                 "samples": gap.missing,
                 "of": gap.samples,
-                "first_ns": gap.first_ns,
-                "last_ns": gap.last_ns,
-                "longest_ns": list(gap.longest_ns),
+                **json_fields(gap, "first_ns", "last_ns", "longest_ns"),
             }
             for gap in witness.gaps
         ],
         "explanation": list(sentences_of(witness, first_ns=first_ns)),
     }
     if witness.missed is not None:
-        missed = witness.missed
-        value["missed"] = {
-            "condition": missed.condition,
-            "response": missed.response,
-            "time_ns": missed.time_ns,
-        }
+        value["missed"] = json_fields(witness.missed, "condition", "response", "time_ns")
     if deciding is not None:
         value["atom"] = {
-            "text": deciding.text,
+            **json_fields(deciding, "text", "objects", "value", "lower", "upper", "unknown"),
             "relation": deciding.atom.relation,
-            "objects": list(deciding.objects),
-            "value": json_number(deciding.value),
-            "lower": json_number(deciding.lower),
-            "upper": json_number(deciding.upper),
             "measured": [_measured(each) for each in deciding.measured],
-            "unknown": list(deciding.unknown),
         }
     if threshold is not None:
-        value["threshold"] = {
-            "value": threshold.value,
-            "flips_at": threshold.flips_at,
-            "written": threshold.is_written,
-            "exact": threshold.is_exact,
-            "verdict": str(threshold.verdict),
-            "constant": threshold.constant or None,
-        }
+        value["threshold"] = {**json_fields(threshold), "constant": threshold.constant or None}
     return value
 
 
 def _measured(measured: Measured) -> dict[str, Any]:
     contact = measured.contact
     return {
-        "quantity": measured.quantity,
-        "names": list(measured.names),
-        "value": json_number(measured.value),
-        "spread": measured.spread,
+        **json_fields(measured, "quantity", "names", "value", "spread"),
         "points": None if contact is None else [list(contact.first), list(contact.second)],
     }
 
@@ -323,14 +267,9 @@ def explain_node(result: SpecResult, node: int = 0, *, first_ns: int, goes_on: b
     document = {
         "specification": result.name,
         "object": result.object,
-        "requirement": about.requirement,
-        "title": about.title,
         "node": node,
-        "name": about.name,
+        **_of_node(about),
         "verdict": str(verdict),
-        "robustness": json_number(about.robustness),
-        "lower": json_number(about.final_lower),
-        "upper": json_number(about.final_upper),
         "since_ns": None if is_open else result.certain_ns(node),
         "may_change": is_open,
         **{key: decided[key] for key in ("time_ns", "atom", "threshold", "obstacle", "missed", "missing")},

@@ -57,10 +57,10 @@ from spatial_replay.replay.selection import (
 from spatial_replay.replay.specification_files import SpecificationFiles, constant_value
 from spatial_replay.spec import parse_specification
 from spatial_replay.spec.checks import with_numbers
-from spatial_replay.spec.diagnostics import Diagnostic, nearest_hint
+from spatial_replay.spec.diagnostics import nearest_hint
 from spatial_replay.spec.format import format_duration, format_specification
 from spatial_replay.spec.formula import Constant, Specification, iter_nodes
-from spatial_replay.text import counted_from
+from spatial_replay.text import counted_from, listed
 from spatial_replay.trace.trace import Trace
 
 _FEW: Final = 2_000
@@ -286,7 +286,7 @@ class LoadedLog:
         self.inside = selection.inside(self.trace)
         if not len(self.inside):
             raise selection.nothing_to_evaluate(self.faults)
-        self.missing = self._missing(selection)
+        self.missing = selection.missing_names(LogNames.of(self.trace))
         self.dropped = dropped_samples(source)
         self.first_ns = first_sample_ns(source) if options.window.start_ns else int(self.trace.times_ns[0])
         self._places = _places(self._files)
@@ -306,7 +306,8 @@ class LoadedLog:
             return LoadedLog(self._source, files, options, saved=self._saved)
         other = copy(self)
         other._files, other._kept = tuple(files), logged_specifications(files, self.trace.units)
-        other.missing = other._missing(Selection(self._source, tuple(files), self.options))
+        selection = Selection(self._source, tuple(files), self.options)
+        other.missing = selection.missing_names(LogNames.of(self.trace))
         other._places = _places(other._files)
         other.constants = other._constants(other._files)
         return other
@@ -330,11 +331,6 @@ class LoadedLog:
     def was_written(self, name: str) -> bool:
         """Say whether a constant has the value in its file that `write_constants` gave it."""
         return self._saved is not None and self._saved.was_written(*self._places[name])
-
-    def _missing(self, selection: Selection) -> tuple[Diagnostic, ...]:
-        names = LogNames()
-        names.add(self.trace)
-        return selection.missing_names(names)
 
     def _by_file(self, values: Mapping[str, float | str]) -> list[dict[str, float | str]]:
         edits = [dict[str, float | str]() for _ in self._files]
@@ -487,8 +483,7 @@ class Evaluated:
             for name, constant in self.edited.constants.items()
             if constant != written[name]
         ]
-        more = ", …" if len(changed) > _MOST_NAMED else ""
-        return text + (f" ({', '.join(changed[:_MOST_NAMED])}{more})" if changed else "")
+        return text + (f" ({listed(changed, _MOST_NAMED)})" if changed else "")
 
     @cached_property
     def layout(self) -> Attachment:

@@ -46,7 +46,7 @@ from spatial_replay.spec.diagnostics import Diagnostic
 from spatial_replay.spec.format import format_bound, format_duration
 from spatial_replay.spec.formula import Specification, Temporal
 from spatial_replay.spec.walks import iter_formulas
-from spatial_replay.text import time_text
+from spatial_replay.text import listed, time_text
 from spatial_replay.trace.trace import FOREVER, Trace, window_of, within
 
 if TYPE_CHECKING:
@@ -92,9 +92,8 @@ def _check_patterns(source: Source, patterns: Sequence[str]) -> None:
         raise UsageError(f"{source.name} has no messages to keep; it holds samples only")
     for pattern in patterns:
         if not any(is_kept(topic, (pattern,), ()) for topic in topics):
-            listed = ", ".join(topics[:8]) + (", …" if len(topics) > 8 else "")
             raise UsageError(
-                f"no topic of {source.name} fits {pattern!r}; it has {listed}; "
+                f"no topic of {source.name} fits {pattern!r}; it has {listed(topics)}; "
                 "'all' keeps everything, 'mapped' the topics that make the samples"
             )
 
@@ -208,6 +207,13 @@ class LogNames:
     signals: set[str] = field(default_factory=set)
     classes: set[str] = field(default_factory=set)
 
+    @classmethod
+    def of(cls, trace: Trace) -> LogNames:
+        """Return those of a whole log."""
+        names = cls()
+        names.add(trace)
+        return names
+
     def add(self, trace: Trace) -> None:
         """Add those of some samples."""
         self.objects.update(trace.names)
@@ -286,6 +292,18 @@ class Selection:
             traces.append(trace)
             advance(len(trace))
         return replace(Trace.concatenate(traces), units=self.source.axes.units)
+
+    def checked_trace(self, advance: Callable[[int], None]) -> tuple[Trace, tuple[Diagnostic, ...]]:
+        """Return that trace, with a warning for each name that it lacks; see `missing_names`.
+
+        Raises:
+            LogError, UsageError: it has no sample in the window.
+            SpecificationError: it lacks names, and these are strict.
+        """
+        trace = self.trace(advance)
+        if not len(self.inside(trace)):
+            raise self.nothing_to_evaluate(trace.faults)
+        return trace, self.missing_names(LogNames.of(trace))
 
     def inside(self, trace: Trace) -> Trace:
         """Return those samples that are in the window."""

@@ -23,7 +23,7 @@ from spatial_replay.logs.messages import AUTOMATON, ROBUSTNESS, SPECIFICATION, S
 from spatial_replay.logs.output_file import replacing
 from spatial_replay.logs.schemas.AutomatonState_pb2 import AutomatonState
 from spatial_replay.logs.schemas.Specification_pb2 import Specification, SpecificationResult
-from spatial_replay.text import counted_from
+from spatial_replay.text import counted_from, cut
 
 Quantity: TypeAlias = Literal["value", "now", "lower", "upper"]
 TIME = "time_ns"
@@ -190,8 +190,7 @@ def _paths(result: _Result, tree: SpecificationResult) -> Mapping[int, str]:
         elif node.name:
             title = owners[node.id] = f"{owner}/{node.name}"
         else:
-            text = node.text if len(node.text) <= _LONGEST_TEXT else f"{node.text[: _LONGEST_TEXT - 1]}…"
-            title, owners[node.id] = f"{owner}: {text}", owner
+            title, owners[node.id] = f"{owner}: {cut(node.text, _LONGEST_TEXT)}", owner
         titles[node.id] = title
     return titles
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import base64
 import hashlib
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from html import escape
@@ -18,7 +17,7 @@ from typing import Final
 from spatial_replay import __version__
 from spatial_replay.monitor.causes import settled_time
 from spatial_replay.monitor.result import SpecResult, worst_first
-from spatial_replay.monitor.verdict import Verdict
+from spatial_replay.monitor.verdict import Verdict, counts_text
 from spatial_replay.notebook.figures import Html, element
 from spatial_replay.palette import SIGNS
 from spatial_replay.report.compact import json_text, sentence_parts
@@ -164,10 +163,8 @@ def _verdicts(report: RunReport) -> Iterator[Html]:
 
 
 def _counts(report: RunReport) -> str:
-    """Return how many results have each verdict, the worst first: "26 violated, 2 satisfied"."""
-    counts = Counter(each.result.verdict for each in report.results)
-    order = (Verdict.VIOLATED, Verdict.UNKNOWN, Verdict.SATISFIED)
-    return ", ".join(f"{counts[verdict]:,} {verdict}" for verdict in order if counts[verdict])
+    """Return how many results have each verdict."""
+    return counts_text(each.result.verdict for each in report.results)
 
 
 def _summary(each: ReportedResult, first_ns: int) -> Html:
@@ -335,7 +332,7 @@ def document(
     *,
     has_pictures: bool = False,
 ) -> bytes:
-    """Return a whole page, in UTF-8.
+    """Return a whole page about runs, in UTF-8.
 
     Args:
         parts: what is between the beginning of its body and the bar at the bottom.
@@ -343,38 +340,60 @@ def document(
         script_name: the file of browser/ that runs the others.
         has_pictures: whether there are pictures among the facts.
     """
-    style = "\n".join([theme(), *map(_asset, _STYLES)])
-    library, script = _asset(_LIBRARY), _script(script_name)
-    allowed = policy([library, script], style, has_pictures)
     json_kind, packed_kind = "application/json", "application/octet-stream"
-    whole = [
-        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">',
-        f'<meta http-equiv="Content-Security-Policy" content="{allowed}">',
-        '<meta name="viewport" content="width=device-width, initial-scale=1">',
-        '<meta name="color-scheme" content="light dark">',
-        element("title", text(title)),
-        f"<style>{style}</style></head><body>",
+    body = [
         *parts,
         '<div id="transport" class="transport" role="region" aria-label="Time"></div>',
         *(f'<script type="{json_kind}" id="{name}">{each}</script>' for name, each in facts.items()),
         *(f'<script type="{packed_kind}" id="{name}">{each}</script>' for name, each in numbers.items()),
-        f"<script>{library}</script>",
-        f"<script>{script}</script></body></html>\n",
+    ]
+    scripts = [asset(_LIBRARY), _script(script_name)]
+    return html_page(title, body, scripts, _STYLES, has_pictures=has_pictures)
+
+
+def html_page(
+    title: str,
+    body: Sequence[str],
+    scripts: Sequence[str],
+    styles: Sequence[str],
+    *,
+    marks: str = "",
+    has_pictures: bool = False,
+) -> bytes:
+    """Return a page with its styles and scripts in it, in UTF-8.
+
+    Args:
+        styles: assets, see `asset`.
+        marks: attributes of its root.
+    """
+    style = "\n".join([theme(), *map(asset, styles)])
+    whole = [
+        f'<!doctype html>\n<html lang="en"{marks}><head><meta charset="utf-8">',
+        f'<meta http-equiv="Content-Security-Policy" content="{_policy(scripts, style, has_pictures)}">',
+        '<meta name="viewport" content="width=device-width, initial-scale=1">',
+        '<meta name="color-scheme" content="light dark">',
+        element("title", text(title)),
+        f"<style>{style}</style></head><body>",
+        *body,
+        *(f"<script>{each}</script>" for each in scripts),
+        "</body></html>\n",
     ]
     return "".join(whole).encode("utf-8")
 
 
-def _asset(name: str) -> str:
-    return files(__package__).joinpath(name).read_text("utf-8")
+def asset(name: str) -> str:
+    """Return the text of a file of this room, or of another one: "batch:overview.css"."""
+    room, _, file = name.rpartition(":")
+    return files(f"spatial_replay.{room or 'report'}").joinpath(file).read_text("utf-8")
 
 
 def _script(name: str) -> str:
     """Return our scripts as one, in a scope of its own."""
-    scripts = "\n".join(_asset(f"browser/{each}.js") for each in (*_SCRIPTS, name))
+    scripts = "\n".join(asset(f"browser/{each}.js") for each in (*_SCRIPTS, name))
     return f'(() => {{\n"use strict";\n{scripts}\n}})();\n'
 
 
-def policy(scripts: Sequence[str], style: str, has_pictures: bool = False) -> str:
+def _policy(scripts: Sequence[str], style: str, has_pictures: bool) -> str:
     """Return the policy: the browser loads nothing, and runs only the scripts of the page."""
     pictures = "img-src data:; " if has_pictures else ""
     allowed = " ".join(map(_digest, scripts))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import combinations
 from pathlib import Path
 from types import MappingProxyType
@@ -31,7 +30,7 @@ from spatial_replay.spec.formula import (
 )
 from spatial_replay.spec.load import require_specification
 from spatial_replay.spec.walks import is_spatial, iter_formulas, looks_back, other_names, terms_of
-from spatial_replay.text import counted, json_number, named_arguments, number_text, shortened_formula
+from spatial_replay.text import counted, json_fields, named_arguments, number_text, shortened_formula
 
 MAX_PAIRS: Final = 300
 """How many pairs of specs are compared at most."""
@@ -141,10 +140,8 @@ class Examination(Printed):
             "findings": [_finding(each) for each in self.findings],
             "specifications": [
                 {
-                    "name": spec.name,
+                    **json_fields(spec, "name", "reason", "undecided"),
                     "automaton": not spec.reason,
-                    "reason": spec.reason,
-                    "undecided": spec.undecided,
                     "by_logic_alone": spec.unrelated,
                     "satisfied": _example_document(spec.satisfied),
                     "violated": _example_document(spec.violated),
@@ -178,28 +175,18 @@ def _example(example: Example, file: Path | None) -> Iterator[str]:
 
 
 def _finding(finding: Finding) -> dict[str, Any]:
-    place = finding.diagnostic
     return {
-        "kind": finding.kind,
+        **json_fields(finding, "kind", "reason", "exclusions"),
         "specifications": finding.specs,
-        "message": place.message,
-        "hint": place.hint,
-        "reason": finding.reason,
-        "exclusions": finding.exclusions,
-        "line": place.line,
-        "column": place.column,
+        **json_fields(finding.diagnostic, "message", "hint", "line", "column"),
     }
 
 
 def _example_document(example: Example | None) -> dict[str, Any] | None:
     if example is None:
         return None
-    return {
-        "samples": example.sentences,
-        "robustness": None if example.robustness is None else json_number(example.robustness),
-        "tracks": example.rows,
-        "note": example.note,
-    }
+    about = json_fields(example, "robustness", "note")
+    return {"samples": example.sentences, "tracks": example.rows, **about}
 
 
 @named_arguments
@@ -243,33 +230,23 @@ def _refuse(specification: Specification, names: Sequence[str], ends: Sequence[b
     """Refuse those specs of some names that no run satisfies (True), or violates (False)."""
     examiner = _Examiner(specification)
     specs = [spec for spec in specification.specs if spec.name in names]
-    parts = [_Part(spec.name, spec.formula, spec.span) for spec in specs]
-    found = [examiner.why_empty(part, satisfied) for part in parts for satisfied in ends]
+    found = [examiner.why_empty(spec, satisfied) for spec in specs for satisfied in ends]
     errors = [replace(each.diagnostic, severity="error") for each in found if each is not None]
     if errors:
         raise SpecificationError(errors)
 
 
-@dataclass(frozen=True)
-class _Part:
-    """A spec that is a result, or a conjunct of one under its own name."""
-
-    name: str
-    formula: Formula
-    span: Span
-
-    @cached_property
-    def names(self) -> frozenset[str]:
-        """Its subject."""
-        atoms = [each for each in iter_formulas(self.formula) if isinstance(each, Atom)]
-        signals = {str(each.parameters[0]) for each in atoms if each.relation == "signal"}
-        named = {each.name for each in iter_formulas(self.formula) if each.name is not None}
-        return (other_names(self.formula) - named) | signals
+def _subject(formula: Formula) -> frozenset[str]:
+    """Return the objects, regions and signals that a formula is about."""
+    atoms = [each for each in iter_formulas(formula) if isinstance(each, Atom)]
+    signals = {str(each.parameters[0]) for each in atoms if each.relation == "signal"}
+    named = {each.name for each in iter_formulas(formula) if each.name is not None}
+    return (other_names(formula) - named) | signals
 
 
-def _parts(spec: NamedSpec, specs: dict[str, NamedSpec]) -> Iterator[_Part]:
+def _parts(spec: NamedSpec, specs: dict[str, NamedSpec]) -> Iterator[NamedSpec]:
     """Yield the named conjuncts of a spec; the spec itself, if it has others."""
-    waiting = [_Part(spec.name, spec.formula, spec.span)]
+    waiting = [spec]
     while waiting:
         part = waiting.pop()
         formula = part.formula
@@ -278,7 +255,7 @@ def _parts(spec: NamedSpec, specs: dict[str, NamedSpec]) -> Iterator[_Part]:
         )
         below = [specs.get(each.name or "") for each in operands]
         if operands and all(below):
-            waiting += [_Part(each.name, each.formula, each.span) for each in reversed(below) if each]
+            waiting += [each for each in reversed(below) if each]
         else:
             yield part
 
@@ -302,10 +279,9 @@ class _Examiner:
         results = self._specification.results
         parts = {part.name: part for spec in results for part in _parts(spec, specs)}
         for spec in results:
-            whole = _Part(spec.name, spec.formula, spec.span)
-            self._examine(whole)
-            if not self._is_empty(whole, True):
-                self._antecedents(whole)
+            self._examine(spec)
+            if not self._is_empty(spec, True):
+                self._antecedents(spec)
         for part in parts.values():
             if part.name not in {spec.name for spec in results}:
                 self._examine(part)
@@ -314,19 +290,19 @@ class _Examiner:
         places = sorted(self._findings, key=lambda each: (each.diagnostic.line, each.diagnostic.column))
         return Examination(tuple(places), described, tuple(self._notes))
 
-    def why_empty(self, part: _Part, satisfied: bool) -> Finding | None:
+    def why_empty(self, part: NamedSpec, satisfied: bool) -> Finding | None:
         """Return the finding that no run satisfies, or violates, a part; None if one may."""
         if not self._is_empty(part, satisfied):
             return None
         self._examine(part)
         return self._findings[-1]
 
-    def _reading(self, part: _Part) -> SpecReading:
+    def _reading(self, part: NamedSpec) -> SpecReading:
         if part.name not in self._readings:
             self._readings[part.name] = reading_of(self._specification, part.name, part.formula)
         return self._readings[part.name]
 
-    def _answer(self, part: _Part, satisfied: bool) -> Answer | None:
+    def _answer(self, part: NamedSpec, satisfied: bool) -> Answer | None:
         """Return the shortest run that satisfies, or violates, a part; None if that is not decided."""
         key = part.name, satisfied
         if key not in self._answers:
@@ -338,7 +314,7 @@ class _Examiner:
         return self._answers[key]
 
     def _asked(
-        self, name: str, what: str, *runs: Runs, whole: tuple[_Part, bool] | None = None
+        self, name: str, what: str, *runs: Runs, whole: tuple[NamedSpec, bool] | None = None
     ) -> Answer | None:
         try:
             if runs:
@@ -349,7 +325,7 @@ class _Examiner:
         self._undecided.setdefault(name, []).append(what)
         return None
 
-    def _of_whole(self, part: _Part, satisfied: bool) -> Answer | None:
+    def _of_whole(self, part: NamedSpec, satisfied: bool) -> Answer | None:
         """Return what the automaton of a whole part says; None if that is not decided either."""
         try:
             side = Side(automaton_of(self._specification, part.name, part.formula), satisfied)
@@ -359,11 +335,11 @@ class _Examiner:
         except (NoAutomatonError, UndecidedError):
             return None
 
-    def _is_empty(self, part: _Part, satisfied: bool) -> bool:
+    def _is_empty(self, part: NamedSpec, satisfied: bool) -> bool:
         answer = self._answer(part, satisfied)
         return answer is not None and answer.word is None
 
-    def _examine(self, part: _Part) -> None:
+    def _examine(self, part: NamedSpec) -> None:
         if self._is_empty(part, True):
             message = f"no run satisfies {part.name}"
             self._add(
@@ -373,7 +349,7 @@ class _Examiner:
             message = f"every run satisfies {part.name}"
             self._add("always true", (part.name,), part.span, self._answer(part, False), message, _ALWAYS)
 
-    def _antecedents(self, part: _Part) -> None:
+    def _antecedents(self, part: NamedSpec) -> None:
         satisfying = self._reading(part).satisfying
         nodes = (node for _, _, node in iter_nodes(part.formula))
         implications = {
@@ -404,12 +380,12 @@ class _Examiner:
             if within is not None and within.word is None:
                 self._add_idle(part, node, within, f" in a run that satisfies {part.name}")
 
-    def _add_idle(self, part: _Part, node: Boolean, found: Answer, where: str) -> None:
+    def _add_idle(self, part: NamedSpec, node: Boolean, found: Answer, where: str) -> None:
         text = shortened_formula(format_formula(node.operands[0]))
         message = f"`{text}` never holds{where}, so this implication checks nothing"
         self._add("idle antecedent", (part.name,), node.span, found, message, _IDLE)
 
-    def _sometime(self, part: _Part, formula: Formula) -> Runs | None:
+    def _sometime(self, part: NamedSpec, formula: Formula) -> Runs | None:
         """Return the runs in which a part of a spec holds in some sample; None without an automaton."""
         wanted = loosened(Temporal("F", (formula,)))
         try:
@@ -417,10 +393,13 @@ class _Examiner:
         except NoAutomatonError:
             return None
 
-    def _pairs(self, parts: Sequence[_Part], results: Sequence[NamedSpec]) -> None:
+    def _pairs(self, parts: Sequence[NamedSpec], results: Sequence[NamedSpec]) -> None:
         """Compare specs that are about the same things, and are no trouble on their own."""
         sound = [part for part in parts if not (self._is_empty(part, True) or self._is_empty(part, False))]
-        pairs = [(one, other) for one, other in combinations(sound, 2) if one.names & other.names]
+        subjects = {part.name: _subject(part.formula) for part in sound}
+        pairs = [
+            (one, other) for one, other in combinations(sound, 2) if subjects[one.name] & subjects[other.name]
+        ]
         if len(pairs) > MAX_PAIRS:
             self._notes.append(f"of {len(pairs)} pairs of specs, {MAX_PAIRS} were compared")
         for one, other in pairs[:MAX_PAIRS]:
@@ -446,7 +425,7 @@ class _Examiner:
                 message = f"{one.name} follows from {other.name}"
                 self._add("implied", (one.name, other.name), one.span, before, message, _IMPLIED)
 
-    def _compared(self, one: _Part, verb: str, other: _Part, *runs: Runs | None) -> Answer | None:
+    def _compared(self, one: NamedSpec, verb: str, other: NamedSpec, *runs: Runs | None) -> Answer | None:
         given = [each for each in runs if each is not None]
         if len(given) < len(runs):
             return None
@@ -464,8 +443,8 @@ class _Examiner:
         diagnostic = self._source.diagnostic("warning", span, f"{message}: {reason}", hint)
         self._findings.append(Finding(kind, specs, reason, found.exclusions, diagnostic))
 
-    def _example(self, spec: NamedSpec, part: _Part, satisfied: bool, word: Word) -> Example | None:
-        reading = self._reading(part)
+    def _example(self, spec: NamedSpec, satisfied: bool, word: Word) -> Example | None:
+        reading = self._reading(spec)
         wanted = reading.satisfying if satisfied else reading.violating
         return shortest_example(
             self._specification,
@@ -478,15 +457,14 @@ class _Examiner:
         )
 
     def _described(self, spec: NamedSpec, examples: bool) -> SpecExamination:
-        part = _Part(spec.name, spec.formula, spec.span)
         runs: list[Example | None] = []
         for satisfied in (True, False):
-            answer = self._answer(part, satisfied)
+            answer = self._answer(spec, satisfied)
             word = None if answer is None else answer.word
-            runs.append(self._example(spec, part, satisfied, word) if word is not None and examples else None)
+            runs.append(self._example(spec, satisfied, word) if word is not None and examples else None)
         undecided = tuple(self._undecided.get(spec.name, ()))
         return SpecExamination(
-            spec.name, self._reading(part).reason, undecided, tuple(_unrelated(spec.formula)), *runs
+            spec.name, self._reading(spec).reason, undecided, tuple(_unrelated(spec.formula)), *runs
         )
 
 

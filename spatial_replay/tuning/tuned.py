@@ -24,7 +24,7 @@ from spatial_replay.spec.checks import with_numbers
 from spatial_replay.spec.diagnostics import nearest_hint
 from spatial_replay.spec.formula import Specification
 from spatial_replay.spec.load import constant_writer
-from spatial_replay.text import counted, json_number
+from spatial_replay.text import counted, json_fields, json_number, json_value
 from spatial_replay.trace.units import require_same_units
 from spatial_replay.tuning.margins import (
     Direction,
@@ -842,42 +842,14 @@ class Tuning(Displayed):
     @property
     def document(self) -> dict[str, Any]:
         """This as values for JSON."""
+        unknown = {} if self.is_found else {"low": None, "high": None}
         return {
             "found": self.is_found,
             "margin": json_number(self.margin),
             "widest": self.is_widest,
-            "constants": [
-                {
-                    "name": each.name,
-                    "value": each.value,
-                    "written": each.written,
-                    "low": each.low if self.is_found else None,
-                    "high": each.high if self.is_found else None,
-                    "tried": list(each.tried),
-                    "step": each.step,
-                    "direction": each.direction,
-                    "decided": each.is_decided,
-                }
-                for each in self.constants
-            ],
-            "runs": [
-                {
-                    "name": run.name,
-                    "good": run.is_good,
-                    "verdict": run.verdict,
-                    "robustness": json_number(run.robustness),
-                    "margin": json_number(run.margin),
-                }
-                for run in self.runs
-            ],
-            "conflict": None
-            if self.conflict is None
-            else {
-                "runs": list(self.conflict.runs),
-                "message": self.conflict.message,
-                "proven": self.conflict.is_proven,
-                "alone": list(self.conflict.alone),
-            },
+            "constants": [{**json_fields(each), **unknown} for each in self.constants],
+            "runs": json_value(self.runs),
+            "conflict": json_value(self.conflict),
         }
 
 

@@ -72,9 +72,9 @@ def test_runs_of_different_speeds_are_aligned_by_their_progress() -> None:
     with pytest.raises(sr.UsageError, match="did you mean 'away'"):
         sr.diff_logs(fast, slow, specification, align="progress:awy")
     assert len(by_progress.alignment.knots) >= 3
-    assert by_time.shift > 5.0
+    assert by_time.greatest_shift > 5.0
     # between two changes of state the cup moves evenly, so that each sample has its counterpart
-    assert all(each.shift <= 1.0 for each in by_progress.objects)
+    assert all(each.greatest_shift <= 1.0 for each in by_progress.objects)
     assert not by_progress.is_empty
 
 
@@ -83,7 +83,7 @@ def test_runs_are_aligned_by_an_event() -> None:
     specification = sr.parse_specification(ROUND)
     (by_time,) = sr.diff_logs(early, late, specification).objects
     by_event = sr.diff_logs(early, late, specification, align="near")
-    assert by_time.shift > 5.0
+    assert by_time.greatest_shift > 5.0
     assert by_event.objects == ()
     assert by_event.alignment is not None
     ((a_ns, b_ns),) = by_event.alignment.knots
@@ -114,7 +114,7 @@ def test_signals_with_other_values_are_listed_and_other_units_noticed() -> None:
 
     levels = [0.9, 0.8, 0.7]
     (battery,) = sr.diff_logs(run(levels), run([0.9, 0.8, 0.4])).signals
-    assert (battery.name, battery.first_ns, battery.greatest) == ("battery", 2 * 10**9, 0.7 - 0.4)
+    assert (battery.name, battery.first_ns, battery.greatest_difference) == ("battery", 2 * 10**9, 0.7 - 0.4)
     diff = sr.diff_logs(run(levels), run([100 * level for level in levels]))
     assert not diff.is_empty
     assert "100 times as large in B: it may be in another unit there" in repr(diff)
@@ -128,8 +128,8 @@ def test_squares_differ_by_their_corners_alone() -> None:
     )
     (tile,) = sr.diff_logs(one, other).objects
     assert tile.name == "tile"
-    assert tile.shift == 0.0
-    assert tile.greatest < 0.0
+    assert tile.greatest_shift == 0.0
+    assert tile.greatest_distance < 0.0
 
 
 def test_a_group_under_another_name_is_the_same_group() -> None:

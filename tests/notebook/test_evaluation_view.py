@@ -43,7 +43,7 @@ def test_a_page_shows_the_interval_of_an_unknown_robustness():
 def test_texts_of_logs_are_escaped():
     trace = sr.Trace.from_samples([sr.Sample(0, {"<b>a</b>": sr.Footprint.disc(0, 0, 1)})])
     evaluation = judged("spec seen(x) = G x dist x <= 0", trace, each={"x": "all"})
-    assert "seen for <b>a</b>" in shown(evaluation)
+    assert "seen(<b>a</b>)" in shown(evaluation)
 
 
 def test_a_page_of_many_results_shows_the_worst_and_counts_the_others():

@@ -31,7 +31,7 @@ from spatial_replay.geometry.arrays import Floats, Integers, combined, equal_pla
 from spatial_replay.geometry.footprint import FootprintBatch
 from spatial_replay.logs.schemas.Robustness_pb2 import HOLDS_SO_FAR, PENDING, SATISFIED, UNKNOWN, VIOLATED
 from spatial_replay.palette import HOLDING, MAP, NEGATIVE, NEUTRAL, POSITIVE
-from spatial_replay.text import Instant
+from spatial_replay.text import Instant, cut
 
 
 def failed_objects(
@@ -173,9 +173,8 @@ def arrow_texts(
         result, leaf, holds, moment_ns, atom = (int(each[places[0]]) for each in columns)
         known = results[result].leaf_pairs if result >= 0 and leaf >= 0 else None
         text = found.atoms[atom] if atom >= 0 else "" if known is None else known.texts[leaf]
-        text = text if len(text) <= _LONGEST_CAUSE else f"{text[: _LONGEST_CAUSE - 1]}…"
         at = " now" if moment_ns < 0 else f" at {Instant(moment_ns, first_ns)}"
-        said = f"{text}{at}: {'must not hold, holds by ' if holds else ''}"
+        said = f"{cut(text, _LONGEST_CAUSE)}{at}: {'must not hold, holds by ' if holds else ''}"
         dashes = () if moment_ns < 0 else _outlines_then(results[result].settled)
         causes.append(CauseText(said, int(lengths[places[0]]), dashes))
     numbers = [b""] * len(found.result)

@@ -25,7 +25,7 @@ from spatial_replay.geometry.arrays import Integers, flat_index, starts_from_cou
 from spatial_replay.geometry.footprint import Concave, FootprintBatch
 from spatial_replay.logs.messages import BLOCK_SAMPLES
 from spatial_replay.logs.read_options import FaultList, Lost, frame_times
-from spatial_replay.text import Instant, Sentence, is_encodable, text_number, times_apart
+from spatial_replay.text import Instant, Sentence, cut, is_encodable, text_number, times_apart
 from spatial_replay.trace.observations import Observations, trace_from_observations
 from spatial_replay.trace.trace import LATEST_NS, Trace, class_order, require_few
 
@@ -307,7 +307,7 @@ def _list(value: Any, what: str) -> list[Any]:
 def _check_keys(entry: dict[str, Any], known: set[str], what: str) -> None:
     if not entry.keys() <= known:
         unknown, listed = ", ".join(map(repr, sorted(entry.keys() - known))), ", ".join(sorted(known))
-        raise _NoSampleError(f"{what} has the unknown key {_shorten(unknown)}; known are {listed}")
+        raise _NoSampleError(f"{what} has the unknown key {cut(unknown, 60)}; known are {listed}")
 
 
 def _is_text(text: str, *, empty: bool = False) -> bool:
@@ -324,13 +324,9 @@ def _short(value: Any) -> str:
     if isinstance(value, dict | list):
         return _kind(value)
     try:
-        return _shorten(json.dumps(value))
+        return cut(json.dumps(value), 60)
     except ValueError:
         return "a number of too many digits"
-
-
-def _shorten(text: str) -> str:
-    return text if len(text) <= 60 else text[:59] + "…"
 
 
 CSV_COLUMNS = ("time_ns", "name", "class", "x", "y", "yaw", "length", "width")

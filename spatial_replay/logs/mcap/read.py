@@ -64,7 +64,7 @@ from spatial_replay.logs.messages import (
 from spatial_replay.logs.objects import decode_objects
 from spatial_replay.logs.read_options import FaultList
 from spatial_replay.logs.remote import RemoteFile, file_size, open_file, plan_reads
-from spatial_replay.text import Instant, Sentence, counted
+from spatial_replay.text import Instant, Sentence, counted, listed
 from spatial_replay.trace.trace import LATEST_NS, Trace
 from spatial_replay.trace.units import Axes
 
@@ -438,8 +438,7 @@ class McapSource(FileSource):
         topics = sorted({channel.topic for channel in walk.channels.values()})
         if not topics:
             return LogError(f"{self.name} holds no message" + (f": {fault}" if fault else ""))
-        listed = ", ".join(map(repr, topics[:8])) + (", …" if len(topics) > 8 else "")
-        what = f"no topic {OBJECTS!r} in {self.name}; it has {listed}"
+        what = f"no topic {OBJECTS!r} in {self.name}; it has {listed([*map(repr, topics)])}"
         if fault:
             return LogError(f"{what}: {fault}")
         if METADATA in dict(self.metadata()):
