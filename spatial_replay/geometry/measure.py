@@ -85,19 +85,13 @@ def measure(batch: FootprintBatch, operands: Sequence[Operand], requests: Sequen
         (K, T) float64 for K requests.
 
     Raises:
-        GeometryError: operands over different numbers of samples, a row the batch does not have, a
-            request for an operand that does not exist.
+        GeometryError: a row that the batch does not have.
     """
-    samples = {operand.rows.shape[0] for operand in operands}
-    if len(samples) > 1:
-        raise GeometryError(f"operands span {sorted(samples)} samples; give each the same number")
     members = np.concatenate([np.ravel(operand.rows) for operand in operands] or [_NO_ROWS])
     if members.size and members.max() >= len(batch):
         raise GeometryError(f"an operand has row {members.max()}; the batch has {len(batch)} rows, from 0")
     size = np.array([operand.rows.size for operand in operands], dtype=np.int64)
-    for request in requests:
-        _check_request(request, len(operands))
-    values = np.empty((len(requests), samples.pop() if samples else 0))
+    values = np.empty((len(requests), operands[0].rows.shape[0] if operands else 0))
     codes = np.array([QUANTITY_CODES[request.quantity] for request in requests], dtype=np.int64)
     if values.shape[1] > 1:
         rests = [_rests(operand) for operand in operands]
@@ -137,15 +131,6 @@ def _rests(operand: Operand) -> bool:
 
 def _operands_of(request: MeasureRequest) -> tuple[int, ...]:
     return (request.first, request.second) if request.quantity in _BETWEEN_TWO else (request.first,)
-
-
-def _check_request(request: MeasureRequest, operand_count: int) -> None:
-    if request.quantity not in QUANTITY_CODES:
-        raise GeometryError(f"no quantity {request.quantity!r}; there are {', '.join(QUANTITY_CODES)}")
-    for index in _operands_of(request):
-        if not 0 <= index < operand_count:
-            asked = f"{request.quantity} asks for operand {index}"
-            raise GeometryError(f"{asked}; there are {operand_count}, from 0")
 
 
 def misalignment(first: Floats, second: Floats) -> Floats:

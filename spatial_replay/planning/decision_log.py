@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import accumulate, pairwise
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple
@@ -216,23 +216,31 @@ _PIXELS = 3.0
 
 
 class BlackBox:
-    """A planner together with the messages of all its decisions.
+    """A planner whose decisions are written, as messages.
 
     Samples, decisions and outcomes have to go through it in the order in which they happen. Equal ones give
     equal bytes, so that a log can be verified by recomputing it.
 
     Attributes:
         planner: the planner.
+        planning_s: time spent planning, in seconds of real time.
     """
 
-    def __init__(self, planner: Planner, *, timings: bool = False) -> None:
+    def __init__(
+        self,
+        planner: Planner,
+        write: Callable[[Messages], None] = lambda messages: None,
+        *,
+        timings: bool = False,
+    ) -> None:
         """Begin before the first sample.
 
         Args:
+            write: takes the messages of each decision, and of each outcome.
             timings: also log how long each decision took, so that equal runs do not give equal logs.
         """
-        self.planner = planner
-        self._times = timings
+        self.planner, self.planning_s = planner, 0.0
+        self._write, self._times = write, timings
         self._written = dict.fromkeys(_CHANNELS, 0)
         self._sample: Sample | None = None
         self._step: Step | None = None
@@ -246,16 +254,18 @@ class BlackBox:
         Raises:
             TraceError: its time is not after that of the last one.
         """
+        began = time.perf_counter()
         self.planner.observe(sample)
         self._sample = sample
         tracked = self._object_moved()
         if tracked is not None:
             self._travelled.append(centre_of(tracked.footprint))
+        self.planning_s += time.perf_counter() - began
 
-    def decide(self) -> tuple[Step, Messages]:
-        """Return the planner's next step and its messages; none while the same wait goes on.
+    def next_step(self) -> Step:
+        """Return the planner's next step, and write it, unless it is the same wait as before.
 
-        The outcome of a wait comes with the decision after it.
+        The outcome of a wait is written with the decision after it.
 
         Raises:
             UsageError: nothing was observed yet, or the last step was not concluded.
@@ -264,7 +274,7 @@ class BlackBox:
         step = self.planner.next_step()
         took_s = time.perf_counter() - began
         if step is self._step:
-            return step, self._messages(step.time_ns, [], [], [])
+            return step
         ended = self._ended_wait(step.time_ns)
         self._step = step
         self._tracked = self._object_moved()
@@ -274,10 +284,13 @@ class BlackBox:
         maps = [map_message(each, step.time_ns, layers[each.candidate]) for each in maps_of(step)]
         path = path_message(step.target, self._tracked, step.time_ns)
         timings = [[_timing(step, took_s)]] if self._times else []
-        return step, self._messages(step.time_ns, [*ended, self._decision], maps, [path], *timings)
+        messages = self._messages(step.time_ns, [*ended, self._decision], maps, [path], *timings)
+        self.planning_s += time.perf_counter() - began
+        self._write(messages)
+        return step
 
-    def conclude(self, outcome: Outcome) -> Messages:
-        """Take the outcome of the last step, and return its messages.
+    def conclude(self, outcome: Outcome) -> None:
+        """Take the outcome of the last step, and write it.
 
         Raises:
             UsageError: no step is being executed.
@@ -288,7 +301,7 @@ class BlackBox:
         step, end_ns = self._step, self._sample.time_ns
         path = path_message(step.target, self._tracked, end_ns, self._travelled)
         self._step = None
-        return self._messages(end_ns, [self._concluded(outcome, end_ns)], [], [path])
+        self._write(self._messages(end_ns, [self._concluded(outcome, end_ns)], [], [path]))
 
     def _ended_wait(self, end_ns: int) -> list[PlanDecision]:
         """Return the last decision with its outcome if it was a wait."""

@@ -9,7 +9,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 
 from spatial_replay.automata.automaton import Automaton
 from spatial_replay.automata.compile import automaton as automaton_of
@@ -55,6 +55,7 @@ from spatial_replay.text import counted, named_arguments, times_apart
 from spatial_replay.trace.trace import Sample, require_sample
 
 if TYPE_CHECKING:
+    from spatial_replay.planning.decision_log import BlackBox
     from spatial_replay.recording.recorder import Recorder
 
 _LONGEST_WANTED: Final = 60
@@ -461,27 +462,6 @@ class Robot(Executor, Protocol):
         """Write one more sample to the recorder, while nothing moves."""
 
 
-class Decider(Protocol):
-    """A planner whose decisions are written somewhere."""
-
-    @property
-    def planner(self) -> Planner | None:
-        """The planner."""
-
-    def next_step(self) -> Step:
-        """Return the planner's next step, and write it."""
-
-    def conclude(self, outcome: Outcome) -> None:
-        """Take the outcome of the last step, and write it."""
-
-
-class LoopEnd(NamedTuple):
-    """How a loop ended: the last decision, and the number of motions, without refused ones."""
-
-    last: Step
-    motions: int
-
-
 @named_arguments
 def plan(planner: Planner, robot: Robot, recorder: Recorder, *, timings: bool = False) -> Step:
     """Let a planner decide and a robot act until there is nothing more to do, and record all of it.
@@ -509,11 +489,13 @@ def plan(planner: Planner, robot: Robot, recorder: Recorder, *, timings: bool = 
         raise UsageError(
             "a recorder with a planner was given its timings when that was attached; leave them out"
         )
-    return run_plan(recorder, robot.execute, robot.look).last
+    return run_plan(recorder, robot.execute, robot.look)
 
 
-def run_plan(decider: Decider, execute: Callable[[Step], Outcome], look: Callable[[], None]) -> LoopEnd:
-    """Look, decide and act until there is nothing more to do.
+def run_plan(
+    decider: BlackBox | Recorder, execute: Callable[[Step], Outcome], look: Callable[[], None]
+) -> Step:
+    """Look, decide and act until there is nothing more to do; return the last decision.
 
     Args:
         look: takes one more sample, which the planner observes, while nothing moves.
@@ -533,7 +515,7 @@ def run_plan(decider: Decider, execute: Callable[[Step], Outcome], look: Callabl
             waited += not step.ahead or planner.states in reached
             reached.add(planner.states)
         elif step.kind != "hold" or _holds(planner, look):
-            return LoopEnd(step, planner.motions)
+            return step
 
 
 def _holds(planner: Planner, look: Callable[[], None]) -> bool:

@@ -284,12 +284,19 @@ class Rerun:
 
     def __init__(self, planner: Planner) -> None:
         """Begin before the first sample."""
-        self.box = BlackBox(planner)
+        self._written: list[Messages] = []
+        self.box = BlackBox(planner, self._written.append)
         self.last: Step | None = None
         self.is_moving = False
 
-    def repeat(self, recorded: PlanDecision) -> Messages | None:
-        """Repeat a recorded decision, or conclude it with its recorded outcome; return the messages of that.
+    def taken(self) -> Messages:
+        """Return the messages of what was repeated since the last call."""
+        written = merge(self._written)
+        self._written.clear()
+        return written
+
+    def repeat(self, recorded: PlanDecision) -> None:
+        """Repeat a recorded decision, or conclude it with its recorded outcome.
 
         Raises:
             LogError: a decision without the outcome of the one before, or an outcome without a decision.
@@ -300,16 +307,14 @@ class Rerun:
                 raise LogError(
                     f"the log has decision {recorded.number}, and no outcome of {self.last.number} before it"
                 )
-            self.last, messages = self.box.decide()
+            self.last = self.box.next_step()
             self.is_moving = self.last.kind == "execute"
-            return messages
-        if recorded.kind == PlanDecision.KIND_WAIT:
-            # the outcome of a wait is written with the next decision, and so is repeated with it
-            return None
-        if not self.is_moving:
-            raise LogError(f"the log has the outcome of decision {recorded.number}, and not the decision")
-        self.is_moving = False
-        return self.box.conclude(_outcome(recorded))
+        # the outcome of a wait is written with the next decision, and so is repeated with it
+        elif recorded.kind != PlanDecision.KIND_WAIT:
+            if not self.is_moving:
+                raise LogError(f"the log has the outcome of decision {recorded.number}, and not the decision")
+            self.is_moving = False
+            self.box.conclude(_outcome(recorded))
 
 
 def _outcome(decision: PlanDecision) -> Outcome:
@@ -421,11 +426,11 @@ class _Comparison:
     def _recomputed(self, recorded: PlanDecision) -> Iterator[PlannerMessage]:
         has_outcome = recorded.HasField("outcome")
         self.began_within |= self.rerun.last is None and bool(has_outcome or recorded.number)
-        messages = self.rerun.repeat(recorded)
+        self.rerun.repeat(recorded)
         if not has_outcome and self.rerun.last is not None:
             self.decisions += 1
             self.maps += len(maps_of(self.rerun.last))
-        return iter(()) if messages is None else planner_messages(messages)
+        return planner_messages(self.rerun.taken())
 
 
 def _missing(rerun: Rerun) -> Iterator[str]:
@@ -714,9 +719,9 @@ class _Redoing:
         waiting = self._new.last is not None and self._new.last.kind == "wait"
         if self._is_changed and waiting and not made:
             # what it decides now comes before anything in the log
-            step, messages = self._new.box.decide()
+            step = self._new.box.next_step()
             if step is not self._new.last:
-                self._differ(sample, None, step, messages)
+                self._differ(sample, None, step, self._new.taken())
             return
         for decision in decisions:
             if not self._repeat(sample, decision, recorded):
@@ -726,9 +731,9 @@ class _Redoing:
         """Repeat a decision or its outcome; return whether the same was done."""
         before = self._new.last
         self._old.repeat(decision)
-        messages = self._new.repeat(decision)
-        old, new = self._old.last, self._new.last
-        if messages is None or old is None or new is None:
+        self._new.repeat(decision)
+        messages, old, new = self._new.taken(), self._old.last, self._new.last
+        if old is None or new is None:
             return True
         if decision.HasField("outcome"):
             self.messages.append(_on_redone_topics(messages))

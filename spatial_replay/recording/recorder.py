@@ -855,7 +855,7 @@ class Recorder(SampleWriter):
         from spatial_replay.planning.decision_log import BlackBox
 
         self._refuse_planner(planner)
-        self._box = BlackBox(planner, timings=timings)
+        self._box = BlackBox(planner, self._write_decision, timings=timings)
         self._drains = True
 
     def _refuse_planner(self, planner: Planner) -> None:
@@ -897,9 +897,7 @@ class Recorder(SampleWriter):
             UsageError: there is no planner, nothing was written yet, or the last step was not concluded.
             OutputError: something before could not be written.
         """
-        step, messages = self._require_box().decide()
-        self._write_decision(messages)
-        return step
+        return self._require_box().next_step()
 
     def conclude(self, outcome: Outcome) -> None:
         """Record the outcome of the last step, after the samples of its motion.
@@ -908,7 +906,7 @@ class Recorder(SampleWriter):
             UsageError: there is no planner, not an outcome, or no step is being executed.
             OutputError: something before could not be written.
         """
-        self._write_decision(self._require_box().conclude(outcome))
+        self._require_box().conclude(outcome)
 
     def _require_box(self) -> BlackBox:
         if self._box is None:

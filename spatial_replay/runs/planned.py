@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
@@ -131,55 +130,13 @@ def execute_in(world: Tabletop, settings: Settings, step: Step) -> Outcome:
     return world.place(target.name, target.x, target.y, target.yaw, target.waypoints[1:-1])
 
 
-class PlanLoop:
-    """A planner in the loop of a simulated run: its decisions go to the log as its samples do.
-
-    Attributes:
-        planning_s: time spent planning, in seconds of real time.
-        bounds: how many samples the bounds in seconds are, in words; empty without any.
-    """
-
-    def __init__(self, box: BlackBox, log: RunLog) -> None:
-        """Begin before the first sample."""
-        self._box, self._log = box, log
-        self.planning_s = 0.0
-
-    @property
-    def planner(self) -> Planner:
-        """The planner."""
-        return self._box.planner
-
-    def observe(self, sample: Sample) -> None:
-        """Log the next sample and update the planner.
-
-        Raises:
-            TraceError: it is not after the one before.
-            OutputError: the log cannot be written.
-        """
-        self._log.write(sample)
-        began = time.perf_counter()
-        self._box.observe(sample)
-        self.planning_s += time.perf_counter() - began
-
-    def next_step(self) -> Step:
-        """Return the planner's next step, and log it."""
-        began = time.perf_counter()
-        step, messages = self._box.decide()
-        self.planning_s += time.perf_counter() - began
-        self._log.write_messages(messages)
-        return step
-
-    def log_tick(self, tick: TreeTick, time_ns: int) -> None:
-        """Log a tick of the robot's behaviour tree, with the newest sample."""
-        message = BehaviourTree(time_ns=time_ns, tick=tick.number)
-        for node in tick.nodes:
-            status = BehaviourTree.Status.Value(f"STATUS_{node.status}")
-            message.nodes.add(name=node.name, type=node.kind, parent=node.parent, status=status)
-        self._log.write_payload(_TREES, self._log.newest_ns, message.SerializeToString(deterministic=True))
-
-    def conclude(self, outcome: Outcome) -> None:
-        """Take the outcome of the last step, and log it."""
-        self._log.write_messages(self._box.conclude(outcome))
+def _log_tick(log: RunLog, tick: TreeTick, time_ns: int) -> None:
+    """Log a tick of the robot's behaviour tree, with the newest sample."""
+    message = BehaviourTree(time_ns=time_ns, tick=tick.number)
+    for node in tick.nodes:
+        status = BehaviourTree.Status.Value(f"STATUS_{node.status}")
+        message.nodes.add(name=node.name, type=node.kind, parent=node.parent, status=status)
+    log.write_payload(_TREES, log.newest_ns, message.SerializeToString(deterministic=True))
 
 
 @dataclass(frozen=True, slots=True)
@@ -276,18 +233,19 @@ def record_plan(
             run_log(output, [kept, *others], about, inputs, known, durability) as log,
         ):
             log.add_metadata(PLAN_METADATA, plan_metadata(planner, kept.filename))
-            loop = PlanLoop(BlackBox(planner, timings=timings), log)
+            box = BlackBox(planner, log.write_messages, timings=timings)
 
             def observe(sample: Sample) -> str:
-                loop.observe(sample)
+                log.write(sample)
+                box.observe(sample)
                 if film is not None:
                     film.take(sample)
                 advance(1)
                 return planner.stop_reason
 
-            world.attach(observe, lambda tick: loop.log_tick(tick, world.time_ns))
-            end = run_plan(loop, partial(execute_in, world, planner.settings), world.step)
-        last, own = end.last, {spec.name for spec in kept.results}
+            world.attach(observe, lambda tick: _log_tick(log, tick, world.time_ns))
+            last = run_plan(box, partial(execute_in, world, planner.settings), world.step)
+        own = {spec.name for spec in kept.results}
         return PlannedRun(
             samples=log.samples,
             seconds=log.seconds,
@@ -295,9 +253,9 @@ def record_plan(
             name=planner.automaton.name,
             verdict=log.verdicts[planner.automaton.name],
             reason=sentence_of(last),
-            steps=end.motions,
+            steps=planner.motions,
             pruned=len(last.pruned),
-            planning_s=loop.planning_s,
+            planning_s=box.planning_s,
             bounds=planner.bounds,
             yaws="" if world.workspace.yaws or "yaws" in changes else _yaws_text(settings.workspace.yaws),
             others={name: each for name, each in log.verdicts.items() if name not in own},
@@ -325,4 +283,4 @@ def warm_up_planner() -> None:
         "jug": TrackedObject(Footprint.disc(4, 4, 1), height=(0.0, 1.0)),
     }
     box.observe(Sample(0, objects))
-    box.decide()
+    box.next_step()

@@ -14,13 +14,11 @@ from typing import Any, Final, Literal, NamedTuple, TypeAlias
 import numpy as np
 
 from spatial_replay.errors import SpecificationError, UsageError
-from spatial_replay.geometry.arrays import Floats
 from spatial_replay.logs.remote import LogFile
 from spatial_replay.monitor.atoms.measurements import leaf_values
 from spatial_replay.monitor.atoms.terms import TraceScene
 from spatial_replay.monitor.instances import Instance, find_instances
 from spatial_replay.monitor.offline import OfflineFormula, new_leaves
-from spatial_replay.monitor.online.codes import in_channels
 from spatial_replay.spec import check_names
 from spatial_replay.spec.constants import text_of, value_given
 from spatial_replay.spec.diagnostics import nearest_hint
@@ -478,23 +476,21 @@ class _Result(NamedTuple):
     """A result of a specification with some values, compiled.
 
     Attributes:
-        changed: which of its leaves differ from the first one's; None: not the same leaves.
-        regions: those of the specification, if they are not the first one's.
+        regions: those of the specification.
         same_measurements: whether it needs no other measurements than the first one.
     """
 
     order: Sequence[Atom | Quantified]
     formula: OfflineFormula
-    changed: tuple[int, ...] | None
-    regions: Mapping[str, Outline] | None
+    regions: Mapping[str, Outline]
     same_measurements: bool
 
 
 class _Prepared(NamedTuple):
-    """A run with what it needs to be evaluated again: instances of each result, their leaves (C, A, T)."""
+    """A run with what it needs to be evaluated again: instances of each result, and their samples."""
 
     scene: TraceScene
-    instances: Mapping[str, Sequence[tuple[Instance, slice, Floats]]]
+    instances: Mapping[str, Sequence[tuple[Instance, slice]]]
 
 
 class Margins:
@@ -669,19 +665,8 @@ class Margins:
 
     def _compiled_from(self, name: str, formula: Formula, regions: Mapping[str, Outline]) -> _Result:
         order, first = new_leaves(formula, ()), self._first[name]
-        changed = None
-        if len(order) == len(first):
-            changed = tuple(
-                i for i, (one, other) in enumerate(zip(order, first, strict=True)) if one != other
-            )
-        same_regions = regions == self._base.regions
-        return _Result(
-            order,
-            OfflineFormula.of(formula, order),
-            changed,
-            None if same_regions else regions,
-            same_regions and _measurements(order) <= _measurements(first),
-        )
+        is_same = regions == self._base.regions and _measurements(order) <= _measurements(first)
+        return _Result(order, OfflineFormula.of(formula, order), regions, is_same)
 
     def _prepare(self, run: LabelledRun) -> _Prepared:
         scene = TraceScene(run.trace, self._base.regions)
@@ -695,11 +680,10 @@ class Margins:
                 f"{run.name} does not fit {self._base.filename}: {'; '.join(missing)}; leave it out, or "
                 "give names that it has"
             )
-        found: dict[str, list[tuple[Instance, slice, Floats]]] = {}
+        found: dict[str, list[tuple[Instance, slice]]] = {}
         for instance in find_instances(self._base, self._each, [run.trace], 0, FOREVER):
             inside = slice(*window_of(times_ns, instance.start_ns, instance.end_ns))
-            leaves = leaf_values(scene, self._first[instance.name], instance.bindings)
-            found.setdefault(instance.name, []).append((instance, inside, leaves))
+            found.setdefault(instance.name, []).append((instance, inside))
         if not found:
             raise UsageError(f"{run.name} has no object for the template to stand for; leave it out")
         return _Prepared(scene, found)
@@ -708,27 +692,14 @@ class Margins:
         scene = prepared.scene
         if not result.same_measurements:
             # measurements of values that are only tried do not stay in the run's cache
-            regions = scene.regions if result.regions is None else result.regions
-            scene = TraceScene(replace(scene.trace), regions, scene.skip)
+            scene = TraceScene(replace(scene.trace), result.regions, scene.skip)
         lower = upper = np.inf
-        for instance, inside, first in prepared.instances.get(name, ()):
-            leaves = self._leaves(scene, instance, result, first)
+        for instance, inside in prepared.instances.get(name, ()):
+            leaves = leaf_values(scene, result.order, instance.bindings)
             times_ns = scene.trace.times_ns[inside]
             low, high = result.formula.evaluate(leaves[:, :, inside], times_ns).ends(0)
             lower, upper = min(lower, float(low[0])), min(upper, float(high[0]))
         return Robustness(lower, upper)
-
-    def _leaves(self, scene: TraceScene, instance: Instance, result: _Result, first: Floats) -> Floats:
-        """Return the leaves of a result (C, A, T); those that did not change are those of the first one."""
-        if result.changed is None or result.regions is not None:
-            return leaf_values(scene, result.order, instance.bindings)
-        if not result.changed:
-            return first
-        own = leaf_values(scene, [result.order[index] for index in result.changed], instance.bindings)
-        channels = max(len(own), len(first))
-        leaves = in_channels(first, channels).copy()
-        leaves[:, list(result.changed)] = in_channels(own, channels)
-        return leaves
 
 
 def _result_of(specification: Specification, name: str) -> Formula:

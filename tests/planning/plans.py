@@ -53,7 +53,14 @@ def record_plan_of(
         most_recorded: how many decisions and outcomes the log holds; all of them if it is None.
     """
     specification = replace(sr.parse_specification(text), filename="task.spatial")
-    box = BlackBox(Planner(specification, settings, rate_hz=rate_hz))
+    steps, sent = [], []
+
+    def record(messages):
+        sent.append(messages)
+        if most_recorded is None or len(sent) <= most_recorded:
+            log.write_messages(messages)
+
+    box = BlackBox(Planner(specification, settings, rate_hz=rate_hz), record)
     with run_log(path, [specification]) as log:
         about = plan_metadata(box.planner, "task.spatial")
         log.add_metadata(
@@ -61,22 +68,14 @@ def record_plan_of(
         )
         table = Table(dict(objects), _Watched(box, log, recorded_as), **options)
         table.look()
-        steps, sent = [], []
-
-        def record(messages):
-            sent.append(messages)
-            if most_recorded is None or len(sent) <= most_recorded:
-                log.write_messages(messages)
-
         while not steps or steps[-1].kind in ("execute", "wait"):
-            step, messages = box.decide()
+            step = box.next_step()
             if step in steps:
                 table.look()
                 continue
-            record(messages)
             steps.append(step)
             if step.kind == "execute":
-                record(box.conclude(table.execute(step)))
+                box.conclude(table.execute(step))
     return steps
 
 

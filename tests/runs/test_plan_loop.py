@@ -13,8 +13,7 @@ from spatial_replay import Planner, Settings
 from spatial_replay.planning import Grid, Workspace
 from spatial_replay.planning.decision_log import BlackBox
 from spatial_replay.planning.planner import HOLDING_SAMPLES, MOST_WAITING_SAMPLES, run_plan
-from spatial_replay.runs.planned import PlanLoop
-from spatial_replay.runs.scripted import run_log
+from spatial_replay.runs.scripted import RunLog, run_log
 
 TABLE = Settings(Workspace(Grid.over(0, 0, 10, 10, 0.5), supports=frozenset({"plate"})))
 THINGS = {"cup": block(1, 1, size=1), "fork": block(9, 9, size=1), "plate": block(5, 5, size=3)}
@@ -28,7 +27,8 @@ class Camera:
         hides: says for a sample's number and an object's name whether the object is hidden.
     """
 
-    loop: PlanLoop
+    log: RunLog
+    box: BlackBox
     settings: Settings
     hides: object
     seen: int = 0
@@ -36,7 +36,9 @@ class Camera:
     def observe(self, sample):
         objects = {name: each for name, each in sample.objects.items() if not self.hides(self.seen, name)}
         self.seen += 1
-        self.loop.observe(sr.Sample(sample.time_ns, objects))
+        shown = sr.Sample(sample.time_ns, objects)
+        self.log.write(shown)
+        self.box.observe(shown)
 
 
 def run(path, text, hides, things=THINGS, **options):
@@ -45,11 +47,11 @@ def run(path, text, hides, things=THINGS, **options):
     planner = Planner(specification, TABLE)
     with run_log(path, [specification]) as log:
         table = Table(dict(things), None, **options)
-        loop = PlanLoop(BlackBox(planner), log)
-        table.planner = Camera(loop, TABLE, hides)
-        end = run_plan(loop, table.execute, table.look)
+        box = BlackBox(planner, log.write_messages)
+        table.planner = Camera(log, box, TABLE, hides)
+        last = run_plan(box, table.execute, table.look)
     assert log.samples == len(table.samples)
-    return end.last, planner, end.motions, log.verdicts["spec"]
+    return last, planner, planner.motions, log.verdicts["spec"]
 
 
 def test_a_doubt_that_remains_does_not_prolong_a_run(tmp_path):
